@@ -43,7 +43,6 @@ from hybridlog_storage.errors import (
     DatabaseError,
     DiskFullError,
     HybridlogError,
-    IndexChangedError,
     MissingDependencyError,
     ResourceError,
     SegmentError,
@@ -64,8 +63,6 @@ if TYPE_CHECKING:
     from hybridlog.columns.payload_reader import ArrayTable
     from hybridlog.columns.tables import Tables
     from hybridlog.columns.topic_table import TopicTable
-    from hybridlog.index.field_indexes import FieldIndex
-    from hybridlog.index.index_version import GuardedIndex, IndexVersion
     from hybridlog.index.index_writer import IndexTarget
     from hybridlog.query.chunk_columns import Chunk
     from hybridlog.query.predicate.tree import Predicate
@@ -173,7 +170,6 @@ class Session:
         unavailable: The reason why MongoDB is unavailable; None while that is unknown.
         cache: What was read or worked out; chunks of single messages are a kind of it.
         invalidations: How often everything that was read was dropped.
-        field_indexes: The indexes on fields in MongoDB; empty without a connection.
     """
 
     def __init__(
@@ -191,13 +187,10 @@ class Session:
         self.connection = Connection(directory, mongo, cache_mb)
         self.repairs = RepairReport()
         self.cache = Cache()
-        self.field_indexes: list[FieldIndex] = []
-        self._uncertain: tuple[int, dict[str, set[str]]] | None = None
         self.unavailable: HybridlogError | None = None
         self._rests_until = 0.0
         self._connecting = threading.RLock()
         self._is_indexed = False  # the index has all recordings of the snapshot
-        self._indexed: set[str] = set()  # ids of those that it has in any case
         self._stale: set[str] = set()  # recordings that the index may lack
         self._recovers = recover
         self._is_opened = False  # what a crash left was repaired, unless it is left to another
@@ -211,7 +204,6 @@ class Session:
         self._following = threading.RLock()
         self._mending = threading.Lock()
         self._entries: dict[str, RecordingEntry] = {}  # compared with their files, by id
-        self._index_version: IndexVersion | None = None
         self._places: TopicPlaces | None = None
         self._schemas: dict[str, Schema] = {}
         self._channels: dict[str, tuple[RecordingEntry, list[RecordedChannel]]] = {}
@@ -254,51 +246,49 @@ class Session:
 
         A failure is remembered for some seconds.
         """
-        return self._connected_for(None)
+        return self._reached(brings=True)
 
-    def _connected_for(self, entries: Sequence[RecordingEntry] | None) -> Database | None:
-        """The index with some recordings, None for all; connected when it is needed."""
-        is_ready = self._is_indexed or (
-            entries is not None and self._indexed.issuperset(entry.id for entry in entries)
-        )
+    def _reached(self, *, brings: bool) -> Database | None:
+        """The index, connected when it is needed; `brings` it up to date first."""
+        is_ready = self._is_indexed or not brings
         if (self.connected is None or not is_ready) and time.monotonic() >= self._rests_until:
             with suppress(HybridlogError):
-                self.connect(entries)
+                self.connect(brings=brings)
         return self.connected
 
-    def database_about(self, purpose: str, entries: Sequence[RecordingEntry]) -> Database:
-        """The index of some recordings; the rest of the store need not be in it.
+    def index_as_it_is(self, purpose: str) -> Database:
+        """The index, which may lack recordings.
 
         Raises:
             DatabaseError: it is unavailable; has the purpose and the reason.
         """
-        database = self._connected_for(entries)
+        database = self._reached(brings=False)
         if database is None:
             raise self._missing_database(purpose)
         return database
 
-    def connect(self, recordings: Collection[RecordingEntry] | None = None) -> Database:
+    def connect(self, *, brings: bool = True) -> Database:
         """Connect to the index and bring it up to date; try again if the connection breaks.
 
         Args:
-            recordings: The recordings that the index must have; None for all.
+            brings: False to leave it as it is.
 
         Raises:
             DatabaseError: MongoDB does not answer.
             StoreError: it holds the index of another store, or this store is a copy.
         """
         with self._connecting:
-            if self.connected is not None and self._is_indexed:
+            if self.connected is not None and (self._is_indexed or not brings):
                 return self.connected
             try:
                 if self.connected is not None:  # it may have been lost: a new one follows
                     with suppress(ConnectionLostError):
-                        return self._connect(recordings)
+                        return self._connect(brings=brings)
                 for tried in range(1, _TRIES):
                     with suppress(ConnectionBrokenError):
-                        return self._connect(recordings)
+                        return self._connect(brings=brings)
                     time.sleep(_PAUSE_S * 2 ** (tried - 1))
-                return self._connect(recordings)
+                return self._connect(brings=brings)
             except BaseException as error:
                 self.disconnect()
                 if isinstance(error, HybridlogError):
@@ -306,31 +296,23 @@ class Session:
                     self._rests_until = time.monotonic() + _REST_S
                 raise
 
-    def _connect(self, recordings: Collection[RecordingEntry] | None) -> Database:
-        from hybridlog.index import field_indexes
+    def _connect(self, *, brings: bool) -> Database:
         from hybridlog.maintenance import index
 
         if self.connected is None:
-            self._index_version = self._places = None
+            self._places = None
             self._is_indexed = False
-            self._indexed.clear()
         repairs = RepairReport()
         has_changed = False
-        wanted = None if recordings is None else {entry.id: entry for entry in recordings}
         try:
-            is_new = self.connected is None
             database = self.connection.open()
-            if is_new:
-                self.field_indexes = field_indexes.listed(database)
-                self._uncertain = None
-            if self.connection.may_write:
+            if brings and self.connection.may_write:
                 store = index.StoreIndex(self.directory, self.catalog, database, self._progress)
                 has_changed = store.bring_up_to_date(
                     self.snapshot(),
                     self.entry_of,
                     index=self.connection.index,
                     stale=self._stale,
-                    wanted=None if wanted is None else wanted.keys(),
                     report=repairs,
                 )
         finally:
@@ -341,23 +323,20 @@ class Session:
             self.repairs.removed += repairs.removed
         self.unavailable = None
         self._rests_until = 0.0
-        self._stale = set() if wanted is None else self._stale - wanted.keys()
-        known = self._indexed.copy()
-        if has_changed:
-            self.invalidate()
-        self._is_indexed = recordings is None
-        self._indexed = known.union(entry.id for entry in recordings or ())
+        if brings:
+            self._stale = set()
+            if has_changed:
+                self.invalidate()
+            self._is_indexed = True
         return database
 
     def disconnect(self) -> None:
         """Disconnect from MongoDB; questions are then answered from the files."""
         self.connection.close()
-        self._index_version = None
         self._places = None
 
     def take_over(self) -> None:
         """Record in the index that the store is at this location."""
-        self._index_version = None
         self.connection.take_over()
         self.unavailable = None
         self._rests_until = 0.0
@@ -409,7 +388,7 @@ class Session:
                 return IndexTarget(self.connected, renew=self._another_database)
             self.disconnect()
         # Those that a crash has cut are brought into the index by another opening.
-        database = self._connected_for(None if self._recovers else [])
+        database = self._reached(brings=self._recovers)
         if database is None and self.unavailable is not None:
             if isinstance(self.unavailable, ConnectionLostError):
                 return IndexTarget(failure=self.unavailable, renew=self._another_database)
@@ -434,32 +413,6 @@ class Session:
         except (StoreError, ResourceError, MissingDependencyError) as error:
             raise DatabaseError(str(error)) from error
 
-    def index_for(self, purpose: str, recordings: Sequence[RecordingEntry]) -> GuardedIndex:
-        """The index, for queries about some recordings.
-
-        Raises:
-            DatabaseError: it is unavailable; has the purpose and the reason.
-            IndexChangedError: documents of these recordings are missing, or being removed.
-        """
-        from hybridlog.index.index_version import GuardedIndex
-
-        database = self.connected or self.database_for(purpose)
-        try:
-            return GuardedIndex(
-                database, recordings, self.index_version, partial(self._mark_stale, recordings)
-            )
-        except IndexChangedError as error:
-            if self.connection.may_write:
-                raise
-            raise IndexChangedError(
-                f"{error} This MongoDB user may only read: ask once as a user who may write."
-            ) from error
-
-    def _mark_stale(self, recordings: Sequence[RecordingEntry]) -> None:
-        """Look again at what the index has of some recordings, when it is next connected."""
-        self._stale.update(entry.id for entry in recordings)
-        self.invalidate()
-
     def places(self, purpose: str) -> TopicPlaces:
         """The places of topics in the index.
 
@@ -472,44 +425,6 @@ class Session:
         if self._places is None:
             self._places = TopicPlaces(database)
         return self._places
-
-    def index_version(
-        self, database: Database, keys: Collection[str], *, anew: bool = False
-    ) -> IndexVersion:
-        """The state of the index of some recordings, as of the catalog's snapshot.
-
-        Args:
-            database: The index.
-            keys: Keys of the recordings.
-            anew: True to read it from the database now.
-        """
-        from hybridlog.index.index_version import IndexVersion
-
-        found = self._index_version = IndexVersion.of(
-            database, keys, None if anew else self._index_version
-        )
-        return found
-
-    def uncertain(self, topic: str) -> tuple[int, set[str]]:
-        """Recordings whose documents may not tell about a topic, see `IndexState`.
-
-        Returns:
-            The turn of the index before it was asked, and their keys.
-        """
-        from hybridlog_storage.mongo.index_state import IndexState
-
-        assert self.connected is not None
-        state = IndexState(self.connected)
-        if self._uncertain is None:
-            self._uncertain = state.turn(read="linearizable"), {}
-        turn, known = self._uncertain
-        if topic not in known:
-            known[topic] = state.uncertain(topic)
-        return turn, known[topic]
-
-    def clear_uncertain(self) -> None:
-        """Look again: another process has changed the index."""
-        self._uncertain = None
 
     # The moment.
 
@@ -762,7 +677,6 @@ class Session:
         if entry is not None and is_new:
             # The index may have what the files had before.
             self._stale.add(entry.id)
-            self._indexed.discard(entry.id)
             self._is_indexed = False
         return entry
 
@@ -1007,19 +921,23 @@ class Session:
     def predicate(
         self, text: str, topics: tuple[str, ...], recordings: tuple[str, ...] | None
     ) -> Predicate:
-        """A predicate on some topics of some recordings.
+        """A predicate, or a MongoDB filter as JSON, on some topics of some recordings.
 
         Raises:
-            WhereError: it cannot be parsed, or does not fit the fields.
+            WhereError: it cannot be parsed, does not fit the fields, or is not allowed.
         """
         return self._parsed(text, topics, recordings)
 
     def _parse(
         self, text: str, topics: tuple[str, ...], recordings: tuple[str, ...] | None
     ) -> Predicate:
+        from hybridlog.query.predicate.mongo_filter import from_json, mongo_filter
         from hybridlog.query.predicate.parser import parse
+        from hybridlog.query.predicate.tokens import is_filter
         from hybridlog.query.predicate.types import check
 
+        if is_filter(text):
+            return mongo_filter(from_json(text), self.field_types(topics, recordings))
         found = parse(text)
         check(found, self.field_types(topics, recordings))
         return found
@@ -1347,10 +1265,7 @@ class Session:
         self._latest = moment
         if getattr(self._pinned, "moment", None) is not None:
             self._pinned.moment = moment
-        self._uncertain = None
         self._is_indexed = False
-        self._indexed.clear()
-        self._index_version = None
         self._places = None
 
     def _invalidate_recordings(self, recordings: Collection[str]) -> None:

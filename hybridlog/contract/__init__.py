@@ -248,7 +248,7 @@ def _predicate(value: object) -> None:
     if names_topics(text):
         raise ValueError("a share is of one topic's messages: leave the other topic out")
     predicate = parse(text)
-    if predicate.needs_index or not predicate.asks_fields:
+    if not predicate.asks_fields:
         raise ValueError(f"{text!r} is not about fields of the message")
 
 

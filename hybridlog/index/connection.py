@@ -144,7 +144,7 @@ class Connection:
             setting = "--mongo none" if self.wanted else f'mongo = "none" in {NAME}'
             raise WithoutMongoError(
                 f"The store is used without MongoDB ({setting}). With --mongo embedded, or --mongo "
-                "URI, a command uses one, and brings its index up to date first."
+                "URI, a command uses one; `hybridlog index rebuild` makes its index."
             )
         from hybridlog_storage.mongo.database import Database
 

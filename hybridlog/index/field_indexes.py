@@ -11,7 +11,6 @@ from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 from hybridlog_storage.errors import UsageError
-from hybridlog_storage.mongo.index_state import IndexState
 from hybridlog_storage.mongo.topic_places import TopicPlaces
 
 if TYPE_CHECKING:
@@ -43,40 +42,17 @@ def add(database: Database, topics: Iterable[str], fields: Sequence[str]) -> Non
         DatabaseError: MongoDB cannot create it: two of the fields are arrays.
     """
     _check(fields)
-    names = list(topics)
-    for place in TopicPlaces(database).assigned(names).values():
+    for place in TopicPlaces(database).assigned(list(topics)).values():
         database.create_index(place.collection, _keys(fields), only=place.of_topic)
-    _list(database, names, fields, is_there=True)
 
 
 def remove(database: Database, topics: Iterable[str], fields: Sequence[str]) -> int:
     """Drop the index on these fields from each topic; returns the number of indexes dropped."""
     _check(fields)
-    names = list(topics)
-    _list(database, names, fields, is_there=False)
     return sum(
         database.drop_index(place.collection, _keys(fields), only=place.of_topic)
-        for place in TopicPlaces(database).of(names).values()
+        for place in TopicPlaces(database).of(list(topics)).values()
     )
-
-
-def listed(database: Database) -> list[FieldIndex]:
-    """All indexes that were added, without a look at the collections."""
-    return [FieldIndex(*one) for one in IndexState(database).field_indexes()]
-
-
-def _list(
-    database: Database, topics: Iterable[str], fields: Sequence[str], *, is_there: bool
-) -> None:
-    keys = tuple(field for field, _ in _keys(fields))
-    state = IndexState(database)
-    known = dict.fromkeys(state.field_indexes())
-    for topic in topics:
-        if is_there:
-            known[topic, keys] = None
-        else:
-            known.pop((topic, keys), None)
-    state.put_field_indexes(known)
 
 
 def of_topics(database: Database, topics: Iterable[str]) -> list[FieldIndex]:

@@ -76,21 +76,18 @@ class StoreIndex:
         *,
         index: str,
         stale: Collection[str],
-        wanted: Collection[str] | None,
         report: RepairReport,
     ) -> bool:
         """Index missing chunks, and remove documents of removed recordings.
 
         Recordings that the catalog knows to be in this index are not looked at, unless the
-        index has another number of recordings than these. Documents of removed recordings
-        are removed only if all recordings are wanted.
+        index has another number of recordings than these.
 
         Args:
             snapshot: All recordings.
             entry_of: Returns the entry of a recording.
             index: Id of the index.
             stale: Ids of recordings to look at in any case.
-            wanted: Ids of the recordings that the index must have; None for all.
             report: Collects the actions.
 
         Returns:
@@ -103,13 +100,11 @@ class StoreIndex:
         is_other = state.count() - len(known) != len(snapshot) - len(behind)
         if is_other:
             behind = snapshot.summaries
-        if wanted is not None:
-            behind = [one for one in behind if one.id in wanted]
-        has_orphans = wanted is None and (is_other or tables.are_left(directory, snapshot))
+        has_orphans = is_other or tables.are_left(directory, snapshot)
         if not behind and not has_orphans:
             return False
-        if is_other or has_orphans:
-            known = state.of(None if has_orphans else [one.key for one in behind])
+        if has_orphans:
+            known = state.of()
         has_changed = False
         current = []
         for summary in behind:

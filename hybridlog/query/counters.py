@@ -32,7 +32,8 @@ class Counters:
         unreadable: Messages of the predicate's topics that do not fit their definition, or lack
             arrays that it asks for.
         without_arrays: Those of them that lack arrays, since their payloads are gone.
-        unindexed: Messages of running recordings that the index lacks, if it has answered.
+        not_indexed: Labels of recordings with the number of messages that the index lacks, if it
+            has answered; several.
         no_transform: The frame asked for with a reason why points or poses are not in it, and
             the number of messages; several.
         elapsed_s: Wall time, seconds.
@@ -51,9 +52,14 @@ class Counters:
     lacking: int = 0
     unreadable: int = 0
     without_arrays: int = 0
-    unindexed: int = 0
+    not_indexed: tuple[tuple[str, int], ...] = ()
     no_transform: tuple[tuple[str, int], ...] = ()
     elapsed_s: float = 0.0
+
+    @property
+    def unindexed(self) -> int:
+        """Messages that the index lacks, if it has answered."""
+        return sum(number for _, number in self.not_indexed)
 
     def reset(self) -> None:
         """Set every counter to zero."""

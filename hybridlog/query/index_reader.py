@@ -1,4 +1,4 @@
-"""Reads index documents of MongoDB: what only they can answer, and the documents themselves."""
+"""Asks MongoDB for the messages that a filter finds, in the index as it is."""
 
 from __future__ import annotations
 
@@ -6,275 +6,249 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import numpy as np
 
-from hybridlog.query.predicate.to_mongo import replaced, to_mongo
-from hybridlog.query.predicate.tree import Field, Member, Node, Opaque, Predicate, nodes
+from hybridlog.query.predicate.mongo_filter import misjudged
+from hybridlog.query.predicate.tree import And, Field, Member, MongoFilter, Predicate
 from hybridlog.schema.column import STAMP
-from hybridlog.snapshot import UNFINISHED
 from hybridlog_storage.errors import (
     ConnectionLostError,
-    DatabaseError,
     IndexChangedError,
     TopicError,
+    WhereError,
 )
 from hybridlog_storage.mongo.index_columns import KEY, key_columns
+from hybridlog_storage.mongo.index_state import IndexState
+from hybridlog_storage.mongo.topic_places import TopicPlaces
 from hybridlog_storage.stopping import check_wanted
 from hybridlog_storage.times import END
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog.index.index_version import GuardedIndex
     from hybridlog.query.counters import Counters
     from hybridlog.query.question import Part, Span
     from hybridlog.session import Session
-    from hybridlog_storage.catalog import RecordingEntry
-    from hybridlog_storage.mongo.index_columns import KeyColumns
+    from hybridlog_storage.mongo.database import Database
     from hybridlog_storage.mongo.topic_places import TopicPlace
 
-_DOCUMENTS = 10_000
-"""Documents in one answer of MongoDB."""
-_FIRST_DOCUMENTS = 100
-"""Documents asked for by key in the first command; each later one asks for ten times more."""
 _MAX_RANGES = 100
 """Ranges of log time that are asked for apart: as many as one command takes."""
-_PURPOSE = "A MongoDB filter"
+_TRIES = 3
 _SEQ = Field(("_meta", "seq"))
 Filter = dict[str, object]
 _READABLE: Filter = {"_meta.error": {"$exists": False}}
-WITHOUT_FIELDS: Filter = {"_meta.error": {"$exists": True}}
-"""Documents without fields, of which no filter can be asked."""
-TOO_LARGE: Filter = {"_meta.error": {"$regex": "take more than [0-9]+ MiB$"}}
-"""Those whose message has fields, but too large ones for a document."""
+_WITHOUT_FIELDS: Filter = {"_meta.error": {"$exists": True}}
+_TOO_LARGE: Filter = {"_meta.error": {"$regex": "take more than [0-9]+ MiB$"}}
+"""Documents whose message has fields, but too large ones for a document."""
 _T = TypeVar("_T")
 Query = tuple[str, Filter]
 """A collection and a filter."""
 
 
+class Found(NamedTuple):
+    """What MongoDB says about parts of a question.
+
+    Attributes:
+        parts: The parts, with the arrival numbers of what the filters find in their place.
+        documents: Number of documents of those parts of which the index may lack some.
+        untested: Messages that the filters cannot test, since their documents have no fields.
+    """
+
+    parts: list[Part]
+    documents: dict[Part, int]
+    untested: int
+
+
 class IndexReader:
-    """Asks MongoDB about parts of a question."""
+    """Asks MongoDB about parts of one question. It never writes to the index."""
 
     def __init__(self, session: Session, counters: Counters) -> None:
         self._session = session
         self._counters = counters
 
-    def without_index(self, parts: Sequence[Part]) -> list[Part]:
-        """Parts with predicates that columns and messages decide.
-
-        What only documents can answer becomes the arrival numbers of the messages for which it
-        holds.
+    def found(self, parts: Sequence[Part]) -> Found:
+        """The parts with predicates that columns and messages decide.
 
         Raises:
-            DatabaseError: MongoDB is unavailable, or its list of topics is damaged.
-            IndexChangedError: another process changes the index.
+            DatabaseError: MongoDB is unavailable.
+            IndexChangedError: other processes remove documents all the time.
             TopicError: a topic was recorded without index documents.
-            WhereError: MongoDB does not understand the predicate.
+            WhereError: MongoDB does not understand a filter, or index documents cannot tell.
         """
-        missing = next((part.topic for part in parts if not part.is_indexed), None)
-        if missing is not None:
-            raise without_documents(missing)
-        groups: dict[Node, list[Part]] = defaultdict(list)
-        for part in parts:
-            for node in _of_documents(part):
-                groups[node].append(part)
-        found = self._again(
-            parts,
-            lambda: {node: self._holding(group, to_filter(node)) for node, group in groups.items()},
-        )
+        predicate = _predicate(parts[0])
+        asks_fields = any(node.asks_fields for node in predicate.filters)
+        own: list[Filter] = [node.to_filter() for node in predicate.filters]
+        everything: Filter = {"$and": [*own, _READABLE] if asks_fields else own}
 
-        def decided(part: Part) -> Part:
-            def seqs(node: Node) -> Node:
-                numbers = found[node].get(part.recording.key)
-                return Member(_SEQ, () if numbers is None else tuple(numbers.tolist()), False)
+        def ask(database: Database) -> Found:
+            asked = _Asked(self._session, database, parts)
+            documents = asked.documents()
+            asked.check_arrays(predicate.filters)
+            numbers = self._numbers(asked, parts, everything)
+            decided = [
+                replace(part, predicate=_decided(predicate, numbers[part.recording.key]))
+                for part in parts
+            ]
+            untested = 0
+            if asks_fields:
+                lacking = [part for part in parts if part.lacks_fields]
+                # What is read for the rest of the predicate is counted there.
+                is_read = _predicate(decided[0]).asks_fields
+                untested = sum(asked.counts(lacking, _TOO_LARGE if is_read else _WITHOUT_FIELDS))
+            return Found(decided, documents, untested)
 
-            assert part.predicate is not None
-            root = replaced(part.predicate.root, seqs)
-            return replace(part, predicate=Predicate(root, part.predicate.text))
+        return self._ask(parts, ask)
 
-        return [decided(part) for part in parts]
+    def documents(self, parts: Sequence[Part]) -> dict[Part, int]:
+        """Number of documents of those parts of which the index may lack some."""
+        return self._ask(parts, lambda database: _Asked(self._session, database, parts).documents())
 
-    def count(self, parts: Sequence[Part], own: Filter | None = None) -> int:
-        """Number of documents of some parts, whatever their predicates.
-
-        Args:
-            parts: The parts.
-            own: A filter for them; None for all.
-
-        Raises:
-            DatabaseError: MongoDB is unavailable.
-            IndexChangedError: another process changes the index.
-        """
-        if not parts:
-            return 0
-        return self._again(
-            parts,
-            lambda: sum(
-                self._index(parts).count_each(
-                    [query for query, _ in self._queries(parts, own or {})]
-                )
-            ),
-        )
-
-    def documents(self, parts: Sequence[Part], *, reverse: bool) -> list[Iterator[bytes]]:
-        """All documents of some parts of one topic, whatever their predicates.
-
-        Returns:
-            Streams of many documents at a time, each in order.
-
-        Raises:
-            DatabaseError: MongoDB is unavailable.
-        """
-        order = -1 if reverse else 1
-        queries = self._queries(parts, {}, most=1)
-        streams: list[list[Query]] = []
-        ends: list[int] = []
-        for query, (begin, end) in sorted(queries, key=lambda item: item[1]):
-            place = next((i for i, last in enumerate(ends) if last <= begin), len(ends))
-            if place == len(ends):
-                streams.append([])
-                ends.append(end)
-            streams[place].append(query)
-            ends[place] = end
-
-        def read(own: Sequence[Query]) -> Iterator[bytes]:
-            for query in own[::order]:
-                yield from self._found(parts, query, order)
-
-        return [read(own) for own in streams]
-
-    def documents_with(
-        self, parts: Sequence[Part], keys: KeyColumns, *, reverse: bool
-    ) -> Iterator[bytes]:
-        """The documents with some keys, many at a time.
-
-        Args:
-            parts: The parts of one topic that the keys are of.
-            keys: In the order of documents.
-            reverse: True for the last document first.
-
-        Raises:
-            DatabaseError: MongoDB is unavailable.
-        """
-        place = self._places(parts)[parts[0].topic]
-        done, size = 0, _FIRST_DOCUMENTS
-        while done < len(keys):
-            rows = slice(done, done + size)
-            if reverse:
-                rows = slice(max(len(keys) - done - size, 0), len(keys) - done)
-            names = keys.take(rows).to_keys(place.prefix)
-            # Without bounds MongoDB looks at the whole collection.
-            bounds = {"$gte": names[0], "$lte": names[-1], "$in": names}
-            by_key: Filter = {"_id": bounds, **place.of_topic}
-            yield from self._found(parts, (place.collection, by_key), -1 if reverse else 1)
-            done += len(names)
-            size = min(size * 10, _DOCUMENTS)
-
-    def _found(self, parts: Sequence[Part], query: Query, order: int) -> Iterator[bytes]:
-        return self._index(parts).find_raw(*query, sort=[("_id", order)], batch_size=_DOCUMENTS)
-
-    def _holding(self, parts: Sequence[Part], own: Filter) -> dict[str, NDArray[np.int64]]:
+    def _numbers(
+        self, asked: _Asked, parts: Sequence[Part], own: Filter
+    ) -> dict[str, NDArray[np.int64]]:
         """Arrival numbers of the documents that a filter finds, by key of the recording.
 
         A recording has each number once, whatever the topic.
         """
-        index, places = self._index(parts), self._places(parts)
         kinds: dict[bool, list[Part]] = defaultdict(list)  # keys differ in their length
         for part in parts:
-            kinds[places[part.topic].is_shared].append(part)
+            kinds[asked.places[part.topic].is_shared].append(part)
         found: dict[str, list[NDArray[np.int64]]] = defaultdict(list)
         for group in kinds.values():
-            queries = [query for query, _ in self._queries(group, own)]
-            for raw in index.find_each(queries, KEY):
+            for raw in asked.database.find_each(asked.queries(group, own), KEY):
                 check_wanted()
                 keys = key_columns(raw)
                 self._counters.documents_read += len(keys)
                 for recording in np.unique(keys.recording).tolist():
                     found[f"{recording:016x}"].append(keys.seq[keys.recording == recording])
-        return {key: np.unique(np.concatenate(numbers)) for key, numbers in found.items()}
+        none = np.empty(0, np.int64)
+        return {
+            part.recording.key: np.unique(np.concatenate([none, *found[part.recording.key]]))
+            for part in parts
+        }
 
-    def _again(self, parts: Sequence[Part], ask: Callable[[], _T]) -> _T:
-        """An answer; asked for once more if the connection was lost or the index has changed."""
-        self.connect(parts)
-        try:
-            return ask()
-        except (ConnectionLostError, IndexChangedError):
-            self.connect(parts)
-            return ask()
-
-    def connect(self, parts: Sequence[Part]) -> None:
-        """Connect, and bring the index of the recordings of some parts up to date.
-
-        Raises:
-            DatabaseError: MongoDB is unavailable.
-        """
-        entries = _entries(parts)
-        database = self._session.database_about(_PURPOSE, entries)
-        self._session.index_version(database, {entry.key for entry in entries})
-
-    def _index(self, parts: Sequence[Part]) -> GuardedIndex:
-        return self._session.index_for(_PURPOSE, _entries(parts))
-
-    def _places(self, parts: Sequence[Part]) -> dict[str, TopicPlace]:
-        found = self._session.places(_PURPOSE).of({part.topic for part in parts})
+    def _ask(self, parts: Sequence[Part], ask: Callable[[Database], _T]) -> _T:
+        """An answer during which no other process has removed documents."""
         for part in parts:
-            if not found[part.topic].is_listed and part.recording.status not in UNFINISHED:
-                self._index(parts)  # tells if their documents are missing altogether
-                raise DatabaseError(
-                    f"The index does not list {part.topic}: run `hybridlog index rebuild`."
+            if not part.is_indexed:
+                raise TopicError(
+                    f"{part.topic} has no index documents: it was recorded with --no-index. Write "
+                    "a predicate, such as 'x > 1', instead of a MongoDB filter."
                 )
+        failure: Exception | None = None
+        for _ in range(_TRIES):
+            database = self._session.index_as_it_is("A MongoDB filter (a predicate needs none)")
+            state = IndexState(database)
+            try:
+                # What is read after this is as new as this, whichever member is the primary.
+                turn = state.turn(read="linearizable")
+                found = ask(database)
+                if state.turn() == turn:
+                    return found
+            except ConnectionLostError as error:
+                failure = error
+        raise failure or IndexChangedError(
+            "The index was changed by another process while it was asked. Ask again."
+        )
+
+
+class _Asked:
+    """Parts of a question, and where their documents are."""
+
+    def __init__(self, session: Session, database: Database, parts: Sequence[Part]) -> None:
+        self.database = database
+        self.places = TopicPlaces(database).of({part.topic for part in parts})
+        self._session = session
+        self._parts = parts
+
+    def documents(self) -> dict[Part, int]:
+        """Number of documents of the parts whose recordings are not in the index as a whole."""
+        indexed = IndexState(self.database).segments({part.recording.key for part in self._parts})
+        doubtful = [
+            part
+            for part in self._parts
+            if part.recording.status == "open"
+            or not part.recording.digests.items() <= indexed.get(part.recording.key, {}).items()
+        ]
+        return dict(zip(doubtful, self.counts(doubtful, {}), strict=True))
+
+    def counts(self, parts: Sequence[Part], own: Filter) -> list[int]:
+        """Number of documents of each part that satisfy a filter."""
+        queries = [
+            (row, query) for row, part in enumerate(parts) for query in self.queries([part], own)
+        ]
+        found = [0] * len(parts)
+        numbers = self.database.count_each([query for _, query in queries])
+        for (row, _), number in zip(queries, numbers, strict=True):
+            found[row] += number
         return found
 
-    # Queries.
+    def check_arrays(self, filters: Iterable[MongoFilter]) -> None:
+        """Refuse filters of arrays that documents do not have as the filters want them."""
+        by_topic: dict[str, list[Part]] = defaultdict(list)
+        for part in self._parts:
+            by_topic[part.topic].append(part)
+        for topic, parts in by_topic.items():
+            types = _types_of(parts)
+            for node in filters:
+                tests = misjudged(node, types)
+                if not tests or not self._any(parts, {"$or": [*tests.values()]}):
+                    continue
+                for reason, test in tests.items():
+                    if self._any(parts, test):
+                        raise WhereError(f"{topic}: {reason}")
 
-    def _queries(
-        self, parts: Sequence[Part], own: Filter, most: int = _MAX_RANGES
-    ) -> list[tuple[Query, Span]]:
-        """Queries that ask about each part once, with the log time of each.
+    def _any(self, parts: Sequence[Part], own: Filter) -> bool:
+        return any(
+            self.database.find_one(collection, query, {"_id": 1}) is not None
+            for collection, query in self.queries(parts, own)
+        )
+
+    def queries(self, parts: Sequence[Part], own: Filter) -> list[Query]:
+        """Queries that ask about each part once.
 
         Parts that differ only in their recordings are asked about together, where nothing
         else lies between them.
         """
-        places = self._places(parts)
         alike: dict[tuple[str, str, Span | None], list[tuple[Part, Span]]] = defaultdict(list)
-        found: list[tuple[Query, Span]] = []
+        found: list[Query] = []
         for part in parts:
-            place = places[part.topic]
+            place = self.places[part.topic]
             if part.windows is not None:
-                for condition, span in conditions(part, place):
-                    found.append(((place.collection, joined(condition, own)), span))
+                found += [(place.collection, _joined(each, own)) for each in _windows(part, place)]
                 continue
             span, bounds = _time_of(part)
             if span[0] < span[1]:
                 alike[part.topic, part.clock, bounds].append((part, span))
         for (topic, clock, bounds), group in alike.items():
-            place = places[topic]
-            for span, there in self._ranges([p for p, _ in group], [s for _, s in group], most):
-                condition = _chosen(place, span, there)
+            place = self.places[topic]
+            for span, there in self._ranges([p for p, _ in group], [s for _, s in group]):
+                keys = sorted(part.recording.key for part in there)
+                chosen = {"$in": keys} if len(keys) > 1 else keys[0]
+                condition: Filter = {"_meta.rec": chosen, **_between(place, span)}
                 if clock != "log" and bounds is not None:
                     condition.update(_on_clock(clock, bounds))
-                found.append(((place.collection, joined(condition, own)), span))
+                found.append((place.collection, _joined(condition, own)))
         return found
 
     def _ranges(
-        self, parts: Sequence[Part], spans: Sequence[Span], most: int
+        self, parts: Sequence[Part], spans: Sequence[Span]
     ) -> list[tuple[Span, list[Part]]]:
         """Ranges of log time that hold the spans of some parts, with the parts of each.
 
-        Spans are joined if they overlap, and if they are more than `most`, also across gaps in
-        which no other recording lies: finding many documents in one range costs less than
+        Spans are joined if they overlap, and if they are many, also across gaps in which no
+        other recording lies: finding many documents in one range costs less than
         asking for many ranges.
         """
-        if not parts:
-            return []
         order = sorted(range(len(parts)), key=spans.__getitem__)
         ends = np.array([min(spans[i][1], END) for i in order[:-1]], np.int64)
         low = np.maximum.accumulate(ends)
         high = np.array([spans[i][0] for i in order[1:]], np.int64)
         is_apart = low < high
-        if int(is_apart.sum()) >= most:
+        if int(is_apart.sum()) >= _MAX_RANGES:
             first, end = self._session.snapshot().others({part.recording.id for part in parts})
             before = np.searchsorted(np.sort(first), high, "left")
             is_apart &= before > np.searchsorted(np.sort(end), low, "right")
@@ -289,63 +263,48 @@ class IndexReader:
         ]
 
 
-def _entries(parts: Iterable[Part]) -> list[RecordingEntry]:
-    """The recordings of some parts, each once."""
-    return [*{part.recording.id: part.recording for part in parts}.values()]
+def _predicate(part: Part) -> Predicate:
+    assert part.predicate is not None
+    return part.predicate
 
 
-def _of_documents(part: Part) -> list[Node]:
-    """The largest pieces of a part's predicate that only documents answer."""
-    found: list[Node] = []
-
-    def keep(node: Node) -> Node:
-        found.append(node)
-        return node
-
-    if part.predicate is not None:
-        replaced(part.predicate.root, keep)
-    return found
+def _decided(predicate: Predicate, numbers: NDArray[np.int64]) -> Predicate:
+    """A predicate with arrival numbers in place of its filters."""
+    root = predicate.root
+    items = root.items if isinstance(root, And) else (root,)
+    rest = tuple(item for item in items if not isinstance(item, MongoFilter))
+    found = Member(_SEQ, tuple(numbers.tolist()), negated=False)
+    return Predicate(And((found, *rest)), predicate.text)
 
 
-def to_filter(node: Node) -> Filter:
-    """A piece of a predicate as a filter; a document without fields satisfies no condition."""
-    found = to_mongo(node)
-    is_opaque = any(isinstance(each, Opaque) for each in nodes(node))
-    return joined(_READABLE, found) if is_opaque else found
+def _types_of(parts: Sequence[Part]) -> Mapping[str, str] | None:
+    """Types of the fields of a topic; None where a definition does not fix them."""
+    types: dict[str, str] = {}
+    for part in parts:
+        if part.field_types is None:
+            return None
+        types |= part.field_types
+    return types
 
 
-def without_documents(topic: str) -> TopicError:
-    """The error for a topic that MongoDB does not have."""
-    return TopicError(
-        f"{topic} has no index documents: it was recorded with --no-index. Ask for its messages "
-        "or tables."
-    )
-
-
-def joined(condition: Filter, other: Mapping[str, object]) -> Filter:
+def _joined(condition: Filter, other: Filter) -> Filter:
     """Both filters joined by *and*."""
-    return {"$and": [condition, dict(other)]} if other else condition
+    return {"$and": [condition, other]} if other else condition
 
 
-def conditions(part: Part, place: TopicPlace) -> Iterator[tuple[Filter, Span]]:
+def _windows(part: Part, place: TopicPlace) -> Iterator[Filter]:
     """The recording, topic and time of a part as filters, one for each window, in order."""
     recording: Filter = {"_meta.rec": part.recording.key}
     if part.bounds is not None and part.clock != "log":
         recording.update(_on_clock(part.clock, part.bounds))
     for begin, end in part.log_windows.tolist():
-        yield {**recording, **_between(place, (begin, end))}, (begin, end)
+        yield {**recording, **_between(place, (begin, end))}
 
 
 def _on_clock(clock: str, bounds: Span) -> Filter:
     name = STAMP if clock == "header" else "_meta.pub"
     begin, end = bounds
     return {name: {"$gte": begin, "$lte" if end == END else "$lt": end}}
-
-
-def _chosen(place: TopicPlace, span: Span, parts: Sequence[Part]) -> Filter:
-    """The recordings of some parts of a topic, in a range of log time."""
-    keys = sorted(part.recording.key for part in parts)
-    return {"_meta.rec": {"$in": keys} if len(keys) > 1 else keys[0], **_between(place, span)}
 
 
 def _time_of(part: Part) -> tuple[Span, Span | None]:

@@ -147,21 +147,6 @@ class MessageAnswers(Steps):
             self.counters.messages = found
         return found
 
-    def documents(self) -> Iterator[dict[str, Any]]:
-        """The index documents in MongoDB, in the order of the messages.
-
-        In a store without MongoDB, they are made of the messages.
-
-        Raises:
-            DatabaseError: MongoDB does not answer.
-        """
-        from hybridlog.query.answers.index_documents import index_documents
-
-        self._as_they_came("Documents")
-        self.session.renew()
-        self.counters.reset()
-        return index_documents(self.session, self.question, self.counters)
-
     @of_one_moment
     def to_numpy(self, frame: str | None = None) -> NDArray[Any] | list[NDArray[Any]]:
         """Every message as an array (`Message.to_numpy`): stacked if all are alike.

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
+from hybridlog.query.predicate.tokens import is_filter
 from hybridlog.query.question import Question
 from hybridlog.query.topics import split_topic
 from hybridlog_storage.errors import UsageError
@@ -45,7 +46,7 @@ def pieces(query: Query, how: str) -> Iterator[Piece]:
         yield from _of_intervals(query, _marks(query))
         return
     events = query
-    if ": " in how:
+    if ": " in how and not is_filter(how):
         topic, how = split_topic(how)
         topics = query.session.resolve_in([topic], query.recordings)
         events = type(query)(query.session, Question(tuple(topics), query.recordings))

@@ -8,7 +8,7 @@ of its answer; the cheapest one answers, and if it fails, the next one.
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any, Final, TypeVar
@@ -71,7 +71,7 @@ class Planner:
         self.question = question
         self.counters = counters
         self._batch: Sequence[Part] = ()  # parts that are answered one after the other
-        self._decidable: dict[Part, Part] = {}  # without what only MongoDB answers
+        self._decidable: dict[Part, Part] = {}  # with what MongoDB has found
         self._counted: set[Part] = set()  # parts whose messages without fields are counted
         self._ranges = RangeResolver(session, question)
         self._has_many_recordings = False  # recordings
@@ -79,7 +79,7 @@ class Planner:
         self._counting = tuple(engine(session, counters) for engine in _COUNTING)
 
     @lazy
-    def index(self) -> IndexReader:
+    def _index(self) -> IndexReader:
         """The index documents in MongoDB."""
         from hybridlog.query.index_reader import IndexReader
 
@@ -130,23 +130,13 @@ class Planner:
         return self.batch_hint([part for one in found for part in self.parts_in(*one)])
 
     def _matching_ranges(self) -> Ranges:
-        """The recordings to ask, without those of which it is known that nothing matches.
-
-        Bounds of their fields tell, or an index on a field.
-        """
+        """The recordings to ask, without those whose bounds of fields tell that nothing matches."""
         found = self._ranges.resolve()
         predicate = self.question.predicate
-        if predicate is None or predicate.needs_index or len(found) < MIN_RECORDINGS:
+        if predicate is None or predicate.filters or len(found) < MIN_RECORDINGS:
             return found
         self._has_many_recordings = True
-        found = within_bounds(self.session, self.question, found)
-        if self.session.connected is None or not self.session.field_indexes:
-            return found
-        from hybridlog.query.narrowing import narrowed
-
-        wanted = self.question.topics
-        channels = [one for one in self.examples if one.channel.topic in wanted]
-        return narrowed(self.session, self.question, found, channels)
+        return within_bounds(self.session, self.question, found)
 
     def only_part(self) -> Part | None:
         """The only part of the question; None if it has several, or none.
@@ -253,16 +243,17 @@ class Planner:
         return parts
 
     def _decided(self, parts: Sequence[Part]) -> list[Part]:
-        """Parts with predicates that columns and messages decide, see `IndexReader`."""
+        """Parts with predicates that columns and messages decide: MongoDB has been asked."""
         self._count_unreadable(parts)
         wanted = [part for part in parts if part.needs_index and part not in self._decidable]
         if wanted:
             if {*wanted} <= {*self._batch}:
                 wanted = [part for part in self._batch if part.needs_index]
-            found = self.index.without_index(wanted)
-            self._counted.update(found)
-            self._count_without_documents(wanted, found)
-            self._decidable.update(zip(wanted, found, strict=True))
+            found = self._index.found(wanted)
+            self.counters.unreadable += found.untested
+            self.counters.not_indexed += self._lacking(found.documents)
+            self._counted.update(found.parts)
+            self._decidable.update(zip(wanted, found.parts, strict=True))
         return [self._decidable.get(part, part) for part in parts]
 
     def outcomes(self, part: Part) -> Iterator[MatchColumns]:
@@ -399,18 +390,6 @@ class Planner:
         plan.selector = select if selecting else None
         return plan
 
-    def _count_without_documents(self, parts: Sequence[Part], decided: Sequence[Part]) -> None:
-        """Count the messages without documents to ask; engines count those they cannot read."""
-        from hybridlog.query.index_reader import TOO_LARGE, WITHOUT_FIELDS
-
-        groups: dict[bool, list[Part]] = defaultdict(list)
-        for part, now in zip(parts, decided, strict=True):
-            if part.lacks_fields:
-                groups[now.predicate is not None and now.predicate.asks_fields].append(part)
-        for tests_fields, group in groups.items():
-            own = TOO_LARGE if tests_fields else WITHOUT_FIELDS
-            self.counters.unreadable += self.index.count(group, own)
-
     def _count_unreadable(self, parts: Sequence[Part]) -> None:
         """Count, once, the messages that the predicate cannot test for want of fields.
 
@@ -423,8 +402,6 @@ class Planner:
             if part.undecodable:
                 unseen = replace(part, channels=part.undecodable, undecodable=(), predicate=None)
                 self.counters.unreadable += self._count_stored(unseen)
-            if part.needs_index:
-                self.counters.unindexed += self.count_unindexed([part])
 
     def _count_stored(self, part: Part) -> int:
         """Number of messages of a part without a predicate."""
@@ -447,19 +424,24 @@ class Planner:
                     found[state] += self._count_stored(own)
         return found
 
-    def count_unindexed(self, parts: Iterable[Part]) -> int:
-        """Number of messages of running recordings, in the range, that the index lacks.
+    def not_indexed(self) -> tuple[tuple[str, int], ...]:
+        """Number of messages, in the range, that the index lacks, by label of their recording.
 
         Raises:
             DatabaseError: MongoDB is unavailable.
-            IndexChangedError: another process changes the index.
+            IndexChangedError: other processes remove documents all the time.
         """
-        total = 0
-        for part in (part for part in parts if part.recording.status == "open"):
+        parts = self.parts()
+        return self._lacking(self._index.documents(parts)) if parts else ()
+
+    def _lacking(self, documents: Mapping[Part, int]) -> tuple[tuple[str, int], ...]:
+        """Messages that the index lacks, from the documents that it has of some parts."""
+        found: Counter[str] = Counter()
+        for part, number in documents.items():
             channels = (*part.channels, *part.undecodable)
             whole = replace(part, channels=channels, undecodable=(), predicate=None)
-            total += max(self._count_stored(whole) - self.index.count([whole]), 0)
-        return total
+            found[part.recording.label] += max(self._count_stored(whole) - number, 0)
+        return tuple((label, number) for label, number in found.items() if number)
 
     # Choosing.
 

@@ -191,8 +191,8 @@ class Part:
 
     @property
     def needs_index(self) -> bool:
-        """True if only MongoDB can answer the predicate."""
-        return self.predicate is not None and self.predicate.needs_index
+        """True if the predicate has MongoDB filters."""
+        return self.predicate is not None and bool(self.predicate.filters)
 
     @property
     def lacks_fields(self) -> bool:

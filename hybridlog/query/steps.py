@@ -121,9 +121,10 @@ class Steps:
 
         Args:
             predicate: `"ranges.min < 0.5 and header.frame_id == 'laser'"`, or a MongoDB
-                filter. `"/odom: twist.twist.linear.x > 0.5"` asks for a message of another
-                topic, near in log time, in the same recording. Such conditions are answered
-                now, and joined by `and`, `or`, `not` and brackets.
+                filter, as a mapping or JSON, for MongoDB to answer from its index.
+                `"/odom: twist.twist.linear.x > 0.5"` asks for a message of another topic, near
+                in log time, in the same recording. Such conditions are answered now, and
+                joined by `and`, `or`, `not` and brackets.
             within: Greatest distance in time of these messages, either way; or how long
                 before and after such a message: `t - before <= time < t + after`.
 
@@ -141,11 +142,10 @@ class Steps:
                     return self._near(predicate, within)
             checked = self.session.predicate(predicate, self.topics, self.question.recordings)
         else:
-            from hybridlog.query.predicate.from_mongo import from_mongo
-            from hybridlog.query.predicate.types import check_names
+            from hybridlog.query.predicate.mongo_filter import mongo_filter
 
-            checked = from_mongo(predicate)
-            check_names(checked, self.session.field_types(self.topics, self.question.recordings))
+            types = self.session.field_types(self.topics, self.question.recordings)
+            checked = mongo_filter(predicate, types)
         if within is not None:
             raise UsageError(
                 "`within` is for conditions on other topics: where('/odom: twist.twist.linear.x > "

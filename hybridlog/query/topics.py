@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Sequence
 
 from hybridlog.query.predicate.regex import Regex, RegexError, compile_regex, text_of
+from hybridlog.query.predicate.tokens import is_filter
 from hybridlog.wording import listed
 from hybridlog_storage.errors import TopicError
 
@@ -51,8 +52,10 @@ def resolve(patterns: Sequence[str], topics: Collection[str]) -> list[str]:
 def split_topic(text: str) -> tuple[str, str]:
     """The topic before the first colon that a space follows, and the rest: `TOPIC: PREDICATE`.
 
-    A text without such a colon is a topic alone.
+    A text without such a colon is a topic alone; a MongoDB filter has no topic.
     """
+    if is_filter(text):
+        return "", text
     topic, _, rest = text.partition(": ")
     return topic.strip().removesuffix(":"), rest.strip()
 

@@ -7,7 +7,7 @@ not read. `lost.py` finds them.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -144,10 +144,18 @@ def not_written(label: str, messages: int | None, interval_ns: int) -> str:
     return f"{label} is being recorded: {what} not written yet, nor in this answer."
 
 
-def not_indexed(messages: int) -> str:
-    """Messages that the index lacks."""
-    are = "is" if messages == 1 else "are"
-    return f"{counted(messages, 'message')} {are} not indexed yet, nor in this answer of MongoDB."
+def not_indexed(lacks: Iterable[tuple[str, int]]) -> Iterator[str]:
+    """Messages that the index lacks, by the label of their recording."""
+    total: Counter[str] = Counter()
+    for label, number in lacks:
+        total[label] += number
+    if total:
+        are = "is" if total.total() == 1 else "are"
+        yield (
+            f"{counted(total.total(), 'message')} of {listed(total, _MAX_NAMES)} {are} not in the "
+            "index, nor in this answer of MongoDB; `hybridlog index rebuild` brings in those of "
+            "recordings that have ended."
+        )
 
 
 def _gone(counted: Completeness | Counters) -> dict[State, int]:
@@ -193,8 +201,8 @@ def _unreadable(messages: int, question: Question) -> str:
             f"{unfit(messages)} and {'is' if one else 'are'} not in this answer; --format raw, "
             "mcap or bag gives the payloads."
         )
-    if predicate.is_opaque:  # only documents were asked
-        why = "it has no fields there" if one else "they have no fields there"
+    if predicate.filters:
+        why = "it has no fields in the index" if one else "they have no fields in the index"
     elif one:
         why = "it does not fit its definition, or has none"
     else:

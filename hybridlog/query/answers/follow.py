@@ -169,7 +169,10 @@ def _checked(question: Question) -> Question:
     for is_used, problem in (
         (question.reverse, "has no last message to begin with"),
         (question.during is not None, "has no intervals to follow: they are those of one moment"),
-        (question.predicate and question.predicate.needs_index, "is not in MongoDB yet"),
+        (
+            question.predicate is not None and question.predicate.filters,
+            "is not in MongoDB yet: write a predicate instead of a MongoDB filter",
+        ),
         (word.startswith("-"), f"has no end to count {stop} from"),
     ):
         if is_used:

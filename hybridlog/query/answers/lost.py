@@ -65,8 +65,8 @@ def completeness_of(
     unindexed = 0
     for one, cost in answered:
         lacks = _unindexed(session, one, cost)
-        unindexed += lacks
-        late += [not_indexed(lacks)] if lacks else []
+        unindexed += sum(number for _, number in lacks)
+        late += not_indexed(lacks)
         if cost is not None:
             is_short = cost.lacking or cost.without_arrays
             sentences += left_out(one, cost, _why_expired(session, one) if is_short else "")
@@ -243,14 +243,17 @@ def _reaches_past(session: Session, question: Question, one: RecordingSummary) -
     return end > (begin if one.span is None else max(begin, one.span[1]))
 
 
-def _unindexed(session: Session, question: Question, counters: Counters | None) -> int:
+def _unindexed(
+    session: Session, question: Question, counters: Counters | None
+) -> Sequence[tuple[str, int]]:
     """Messages that the index lacks, where MongoDB has answered or must answer."""
-    if counters is not None and counters.unindexed:
-        return counters.unindexed
-    if question.predicate is None or not question.predicate.needs_index:
-        return 0
-    planner = Planner(session, question, Counters())
-    return planner.count_unindexed(planner.parts())
+    if counters is not None and counters.not_indexed:
+        return counters.not_indexed
+    if question.predicate is None or not question.predicate.filters:
+        return ()
+    with suppress(TimeError):  # nothing is in the range
+        return Planner(session, question, Counters()).not_indexed()
+    return ()
 
 
 def lost_parts(entry: RecordingEntry, span: tuple[int, int], parts: int) -> NDArray[np.bool_]:

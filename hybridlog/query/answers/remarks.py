@@ -89,7 +89,7 @@ def _about_stamps(session: Session, question: Question) -> Iterator[str]:
 
 def _missing_fields(session: Session, question: Question, *, is_empty: bool) -> Iterator[str]:
     """Topics of whose messages the predicate asks for a field that they do not have."""
-    if question.predicate is None or question.predicate.is_opaque:
+    if question.predicate is None:
         return
     paths = dict.fromkeys(
         condition.field.names

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
 from hybridlog.query.predicate.parser import MAX_DEPTH
-from hybridlog.query.predicate.tokens import MAX_TEXT, MAX_TOKENS, error_at
+from hybridlog.query.predicate.tokens import MAX_TEXT, MAX_TOKENS, error_at, is_filter
 from hybridlog_storage.errors import WhereError
 
 
@@ -94,7 +94,9 @@ class Token(NamedTuple):
 
 
 def names_topics(text: str) -> bool:
-    """True if a predicate has conditions on other topics."""
+    """True if a predicate has conditions on other topics; a MongoDB filter has none."""
+    if is_filter(text):
+        return False
     return ":" in text and any(token.kind == "topic" for token in tokens(text))
 
 

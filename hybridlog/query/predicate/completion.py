@@ -20,7 +20,7 @@ _BEHIND: Final = ("and", "or", "between", "exists", "in", "missing", "not in")
 _VALUES: Final = ("false", "inf", "nan", "null", "true")
 _BEGINS: Final = frozenset({"and", "or", "not", "(", "topic"})
 _PLAIN: Final = re.compile(r"[^\W\d]\w*")
-_META: Final = ("_meta.t", "_meta.pub", "_meta.seq", "_meta.rec", "_meta.topic", "_meta.error")
+_META: Final = ("_meta.t", "_meta.pub", "_meta.seq", "_meta.rec", "_meta.topic")
 
 Fields = Callable[[str | None], Mapping[str, str] | None]
 """Types of the fields by path: of a topic, or of the message itself. None if unknown."""

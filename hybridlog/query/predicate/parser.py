@@ -41,7 +41,14 @@ import math
 from functools import lru_cache
 
 from hybridlog.query.predicate.regex import RegexError, compile_regex
-from hybridlog.query.predicate.tokens import Token, error_at, regex_text, tokenize, unescape
+from hybridlog.query.predicate.tokens import (
+    Token,
+    error_at,
+    is_filter,
+    regex_text,
+    tokenize,
+    unescape,
+)
 from hybridlog.query.predicate.tree import (
     And,
     Compare,
@@ -82,6 +89,10 @@ _VALUE_WORDS: dict[str, Value] = {
 }
 
 
+_ONLY_INDEXED = frozenset({"inserted_at", "error", "ref"})
+"""Fields of `_meta` that index documents have and messages do not."""
+
+
 def parse(text: str) -> Predicate:
     """Parse a predicate.
 
@@ -90,12 +101,24 @@ def parse(text: str) -> Predicate:
     """
     if not isinstance(text, str):
         raise WhereError(f"a predicate is text, not {type(text).__name__}")
+    if is_filter(text):
+        raise WhereError("MongoDB filters are not possible here: write a predicate, such as x > 1")
     return _parsed(text)
 
 
 @lru_cache(maxsize=128)  # for a small topic, parsing takes as long as the answer
 def _parsed(text: str) -> Predicate:
-    return _Parser(text).parse()
+    found = _Parser(text).parse()
+    for condition in found.conditions():
+        name = condition.field.path.split(".")
+        if name[0] == "_meta" and not _ONLY_INDEXED.isdisjoint(name[1:2]):
+            path = condition.field.path
+            raise error_at(
+                text,
+                condition.field.position,
+                f'only MongoDB has {path}; ask with a filter: {{"{path}": {{"$exists": true}}}}',
+            )
+    return found
 
 
 class _Parser:

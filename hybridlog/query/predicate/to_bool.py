@@ -24,9 +24,9 @@ from hybridlog.query.predicate.tree import (
     Field,
     Match,
     Member,
+    MongoFilter,
     Node,
     Not,
-    Opaque,
     Or,
     Parts,
     Predicate,
@@ -368,8 +368,8 @@ def _node(node: Node, reader: _Reader) -> Decision:
             return partial(_all, [_node(item, reader) for item in items])
         case Or(items):
             return partial(_any, [_node(item, reader) for item in items])
-        case Opaque():
-            raise WhereError(f"only MongoDB can answer {node.to_filter()}")
+        case MongoFilter():
+            raise WhereError(f"{node.to_filter()} is for MongoDB; write a predicate here.")
         case Exists(target, present):
             exists = partial(_exists, reader, target)
             return exists if present else partial(_negated, exists)

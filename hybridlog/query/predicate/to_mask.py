@@ -32,9 +32,9 @@ from hybridlog.query.predicate.tree import (
     Field,
     Match,
     Member,
+    MongoFilter,
     Node,
     Not,
-    Opaque,
     Or,
     Parts,
     Predicate,
@@ -204,7 +204,7 @@ class _Columns:
             case Exists(target, present):
                 found = self._exists(target)
                 return found if present else _not(found)
-            case Opaque():
+            case MongoFilter():
                 raise _UnfitError
             case _:
                 return self._condition(node)

@@ -79,6 +79,11 @@ class Token:
     keyword: str = ""
 
 
+def is_filter(text: str) -> bool:
+    """True if a text is a MongoDB filter rather than a predicate."""
+    return text.lstrip().startswith("{")
+
+
 def error_at(text: str, position: int, message: str) -> WhereError:
     """The error: the message, the line of the text, a caret under the place."""
     begin = text.rfind("\n", 0, position) + 1

@@ -1,4 +1,4 @@
-"""The tree of a predicate, written as text or as a MongoDB filter.
+"""The tree of a predicate.
 
 Nodes are immutable, hashable and picklable. Two nodes are equal if they have the same
 meaning: their places in the text are ignored, and NaN equals NaN.
@@ -155,25 +155,36 @@ class Not(_Node):
     item: Node
 
 
+Reach: TypeAlias = Literal["exists", "value", "whole"]
+"""How a MongoDB filter asks for a path: whether there is one, for its value, for all below it."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
-class Opaque(_Node):
-    """A piece of a MongoDB filter that only MongoDB can answer.
+class MongoFilter(_Node):
+    """A MongoDB filter, at the root of a predicate or in an `And` there.
 
     Attributes:
-        filter: The piece, as returned by `frozen`.
+        filter: The filter, as returned by `frozen`.
+        paths: The paths that it asks for, and how.
     """
 
     filter: object
+    paths: tuple[tuple[str, Reach], ...]
 
     def to_filter(self) -> dict[str, object]:
-        """The piece as a new dictionary."""
+        """The filter as a new dictionary."""
         found = thawed(self.filter)
         assert isinstance(found, dict)
         return found
 
+    @property
+    def asks_fields(self) -> bool:
+        """True if it is about fields of the message."""
+        return not all(is_meta(path) or path.split(".")[0] == "_id" for path, _ in self.paths)
+
 
 Condition: TypeAlias = Compare | Member | Exists | Match
-Node: TypeAlias = Condition | And | Or | Not | Opaque
+Node: TypeAlias = Condition | And | Or | Not | MongoFilter
 
 
 @dataclass(frozen=True, repr=False)
@@ -218,39 +229,19 @@ class Predicate:
     @lazy
     def asks_fields(self) -> bool:
         """True if it is about fields of the message, not only about `_meta`."""
-        return self.is_opaque or not all(map(is_meta, self.fields()))
+        return not all(map(is_meta, self.fields())) or any(
+            each.asks_fields for each in self.filters
+        )
 
     @lazy
-    def is_opaque(self) -> bool:
-        """True if only MongoDB can answer a part of it."""
-        return any(isinstance(node, Opaque) for node in nodes(self.root))
-
-    @lazy
-    def needs_index(self) -> bool:
-        """True if messages alone cannot decide it, without MongoDB."""
-        return needs_index(self.root)
-
-
-_ONLY_INDEXED = frozenset({"inserted_at", "error", "ref"})
-"""Fields of index documents that messages do not have."""
+    def filters(self) -> tuple[MongoFilter, ...]:
+        """The MongoDB filters in it."""
+        return tuple(node for node in nodes(self.root) if isinstance(node, MongoFilter))
 
 
 def is_meta(path: str) -> bool:
     """True if a path leads into `_meta`, which hybridlog adds to a message."""
     return path == "_meta" or path.startswith("_meta.")
-
-
-def needs_index(node: Node) -> bool:
-    """True if only index documents can answer a part of a tree."""
-    return any(
-        isinstance(each, Opaque) or (isinstance(each, Condition) and _is_of_index(each.field))
-        for each in nodes(node)
-    )
-
-
-def _is_of_index(target: Field) -> bool:
-    name = target.path.split(".")
-    return name[0] == "_meta" and (len(name) < 2 or name[1] in _ONLY_INDEXED)
 
 
 def root_of(node: Predicate | Node) -> Node:
@@ -291,11 +282,11 @@ def thawed(value: object) -> object:
 
 
 def spelled(node: Node) -> str:
-    """The node as text of the language; an opaque one as MongoDB writes it."""
+    """The node as text of the language; a filter as MongoDB writes it."""
     match node:
         case Not(item):
             return f"not ({spelled(item)})"
-        case Opaque():
+        case MongoFilter():
             return str(node.to_filter())
         case And(items):
             return " and ".join(map(_bracketed, items)) or "anything"

@@ -26,7 +26,7 @@ from hybridlog.wording import listed
 from hybridlog_storage.errors import WhereError
 
 Stat = Literal["n", "min", "max", "mean"]
-Kind = Literal["number", "string", "bool", "time", "date", "other"]
+Kind = Literal["number", "string", "bool", "time", "other"]
 
 STATS: dict[str, Stat] = {"n": "n", "min": "min", "max": "max", "mean": "mean"}
 """Names of the statistics in the summary of an array."""
@@ -40,7 +40,6 @@ _KINDS: dict[str, Kind] = {
     "bool": "bool",
     "boolean": "bool",
     "string": "string",
-    "date": "date",
     **dict.fromkeys(TIMES, "time"),
     **dict.fromkeys({*NUMBERS, "number", "integer"}, "number"),
 }
@@ -164,15 +163,13 @@ def check(predicate: Predicate, types: FieldTypes | Mapping[str, str] | None) ->
         checker.check(condition)
 
 
-def check_names(predicate: Predicate, types: FieldTypes | Mapping[str, str] | None) -> None:
-    """Refuse a predicate with unknown fields, whatever they are compared with.
+def check_name(text: str, target: Field, types: FieldTypes | Mapping[str, str] | None) -> None:
+    """Refuse an unknown field in a text, whatever it is compared with.
 
     Raises:
         WhereError: there is no such field.
     """
-    checker = _Checker(predicate.text, FieldTypes.of(types))
-    for condition in predicate.conditions():
-        checker.check_name(condition.field)
+    _Checker(text, FieldTypes.of(types)).check_name(target)
 
 
 class _Checker:
@@ -236,10 +233,6 @@ class _Checker:
         )
 
     def _check_value(self, kind: Kind, path: str, value: Value, position: int) -> None:
-        if kind == "date":
-            raise error_at(
-                self._text, position, "_meta.inserted_at has milliseconds only; ask for _meta.t"
-            )
         if kind == "other" or value is None:
             return
         if isinstance(value, bool):

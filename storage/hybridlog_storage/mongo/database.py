@@ -393,9 +393,6 @@ class Database:
         projection: Mapping[str, object] | None = None,
         *,
         sort: Sort | None = None,
-        limit: int = 0,
-        batch_size: int = 0,
-        max_time_ms: int | None = None,
     ) -> Iterator[bytes]:
         """Find documents as bytes: each item is several concatenated BSON documents.
 
@@ -404,9 +401,6 @@ class Database:
             filter: MongoDB's filter document.
             projection: MongoDB's projection document.
             sort: Order; None for the order of the collection, which is that of `_id`.
-            limit: Most documents; 0 for all.
-            batch_size: Documents in one item; 0 for as many as fit 16 MiB.
-            max_time_ms: Most milliseconds on the server.
         """
         of, shape = self._collection(collection), None if projection is None else dict(projection)
 
@@ -415,13 +409,11 @@ class Database:
                 query,
                 shape,
                 sort=sort or None,
-                limit=limit,
-                # By default the server's first batch has 101 documents.
-                batch_size=batch_size or (1 << 30),
-                max_time_ms=max_time_ms,
+                # As many as fit 16 MiB; by default the server's first batch has 101 documents.
+                batch_size=1 << 30,
             )
 
-        is_keyed = not limit and (projection is None or projection.get("_id", 1))
+        is_keyed = projection is None or projection.get("_id", 1)
         order = _key_order(sort) if is_keyed else 0
         return self._found(ask, dict(filter or {}), order, _last_key)
 
@@ -439,7 +431,8 @@ class Database:
     ) -> Iterator[Document]:
         """Find documents one by one; for small answers.
 
-        The arguments are those of `find_raw`, and `read` for what the answer may hold.
+        The arguments are those of `find_raw`, and `read` for what the answer may hold; `limit`
+        0 is for all documents, and `max_time_ms` the most milliseconds on the server.
         """
         of = self._collection(collection, read)
 
@@ -523,9 +516,6 @@ class Database:
         self,
         collection: str,
         filter: Mapping[str, object] | None = None,  # noqa: A002
-        *,
-        by_key: bool = False,
-        max_time_ms: int | None = None,
     ) -> int:
         """Number of documents that match.
 
@@ -535,23 +525,17 @@ class Database:
         Args:
             collection: The collection; one that does not exist is empty.
             filter: MongoDB's filter document.
-            by_key: Find documents by `_id`, whatever other indexes exist. The collection
-            must exist.
-            max_time_ms: Most milliseconds on the server.
         """
         of = self._collection(collection)
-        options: dict[str, Any] = {} if max_time_ms is None else {"maxTimeMS": max_time_ms}
-        if by_key and filter:
-            options["hint"] = {"_id": 1}
 
         def ask() -> int:
             if not filter:
-                return of.estimated_document_count(**options)
+                return of.estimated_document_count()
             # A sharded cluster would count documents twice while it moves them.
             if self._client.is_mongos:
-                return of.count_documents(dict(filter), **options)
+                return of.count_documents(dict(filter))
             # Costs less than a pipeline, as which the driver would send it.
-            reply = self._database.command("count", of.name, query=dict(filter), **options)
+            reply = self._database.command("count", of.name, query=dict(filter))
             return int(reply["n"])
 
         return self._again(ask, question=True)
@@ -624,32 +608,19 @@ class Database:
         self,
         collection: str,
         pipeline: Sequence[Mapping[str, object]],
-        *,
-        hint: str | None = None,
-        max_time_ms: int | None = None,
     ) -> Iterator[Document]:
         """Run an aggregation pipeline that only reads.
 
         Args:
             collection: The collection; one that does not exist is empty.
             pipeline: The stages.
-            hint: Name of the index to use, see `index_name`.
-            max_time_ms: Most milliseconds on the server.
-
-        Raises:
-            WhereError: There is no such index, as well.
         """
         for stage in pipeline:
             if not _WRITING_STAGES.isdisjoint(stage):
                 raise WhereError(f"A pipeline may only read: {', '.join(stage)} is not allowed.")
         of = self._collection(collection)
-        options: dict[str, Any] = {"allowDiskUse": True}
-        if hint is not None:
-            options["hint"] = hint
-        if max_time_ms is not None:
-            options["maxTimeMS"] = max_time_ms
         stages = [dict(stage) for stage in pipeline]
-        yield from self._found(lambda _: of.aggregate(stages, **options), {}, 0, dict)
+        yield from self._found(lambda _: of.aggregate(stages, allowDiskUse=True), {}, 0, dict)
 
     def replace(
         self,

@@ -44,17 +44,6 @@ class KeyColumns:
         """Number of keys."""
         return len(self.time)
 
-    def take(self, rows: NDArray[np.intp] | slice) -> KeyColumns:
-        """The chosen keys."""
-        return KeyColumns(self.time[rows], self.recording[rows], self.seq[rows])
-
-    def to_keys(self, prefix: bytes) -> list[bytes]:
-        """The keys as documents have them, behind the prefix of their topic."""
-        packed = np.empty(len(self), _KEY_VALUE)
-        packed["time"], packed["recording"], packed["seq"] = self.time, self.recording, self.seq
-        whole = packed.tobytes()
-        return [prefix + whole[at : at + KEY_BYTES] for at in range(0, len(whole), KEY_BYTES)]
-
 
 def key_columns(batch: bytes) -> KeyColumns:
     """The keys of index documents, in document order.

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import os
 import secrets
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from typing import Any, Final, Literal, NamedTuple
@@ -20,7 +20,7 @@ from typing import Any, Final, Literal, NamedTuple
 from hybridlog_storage.catalog import RecordingEntry
 from hybridlog_storage.mongo.collection_names import CATALOG_PREFIX
 from hybridlog_storage.mongo.database import Database, ReadConcern
-from hybridlog_storage.mongo.topic_places import SHARED, TopicPlace, text_of
+from hybridlog_storage.mongo.topic_places import SHARED, TopicPlace
 
 RECORDINGS: Final = f"{CATALOG_PREFIX}recordings"
 STORE: Final = f"{CATALOG_PREFIX}store"
@@ -34,12 +34,6 @@ State = Literal["open", "clearing", "indexing", "complete", "removing"]
 indexed, complete, being removed for good."""
 _DESTROYS: Final = frozenset({"clearing", "removing"})
 _TURN: Final = {"_id": "turn"}
-_FIELDS: Final = {"_id": "fields"}
-_UNCERTAIN_CHANNEL: Final = [
-    {"is_indexed": {"$ne": True}},
-    {"reason": {"$ne": None}},
-    {"stats.unreadable": {"$ne": 0}},
-]
 _TURN_MS: Final = 20_000  # a linearizable read waits for members that may be away
 _CHANNEL_BYTES: Final = 600  # of a channel in the mirror, without its texts
 _MAX_CHANNEL_BYTES: Final = 8 << 20  # of all: a document of MongoDB has at most 16 MiB
@@ -113,13 +107,6 @@ class Indexed:
         return self.state == "complete" and dict(self.segments) == entry.digests
 
 
-class Progressed(NamedTuple):
-    """Progress of a recording: its turn, and digests of the indexed segments."""
-
-    turn: int
-    segments: Mapping[str, str]
-
-
 class IndexState:
     """The recordings indexed in a database."""
 
@@ -167,38 +154,12 @@ class IndexState:
         found = self._db.find_one(STORE, _TURN, read=read, max_time_ms=_TURN_MS)
         return int(found["turn"]) if found is not None else 0
 
-    def uncertain(self, topic: str) -> set[str]:
-        """Keys of the recordings whose documents may not tell about a topic.
-
-        Their index is not complete, or messages of the topic have no documents, or documents
-        without fields.
-        """
-        channel = {"$elemMatch": {"topic": text_of(topic), "$or": _UNCERTAIN_CHANNEL}}
-        damaged = {"index.damage": {"$exists": True}}
-        chosen = {"$or": [{"index.state": {"$ne": "complete"}}, damaged, {"channels": channel}]}
-        return {str(one["_id"]) for one in self._db.find(RECORDINGS, chosen, {"_id": 1})}
-
-    def field_indexes(self) -> list[tuple[str, tuple[str, ...]]]:
-        """Topic and fields of each index on fields, as `put_field_indexes` was told."""
-        found = self._db.find_one(STORE, _FIELDS)
-        listed = [] if found is None else found.get("indexes", ())
-        return [(str(one["topic"]), tuple(map(str, one["fields"]))) for one in listed]
-
-    def put_field_indexes(self, indexes: Iterable[tuple[str, Sequence[str]]]) -> None:
-        """List the indexes on fields, so that questions know them without a look at each."""
-        listed = [{"topic": topic, "fields": list(fields)} for topic, fields in indexes]
-        self._db.replace(STORE, _FIELDS, {**_FIELDS, "indexes": listed})
-
-    def progress(self, keys: Collection[str]) -> dict[str, Progressed]:
-        """Progress of recordings by key, without unknown ones."""
-        chosen, wanted = {"_id": {"$in": sorted(keys)}}, {"index.turn": 1, "index.segments": 1}
-        said = {
-            found["_id"]: found.get("index") or {}
-            for found in self._db.find(RECORDINGS, chosen, wanted, read="majority")
-        }
+    def segments(self, keys: Collection[str]) -> dict[str, Mapping[str, str]]:
+        """Digests of the indexed segments of recordings by key, without unknown ones."""
+        chosen = {"_id": {"$in": sorted(keys)}}
         return {
-            key: Progressed(int(index.get("turn", 0)), dict(index.get("segments") or {}))
-            for key, index in said.items()
+            found["_id"]: dict((found.get("index") or {}).get("segments") or {})
+            for found in self._db.find(RECORDINGS, chosen, {"index.segments": 1}, read="majority")
         }
 
     def put(

@@ -15,10 +15,8 @@ import pyarrow as pa
 import pytest
 from hypothesis import HealthCheck, Phase, example, given, settings
 from hypothesis import strategies as st
-from pymongo.collection import Collection
 
 from hybridlog.query.message_filter import MessageFilter
-from hybridlog.query.predicate.from_mongo import from_mongo
 from hybridlog.query.predicate.parser import parse
 from hybridlog.query.predicate.to_bool import statistic, to_bool, to_truth
 from hybridlog.query.predicate.to_mask import to_mask
@@ -34,7 +32,7 @@ from tests.schema.wire_oracle import oracle
 
 Message = dict[str, object]
 Types = dict[str, str] | None
-Ask = Callable[[list[Message], list[Message], Iterable[str | Message], Types], None]
+Ask = Callable[[list[Message], list[Message], Iterable[str], Types], None]
 
 LIMIT = 3
 """Elements of an array that the index holds whole, here."""
@@ -66,15 +64,15 @@ SUMMARISED = ("a", "k", "w")
 
 
 @pytest.fixture(scope="module")
-def ask(collection: Collection[Message]) -> Ask:
+def ask() -> Ask:
     def ask(
         messages: list[Message],
         documents: list[Message],
-        questions: Iterable[str | Message],
+        questions: Iterable[str],
         types: Types,
     ) -> None:
         for question in questions:
-            predicate = parse(question) if isinstance(question, str) else from_mongo(question)
+            predicate = parse(question)
             test = to_bool(predicate, types)
             expected = {n for n, message in enumerate(messages) if test(message)}
 
@@ -287,7 +285,7 @@ even_paths = [
 
 SLOW = settings(
     max_examples=15,
-    phases=[Phase.explicit, Phase.generate],  # to shrink is to ask MongoDB for minutes
+    phases=[Phase.explicit, Phase.generate],  # to shrink takes minutes
     deadline=None,
     suppress_health_check=[HealthCheck.too_slow],
     derandomize=True,
@@ -518,34 +516,6 @@ def part(values: Message) -> object:
         n=values["n"],
         q=np.array(values["q"], np.float32),
         leaves=[leaf(**inner) for inner in values["leaves"]],  # type: ignore[attr-defined]
-    )
-
-
-@pytest.mark.parametrize(
-    "question",
-    [
-        {"x": {"$ne": 1}},
-        {"x": {"$gt": 0, "$lt": 2}},
-        {"i": {"$in": [1, 2]}, "x": {"$nin": [1.0]}},
-        {"$or": [{"i": 1}, {"$nor": [{"s": "a"}, {"b": True}]}]},
-        {"x": {"$not": {"$gte": 1}}},
-        {"y": {"$exists": False}},
-        {"s": {"$regex": "A", "$options": "i"}},
-        {"a": {"$lt": 1}},
-        {"u": 2**63 + 1},
-        {},
-    ],
-)
-@settings(max_examples=3, deadline=None, derandomize=True)
-@given(messages=st.lists(ros_messages, min_size=4, max_size=12))
-def test_of_filters(ask: Ask, question: Message, messages: list[Message]) -> None:
-    codec = ros_codec()
-    types = {path.path: path.type for path in codec.paths()}
-    ask(
-        messages,
-        [index_fields(codec, serialised(message), array_limit=LIMIT) for message in messages],
-        [question],
-        types,
     )
 
 

@@ -7,7 +7,7 @@ import pickle
 
 import pytest
 
-from hybridlog.query.predicate.from_mongo import from_mongo
+from hybridlog.query.predicate.mongo_filter import mongo_filter
 from hybridlog.query.predicate.parser import parse
 from hybridlog.query.predicate.tree import And, Compare, Field, Predicate
 
@@ -61,13 +61,13 @@ def test_a_predicate_shows_what_it_asks(text: str) -> None:
 
 
 def test_what_mongodb_is_asked_is_shown_as_it_is_written() -> None:
-    shown = repr(from_mongo({"x": 1, "$or": [{"a": {"$size": 3}}, {"y": {"$lt": 2}}]}))
-    assert shown == "<Predicate x == 1 and ({'a': {'$size': 3}} or y < 2)>"
-    assert repr(from_mongo({})) == "<Predicate anything>"
+    shown = repr(mongo_filter({"x": 1, "y": {"$lt": 2}}, None) & parse("z == 1"))
+    assert shown == "<Predicate {'x': 1, 'y': {'$lt': 2}} and z == 1>"
+    assert repr(mongo_filter({}, None)) == "<Predicate anything>"
 
 
 def test_joined() -> None:
-    everything = from_mongo({})
+    everything = mongo_filter({}, None)
     one, two = parse("x < 5"), parse("y > 1 and z == 2")
     assert not everything
     assert one
@@ -82,10 +82,10 @@ def test_joined() -> None:
 
 def test_a_predicate_does_not_change_with_its_filter() -> None:
     query: dict[str, object] = {"a": [1, {"b": 2}]}
-    predicate = from_mongo(query)
+    predicate = mongo_filter(query, None)
     inner = query["a"]
     assert isinstance(inner, list)
     inner[1]["b"] = 3
-    assert predicate == from_mongo({"a": [1, {"b": 2}]})
-    assert predicate != from_mongo(query)
+    assert predicate == mongo_filter({"a": [1, {"b": 2}]}, None)
+    assert predicate != mongo_filter(query, None)
     assert math.isnan(parse("x == nan").root.value)  # type: ignore[union-attr, arg-type]

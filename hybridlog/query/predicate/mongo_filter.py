@@ -1,38 +1,31 @@
-"""Predicates from MongoDB filters that a user wrote.
+"""Checks MongoDB filters that a user wrote, before they are handed to MongoDB as they are.
 
 Only operators that compare values are allowed. Operators that run code on the server
 (`$where`, `$function`, `$accumulator`), read other data or are unknown are refused. Values
-with code in them are refused, too. Conditions that the language has become the same tree as
-its text; the rest remains a filter that only MongoDB answers. Patterns have RE2's syntax,
-and are allowed where the language has them.
+with code in them are refused, too. Patterns have RE2's syntax, so no search takes forever.
 """
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from collections.abc import Callable, Mapping
 from datetime import datetime
-from typing import TypeGuard
 
-from hybridlog.query.predicate.numbers import HIGH, LOW, is_nan
+from hybridlog.query.predicate.numbers import HIGH, LOW
 from hybridlog.query.predicate.regex import RegexError, compile_regex
 from hybridlog.query.predicate.tree import (
     And,
-    Compare,
-    Exists,
     Field,
-    Match,
-    Member,
-    Node,
-    Not,
-    Opaque,
-    Or,
-    Order,
+    MongoFilter,
     Predicate,
-    Value,
+    Reach,
     frozen,
+    is_meta,
 )
+from hybridlog.query.predicate.types import STATS, FieldTypes, check_name
+from hybridlog.schema.kinds import width_of
 from hybridlog_storage.errors import WhereError
 
 MAX_DEPTH = 100
@@ -41,8 +34,9 @@ MAX_NODES = 20_000
 """Maximum number of keys and values in total."""
 MAX_CHARACTERS = 1_000_000
 """Maximum number of characters in all keys and strings."""
+WHOLE = 32
+"""Longer arrays are summaries in index documents."""
 
-_ORDERS: dict[str, Order] = {"$lt": "<", "$lte": "<=", "$gt": ">", "$gte": ">="}
 _LOGICAL = {"$and", "$or", "$nor"}
 _LITERAL = {"$eq", "$ne", "$gt", "$gte", "$lt", "$lte"}
 _LISTS = {"$in", "$nin", "$all"}
@@ -77,195 +71,262 @@ _EXPRESSIONS = frozenset(
         *("$convert", "$isNumber", "$toBool", "$toDate", "$toDouble", "$toInt", "$toLong"),
         *("$toString", "$type"),
         # values
-        *("$getField", "$let", "$literal"),
+        *("$let", "$literal"),
     }
 )
 _OPTIONS = set("ims")
 _BSON_VALUES = {"ObjectId", "Decimal128", "Timestamp", "MinKey", "MaxKey"}
 
 
-def from_mongo(query: Mapping[str, object]) -> Predicate:
-    """The predicate that is equivalent to a filter.
+Filter = dict[str, object]
+_Path = tuple[str, ...]
+
+
+def from_json(text: str) -> Filter:
+    """A filter from JSON.
+
+    Raises:
+        WhereError: it is no JSON, or too large.
+    """
+    if len(text) > MAX_CHARACTERS:
+        raise WhereError("filter not allowed: the filter is too large")
+    try:
+        found: Filter = json.loads(text)
+    except RecursionError:
+        raise WhereError(f"filter not allowed: it is nested deeper than {MAX_DEPTH}") from None
+    except ValueError as error:
+        raise WhereError(
+            f'a MongoDB filter is JSON, such as {{"n": {{"$gt": 3}}}}: {error}'
+        ) from None
+    return found
+
+
+def mongo_filter(
+    query: Mapping[str, object], types: FieldTypes | Mapping[str, str] | None
+) -> Predicate:
+    """A filter as a predicate that MongoDB answers.
 
     Numpy scalars become Python numbers, tuples become lists, compiled patterns become `$regex`.
 
     Args:
         query: A filter as `pymongo` takes it.
+        types: Types of the fields by path; None where no definition fixes them.
 
     Raises:
-        WhereError: a part is not allowed; the message has its place.
+        WhereError: a part is not allowed, with its place; or there is no such field.
     """
     if not isinstance(query, Mapping):
         raise WhereError(f"a filter is a mapping, not {type(query).__name__}")
-    root = _Reader().query(query, (), 0)
-    return Predicate(root, str(query))
+    checker = _Checker()
+    found, text = checker.query(query, (), 0), str(query)
+    for path in checker.paths:
+        if path.split(".")[0] != "_id":
+            check_name(text, _field(path), types)
+    if not found:
+        return Predicate(And(()), text)
+    return Predicate(MongoFilter(frozen(found), tuple(checker.paths.items())), text)
 
 
-_Path = tuple[str, ...]
+def misjudged(node: MongoFilter, types: FieldTypes | Mapping[str, str] | None) -> dict[str, Filter]:
+    """What a filter cannot ask for: filters of documents that it misjudges, by the reason.
+
+    Index documents have a long array as a summary only, and no summary of a short one.
+    """
+    known = FieldTypes.of(types)
+    found: dict[str, Filter] = {}
+    for path, reach in node.paths:
+        if is_meta(path) or path.split(".")[0] == "_id":
+            continue
+        names = [name for name in path.split(".") if not name.isdecimal()]
+        name, parent = ".".join(names), ".".join(names[:-1])
+        is_statistic = known.statistic(tuple(names)) is not None
+        if is_statistic:
+            found[
+                f"{parent} of up to {WHOLE} elements is whole in the index, and has no {name} "
+                f"there: write a predicate, such as '{name} > 0'."
+            ] = {parent: {"$type": "array", "$ne": []}, name: {"$exists": False}}
+        if known.known:
+            arrays = known.arrays
+        else:
+            arrays = {".".join(names[: end + 1]) for end in range(len(names))}
+        for array in sorted(arrays):
+            is_above = name.startswith(f"{array}.") and not (is_statistic and array == parent)
+            is_it = array == name and (reach != "exists" or path != name)
+            is_below = reach == "whole" and array.startswith(f"{name}.")
+            width = width_of(known.types.get(array, ""))
+            if (is_above or is_it or is_below) and (width is None or width > WHOLE):
+                found[
+                    f"{array} of more than {WHOLE} elements is a summary in the index: ask for "
+                    f"{array}.min, {array}.max, {array}.mean or {array}.n, or write a predicate, "
+                    f"such as '{array} > 0'."
+                ] = _summaries_of(array, known)
+    return found
 
 
-class _Reader:
+def _summaries_of(array: str, types: FieldTypes) -> Filter:
+    """A filter of the documents that have an array as a summary."""
+    count = f"{array}.n"
+    if types.known and count not in types.types and count not in types.inner:
+        return {count: {"$exists": True}}
+    # The elements may have a field of that name: the shape tells.
+    of = f"${array}"
+    nested = {"$cond": [{"$isArray": of}, of, []]}
+    in_elements = {"$map": {"input": nested, "in": _is_summary("$$this")}}
+    return {"$expr": {"$or": [_is_summary(of), {"$anyElementTrue": in_elements}]}}
+
+
+def _is_summary(value: str) -> Filter:
+    shapes = (("n",), tuple(STATS))
+    return {"$in": [value, [{name: f"{value}.{name}" for name in shape} for shape in shapes]]}
+
+
+def _field(path: str) -> Field:
+    first, *rest = path.split(".")
+    return Field((first, *(int(part) if _is_place(part) else part for part in rest)))
+
+
+def _is_place(part: str) -> bool:
+    return part.isascii() and part.isdecimal() and str(int(part[:9])) == part
+
+
+class _Checker:
+    """Checks a filter.
+
+    Attributes:
+        paths: How the filter asks for each path.
+    """
+
     def __init__(self) -> None:
+        self.paths: dict[str, Reach] = {}
         self._nodes = 0
         self._characters = 0
 
-    def query(self, query: Mapping[str, object], path: _Path, depth: int) -> Node:
-        found: list[Node] = []
-        for key, value in self._items(query, path, depth):
-            inner = (*path, key)
-            if key in _LOGICAL:
-                found.append(self._joined(key, value, inner, depth))
-            elif key == "$expr":
-                found.append(_opaque({key: self._expression(value, inner, depth + 1)}, inner))
-            elif key == "$comment":
-                self._literal(value, inner, depth + 1)
-            elif key.startswith("$"):
-                raise _refused(inner, "the operator is not allowed here")
-            else:
-                found.append(self._condition(key, value, inner, depth + 1))
-        return found[0] if len(found) == 1 else And(tuple(found))
+    def query(
+        self, query: Mapping[str, object], path: _Path, depth: int, above: str = ""
+    ) -> Filter:
+        """A filter in plain Python values.
 
-    def _joined(self, operator: str, value: object, path: _Path, depth: int) -> Node:
-        if not isinstance(value, list | tuple) or not value:
-            raise _refused(path, "needs a list of filters")
-        items = tuple(self.query(_mapping(item, path), path, depth + 1) for item in value)
-        if operator == "$and":
-            return items[0] if len(items) == 1 else And(items)
-        either = items[0] if len(items) == 1 else Or(items)
-        return Not(either) if operator == "$nor" else either
-
-    def _condition(self, name: str, value: object, path: _Path, depth: int) -> Node:
-        if isinstance(value, Mapping) and _has_operators(value, path):
-            return self._operators(name, value, path, depth)
-        if _is_pattern(value):
-            return self._pattern(name, value, path)
-        plain = self._literal(value, path, depth)
-        return _comparison(name, "$eq", plain) or _opaque({name: plain}, path)
-
-    def _operators(
-        self, name: str, operators: Mapping[str, object], path: _Path, depth: int
-    ) -> Node:
-        found: list[Node] = []
-        for key, value in self._items(operators, path, depth):
-            inner = (*path, key)
-            if key == "$not":
-                found.append(Not(self._not(name, value, inner, depth)))
-            elif key == "$regex":
-                options = operators.get("$options", "")
-                found.append(self._regex(name, value, options, inner))
-            elif key != "$options" or "$regex" not in operators:
-                operand = self._operand(key, value, inner, depth)
-                node = _comparison(name, key, operand)
-                found.append(_opaque({name: {key: operand}}, inner) if node is None else node)
-        return found[0] if len(found) == 1 else And(tuple(found))
-
-    def _operand(self, operator: str, value: object, path: _Path, depth: int) -> object:
-        """The operand of an operator, in plain Python values."""
-        if operator in _LITERAL or operator in _PLAIN:
-            return self._literal(value, path, depth + 1)
-        if operator in _LISTS:
-            return self._members(value, path, depth)
-        if operator == "$elemMatch":
-            return self._element(value, path, depth)
-        raise _refused(path, "the operator is not allowed here")
-
-    def _members(self, value: object, path: _Path, depth: int) -> list[object]:
-        if not isinstance(value, list | tuple):
-            raise _refused(path, "needs a list")
-        members: list[object] = []
-        for item in value:
-            if path[-1] == "$all" and isinstance(item, Mapping) and set(item) == {"$elemMatch"}:
-                inner = (*path, "$elemMatch")
-                members.append({"$elemMatch": self._element(item["$elemMatch"], inner, depth + 1)})
-            else:
-                members.append(self._literal(item, path, depth + 1))
-        return members
-
-    def _not(self, name: str, value: object, path: _Path, depth: int) -> Node:
-        if _is_pattern(value):
-            return self._pattern(name, value, path)
-        inner = _mapping(value, path)
-        if not inner or not all(isinstance(key, str) and key[:1] == "$" for key in inner):
-            raise _refused(path, "needs operators")
-        return self._operators(name, inner, path, depth + 1)
-
-    def _element(self, value: object, path: _Path, depth: int) -> dict[str, object]:
-        """The condition on an element, as a filter: only MongoDB can answer it."""
-        inner = _mapping(value, path)
-        keys = [key for key in inner if isinstance(key, str) and key.startswith("$")]
-        if keys and not set(keys) & _LOGICAL:
-            return self._plain_operators(inner, path, depth + 1)
-        if "$expr" in inner:
-            raise _refused((*path, "$expr"), "the operator is not allowed here")
-        return self._plain_query(inner, path, depth + 1)
-
-    def _plain_query(
-        self, query: Mapping[str, object], path: _Path, depth: int
-    ) -> dict[str, object]:
-        found: dict[str, object] = {}
+        Args:
+            query: The filter.
+            path: Its place, for messages.
+            depth: Its depth.
+            above: The path of the array whose elements it is about, and a dot.
+        """
+        found: Filter = {}
         for key, value in self._items(query, path, depth):
             inner = (*path, key)
             if key in _LOGICAL:
                 if not isinstance(value, list | tuple) or not value:
                     raise _refused(inner, "needs a list of filters")
                 found[key] = [
-                    self._plain_query(_mapping(item, inner), inner, depth + 1) for item in value
+                    self.query(_mapping(item, inner), inner, depth + 1, above) for item in value
                 ]
+            elif key == "$expr" and not above:
+                found[key] = self._expression(value, inner, depth + 1)
+            elif key == "$comment" and not above:
+                found[key] = self._literal(value, inner, depth + 1)
             elif key.startswith("$"):
                 raise _refused(inner, "the operator is not allowed here")
-            elif isinstance(value, Mapping) and _has_operators(value, inner):
-                found[key] = self._plain_operators(value, inner, depth + 1)
             else:
-                found[key] = self._literal(value, inner, depth + 1)
+                found[key] = self._condition(above + key, value, inner, depth + 1)
         return found
 
-    def _plain_operators(
-        self, operators: Mapping[str, object], path: _Path, depth: int
-    ) -> dict[str, object]:
-        found: dict[str, object] = {}
+    def _ask(self, name: str, reach: Reach) -> None:
+        """Note that the filter asks for a path, and how."""
+        if self.paths.get(name, "exists") == "exists" or reach == "whole":
+            self.paths[name] = reach
+
+    def _condition(self, name: str, value: object, path: _Path, depth: int) -> object:
+        if isinstance(value, Mapping) and _has_operators(value, path):
+            return self._operators(name, value, path, depth)
+        if _is_pattern(value):
+            self._ask(name, "value")
+            return self._regex(value, "", path)
+        self._ask(name, "whole" if isinstance(value, Mapping | list | tuple) else "value")
+        return self._literal(value, path, depth)
+
+    def _operators(
+        self, name: str, operators: Mapping[str, object], path: _Path, depth: int
+    ) -> Filter:
+        found: Filter = {}
         for key, value in self._items(operators, path, depth):
             inner = (*path, key)
             if key == "$not":
-                nested = _mapping(value, inner)
-                if not nested:
-                    raise _refused(inner, "needs operators")
-                found[key] = self._plain_operators(nested, inner, depth + 1)
-            elif key in {"$regex", "$options"}:
-                raise _refused(inner, "patterns are not allowed within $elemMatch")
-            else:
-                found[key] = self._operand(key, value, inner, depth)
+                found[key] = self._not(name, value, inner, depth)
+            elif key == "$regex":
+                self._ask(name, "value")
+                found |= self._regex(value, operators.get("$options", ""), inner)
+            elif key != "$options" or "$regex" not in operators:
+                found[key] = self._operand(name, key, value, inner, depth)
         return found
 
-    def _pattern(self, name: str, value: object, path: _Path) -> Node:
-        pattern, flags = getattr(value, "pattern", None), getattr(value, "flags", 0)
-        if not isinstance(flags, int):
-            raise _refused(path, "has flags that are not understood")
-        table = {re.IGNORECASE: "i", re.MULTILINE: "m", re.DOTALL: "s"}
-        options = "".join(letter for flag, letter in table.items() if flags & flag)
-        if flags & ~(re.IGNORECASE | re.MULTILINE | re.DOTALL | re.UNICODE):
-            raise _refused(path, "may have the flags i, m and s only")
-        return self._regex(name, pattern, options, path)
+    def _operand(self, name: str, operator: str, value: object, path: _Path, depth: int) -> object:
+        """The operand of an operator, in plain Python values."""
+        if operator == "$elemMatch":
+            return self._element(name, value, path, depth)
+        if operator in _LISTS:
+            return self._members(name, value, path, depth)
+        if operator not in _LITERAL | _PLAIN:
+            raise _refused(path, "the operator is not allowed here")
+        is_nested = isinstance(value, Mapping | list | tuple) and operator in _LITERAL
+        self._ask(name, "exists" if operator == "$exists" else "whole" if is_nested else "value")
+        return self._literal(value, path, depth + 1)
 
-    def _regex(self, name: str, value: object, options: object, path: _Path) -> Node:
+    def _members(self, name: str, value: object, path: _Path, depth: int) -> list[object]:
+        if not isinstance(value, list | tuple):
+            raise _refused(path, "needs a list")
+        is_nested = any(isinstance(item, Mapping | list | tuple) for item in value)
+        self._ask(name, "whole" if is_nested else "value")
+        members: list[object] = []
+        for item in value:
+            if path[-1] == "$all" and isinstance(item, Mapping) and set(item) == {"$elemMatch"}:
+                inner = (*path, "$elemMatch")
+                element = self._element(name, item["$elemMatch"], inner, depth + 1)
+                members.append({"$elemMatch": element})
+            else:
+                members.append(self._literal(item, path, depth + 1))
+        return members
+
+    def _not(self, name: str, value: object, path: _Path, depth: int) -> Filter:
+        if _is_pattern(value):
+            self._ask(name, "value")
+            return self._regex(value, "", path)
+        inner = _mapping(value, path)
+        if not inner or not all(isinstance(key, str) and key[:1] == "$" for key in inner):
+            raise _refused(path, "needs operators")
+        return self._operators(name, inner, path, depth + 1)
+
+    def _element(self, name: str, value: object, path: _Path, depth: int) -> Filter:
+        """The condition on an element of an array."""
+        self._ask(name, "value")
+        inner = _mapping(value, path)
+        keys = [key for key in inner if isinstance(key, str) and key.startswith("$")]
+        if keys and not set(keys) & _LOGICAL and "$expr" not in keys:
+            return self._operators(name, inner, path, depth + 1)
+        return self.query(inner, path, depth + 1, f"{name}.")
+
+    def _regex(self, value: object, options: object, path: _Path) -> Filter:
         if _is_pattern(value):
             if options:
                 raise _refused(path, "has options twice")
-            return self._pattern(name, value, path)
+            flags = getattr(value, "flags", 0)
+            table = {re.IGNORECASE: "i", re.MULTILINE: "m", re.DOTALL: "s"}
+            if not isinstance(flags, int) or flags & ~(sum(table) | re.UNICODE):
+                raise _refused(path, "may have the flags i, m and s only")
+            options = "".join(letter for flag, letter in table.items() if flags & flag)
+            value = getattr(value, "pattern", None)
         if not isinstance(value, str):
             raise _refused(path, "needs a string")
         if not isinstance(options, str) or not set(options) <= _OPTIONS:
             raise _refused(path, "may have the options i, m and s only")
         self._count(path, len(value))
         flags = "".join(sorted(set(options)))
-        pattern = f"(?{flags}){value}" if flags else str(value)
         try:
-            compile_regex(pattern)
+            compile_regex(f"(?{flags}){value}" if flags else str(value))
         except RegexError as error:
             raise _refused(path, f"the pattern is refused: {error}") from None
-        target = _field(name)
-        if target is None:
-            raise _refused(path, "a pattern needs a field of a message")
-        return Match(target, pattern, negated=False)
+        found: Filter = {"$regex": str(value)}
+        return {**found, "$options": flags} if flags else found
 
     def _expression(self, value: object, path: _Path, depth: int) -> object:
         """An aggregation expression."""
@@ -273,6 +334,8 @@ class _Reader:
             self._enter(path, depth)
             return [self._expression(item, path, depth + 1) for item in value]
         if not isinstance(value, Mapping):
+            if isinstance(value, str) and value.startswith("$"):
+                self._ask_in_expression(value, path)
             return self._literal(value, path, depth)
         items = self._items(value, path, depth)
         operators = [key for key, _ in items if key.startswith("$")]
@@ -287,6 +350,16 @@ class _Reader:
             checked[key] = check(inner, place, depth + 1)
         return checked
 
+    def _ask_in_expression(self, text: str, path: _Path) -> None:
+        name = text[1:]
+        if name.startswith("$"):
+            variable, _, name = name[1:].partition(".")
+            if variable not in {"ROOT", "CURRENT"}:
+                return  # of a path that is noted already
+            if not name:
+                raise _refused(path, f"{text} is the whole document; name a field")
+        self._ask(name, "whole")
+
     def _literal(self, value: object, path: _Path, depth: int) -> object:
         """A value to compare with; no operator has a meaning in it."""
         if isinstance(value, Mapping):
@@ -300,6 +373,8 @@ class _Reader:
             self._enter(path, depth)
             return [self._literal(item, path, depth + 1) for item in value]
         self._count(path, len(value) if isinstance(value, str | bytes) else 0)
+        if isinstance(value, int) and not LOW <= value <= HIGH:
+            raise _refused(path, f"{value} does not fit into 64 bits; write it as a float")
         return _scalar(value, path)
 
     def _items(
@@ -392,68 +467,6 @@ _SCALARS: tuple[tuple[Callable[[object], bool], Callable[[object], object]], ...
         _plain_number,
     ),
 )
-
-
-def _comparison(name: str, operator: str, operand: object) -> Node | None:
-    """A condition as a node of the language; None if the language has no equivalent.
-
-    MongoDB's equality with null also finds missing fields, and MongoDB orders values that
-    have no order in the language.
-    """
-    target = _field(name)
-    if target is None:
-        return None
-    if isinstance(operand, int) and not isinstance(operand, bool):
-        operand = int(operand)  # also converts an Int64 of BSON
-    if operator in {"$in", "$nin"} and isinstance(operand, list):
-        values = tuple(value for value in operand if _is_value(value))
-        member = Member(target, values, negated=False) if len(values) == len(operand) else None
-        return member if operator == "$in" or member is None else Not(member)
-    if operator == "$exists" and isinstance(operand, bool):
-        return Exists(target, present=operand)
-    if not _is_value(operand):
-        return None
-    if operator in {"$eq", "$ne"}:
-        same = Compare(target, "==", operand)
-        return same if operator == "$eq" else Not(same)
-    order = _ORDERS.get(operator)
-    is_ordered = not isinstance(operand, bool) and not is_nan(operand)
-    return Compare(target, order, operand) if order is not None and is_ordered else None
-
-
-def _is_value(operand: object) -> TypeGuard[Value]:
-    """True if an operand has the same meaning for MongoDB and in the language."""
-    return type(operand) in {bool, int, float, str}
-
-
-def _field(name: str) -> Field | None:
-    """The field of a path; None if only MongoDB understands it."""
-    parts = name.split(".")
-    if not all(parts) or parts[0] == "_id" or name == "_meta.inserted_at":
-        return None
-    return Field((parts[0], *map(_place_or_name, parts[1:])))
-
-
-def _place_or_name(part: str) -> str | int:
-    is_place = part.isascii() and part.isdecimal() and str(int(part[:9])) == part
-    return int(part) if is_place else part
-
-
-def _opaque(query: dict[str, object], path: _Path) -> Opaque:
-    _check_width(query, path)
-    return Opaque(frozen(query))
-
-
-def _check_width(value: object, path: _Path) -> None:
-    """Refuse integers that MongoDB cannot hold."""
-    if isinstance(value, Mapping):
-        for inner in value.values():
-            _check_width(inner, path)
-    elif isinstance(value, list):
-        for inner in value:
-            _check_width(inner, path)
-    elif isinstance(value, int) and not LOW <= value <= HIGH:
-        raise _refused(path, f"{value} does not fit into 64 bits; write it as a float")
 
 
 def _has_operators(value: Mapping[str, object], path: _Path) -> bool:
