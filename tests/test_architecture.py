@@ -33,7 +33,6 @@ ALLOWED = {
     "PIL": ("hybridlog.arrays.message_arrays", "hybridlog.drawing.images"),
     "av": ("hybridlog.arrays.video",),
     "bson": (
-        "hybridlog.query.answers.index_documents",  # as MongoDB has them
         "hybridlog.schema.index_bodies",
         "hybridlog.schema.objects",
         "hybridlog.schema.protobuf_codec",

@@ -16,6 +16,7 @@ from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.mongo.mongod import EmbeddedMongod
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from hybridlog_storage.settings import read_settings
+from tests.indexed import documents_of
 from tests.storage.chunk_entries import chunk_entries
 from tests.test_model import drafts_of, write_mcap
 
@@ -84,14 +85,15 @@ def tell(store: Path) -> Told:
     with hl.open(store, require_database=True) as opened:
         topics = opened.topics()
         whole = opened.query(topics, ["log5"])
-        stamped = opened.query(["/twin"], ["log5"])
         told: Told = {
             "entries": [entry.to_document() for entry in opened.recordings()],
             "messages": [(m.topic, m.seq, m.log_time_ns, m.raw) for m in whole],
             "decoded": [m.fields for m in opened.query(["/a__b"], ["log5"])],
             "count": {t: opened.query([t]).count() for t in topics},
-            "where": {t: opened.query([t]).where({"number": {"$gte": 0}}).count() for t in topics},
-            "stamps": sorted(d["header"]["stamp"] for d in stamped.documents() if "header" in d),
+            "where": {t: opened.query([t]).where("number >= 0").count() for t in topics},
+            "stamps": sorted(
+                d["header"]["stamp"] for d in documents_of(opened, "/twin") if "header" in d
+            ),
             "damaged": 0,
         }
         try:

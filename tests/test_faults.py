@@ -266,7 +266,7 @@ def test_the_index_may_be_ahead_of_the_file(
         assert entry.status == ("damaged" if listed else "recovered")
         assert lost(entry) == (topics_of(said - content(messages)) if listed else Counter())
         topics = sorted({m.topic for m in messages})
-        assert opened.query(topics).where({"_meta.seq": {"$gte": 0}}).count() == len(messages)
+        assert opened.query(topics).where("_meta.seq >= 0").count() == len(messages)
         assert opened.verify().findings == []
 
 
@@ -377,9 +377,7 @@ def test_mongod_killed_and_not_to_be_had_again(
     with hl.open(place, require_database=True) as store:
         assert store.repairs.indexed["robot"] > 0
         assert store.verify().findings == []
-        assert store.topic("/imu/data").where({"_meta.t": {"$gt": 0}}).count() == len(
-            spoken["/imu/data"]
-        )
+        assert store.topic("/imu/data").where("_meta.t > 0").count() == len(spoken["/imu/data"])
 
 
 # A disk that is full.
@@ -499,7 +497,7 @@ def check_what_is_missing(store: hl.Store, said: Counter[Message], segments: set
     files = {row["file"] for row in entry.end["losses"]}
     assert files == {f"{segment:06d}.mcap" for segment in segments}
     for topic, count in topics_of(messages).items():
-        assert store.topic(topic).where({"_meta.seq": {"$gte": 0}}).count() == count
+        assert store.topic(topic).where("_meta.seq >= 0").count() == count
 
 
 def check_the_rest(store: hl.Store, said: Counter[Message], lost: set[tuple[int, int]]) -> None:
@@ -697,7 +695,7 @@ def test_a_summary_is_made_again(store: hl.Store, said: Counter[Message]) -> Non
         assert (entry.status, lost(entry)) == ("complete", Counter())
         assert content(fetched(opened, "short")) == said
         topics = sorted(topics_of(said))
-        assert opened.query(topics).where({"_meta.seq": {"$gte": 0}}).count() == said.total()
+        assert opened.query(topics).where("_meta.seq >= 0").count() == said.total()
 
 
 @pytest.mark.parametrize("part", ["summary", "chunk"])
@@ -722,7 +720,7 @@ def test_one_damaged_recording_keeps_no_other_out_of_the_index(
         (entry,) = opened.select(["short"])
         assert entry.status == "damaged"
         assert {row["file"] for row in entry.end["losses"]} == {place.path.name}
-        found = opened.query(sorted(topics_of(said)), ["short"]).where({"_meta.seq": {"$gte": 0}})
+        found = opened.query(sorted(topics_of(said)), ["short"]).where("_meta.seq >= 0")
         if part == "summary":
             assert found.count() == said.total() - lost(entry).total()
         else:
@@ -732,7 +730,7 @@ def test_one_damaged_recording_keeps_no_other_out_of_the_index(
             hurt = set(lost(entry))
             for topic, count in topics_of(said).items():
                 if topic not in hurt:
-                    own = opened.query([topic], ["short"]).where({"_meta.seq": {"$gte": 0}})
+                    own = opened.query([topic], ["short"]).where("_meta.seq >= 0")
                     assert own.count() == count
             assert opened.query(sorted(topics_of(said)), [other]).count() == said.total()
         # Of a chunk it is known without the catalog, too.
@@ -879,7 +877,7 @@ def test_what_the_index_says_of_itself_is_put_right_by_the_next_who_connects(
             # All that alters the index notes first that it is not known to be whole.
             shared.catalog.put_indexed([entry.id for entry in shared.recordings()], "")
         with reopened(shared) as opened:
-            everything = opened.all_topics().where({"_meta.seq": {"$gte": 0}})
+            everything = opened.all_topics().where("_meta.seq >= 0")
             assert everything.count() == said.total()
             assert list(found.find({}, {"index.turn": 0})) == before
             assert opened.verify().findings == []
@@ -1044,7 +1042,7 @@ def test_while_the_index_is_made_anew_others_answer_as_always(
                 for name in ("short", "zz"):
                     query = other.query(topics, [name])
                     assert query.count() == said.total(), (label, name)
-                    query = query.where({"_meta.seq": {"$gte": 0}})
+                    query = query.where("_meta.seq >= 0")
                     if name == label:
                         # It is told that this cannot be said now, or said right.
                         with suppress(IndexChangedError):

@@ -176,7 +176,7 @@ def test_root_takes_no_ones_server(place: Path) -> None:
     store = place / "lab" / "store"
     ann.run("record", place / "small.bag", "-q", "--store", store)
     with hl.open(store) as opened:
-        assert len(list(opened.topic("/imu/data").documents())) > 0
+        assert opened.topic("/imu/data").where({"_meta.seq": {"$gte": 0}}).count() > 0
     assert (store / "mongod-0").stat().st_uid == 0
     theirs = [store / "mongod", *(store / "mongod").rglob("*")]
     assert {p.stat().st_uid for p in theirs if p.exists()} == {ann.uid}

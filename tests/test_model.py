@@ -1026,7 +1026,7 @@ def query_of(store: hl.Store, asked: Asked) -> Query:
     if asked.bounds is not None:
         query = query.between(*asked.bounds)
     if asked.number is not None:
-        query = query.where({"number": {"$gte": asked.number}})
+        query = query.where(f"number >= {asked.number}")
     if asked.limit is not None:
         query = query.limit(asked.limit)
     return query.reverse() if asked.reverse else query
@@ -1050,8 +1050,6 @@ def check(store: hl.Store, model: dict[str, Recording], asked: Asked) -> None:
         return
     assert got == [(m.topic, m.recording, m.seq, m.log_time, m.published, m.payload) for m in want]
     assert query_of(store, asked).count() == len(want)
-    if len(asked.topics) == 1:
-        assert list(map(plain, query_of(store, asked).documents())) == list(map(document, want))
 
 
 def seen(message: hl.Message) -> tuple[object, ...]:

@@ -13,6 +13,7 @@ from hybridlog_storage.errors import HybridlogError
 from tests.faults.cases import Bench, Scenario
 from tests.faults.steps import Pauses, Point
 from tests.faults.stores import WHERE, Seen, look, number_of
+from tests.indexed import EVERYTHING
 
 
 @dataclass
@@ -92,16 +93,16 @@ def _topics(entry: RecordingEntry) -> list[str]:
 
 def _count(store: hl.Store, entry: RecordingEntry) -> dict[str, int]:
     query = {t: store.query([t], [entry.id]) for t in _topics(entry)}
-    return {t: q.where({"n": {"$gte": WHERE}}).count() for t, q in query.items()}
+    return {t: q.where(f"n >= {WHERE}").count() for t, q in query.items()}
 
 
 def _fetch_where(store: hl.Store, entry: RecordingEntry) -> list[tuple[int, bytes]]:
-    query = store.query(_topics(entry), [entry.id]).where({"n": {"$gte": WHERE}})
+    query = store.query(_topics(entry), [entry.id]).where(f"n >= {WHERE}")
     return [(m.log_time_ns, bytes(m.raw)) for m in query]
 
 
 def _documents(store: hl.Store, entry: RecordingEntry) -> int:
-    return len(list(store.query(_topics(entry), [entry.id]).documents()))
+    return store.query(_topics(entry), [entry.id]).where(EVERYTHING).count()
 
 
 def _fetch(store: hl.Store, entry: RecordingEntry) -> list[tuple[int, bytes]]:

@@ -195,7 +195,7 @@ def test_other_failures(tmp_path: Path, calls: Calls) -> None:
 def test_the_table_of_formats_loads_no_library() -> None:
     code = (
         "import sys, hybridlog.formats, hybridlog.query.times, hybridlog.query.topics, "
-        "hybridlog.query.predicate.parser, hybridlog.query.predicate.from_mongo; "
+        "hybridlog.query.predicate.parser, hybridlog.query.predicate.mongo_filter; "
         "print(sorted({'pyarrow', 'pandas', 'rosbags', 'mcap', 'pymongo', 'numpy', 're2'} "
         "& set(sys.modules)))"
     )

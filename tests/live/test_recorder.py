@@ -45,6 +45,7 @@ from hybridlog_storage.messages import SUPPLIED, Channel, Schema
 from hybridlog_storage.mongo.collection_names import collection_of
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.calls import Calls
+from tests.indexed import documents_of
 from tests.limits import Limit
 from tests.live.speaker import Speaker, scan, scan_channel, text, text_channel
 from tests.waiting import wait_for
@@ -145,12 +146,12 @@ def test_payloads_step_down_and_fields_stay(store: hl.Store, limit: Limit) -> No
         assert rows[topic, "degrade"] == reduced
     assert any("/cam" in line and "one payload in five" in line for line in robot.said)
     # Fields of all messages are in the index, whole or not, and stay there.
-    documents = list(store.topic("/cam").documents())
+    documents = documents_of(store, "/cam")
     assert [d["id"] for d in documents] == list(range(1, 61))
     assert {d["data"]["n"] for d in documents} == {9000}
     assert store.topic("/cam").where("near > 5 and near <= 10").count() == 10
     store.index.rebuild()
-    assert list(store.topic("/cam").documents()) == documents
+    assert documents_of(store, "/cam") == documents
     store.verify()
 
 

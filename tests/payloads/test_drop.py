@@ -23,6 +23,7 @@ from hybridlog_storage.segments.segment_format import moved_record
 from hybridlog_storage.segments.segment_reader import SegmentReader
 from tests.calls import Calls
 from tests.copies import bring
+from tests.indexed import documents_of
 from tests.payloads.logs import (
     BASE,
     COUNT,
@@ -104,7 +105,7 @@ def test_index_and_tables_are_made_again_from_columns(plain: Path, copy: Path) -
         shutil.rmtree(copy / "tables")
         store.index.rebuild()
         assert store.verify().findings == []
-        documents = [d["ranges"]["max"] for d in store.topic("/scan").documents()]
+        documents = [d["ranges"]["max"] for d in documents_of(store, "/scan")]
         with hl.open(plain) as other:
             assert documents == [m.fields["ranges"]["max"] for m in other.topic("/scan")]
             assert answers(store) == answers(other)

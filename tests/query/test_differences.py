@@ -269,9 +269,3 @@ def test_a_filter_that_only_mongodb_understands_sees_documents_only(blind: hl.St
     assert (mixed.count(), mixed.counters.unreadable) == (1, 3)
     near = query.between(1 * SECOND, 3 * SECOND)
     assert (near.count(), near.counters.unreadable) == (0, 0)
-
-
-def test_index_documents_are_those_of_the_messages_that_match(blind: hl.Store) -> None:
-    found = [*blind.topic("/r").where("n > 1").documents()]
-    assert [d["_meta"]["t"] // SECOND for d in found] == [3, 4, 6]
-    assert [d.get("n") for d in found] == [None, 3, None]

@@ -21,6 +21,7 @@ from hybridlog_storage.segments.compression import FilePart
 from tests.cli.running import complete
 from tests.cli.within import answer
 from tests.imports import ROOT
+from tests.indexed import documents_of
 from tests.limits import Limit
 from tests.running.methods import LABEL, METHODS, rows, same, sent
 from tests.running.running import NO_MONGODB, Running, begun
@@ -176,7 +177,7 @@ def test_documents_are_a_beginning(running: Running) -> None:
     """MongoDB has what is indexed, which may be less than what is flushed."""
     known = running.flushed()
     with hl.open(running.path) as store:
-        found = [one["n"] for one in store.topic("said").documents()]
+        found = [one["n"] for one in documents_of(store, "/said")]
     wanted = [m.fields["n"] for m in known.of("/said") if m.fields is not None]
     assert found == wanted
 

@@ -79,7 +79,6 @@ ASKED: dict[str, Work] = {
     "filter of MongoDB": lambda store: (
         store.topic("pose").where({"$expr": {"$gt": ["$data", 4.5]}}).between(*day(4)).count()
     ),
-    "documents of a day": lambda store: list(store.topic("pose").between(*day(4)).documents()),
     "intervals of a day": lambda store: (
         store.topic("pose").where("data > 4.5").between(*day(4)).intervals()
     ),

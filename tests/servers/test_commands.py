@@ -13,7 +13,7 @@ import pytest
 import hybridlog as hl
 from hybridlog.query.choice import Choice
 from hybridlog.query.counters import Counters
-from hybridlog.query.index_reader import IndexReader
+from hybridlog.query.index_reader import _Asked
 from hybridlog.query.planner import Planner
 from tests.faults import logs
 from tests.limits import Limit
@@ -26,7 +26,6 @@ GAP = 1000  # messages that would lie between two recordings
 ABSOLUTE = f"{logs.BEGIN_NS + 3 * logs.STEP_NS}ns", f"{logs.BEGIN_NS + 9_005 * logs.STEP_NS}ns"
 RELATIVE = "+0s", "+0.055s"
 RAW = {"$expr": {"$gt": ["$n", 1]}}
-"""What only MongoDB understands."""
 BY_COLUMNS: dict[str, Callable[[hl.Store], object]] = {
     "count": lambda s: s.topic("/number").where("x > 1").count(),
     "count of relative times": lambda s: (
@@ -50,11 +49,6 @@ BY_MONGODB: dict[str, Callable[[hl.Store], object]] = {
     "count of several topics": lambda s: s.topic("/number", "/stamped").where(RAW).count(),
     "fetch": lambda s: [m.raw for m in s.topic("/number").where(RAW).where("x > 1")],
     "table": lambda s: s.topic("/number").where(RAW).to_pandas()["n"].tolist(),
-    "documents": lambda s: [d["n"] for d in s.topic("/number").where("n > 1").documents()],
-    "last documents": lambda s: [
-        d["n"] for d in s.topic("/number").where("n > 1").reverse().limit(3).documents()
-    ],
-    "all documents": lambda s: [d["n"] for d in s.topic("/number").documents()],
     "intervals": lambda s: [*s.topic("/number").where(RAW).intervals()],
     "intervals of relative times": lambda s: [
         *s.topic("/number").where(RAW).between("+0.025s", "+0.045s").intervals()
@@ -139,19 +133,15 @@ def test_some_of_many_recordings(tmp_path: Path, limit: Limit, most: int) -> Non
             query = store.topic("/number").in_recording(*(f"log {n}" for n in chosen))
             there = [n * GAP + k for n in chosen for k in range(MESSAGES)]
             parts = Planner(store.session, query.question, Counters()).parts()
-            reader = IndexReader(store.session, Counters())
-            ranges = reader._ranges(parts, [part.recording.span for part in parts], most)
+            reader = _Asked(store.session, store.connect(), parts)
+            ranges = reader._ranges(parts, [part.recording.span for part in parts])
             assert len(ranges) == (apart if most == 1 else len(chosen))
             assert [p for _, own in ranges for p in own] == parts
             assert query.where("n >= 5").count() == len([n for n in there if n >= 5])
-            assert [d["n"] for d in query.where("n >= 5").documents()] == [
-                n for n in there if n >= 5
-            ]
             asked = query.where(RAW).between("+0.025s", "+0.075s")
             wanted = [n for n in there if 3 <= n % GAP < 8]
             assert asked.count() == len(wanted)
             assert [m.fields["n"] for m in asked] == wanted
-            assert [d["n"] for d in asked.reverse().documents()] == wanted[::-1]
             assert len(asked.windows(0, "1ms")) == len(wanted)
 
 

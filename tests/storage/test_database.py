@@ -237,13 +237,8 @@ def test_the_drivers_own_log_and_monitors_cope(
 def test_find_raw_with_all_its_arguments(database: Database, name: str) -> None:
     documents = encoded(500)
     database.insert_raw(name, b"".join(documents), 500)
-    batches = list(
-        database.find_raw(
-            name, {"x": {"$gte": 100}}, {"x": 1}, sort=[("x", -1)], limit=25, batch_size=10
-        )
-    )
-    assert [len(bson.decode_all(b)) for b in batches] == [10, 10, 5]
-    assert [d["x"] for b in batches for d in bson.decode_all(b)] == list(range(499, 474, -1))
+    batches = list(database.find_raw(name, {"x": {"$gte": 100}}, {"x": 1}, sort=[("x", -1)]))
+    assert [d["x"] for b in batches for d in bson.decode_all(b)] == list(range(499, 99, -1))
     begin, end = ((i).to_bytes(20, "big") for i in (5, 8))
     found = database.find_raw(name, {"_id": {"$gte": begin, "$lt": end}})
     assert b"".join(found) == b"".join(documents[5:8])
@@ -271,7 +266,7 @@ def test_many_questions_at_once(database: Database, name: str) -> None:
     assert [d["x"] for b in some for d in bson.decode_all(b)] == [x for part in parts for x in part]
     assert b"".join(database.find_each([("none", one) for one in ranges], {"x": 1})) == b""
     assert list(database.find_each([], {"x": 1})) == []
-    assert database.count(name, ranges[1], by_key=True) == want[1]
+    assert database.count(name, ranges[1]) == want[1]
 
 
 def test_large_questions_go_in_several_commands(
@@ -288,7 +283,7 @@ def test_a_reader_that_stops_early_leaves_no_cursor(
 ) -> None:
     database.insert_raw(name, b"".join(encoded(500)), 500)
     before = plain.command("serverStatus")["metrics"]["cursor"]["open"]["total"]
-    for reader in (database.find_raw(name, batch_size=10), database.find(name)):
+    for reader in (database.find_raw(name), database.find(name)):
         assert next(reader)
         reader.close()
     assert plain.command("serverStatus")["metrics"]["cursor"]["open"]["total"] == before
@@ -303,7 +298,7 @@ def test_small_things(database: Database, name: str) -> None:
     assert database.update(name, {"_id": 9}, {"$set": {"b": 2}}) == 0
     assert database.find_one(name, {"b": 2}, {"_id": 0, "b": 1}) == {"b": 2}
     assert database.find_one(name, {"b": 3}) is None
-    assert database.count(name) == database.count(name, {"b": 2}, max_time_ms=1000) == 1
+    assert database.count(name) == database.count(name, {"b": 2}) == 1
     assert list(database.aggregate(name, [{"$group": {"_id": None, "n": {"$sum": "$b"}}}])) == [
         {"_id": None, "n": 2}
     ]
@@ -392,19 +387,11 @@ def test_a_wrong_predicate_is_the_users_error(
         list(database.aggregate(name, [{"$match": predicate}]))
 
 
-def test_a_pipeline_may_not_write(database: Database, name: str) -> None:
-    for stage in ({"$out": "x"}, {"$merge": {"into": "x"}}):
-        with pytest.raises(WhereError, match="only read"):
-            list(database.aggregate(name, [stage]))
-
-
 def test_the_time_allowed(database: Database, name: str) -> None:
     database.insert_raw(name, b"".join(encoded(3000, 2000)), 3000)
     slow = {"s": {"$regex": "(ü+)+x$"}, "nan": {"$ne": 1}}
     with pytest.raises(DatabaseError, match="time allowed"):
-        list(database.find_raw(name, slow, max_time_ms=1))
-    with pytest.raises(DatabaseError, match="time allowed"):
-        database.count(name, slow, max_time_ms=1)
+        list(database.find(name, slow, max_time_ms=1))
 
 
 @pytest.mark.parametrize("bad", ["", "a$b", "a\0b", ".a", "x" * 300])

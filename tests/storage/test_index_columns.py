@@ -22,8 +22,6 @@ def test_keys_are_those_of_the_documents(rows: list[tuple[int, int, int]]) -> No
     columns = (found.time, found.recording, found.seq)
     assert list(zip(*(c.tolist() for c in columns), strict=True)) == rows
     assert found.recording.dtype == np.uint64
-    assert found.to_keys(b"") == keys
-    assert found.to_keys(b"prefix") == [b"prefix" + key for key in keys]
 
 
 @pytest.mark.parametrize(

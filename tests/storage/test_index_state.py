@@ -216,8 +216,8 @@ def test_only_the_recordings_that_are_asked_for(state: IndexState) -> None:
     assert state.of([OTHER[:16], "0" * 16]).keys() == {OTHER[:16]}
     assert state.of([]) == {}
     both = [ONE[:16], OTHER[:16]]
-    assert state.progress(both) == {ONE[:16]: (1, DIGESTS), OTHER[:16]: (2, {})}
-    assert state.progress([OTHER[:16], "0" * 16]) == {OTHER[:16]: (2, {})}
+    assert state.segments(both) == {ONE[:16]: DIGESTS, OTHER[:16]: {}}
+    assert state.segments([OTHER[:16], "0" * 16]) == {OTHER[:16]: {}}
 
 
 def test_what_another_program_has_put_there_is_not_whole(
@@ -227,7 +227,7 @@ def test_what_another_program_has_put_there_is_not_whole(
     found = indexed(state)
     assert found is not None
     assert (found.state, found.turn) == ("indexing", 0)
-    assert state.progress([ONE[:16]]) == {ONE[:16]: (0, {})}
+    assert state.segments([ONE[:16]]) == {ONE[:16]: {}}
     assert not found.is_whole(recording())
     assert not found.mirrors(recording())
 

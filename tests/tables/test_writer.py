@@ -28,6 +28,7 @@ from hybridlog_storage.segments.segment_reader import SegmentReader
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.calls import Calls
 from tests.data import DATA, needs_data
+from tests.indexed import documents_of
 from tests.limits import Limit
 from tests.some import each
 from tests.tables.conftest import SMALL_CHUNKS
@@ -172,7 +173,7 @@ def test_where_a_message_lies(recorded: hl.Store) -> None:
     assert table is not None
     want = [
         (r["seg"], r["chunk"], r["off"], r["len"])
-        for r in (d["_meta"]["ref"] for d in recorded.query(["/large"]).documents())
+        for r in (d["_meta"]["ref"] for d in documents_of(recorded, "/large"))
     ]
     assert [r for block in table.scan(own=["ref"]) for r in references(block)] == want
 
@@ -283,7 +284,7 @@ def test_unreadable_messages_say_why(store: hl.Store, tmp_path: Path, count: int
     (entry,) = store.recordings()
     table = Tables(store.directory.path).of(entry, "/a")
     assert table is not None
-    want = [d["_meta"].get("error") for d in store.query(["/a"]).documents()]
+    want = [d["_meta"].get("error") for d in documents_of(store, "/a")]
     have = [e for block in table.scan(own=["error"]) for e in block.own["error"].to_pylist()]
     assert have == want
     assert table.unreadable == sum(error is not None for error in want) > 0

@@ -95,7 +95,6 @@ _WRONG_QUESTION = frozenset(
 _UNNAMED_CODE = "Location"
 """Prefix of the server's unnamed error codes: thousands of checks on the arguments of
 operators and expressions. Failures of the server itself have names."""
-_WRITING_STAGES = frozenset({"$out", "$merge"})
 _WRITES = frozenset({"insert", "remove", "update"})
 _UNAUTHORIZED = 13
 _LOGIN_FAILED = 18
@@ -615,9 +614,6 @@ class Database:
             collection: The collection; one that does not exist is empty.
             pipeline: The stages.
         """
-        for stage in pipeline:
-            if not _WRITING_STAGES.isdisjoint(stage):
-                raise WhereError(f"A pipeline may only read: {', '.join(stage)} is not allowed.")
         of = self._collection(collection)
         stages = [dict(stage) for stage in pipeline]
         yield from self._found(lambda _: of.aggregate(stages, allowDiskUse=True), {}, 0, dict)
