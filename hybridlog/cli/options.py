@@ -290,7 +290,8 @@ class Filtered(Strict, Topics):
     """Options of commands about messages that satisfy predicates."""
 
     where: tuple[str, ...] = option(  # type: ignore[misc]
-        "Only messages that satisfy this, such as 'ranges.min < 0.5 and scan_time > 0'.",
+        "Only messages that satisfy this, such as 'ranges.min < 0.5 and scan_time > 0', or a "
+        "MongoDB filter as JSON.",
         "PREDICATE",
         shell_complete=complete_path,
     )
