@@ -223,7 +223,7 @@ def blind(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
         ("/r", None, "n != 1", [1, 3, 4, 6], 1),
         ("/r", None, "not (n > 1)", [1, 2], 1),
         ("/r", None, "text ~ 'xxx'", [3, 6], 1),
-        ("/r", None, {"n": {"$gt": 1}}, [3, 4, 6], 1),
+        ("/r", None, {"n": {"$gt": 1}}, [4], 3),
         ("/r", (4, 6), "n > 1", [4], 1),
         ("/r", (1, 5), "n > 1", [3, 4], 0),
         ("/r", (6, 7), "n > 1", [6], 0),
