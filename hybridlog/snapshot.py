@@ -242,15 +242,6 @@ class Snapshot:
         last = np.where(is_written, np.maximum(last, now), last)
         return places[(first < last) & (first < end) & (last > begin)]
 
-    def others(self, ids: Collection[str]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Begin and end of the log time in which all recordings but some may have messages."""
-        is_other = self.begin < self.end
-        is_other |= self.is_open
-        is_other[[self.by_id[recording] for recording in ids if recording in self.by_id]] = False
-        begin = np.where(self.is_open, 0, self.begin)
-        end = np.where(self.is_open, _LATEST, self.end)
-        return begin[is_other], end[is_other]
-
     def differing(self, places: NDArray[np.intp]) -> list[RecordingSummary]:
         """One of the recordings at some positions for each set of topics and types."""
         _, firsts = np.unique(self._set[places], return_index=True)

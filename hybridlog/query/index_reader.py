@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import numpy as np
@@ -35,7 +34,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.mongo.topic_places import TopicPlace
 
 _MAX_RANGES = 100
-"""Ranges of log time that are asked for apart: as many as one command takes."""
+"""Recordings whose log time is asked for apart: as many as one command takes."""
 _TRIES = 3
 _SEQ = Field(("_meta", "seq"))
 Filter = dict[str, object]
@@ -208,11 +207,7 @@ class _Asked:
         )
 
     def queries(self, parts: Sequence[Part], own: Filter) -> list[Query]:
-        """Queries that ask about each part once.
-
-        Parts that differ only in their recordings are asked about together, where nothing
-        else lies between them.
-        """
+        """Queries that ask about each part once; many parts of a topic are asked together."""
         alike: dict[tuple[str, str, Span | None], list[tuple[Part, Span]]] = defaultdict(list)
         found: list[Query] = []
         for part in parts:
@@ -225,42 +220,16 @@ class _Asked:
                 alike[part.topic, part.clock, bounds].append((part, span))
         for (topic, clock, bounds), group in alike.items():
             place = self.places[topic]
-            for span, there in self._ranges([p for p, _ in group], [s for _, s in group]):
-                keys = sorted(part.recording.key for part in there)
-                chosen = {"$in": keys} if len(keys) > 1 else keys[0]
-                condition: Filter = {"_meta.rec": chosen, **_between(place, span)}
+            # Finding many documents in one range costs less than asking for many ranges.
+            together = [group] if len(group) > _MAX_RANGES else [[one] for one in group]
+            for some in together:
+                keys = sorted(part.recording.key for part, _ in some)
+                span = min(low for _, (low, _) in some), max(high for _, (_, high) in some)
+                condition: Filter = {"_meta.rec": {"$in": keys}, **_between(place, span)}
                 if clock != "log" and bounds is not None:
                     condition.update(_on_clock(clock, bounds))
                 found.append((place.collection, _joined(condition, own)))
         return found
-
-    def _ranges(
-        self, parts: Sequence[Part], spans: Sequence[Span]
-    ) -> list[tuple[Span, list[Part]]]:
-        """Ranges of log time that hold the spans of some parts, with the parts of each.
-
-        Spans are joined if they overlap, and if they are many, also across gaps in which no
-        other recording lies: finding many documents in one range costs less than
-        asking for many ranges.
-        """
-        order = sorted(range(len(parts)), key=spans.__getitem__)
-        ends = np.array([min(spans[i][1], END) for i in order[:-1]], np.int64)
-        low = np.maximum.accumulate(ends)
-        high = np.array([spans[i][0] for i in order[1:]], np.int64)
-        is_apart = low < high
-        if int(is_apart.sum()) >= _MAX_RANGES:
-            first, end = self._session.snapshot().others({part.recording.id for part in parts})
-            before = np.searchsorted(np.sort(first), high, "left")
-            is_apart &= before > np.searchsorted(np.sort(end), low, "right")
-        steps = [0, *(np.flatnonzero(is_apart) + 1).tolist(), len(order)]
-        groups = [order[begin:end] for begin, end in pairwise(steps)]
-        return [
-            (
-                (spans[group[0]][0], max(spans[i][1] for i in group)),
-                [parts[i] for i in group],
-            )
-            for group in groups
-        ]
 
 
 def _predicate(part: Part) -> Predicate:

@@ -1,13 +1,11 @@
-"""Counts and intervals that contain a message, against loops; what they cost MongoDB."""
+"""Intervals that contain a message, and statistics of arrays, against loops."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-import bson
 import numpy as np
 import pytest
 from hypothesis import given
@@ -17,10 +15,7 @@ import hybridlog as hl
 from hybridlog.query.intervals import Intervals
 from hybridlog_storage.errors import UsageError, WhereError
 from hybridlog_storage.messages import Channel, Schema
-from hybridlog_storage.mongo.database import Database
-from hybridlog_storage.mongo.index_documents import key_bound
 from hybridlog_storage.segments.segment_writer import SegmentSettings
-from tests.calls import Calls
 from tests.query.test_intervals import (
     BASE,
     SECOND,
@@ -39,63 +34,6 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
     place = tmp_path_factory.mktemp("counting") / "store"
     with hl.open(place, create=True, require_database=True) as opened:
         yield opened
-
-
-# --- counts in all times --------------------------------------------------------------
-
-GONE = "f" * 16
-"""Key of a recording that the store does not know."""
-
-
-@several
-@given(
-    logs=st.fixed_dictionaries({"a": log, "b": log}),
-    index=st.sampled_from([None, "s", "_meta.rec"]),
-    chosen=st.sampled_from([("a",), ("b",), ("a", "b")]),
-)
-def test_a_count_is_what_a_loop_counts(
-    store: hl.Store,
-    logs: dict[str, Any],
-    index: str | None,
-    chosen: tuple[str, ...],
-) -> None:
-    model = recorded(store, logs)
-    has = [model.ids[name] for name in chosen if model.of(model.ids[name])]
-    if not has:
-        return
-    database = store.session.database_for("the test")
-    if index is not None:
-        database.create_index("state", [(index, 1)])
-    query = store.topic("/state").in_recording(*has).where("s >= 1")
-    assert query.count() == sum(m.value["s"] >= 1 for name in has for m in model.of(name))
-    query = query.where("x > 1")
-    assert query.count() == sum(
-        m.value["s"] >= 1 and m.value.get("x", 0) > 1 for name in has for m in model.of(name)
-    )
-    if index is not None:
-        database.drop_index("state", [(index, 1)])
-
-
-@pytest.mark.parametrize("trace", ["documents", "entry", "directory"])
-def test_what_no_recording_has_is_not_counted(store: hl.Store, trace: str, calls: Calls) -> None:
-    recorded(store, {"a": [(second, "/state", {"s": 1}) for second in range(6)]})
-    query = store.topic("/state").where("s == 1")
-    database = store.session.database_for("the test")
-    stray = bson.encode({"_id": key_bound(BASE), "s": 1, "_meta": {"rec": GONE}})
-    database.insert_raw("state", stray, 1)
-    if trace != "documents":
-        # The collection's own count is about right only, after a crash.
-        calls.change(Database, "count", lambda found, _, *a, **__: found - (len(a) == 1))
-    if trace == "entry":
-        database.replace("hybridlog.recordings", {"_id": GONE}, {"_id": GONE})
-    if trace == "directory":
-        (store.directory.path / "recordings" / "gone").mkdir()
-    assert query.count() == 6
-    database.delete("hybridlog.recordings", {"_id": GONE})
-    database.delete("state", {"_meta.rec": GONE})
-    if trace == "directory":
-        with suppress(FileNotFoundError):  # the next look at the store removes it, too
-            (store.directory.path / "recordings" / "gone").rmdir()
 
 
 # --- intervals that contain a message -------------------------------------------------

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from datetime import datetime
 
 from hybridlog.query.predicate.numbers import HIGH, LOW
@@ -75,7 +75,7 @@ _EXPRESSIONS = frozenset(
     }
 )
 _OPTIONS = set("ims")
-_BSON_VALUES = {"ObjectId", "Decimal128", "Timestamp", "MinKey", "MaxKey"}
+_BSON_VALUES = {"Int64", "ObjectId", "Decimal128", "Timestamp", "MinKey", "MaxKey"}
 
 
 Filter = dict[str, object]
@@ -386,7 +386,8 @@ class _Checker:
             if not isinstance(key, str):
                 raise _refused(path, f"has a key that is no string: {key!r}")
             try:
-                plain = _plain_text(key)
+                plain = str(key)
+                plain.encode()
             except ValueError:
                 raise _refused(path, "has a name that is not valid Unicode") from None
             if "\0" in plain:
@@ -407,66 +408,30 @@ class _Checker:
 
 
 def _scalar(value: object, path: _Path) -> object:
-    for test, make in _SCALARS:
-        if test(value):
-            try:
-                return make(value)
-            except (OverflowError, ValueError, TypeError) as error:
-                raise _refused(path, str(error)) from None
-    raise _refused(path, f"a value of type {type(value).__name__} is not allowed")
+    """A value as Python's own, if BSON can hold it."""
+    kind = type(value)
+    try:
+        if hasattr(value, "to_pydatetime"):  # pandas.Timestamp
+            value = value.to_pydatetime()
+        elif kind.__module__ == "numpy" and getattr(value, "shape", None) == ():
+            value = value.item()  # type: ignore[attr-defined]
+        if _is_bson(value) and kind.__name__ in _BSON_VALUES:
+            return value
+        if isinstance(value, str) and not _is_bson(value):  # bson.code.Code is a string
+            value.encode()  # half a surrogate pair raises a ValueError
+            return str(value)
+        if isinstance(value, float):
+            return float(value)
+        is_date = isinstance(value, datetime) and not math.isnan(value.timestamp())
+        if is_date or value is None or isinstance(value, bool | int | bytes):
+            return value
+    except (OverflowError, ValueError, TypeError) as error:
+        raise _refused(path, str(error)) from None
+    raise _refused(path, f"a value of type {kind.__name__} is not allowed")
 
 
 def _is_bson(value: object) -> bool:
     return type(value).__module__.split(".")[0] == "bson"
-
-
-def _plain_number(value: object) -> object:
-    """A numpy scalar or an int as a Python number that BSON can hold."""
-    if getattr(value, "shape", ()) != ():
-        raise TypeError(f"a value of type {type(value).__name__} is not allowed")
-    number = value.item() if hasattr(value, "item") else value
-    if not isinstance(number, bool | int | float | None):
-        raise TypeError(f"a value of type {type(value).__name__} is not allowed")
-    return float(number) if isinstance(number, float) else number
-
-
-def _plain_text(value: object) -> str:
-    text = str(value)
-    text.encode()  # half a surrogate pair raises a ValueError
-    return text
-
-
-def _plain_date(value: object) -> object:
-    convert = getattr(value, "to_pydatetime", None)  # pandas.Timestamp
-    moment = convert() if convert is not None else value
-    if not isinstance(moment, datetime) or not isinstance(moment.year, int):
-        raise TypeError("is not a date")
-    if math.isnan(moment.timestamp()):
-        raise ValueError("is not a date")
-    return moment
-
-
-_SCALARS: tuple[tuple[Callable[[object], bool], Callable[[object], object]], ...] = (
-    (lambda value: value is None or isinstance(value, bool), lambda value: value),
-    # bson.code.Code is a str, so its module is tested first.
-    (
-        lambda value: _is_bson(value) and type(value).__name__ in _BSON_VALUES | {"Int64"},
-        lambda value: value,
-    ),
-    (
-        lambda value: isinstance(value, bytes) and type(value).__name__ != "Code",
-        lambda value: value,
-    ),
-    (lambda value: isinstance(value, str) and not _is_bson(value), _plain_text),
-    (lambda value: isinstance(value, datetime), _plain_date),
-    (
-        lambda value: (
-            not _is_bson(value)
-            and (isinstance(value, int | float) or type(value).__module__ == "numpy")
-        ),
-        _plain_number,
-    ),
-)
 
 
 def _has_operators(value: Mapping[str, object], path: _Path) -> bool:
