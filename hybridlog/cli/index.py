@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 @click.group()
 def index_command() -> None:
-    """Index fields in MongoDB, for questions and other programs."""
+    """Index fields in MongoDB, for MongoDB filters and other programs."""
 
 
 @dataclass(frozen=True, kw_only=True)

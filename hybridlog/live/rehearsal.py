@@ -118,7 +118,7 @@ def rehearse(
         stored += sum(channel.stats.payload_bytes for channel in entry.channels)
         within = list(planner.parts_in(one.summary, one.bounds, None))
         found = [np.empty(0, np.int64)]
-        for part in planner.batch_hint([part for part in within if part.topic in able]):
+        for part in [part for part in within if part.topic in able]:
             found += [o.log_time[o.holds] for o in planner.outcomes(part)]
         times = np.sort(np.concatenate(found))
         fired += len(times)

@@ -63,7 +63,7 @@ def to_bool(
         summarised: True if messages without types have summaries for long arrays.
 
     Raises:
-        WhereError: only MongoDB can answer a part of it.
+        WhereError: it has a MongoDB filter.
     """
     decide = to_truth(node, types, summarised=summarised)
     return lambda message: decide(message) is True
@@ -83,7 +83,7 @@ def to_truth(
         summarised: As for `to_bool`.
 
     Raises:
-        WhereError: only MongoDB can answer a part of it.
+        WhereError: it has a MongoDB filter.
     """
     reader = _Reader(FieldTypes.of(types), summarised)
     return _node(root_of(node), reader)
