@@ -166,8 +166,8 @@ class IndexWriter:
 
     One thread reads the chunks that were flushed: every few seconds, after many bytes, when a
     segment is sealed and at the end. A failing database stops the index, never the recording:
-    the index goes on where it was as soon as the database answers again, at the latest when a
-    question needs it.
+    the index goes on where it was as soon as the database answers again, at the latest when it
+    is next brought up to date.
 
     Args:
         recording: The recording's directory.

@@ -170,6 +170,7 @@ class _Asked:
             part
             for part in self._parts
             if part.recording.status == "open"
+            or not self.places[part.topic].is_listed
             or not part.recording.digests.items() <= indexed.get(part.recording.key, {}).items()
         ]
         return dict(zip(doubtful, self.counts(doubtful, {}), strict=True))
