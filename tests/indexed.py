@@ -13,9 +13,9 @@ EVERYTHING = {"_meta.seq": {"$gte": 0}}
 
 def documents_of(store: hl.Store, *topics: str) -> list[dict[str, Any]]:
     """The documents of some topics, by time, recording and arrival."""
-    database = store.database_for("A test")
+    database = store.session.database_for("A test")
     found: list[dict[str, Any]] = []
     for topic in topics:
-        place = store.topic_place(topic)
+        place = store.index.place(topic)
         found += database.find(place.collection, place.documents(), sort=[("_id", 1)])
     return sorted(found, key=lambda one: bytes(one["_id"][-KEY_BYTES:]))

@@ -75,7 +75,7 @@ class Index:
 
         Args:
             topic: Full name, short name, glob, or `re:` and a regular expression.
-            fields: Fields of the messages, or `_meta.inserted_at` and the like. Questions
+            fields: Fields of the messages, or `_meta.inserted_at` and the like. Filters
                 should give a value or a range of the first one; the others narrow it down.
 
         Returns:
@@ -89,7 +89,6 @@ class Index:
         database = self._session.database_for("An index", writes=True)
         query.fields(*(name for name in fields if name not in field_indexes.OWN_FIELDS))
         field_indexes.add(database, query.topics, fields)
-        self._session.field_indexes = field_indexes.listed(database)
         return field_indexes.of_topics(database, query.topics)
 
     @again_if_lost
@@ -101,9 +100,7 @@ class Index:
         """
         query = self._about(topic)
         database = self._session.database_for("An index", writes=True)
-        found = field_indexes.remove(database, query.topics, fields)
-        self._session.field_indexes = field_indexes.listed(database)
-        return found
+        return field_indexes.remove(database, query.topics, fields)
 
     @again_if_lost
     def list(self, *topics: str) -> _FieldIndexes:

@@ -120,7 +120,7 @@ def test_what_the_index_lacks_while_documents_go(case: Case) -> None:
             assert store.topic("/number").count() == whole
             assert len(list(store.topic("/number"))) == whole
             assert store.query(["/number"], ["b"]).where("n >= 0").count() > 0
-        store.rebuild_index(["a"])
+        store.index.rebuild(["a"])
         assert (own.count(), own.counters.unindexed) == (whole, 0)
 
 

@@ -139,8 +139,8 @@ def test_mongodb_answers_as_it_does_by_itself(store: hl.Store, own: dict[str, ob
         return
     query = store.topic("/t").where(own)
     found = seqs(query)
-    address = store.index_address()
-    place = store.topic_place("/t")
+    address = store.index.address()
+    place = store.index.place("/t")
     labels = {one.key: one.id for one in store.recordings()}
     with MongoClient(address.uri) as client:
         collection = client[address.database][place.collection]
