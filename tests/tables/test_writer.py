@@ -171,9 +171,10 @@ def test_where_a_message_lies(recorded: hl.Store) -> None:
     (entry,) = recorded.recordings()
     table = Tables(recorded.directory.path).of(entry, "/large")
     assert table is not None
+    with hl.open(recorded.directory.path, mongo="embedded") as indexed:
+        documents = documents_of(indexed, "/large")
     want = [
-        (r["seg"], r["chunk"], r["off"], r["len"])
-        for r in (d["_meta"]["ref"] for d in documents_of(recorded, "/large"))
+        (r["seg"], r["chunk"], r["off"], r["len"]) for r in (d["_meta"]["ref"] for d in documents)
     ]
     assert [r for block in table.scan(own=["ref"]) for r in references(block)] == want
 
