@@ -29,6 +29,8 @@ from hybridlog_storage.mongo.index_state import IndexState
 from tests.calls import Calls
 from tests.cli.within import answer
 
+pytestmark = pytest.mark.mongo("embedded")
+
 SECOND = 10**9
 THINGS = Schema(
     "pkg/T",
