@@ -86,7 +86,6 @@ ALLOWED = {
     "rclpy": ("hybridlog.live.sources.ros2.child.middleware",),
     "rich": ("hybridlog.cli",),
     "rosbags": (
-        "hybridlog.demo",
         "hybridlog.formats.rosbag1.writer",
         "hybridlog.formats.rosbag2.writer",
         "hybridlog.schema",
@@ -123,7 +122,7 @@ DISTRIBUTIONS = {
 # Modules of ours that only some may import when the program runs.
 WIRED_BY = {
     "hybridlog_storage.mongo.mongod": ("hybridlog.cli.installed", "hybridlog.index.connection"),
-    "hybridlog.store": ("hybridlog", "hybridlog.cli", "hybridlog.demo", "hybridlog.store"),
+    "hybridlog.store": ("hybridlog", "hybridlog.cli", "hybridlog.store"),
 }
 
 

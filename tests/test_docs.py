@@ -355,7 +355,7 @@ def take(page: Path, directory: Path, bag: Path) -> Iterator[tuple[Step, int, st
     """Run a page's steps where `hybridlog demo` was run, less its store; to be exhausted."""
     place = directory / "hybridlog-demo"
     place.mkdir()
-    os.link(bag, place / "robot.bag")
+    shutil.copyfile(bag, place / "robot.bag")
     shell, python = Shell(directory), Python()
     try:
         with elsewhere(directory, page) as uri:
@@ -382,14 +382,9 @@ def trouble(page: Path, directory: Path, bag: Path) -> str:
 
 
 @pytest.fixture(scope="session")
-def demo_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The bag of the demo, but for the size of its pictures: the same answers, faster."""
-    from hybridlog.demo.topics import RobotConfig
-    from hybridlog.demo.write import write_bag
-
-    path = tmp_path_factory.mktemp("demo") / "robot.bag"
-    write_bag(path, config=RobotConfig(image_size=(64, 48), cloud_columns=64))
-    return path
+def demo_bag() -> Path:
+    """The bag of the demo."""
+    return ROOT / "hybridlog" / "demo" / "robot.bag"
 
 
 RUN = [page for page in SHOWN if steps(page)]
@@ -768,9 +763,9 @@ def test_the_times_are_understood() -> None:
 
 
 def test_the_patterns_find_what_is_said() -> None:
-    from hybridlog.demo.topics import TOPICS
+    from benchmarks.simulator.topics import DEMO, topics_of
 
-    names = [topic.name for topic in TOPICS]
+    names = [topic.name for topic in topics_of(DEMO)]
     shown = examples("topics")
     assert len(shown) > 5
     for line in shown:

@@ -26,8 +26,8 @@ from mcap.opcode import Opcode
 from mcap.writer import Writer
 
 import hybridlog as hl
-from hybridlog.demo.topics import RobotConfig
-from hybridlog.demo.write import write_bag
+from benchmarks.simulator.topics import RobotConfig
+from benchmarks.simulator.write import write_bag
 from hybridlog_storage import journal
 from hybridlog_storage.catalog import RecordingEntry
 from hybridlog_storage.errors import DatabaseError, IndexChangedError, SegmentError, StoreError

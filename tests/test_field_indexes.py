@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 import hybridlog as hl
-from hybridlog.demo.topics import RobotConfig
-from hybridlog.demo.write import write_bag
+from benchmarks.simulator.topics import RobotConfig
+from benchmarks.simulator.write import write_bag
 from hybridlog_storage.errors import DatabaseError, TopicError, UsageError
 from tests.cli.running import run
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import hybridlog as hl
-from hybridlog.demo.write import write_bag
+from benchmarks.simulator.write import write_bag
 from hybridlog_storage.settings import StoreSettings, write_settings
 from tests.other_user import User, needs_root, open_place
 from tests.waiting import wait_for

@@ -22,8 +22,8 @@ import pytest
 from pymongo import MongoClient
 
 import hybridlog as hl
+from benchmarks.simulator.write import write_bag
 from hybridlog import session as session_module
-from hybridlog.demo.write import write_bag
 from hybridlog.query.counters import Counters
 from hybridlog.query.engines import MatchColumns
 from hybridlog.query.engines.payload_scan import PayloadScan

@@ -19,7 +19,7 @@ from pathlib import Path
 import pytest
 
 import hybridlog as hl
-from hybridlog.demo.write import write_bag
+from benchmarks.simulator.write import write_bag
 from hybridlog_storage.errors import HybridlogError, StoreError
 from hybridlog_storage.mongo import mongod_keeper
 from hybridlog_storage.mongo.mongod import EmbeddedMongod

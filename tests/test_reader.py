@@ -26,7 +26,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 import hybridlog as hl
-from hybridlog.demo.write import write_bag
+from benchmarks.simulator.write import write_bag
 from hybridlog.query.counters import Counters
 from hybridlog.query.planner import Planner
 from hybridlog.query.query import Query

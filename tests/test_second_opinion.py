@@ -14,8 +14,8 @@ from typing import Any
 import pytest
 
 import hybridlog as hl
-from hybridlog.demo.topics import RobotConfig
-from hybridlog.demo.write import write_bag
+from benchmarks.simulator.topics import RobotConfig
+from benchmarks.simulator.write import write_bag
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.data import DATA
 from tests.storage.chunk_entries import chunk_entries

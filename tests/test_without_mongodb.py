@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 import hybridlog as hl
+from benchmarks.simulator.write import write_bag
 from hybridlog.columns.payload_files import WalkedSegment
-from hybridlog.demo.write import write_bag
 from hybridlog.index.of_store import contents
 from hybridlog_storage.errors import (
     ConnectionLostError,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hybridlog.demo.topics import Types
+from benchmarks.simulator.topics import Types
 from hybridlog_storage.messages import Channel, Schema
 
 if TYPE_CHECKING:

@@ -1,6 +1,6 @@
 """Takes the picture of `hybridlog view` in the README: `python docs/pictures/make.py`.
 
-It simulates the demo's robot, records its bag, and looks at the store with chromium.
+It records the demo bag, and looks at the store with chromium.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from PIL import Image
 from playwright.sync_api import sync_playwright
 
 import hybridlog as hl
-from hybridlog.demo.write import write_bag
 from hybridlog.view.server import ViewServer
 
+BAG: Final = Path(hl.__file__).parent / "demo" / "robot.bag"
 SIZE: Final = {"width": 1360, "height": 850}
 QUESTION: Final = '{"kind":"predicate","topic":"/base/scan","text":"ranges.min < 0.5","within":""}'
 
@@ -29,7 +29,7 @@ def look(store: hl.Store, browser: str, output: Path) -> None:
     """Take the picture of a store's first recording, at its nearest obstacle.
 
     Args:
-        store: An open store of the demo's robot.
+        store: An open store of the demo bag.
         browser: Path of chromium.
         output: The PNG file.
     """
@@ -62,11 +62,11 @@ def look(store: hl.Store, browser: str, output: Path) -> None:
 
 
 def main() -> None:
-    """Make the robot's store in a temporary directory, and take the picture."""
+    """Record the bag in a temporary directory, and take the picture."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("output", nargs="?", type=Path, default=Path(__file__).parent / "view.png")
     parser.add_argument("--browser", default=shutil.which("chromium"), help="path of chromium")
-    parser.add_argument("--store", type=Path, help="a store of the robot that is there already")
+    parser.add_argument("--store", type=Path, help="a store of the bag that is there already")
     options = parser.parse_args()
     if options.browser is None:
         parser.error("chromium is not on the PATH; --browser says where it is")
@@ -74,11 +74,12 @@ def main() -> None:
         with hl.open(options.store) as store:
             look(store, options.browser, options.output)
         return
-    with tempfile.TemporaryDirectory() as folder:
-        write_bag(Path(folder) / "robot.bag")
-        with hl.open(Path(folder) / "store", create=True) as store:
-            store.record(Path(folder) / "robot.bag")
-            look(store, options.browser, options.output)
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        hl.open(Path(folder) / "store", create=True) as store,
+    ):
+        store.record(BAG)
+        look(store, options.browser, options.output)
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ from pathlib import Path
 import click
 from click.core import ParameterSource
 
-from hybridlog.cli.binder import argument, command, option
+from hybridlog.cli.binder import argument, command
 from hybridlog.cli.hints import Command
 from hybridlog.cli.record_choices import LiveOption, RecordChoices, check_choices
 
@@ -92,15 +92,11 @@ class _Demo:
         "[DIRECTORY]",
         default=Path("hybridlog-demo"),
     )
-    duration: float = option(
-        "Seconds of robot time.", "SECONDS", type=click.FloatRange(min=5), default=60.0
-    )
-    seed: int = option("Another number gives another drive.", "N", default=1)
 
 
 @command(_Demo)
 def demo_command(given: _Demo) -> int:
-    """Take a tour: simulate a robot, record it, query it."""
+    """Take a tour: record the log of a simulated robot, query it."""
     from hybridlog.demo import tour
 
-    return tour.run(given.directory, duration_s=given.duration, seed=given.seed)
+    return tour.run(given.directory)

@@ -1,5 +1,1 @@
-"""A simulated robot, and the demonstration that uses it.
-
-Importing this package is fast: the simulation (numpy), the writer
-(rosbags) and the tour are separate modules.
-"""
+"""The demo bag, one minute of a simulated robot, and the tour that asks it questions."""

@@ -1,4 +1,4 @@
-"""The guided tour: prints and runs every command, and checks its answer."""
+"""The guided tour of the demo bag: prints and runs every command, and checks its answer."""
 
 from __future__ import annotations
 
@@ -7,17 +7,16 @@ import shlex
 import shutil
 import subprocess
 import sys
-from pathlib import PurePath
-from typing import TYPE_CHECKING, NamedTuple
+from pathlib import Path, PurePath
+from typing import NamedTuple
 
-from hybridlog_storage.errors import UsageError
+from hybridlog_storage.errors import NO_SPACE, DiskFullError, UsageError
 
-if TYPE_CHECKING:
-    from pathlib import Path
-
-DEFAULT_DURATION_S, DEFAULT_SEED = 60.0, 1
-BAG, STORE, SLICE, TRUTH = "robot.bag", "robot-logs", "scan.npz", "truth.json"
+BAG, STORE, SLICE = "robot.bag", "robot-logs", "scan.npz"
 """Names of the files that the tour makes in its directory."""
+_PACKAGED = Path(__file__).with_name(BAG)
+_COUNTED = _PACKAGED.with_suffix(".json")
+"""The bag, and what the simulation counted when it was written."""
 
 _SNIPPET = f"""\
 import hybridlog as hl
@@ -28,8 +27,6 @@ print(frame.shape)
 print(frame[["angular_velocity.z", "linear_acceleration.x"]].describe())
 """
 _STEPS = """\
-A robot drives through a floor plan
-python -m hybridlog.demo {bag} --duration {duration:g} --seed {seed} --truth {truth} # makes {bag}
 Record its log
 hybridlog record {bag} {store}
 What is in the store?
@@ -53,8 +50,8 @@ Where was the robot in that second, and how fast?
 class Step(NamedTuple):
     """One command of the tour, as typed, and the file that it makes.
 
-    `fact` is the key of the right answer in the simulation's truth: a number that the command
-    prints with `--count`, else its number of lines.
+    `fact` is the key of the right answer in what the simulation counted: a number that the
+    command prints with `--count`, else its number of lines.
     """
 
     title: str
@@ -70,18 +67,13 @@ class Step(NamedTuple):
         return [sys.executable, "-P", *module, *words]
 
 
-def steps(duration_s: float = DEFAULT_DURATION_S, seed: int = DEFAULT_SEED) -> list[Step]:
+def steps() -> list[Step]:
     """The tour, in order."""
-    # A second from the middle; a short recording has none after ten seconds.
-    start = min(10.0, duration_s / 2)
     text = _STEPS.format(
         bag=BAG,
         slice=SLICE,
-        truth=TRUTH,
-        duration=duration_s,
-        seed=seed,
         fetch="hybridlog fetch --topic",
-        second=f"--between +{start:g}s +{start + 1:g}s",
+        second="--between +10s +11s",
         errors="'status[].name,status[].message'",
         pose="pose.pose.position.x,pose.pose.position.y,twist.twist.linear.x",
         store=f"--store {STORE}",
@@ -94,7 +86,7 @@ def steps(duration_s: float = DEFAULT_DURATION_S, seed: int = DEFAULT_SEED) -> l
     return [*found, Step("A pandas frame", f"python -c '\n{_SNIPPET}'")]
 
 
-def run(directory: Path, duration_s: float = DEFAULT_DURATION_S, seed: int = DEFAULT_SEED) -> int:
+def run(directory: Path) -> int:
     """Run the tour, which leaves its bag and store in `directory`.
 
     Returns:
@@ -102,19 +94,22 @@ def run(directory: Path, duration_s: float = DEFAULT_DURATION_S, seed: int = DEF
 
     Raises:
         UsageError: a file of the tour is in `directory` already, or the directory
-            cannot be made.
+            cannot be made or written to.
     """
-    for path in (directory / name for name in (BAG, STORE, SLICE, TRUTH)):
+    for path in (directory / name for name in (BAG, STORE, SLICE)):
         if path.exists():
             raise UsageError(f"{path} exists already; remove it or choose another directory")
     try:
         directory.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(_PACKAGED, directory / BAG)
     except OSError as error:
+        if error.errno in NO_SPACE:
+            raise DiskFullError(f"no space left in {directory}; choose another disk") from error
         raise UsageError(
-            f"cannot make {directory}: {error.strerror}; choose another directory"
+            f"cannot write to {directory}: {error.strerror}; choose another directory"
         ) from error
-    _print(f"The tour runs in {directory}\n")
-    for step in steps(duration_s, seed):
+    _print(f"The tour runs in {directory}\n{BAG} is the log of a minute of a simulated robot\n")
+    for step in steps():
         _print(f"\n# {step.title}\n$ {step.command}\n")
         code, fault = _take(step, directory)
         if code:
@@ -152,7 +147,7 @@ def _take(step: Step, directory: Path) -> tuple[int, str]:
     if step.makes and not (made.is_file() and made.stat().st_size):
         return 1, f"left no {step.makes}"
     if step.fact:
-        right = json.loads((directory / TRUTH).read_text("utf-8"))[step.fact]
+        right = json.loads(_COUNTED.read_text("utf-8"))[step.fact]
         lines = done.stdout.split("\n")[:-1]
         answer = lines[-1:] if "--count" in step.command else [str(len(lines))]
         fact = f"{step.fact.replace('_', ' ')}: {right}"

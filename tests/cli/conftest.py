@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from hybridlog.demo.write import write_bag
+from benchmarks.simulator.write import write_bag
 
 from . import odd_log
 from .running import run

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 import hybridlog as hl
-from hybridlog.demo.topics import RobotConfig
-from hybridlog.demo.write import write_bag
+from benchmarks.simulator.topics import RobotConfig
+from benchmarks.simulator.write import write_bag
 from hybridlog.formats import OUTPUTS
 
 from .running import run

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from hybridlog.demo.write import write_bag
+from benchmarks.simulator.write import write_bag
 from tests.waiting import wait_for
 
 from .running import environment, run

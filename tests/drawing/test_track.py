@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
 
 import hybridlog as hl
-from hybridlog.demo.write import write_bag
+from benchmarks.simulator.write import write_bag
 from hybridlog.drawing.track import Grid, Position, fix_of, pose_of, position_of, track
 from hybridlog.query.asked import field_types
 from hybridlog.query.topics import TopicMatcher

@@ -21,9 +21,9 @@ import pytest
 from mcap.reader import make_reader
 
 import hybridlog as hl
+from benchmarks.simulator.write import write_bag
 from hybridlog.columns.table_writer import TableWriter
 from hybridlog.columns.tables import Tables
-from hybridlog.demo.write import write_bag
 from hybridlog.index.indexing import ChunkIndexer
 from hybridlog.live import LiveRecording
 from hybridlog.live import recording as live

@@ -151,7 +151,7 @@ def test_a_damaged_chunk_is_named(many: hl.Store) -> None:
 def test_who_changes_a_message_does_not_change_what_is_kept(
     tmp_path: Path, compression: str
 ) -> None:
-    from hybridlog.demo.write import write_bag
+    from benchmarks.simulator.write import write_bag
 
     write_bag(tmp_path / "robot.bag", duration_s=1.0)
     settings = SegmentSettings(compression=compression)  # type: ignore[arg-type]

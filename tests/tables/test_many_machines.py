@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import hybridlog as hl
-from hybridlog.demo.write import write_bag
+from benchmarks.simulator.write import write_bag
 
 pytestmark = pytest.mark.exhaustive
 

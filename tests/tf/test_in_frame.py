@@ -16,7 +16,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 import hybridlog as hl
-from hybridlog.demo.write import write_bag
+from benchmarks.simulator.write import write_bag
 from hybridlog_storage.errors import IncompleteError, TopicError, UsageError
 from tests.cli.running import run
 from tests.data import DATA, needs_data

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 import hybridlog as hl
-from hybridlog.demo.topics import RobotConfig
-from hybridlog.demo.write import write_bag
+from benchmarks.simulator.topics import RobotConfig
+from benchmarks.simulator.write import write_bag
 from hybridlog.drawing.images import shown_pixels
 from hybridlog.training.feature_map import FeatureMap
 from hybridlog_storage.errors import UsageError

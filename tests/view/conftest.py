@@ -14,8 +14,8 @@ import pytest
 from starlette.testclient import TestClient
 
 import hybridlog as hl
-from hybridlog.demo.topics import RobotConfig
-from hybridlog.demo.write import write_bag
+from benchmarks.simulator.topics import RobotConfig
+from benchmarks.simulator.write import write_bag
 from hybridlog.view.loopback import Admission
 from hybridlog.view.server import ViewServer, make_app
 from tests.every_image import write_images

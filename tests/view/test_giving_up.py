@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, get_args
 import pytest
 
 import hybridlog as hl
-from hybridlog.demo.write import write_bag
+from benchmarks.simulator.write import write_bag
 from hybridlog.view import context
 from hybridlog.view.loopback import Admission
 from hybridlog.view.routes import ask

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from hybridlog.demo.plan import DEPTH, WALL_HEIGHT, WIDTH, Floats
-from hybridlog.demo.robot import Robot, State
+from benchmarks.simulator.plan import DEPTH, WALL_HEIGHT, WIDTH, Floats
+from benchmarks.simulator.robot import Robot, State
 
 Singles = NDArray[np.float32]
 

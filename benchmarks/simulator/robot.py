@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hybridlog.demo.plan import Floats, FloorPlan
+from benchmarks.simulator.plan import Floats, FloorPlan
 from hybridlog_storage.errors import UsageError
 
 MAX_DURATION_S = 7 * 86_400.0

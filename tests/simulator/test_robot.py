@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hybridlog.demo import sensors
-from hybridlog.demo.plan import WALL_HEIGHT, FloorPlan
-from hybridlog.demo.robot import MOTOR_ERROR, Robot
-from hybridlog.demo.sensors import CAMERA_HEIGHT, GRAVITY, Camera, Odometer, inertial
-from hybridlog.demo.topics import TOPICS
+from benchmarks.simulator import sensors
+from benchmarks.simulator.plan import WALL_HEIGHT, FloorPlan
+from benchmarks.simulator.robot import MOTOR_ERROR, Robot
+from benchmarks.simulator.sensors import CAMERA_HEIGHT, GRAVITY, Camera, Odometer, inertial
+from benchmarks.simulator.topics import TOPICS
 from hybridlog_storage.errors import UsageError
 
 DT = 0.002

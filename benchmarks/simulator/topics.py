@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import zlib
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
@@ -9,16 +10,16 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from hybridlog.demo import sensors
-from hybridlog.demo.plan import DEPTH, WIDTH
-from hybridlog.demo.robot import MOTOR_ERROR, MOTOR_WARN
+from benchmarks.simulator import sensors
+from benchmarks.simulator.plan import DEPTH, WIDTH
+from benchmarks.simulator.robot import MOTOR_ERROR, MOTOR_WARN
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from numpy.typing import NDArray
 
-    from hybridlog.demo.robot import Robot, State
+    from benchmarks.simulator.robot import Robot, State
 
     Floats = NDArray[np.float64]
 
@@ -32,11 +33,20 @@ _MAP_RESOLUTION, _TRACK, _WHEEL_RADIUS = 0.05, 0.42, 0.1
 
 
 class RobotConfig(NamedTuple):
-    """Sizes of the large messages: image width and height, beams, directions of the lidar."""
+    """Sizes of the large messages: image width and height, beams, directions of the lidar.
+
+    With a `jpeg` quality, images are compressed; an `intensity_step` rounds those of scans.
+    """
 
     image_size: tuple[int, int] = (320, 240)
     scan_beams: int = 720
     cloud_columns: int = 1250
+    jpeg: int | None = None
+    intensity_step: float | None = None
+
+
+DEMO = RobotConfig(cloud_columns=100, jpeg=75, intensity_step=50.0)
+"""Small enough for the package."""
 
 
 class Types:
@@ -120,8 +130,7 @@ class Speaker:
     """The robot with its sensors and its message types."""
 
     def __init__(self, robot: Robot, config: RobotConfig, types: Types) -> None:
-        self.robot, self.types = robot, types
-        self.scan_beams, self.cloud_columns = config.scan_beams, config.cloud_columns
+        self.robot, self.types, self.config = robot, types, config
         self.front = sensors.Camera(config.image_size, 0.0, 0.15, colour=True)
         self.rear = sensors.Camera(config.image_size, np.pi, -0.15, colour=False)
         self._odometer, self._odometry = sensors.Odometer(robot), (-1, robot.at(np.zeros(1)))
@@ -194,6 +203,19 @@ TOPICS: list[Topic] = []
 """Every topic, in the order of a bag's connections."""
 
 
+def topics_of(config: RobotConfig) -> list[Topic]:
+    """Every topic, where those of compressed images are named as in ROS."""
+    if config.jpeg is None:
+        return TOPICS
+    compressed = "sensor_msgs/CompressedImage"
+    return [
+        one._replace(name=f"{one.name}/compressed", msgtype=compressed)
+        if one.msgtype == "sensor_msgs/Image"
+        else one
+        for one in TOPICS
+    ]
+
+
 def topic(*settings: Any, **others: Any) -> Callable[[Fill], Fill]:
     """Add a topic that the decorated function fills."""
 
@@ -251,10 +273,13 @@ def _scan(speaker: Speaker, ticks: Ticks) -> Filled:
     values: Values = {"header.frame_id": "base_laser_link", "scan_time": 1 / sensors.SCAN_HZ}
     values |= {"angle_min": sensors.SCAN_ANGLE_MIN, "angle_max": -sensors.SCAN_ANGLE_MIN}
     values |= {"range_min": sensors.SCAN_RANGE_MIN, "range_max": sensors.SCAN_RANGE_MAX}
-    steps = sensors.scan_steps(speaker.scan_beams)
+    steps = sensors.scan_steps(speaker.config.scan_beams)
     values |= dict(zip(("angle_increment", "time_increment"), steps, strict=True))
-    found = sensors.scan(speaker.robot, ticks.seconds, speaker.scan_beams, ticks.rng)
-    return values, dict(zip(("ranges", "intensities"), found, strict=True))
+    beams, step = speaker.config.scan_beams, speaker.config.intensity_step
+    ranges, intensities = sensors.scan(speaker.robot, ticks.seconds, beams, ticks.rng)
+    if step is not None:
+        intensities = np.round(intensities / np.float32(step)) * np.float32(step)
+    return values, {"ranges": ranges, "intensities": intensities}
 
 
 _FRONT, _REAR = "camera/front", "camera/rear"
@@ -264,13 +289,27 @@ def _image(name: str) -> Fill:
     def fill(speaker: Speaker, ticks: Ticks) -> Filled:
         camera: sensors.Camera = getattr(speaker, name)
         values: Values = {"header.frame_id": f"{name}_camera_optical_frame"}
-        values |= {"height": camera.height, "width": camera.width}
-        values["encoding"] = "bgr8" if camera.channels == 3 else "mono8"
-        values["step"] = camera.width * camera.channels
+        encoding = "bgr8" if camera.channels == 3 else "mono8"
         pictures = [camera.render(speaker.robot, t, ticks.rng) for t in ticks.seconds.tolist()]
+        if speaker.config.jpeg is not None:
+            values["format"] = f"{encoding}; jpeg compressed {encoding}"
+            return values, {"data": [_jpeg(p, camera, speaker.config.jpeg) for p in pictures]}
+        values |= {"height": camera.height, "width": camera.width, "encoding": encoding}
+        values["step"] = camera.width * camera.channels
         return values, {"data": pictures}
 
     return fill
+
+
+def _jpeg(pixels: NDArray[np.uint8], camera: sensors.Camera, quality: int) -> NDArray[np.uint8]:
+    from PIL import Image
+
+    # Pictures are blue, green, red; files are red, green, blue.
+    shape = camera.height, camera.width, camera.channels
+    picture = np.ascontiguousarray(pixels.reshape(shape)[:, :, ::-1].squeeze())
+    file = io.BytesIO()
+    Image.fromarray(picture).save(file, "jpeg", quality=quality, optimize=True)
+    return np.frombuffer(file.getvalue(), np.uint8)
 
 
 topic(
@@ -307,7 +346,7 @@ topic(
 
 @topic("/lidar/points", "sensor_msgs/PointCloud2", "/velodyne_node", 0.5, 0.1, (0.061, 0.004), 1e-3)
 def _cloud(speaker: Speaker, ticks: Ticks) -> Filled:
-    width, step = speaker.cloud_columns, sensors.POINT.itemsize
+    width, step = speaker.config.cloud_columns, sensors.POINT.itemsize
     fields: list[Any] = []
     values: Values = {"header.frame_id": "velodyne", "height": sensors.RINGS, "width": width}
     for name, place in (sensors.POINT.fields or {}).items():
