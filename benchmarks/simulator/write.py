@@ -7,7 +7,6 @@ The same arguments give the same bytes.
 from __future__ import annotations
 
 import json
-import shutil
 from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
@@ -18,8 +17,7 @@ from rosbags import rosbag1, rosbag2
 
 from benchmarks.simulator.robot import Robot
 from benchmarks.simulator.topics import DEMO, RobotConfig, Speaker, Types, topics_of
-from hybridlog_storage.errors import NO_SPACE, DiskFullError, TopicError, UsageError
-from hybridlog_storage.stopping import at_safe_points, safe_point
+from hybridlog_storage.errors import TopicError, UsageError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -48,7 +46,6 @@ class BagSummary(NamedTuple):
     truth: Mapping[str, int]
 
 
-@at_safe_points()
 def write_bag(
     path: Path | str,
     *,
@@ -73,9 +70,8 @@ def write_bag(
         config: Sizes of the large messages.
 
     Raises:
-        UsageError: an argument is out of range, or `path` exists or cannot be written.
+        UsageError: an argument is out of range, or `path` exists.
         TopicError: a name in `topics` is none of the robot's.
-        DiskFullError: no space left. After any failure, no partial bag remains.
     """
     path = Path(path)
     speaker = Speaker(Robot(duration_s, seed), config or RobotConfig(), Types(ros))
@@ -91,28 +87,18 @@ def write_bag(
         raise UsageError("compression applies to ROS 1 bags only; leave it out with ros=2")
     counts = Counter({topic.name: 0 for topic in chosen})
     truth = Counter({fact: 0 for fact, _ in _FACTS.values()})
-    try:
-        with _writer(path, ros, storage, compression) as writer:
-            connections = []
-            for topic in chosen:
-                about: dict[str, Any] = {"typestore": speaker.types.store}
-                if ros == 1:
-                    about |= {"callerid": topic.node, "latching": int(topic.latched) or None}
-                msgtype = topic.type_in(speaker.types)
-                connections.append(writer.add_connection(topic.name, msgtype, **about))
-            for log_time, _, index, payload, fact in _messages(speaker, chosen):
-                safe_point()
-                writer.write(connections[index], log_time, payload)
-                counts[chosen[index].name] += 1
-                truth[fact] += 1
-    except BaseException as error:
-        # Also on interruption: a bag without its index would only be noticed later.
-        shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
-        if isinstance(error, OSError):
-            if error.errno in NO_SPACE:
-                raise DiskFullError(f"no space left for {path}; write elsewhere") from error
-            raise UsageError(f"cannot write {path}: {error.strerror or error}") from error
-        raise
+    with _writer(path, ros, storage, compression) as writer:
+        connections = []
+        for topic in chosen:
+            about: dict[str, Any] = {"typestore": speaker.types.store}
+            if ros == 1:
+                about |= {"callerid": topic.node, "latching": int(topic.latched) or None}
+            msgtype = topic.type_in(speaker.types)
+            connections.append(writer.add_connection(topic.name, msgtype, **about))
+        for log_time, _, index, payload, fact in _messages(speaker, chosen):
+            writer.write(connections[index], log_time, payload)
+            counts[chosen[index].name] += 1
+            truth[fact] += 1
     del truth[""]
     size = sum(f.stat().st_size for f in ([path] if path.is_file() else path.iterdir()))
     return BagSummary(path, size, dict(counts), speaker.robot.start_ns, dict(truth))

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import io
 import json
-import signal
 import subprocess
 import sys
 from collections import defaultdict
@@ -19,10 +17,9 @@ import pytest
 from PIL import Image
 
 from benchmarks.simulator.robot import Robot
-from benchmarks.simulator.topics import TOPICS, RobotConfig, Topic, Types
+from benchmarks.simulator.topics import TOPICS, RobotConfig, Types
 from benchmarks.simulator.write import BagSummary, write_bag, write_demo
-from hybridlog_storage.errors import DiskFullError, TopicError, UsageError
-from tests.calls import Calls
+from hybridlog_storage.errors import TopicError, UsageError
 
 ROOT = Path(__file__).parents[2]
 DURATION = 17.0
@@ -201,14 +198,6 @@ def test_transforms_chain_to_the_truth(log: dict[str, list[tuple[int, Any]]]) ->
         assert (x, y) == pytest.approx((float(truth.x[0]), float(truth.y[0])), abs=1e-3)
 
 
-def test_viewpoint_looks_at_the_robot(log: dict[str, list[tuple[int, Any]]]) -> None:
-    for _, pose in log["/rviz_camera_publisher/camera_pose"][::10]:
-        q = pose.orientation
-        assert q.x**2 + q.y**2 + q.z**2 + q.w**2 == pytest.approx(1)
-        # The x axis of the viewpoint, turned by the quaternion: inwards and down.
-        assert 2 * (q.x * q.z - q.w * q.y) < -0.3
-
-
 def test_battery_discharges(log: dict[str, list[tuple[int, Any]]]) -> None:
     charge = [m.charge for _, m in log["/battery"]]
     assert all(a > b for a, b in pairwise(charge))
@@ -246,15 +235,6 @@ def test_ros2_says_the_same(tmp_path: Path, storage: Any) -> None:
     a, b = first["/lidar/points"][0][1], second["/lidar/points"][0][1]
     assert np.array_equal(a.data, b.data)
     assert [m.level for _, m in second["/rosout"]] == [20, 20]
-
-
-def test_ros2_mcap_opens_in_the_mcap_reader(tmp_path: Path) -> None:
-    from mcap.reader import make_reader
-
-    summary = write_bag(tmp_path / "robot", duration_s=2, seed=1, ros=2, config=SMALL)
-    with (tmp_path / "robot" / "robot.mcap").open("rb") as stream:
-        count = sum(1 for _ in make_reader(stream, validate_crcs=True).iter_messages())
-    assert count == sum(summary.messages.values())
 
 
 @pytest.mark.parametrize("compression", ["lz4", "bz2"])
@@ -298,52 +278,9 @@ def test_unknown_topics_and_taken_names_are_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="exists"):
         write_bag(taken, duration_s=1)
     assert taken.read_bytes() == b"precious"
-    with pytest.raises(UsageError, match="cannot write"):
-        write_bag(tmp_path / "no" / "such" / "x.bag", duration_s=1)
     with pytest.raises(UsageError, match="compression"):
         write_bag(tmp_path / "y", duration_s=1, ros=2, compression="lz4")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["taken.bag"]
-
-
-@pytest.mark.parametrize("ros", [1, 2])
-@pytest.mark.parametrize(
-    ("fault", "raised"),
-    [
-        (OSError(errno.ENOSPC, "No space left on device"), DiskFullError),
-        (KeyboardInterrupt(), KeyboardInterrupt),
-    ],
-)
-def test_nothing_half_made_is_left(
-    tmp_path: Path,
-    calls: Calls,
-    ros: Any,
-    fault: BaseException,
-    raised: type[BaseException],
-) -> None:
-    calls.fail(Topic, "log_times", fault)
-    with pytest.raises(raised):
-        write_bag(tmp_path / "x", duration_s=2, ros=ros, topics=["/odom"])
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_signal_stops_it_between_messages(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    written = []
-
-    def press(*_: object) -> None:
-        written.append(True)
-        signal.raise_signal(signal.SIGINT)
-
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    monkeypatch.setattr("rosbags.rosbag1.Writer.write", press)
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            write_bag(tmp_path / "x.bag", duration_s=2, topics=["/odom"])
-    finally:
-        signal.signal(signal.SIGINT, before)
-    assert written == [True]
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_the_writer_as_a_command(tmp_path: Path) -> None:
