@@ -34,7 +34,6 @@ from hybridlog_storage.errors import CatalogError, DiskFullError, SegmentError, 
 from hybridlog_storage.journal import Journal, PayloadFile
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_file import Sealed, sealed_channels
-from hybridlog_storage.segments.segment_format import MOVED_SIZE
 from hybridlog_storage.segments.segment_reader import SegmentReader, SegmentSummary
 from hybridlog_storage.summary import RecordingSummary, TopicType, hash_of, topics_to_json
 
@@ -91,7 +90,7 @@ class Inventory:
         listing: Names of its files.
         state: State of the journal; None without one.
         summaries: Summaries of valid segments, by number.
-        stored: Digest and size of the files of segments with moved chunks, by number. Their
+        stored: Digest and size of the files of segments with expired chunks, by number. Their
             summaries have the digest of the segment as it was before.
         misfits: Files that differ from the journal.
         lost: Listed segments that are missing or changed.
@@ -119,7 +118,7 @@ class Inventory:
 
     @property
     def payloads(self) -> dict[str, PayloadFile]:
-        """Files of columns of payloads, as the journal and the segments list them."""
+        """Files of fields of expired messages, as the journal and the segments list them."""
         found: dict[str, PayloadFile] = {}
         for summary in self.summaries.values():
             files = (summary.compacted or {}).get("files", ())
@@ -198,7 +197,7 @@ def take_inventory(directory: StoreDirectory, label: str) -> Inventory:
 def _find_joined(inventory: Inventory, folder: Path) -> None:
     """Find what took the place of files of fields that are missing; the journal may be lost."""
     listed, there = inventory.payloads, inventory.listing.payloads
-    if all(path in there for path, file in listed.items() if file.has_fields):
+    if listed.keys() <= there.keys():
         return
     from hybridlog.columns.column_file import ColumnFile
 
@@ -219,7 +218,7 @@ def _difference(
 ) -> str | None:
     """The difference of a whole segment from the journal; None if it matches.
 
-    A segment with moved chunks gets the digest that it had before, which it names itself: the
+    A segment with expired chunks gets the digest that it had before, which it names itself: the
     journal may lack the line about it.
     """
     its_id, its_number = summary.recording.get("id"), summary.recording.get("segment")
@@ -290,7 +289,7 @@ def describe(catalog: Catalog, inventory: Inventory, *, is_open: bool = False) -
     entry.end = dict(end) if end is not None else {}
     ours = [row for sealed in inventory.lost for row in _losses_of_segment(inventory, sealed)]
     ours += _losses_of_crash(inventory)
-    ours += _losses_of_columns(inventory)
+    ours += _losses_of_fields(inventory)
     ours += _losses_of_chunks(inventory, catalog.damage(inventory.id))
     entry.status = _status(inventory, end, is_open=is_open, has_losses=bool(ours))
     if lost or ours:
@@ -470,8 +469,8 @@ def _losses_of_crash(inventory: Inventory) -> list[dict[str, Any]]:
     return rows
 
 
-def _losses_of_columns(inventory: Inventory) -> list[dict[str, Any]]:
-    """Rows for missing or changed files of columns, if segments do not hold the messages."""
+def _losses_of_fields(inventory: Inventory) -> list[dict[str, Any]]:
+    """Rows for missing or changed files of fields of expired messages."""
     rows = []
     for file in inventory.payloads.values():
         size = inventory.listing.payloads.get(file.file)
@@ -487,16 +486,14 @@ def _losses_of_columns(inventory: Inventory) -> list[dict[str, Any]]:
                 "last": max(last for _, last in spans),
             }
             name = f"{PAYLOADS}/{file.file}"
-            what = "fields" if file.has_fields else "columns"
-            rows.append(_loss(name, f"a file of {what} {problem}", lost, length=file.bytes))
+            rows.append(_loss(name, f"a file of fields {problem}", lost, length=file.bytes))
     return rows
 
 
 def _span_of(summary: SegmentSummary, file: PayloadFile) -> tuple[int, int] | None:
-    """First and last log time of messages that need a file: moved or expired ones of its topic."""
+    """First and last log time of messages that need a file: expired ones of its topic."""
     table = summary.table
-    needs = table.is_expired if file.has_fields else table.chunks["length"] == MOVED_SIZE
-    needs_file = np.repeat(needs, table.chunks["parts"])
+    needs_file = np.repeat(table.is_expired, table.chunks["parts"])
     channels = [n for n, channel in summary.channels.items() if channel.topic == file.topic]
     parts = table.parts[needs_file & np.isin(table.parts["channel"], channels)]
     return (int(parts["first"].min()), int(parts["last"].max())) if len(parts) else None
@@ -595,14 +592,14 @@ def journal_from_segments(inventory: Inventory, store_id: str, reason: str) -> l
         ]
         lines += [journal.event(journal.MARKED, **mark) for mark in state.marks]
         lines += [journal.event(journal.PINNED, **pin) for pin in state.pins.values()]
-    lines += _compacted_lines(inventory)
+    lines += _expired_lines(inventory)
     if inventory.end is not None:
         lines.append(journal.event(journal.ENDED, end=dict(inventory.end)))
     return lines
 
 
 def unlisted_lines(inventory: Inventory) -> list[journal.Event]:
-    """The lines about valid segments, and the columns that they need, that a journal lacks."""
+    """The lines about valid segments, and the fields that they need, that a journal lacks."""
     unlisted = {misfit.segment: misfit.file for misfit in inventory.misfits if misfit.is_unlisted}
     state = inventory.state
     if state is None or not unlisted:
@@ -610,19 +607,23 @@ def unlisted_lines(inventory: Inventory) -> list[journal.Event]:
     # It may have listed other segments that are gone; this cannot be excluded.
     reason = f"it did not list {', '.join(unlisted.values())}"
     new = [sealed_line(inventory, number) for number in unlisted if number not in state.sealed]
-    return [journal.event(journal.REBUILT, reason=reason), *new, *_compacted_lines(inventory)]
+    return [journal.event(journal.REBUILT, reason=reason), *new, *_expired_lines(inventory)]
 
 
-def _compacted_lines(inventory: Inventory) -> list[journal.Event]:
+def _expired_lines(inventory: Inventory) -> list[journal.Event]:
+    def topics(number: int) -> list[str]:
+        summary = inventory.summaries[number]
+        return summary.topics_in(one for one in summary.chunks if one.is_expired)
+
     replaced = inventory.replaced
     files = [asdict(file) for file in (*replaced.values(), *inventory.payloads.values())]
     segments = [
-        {"segment": number, "digest": digest, "bytes": size}
+        {"segment": number, "digest": digest, "bytes": size, "topics": topics(number)}
         for number, (digest, size) in inventory.stored.items()
     ]
     lines: list[journal.Event] = []
     if files:
-        lines.append(journal.event(journal.COMPACTED, files=files, segments=segments))
+        lines.append(journal.event(journal.EXPIRED, files=files, segments=segments))
     if replaced:
         lines.append(journal.event(journal.EXPIRED, deleted=[*replaced]))
     return lines

@@ -60,7 +60,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from hybridlog.columns.payload_reader import ArrayTable
     from hybridlog.columns.tables import Tables
     from hybridlog.columns.topic_table import TopicTable
     from hybridlog.index.index_writer import IndexTarget
@@ -1130,22 +1129,6 @@ class Session:
         path = self.directory.recording(label)
         return open_segment(path / f"{number:06d}.mcap", number, self._contents_of(path, entry))
 
-    def arrays(self, recording: RecordingEntry, topic: str) -> ArrayTable | None:
-        """The arrays of a topic in columns; None without, or if they cannot be used."""
-        from hybridlog.columns.payload_reader import ArrayTable
-
-        with self._lock:
-            path = self.directory.recording(recording.label)
-            contents = self._contents_of(path, recording)
-        try:
-            readers = contents.ordered(topic)
-        except StoreError:
-            return None
-        channel = next((c for c in self.channels(recording) if c.channel.topic == topic), None)
-        if not readers or channel is None:
-            return None
-        return ArrayTable(channel, readers, self.tables.opened)
-
     def expired_fields(
         self, recording: RecordingEntry, topic: str, chunks: Collection[tuple[int, int]]
     ) -> TopicTable:
@@ -1156,7 +1139,7 @@ class Session:
         return contents.expired_fields(topic, chunks, self.tables.opened)
 
     def _contents_of(self, path: Path, recording: RecordingEntry) -> RecordingPayloads:
-        """The content of moved chunks, shared by the segments of a recording as it is now."""
+        """What is left of expired chunks, shared by the segments of a recording as it is now."""
         key = path, frozenset(recording.stored.items())
         found = self._contents.get(key)
         if found is None:

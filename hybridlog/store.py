@@ -26,11 +26,7 @@ from hybridlog.entries import text
 from hybridlog.index import consent
 from hybridlog.index.connection import again_if_lost
 from hybridlog.index.of_store import Index
-from hybridlog.maintenance.report import (
-    CompactedTopic,
-    Progress,
-    RepairReport,
-)
+from hybridlog.maintenance.report import Progress, RepairReport
 from hybridlog.query.asked import narrowed
 from hybridlog.query.choice import Choice
 from hybridlog.query.query import Query
@@ -1049,61 +1045,6 @@ class Store:
             )
             self.refresh()
         return done
-
-    def compact(
-        self,
-        recordings: Names | None = None,
-        topics: Sequence[str] | None = None,
-        *,
-        drop_mcap: bool = False,
-        dry_run: bool = False,
-        progress: Progress | None = None,
-    ) -> list[CompactedTopic]:
-        """Write payloads of ended recordings into columns (Parquet), exact to the byte.
-
-        Args:
-            recordings: The recordings; None for all that have ended.
-            topics: Topics, as for `topic`; None for those that consist of arrays mostly: laser
-                scans, point clouds, images and other arrays of numbers.
-            drop_mcap: True to take payloads that are in columns out of the segments. Every
-                message is rebuilt and compared before.
-            dry_run: True to say what would be done, and write nothing.
-            progress: Called after each chunk.
-
-        Returns:
-            Each topic that was chosen, by recording.
-
-        Raises:
-            TopicError: A recording or a topic does not exist.
-            StoreError: A named recording is being written.
-        """
-        self._check_on_disk()
-        from hybridlog.maintenance import index
-        from hybridlog.maintenance.compact import compact
-
-        self.refresh()
-        wanted = None if topics is None else set(self.topic(*topics).topics)
-        found: list[CompactedTopic] = []
-        try:
-            for entry in self.select(recordings):
-                if recordings is None and entry.status in {"open", "unfinished"}:
-                    continue
-                found += compact(
-                    self.directory,
-                    self.catalog,
-                    entry,
-                    topics=wanted,
-                    drop_mcap=drop_mcap,
-                    dry_run=dry_run,
-                    progress=progress,
-                )
-                connected = self.session.connected
-                if not dry_run and connected is not None and self.session.connection.may_write:
-                    with suppress(ConnectionLostError):  # the next connection mirrors it
-                        index.mirror(self.catalog, connected, entry.id)
-        finally:
-            self.refresh()
-        return found
 
     @_again_if_overtaken
     def keep(

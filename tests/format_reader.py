@@ -1,7 +1,7 @@
 """A second reader of stores, written from `docs/format.md` alone.
 
 It shares no code with hybridlog: `struct`, `zlib`, `json` and `zstandard` are all it needs, and
-`pyarrow` for columns of payloads (`format_columns.py`). Whatever it reads, it has checked before.
+`pyarrow` for fields of expired messages (`format_columns.py`). What it reads, it has checked.
 """
 
 from __future__ import annotations
@@ -176,7 +176,7 @@ class Journal:
         self.sealed: dict[int, dict[str, Any]] = {}
         self.replaced: list[tuple[dict[str, Any], dict[str, Any]]] = []
         self.end: dict[str, Any] | None = None
-        self.files: dict[str, dict[str, Any]] = {}  # of columns, by path
+        self.files: dict[str, dict[str, Any]] = {}  # of fields, by path
         self.thinned: dict[int, list[tuple[str, int]]] = {}
         self.is_rebuilt = False
         self.is_removing = False
@@ -225,7 +225,7 @@ class Journal:
                 self.sealed.pop(line["segment"])
             case "adopted":
                 self.store = line["store"]
-            case "compacted" | "expired":
+            case "expired":
                 self.files |= {file["file"]: file for file in line.get("files", ())}
                 for one in line.get("segments", ()):
                     written = one["digest"], one["bytes"]
@@ -331,9 +331,6 @@ class Segment:
     def _opcode(self, number: int) -> int:
         return self.data[self.chunks[number].offset]
 
-    def is_moved(self, number: int) -> bool:
-        return self._opcode(number) == 0x93
-
     def is_expired(self, number: int) -> bool:
         return self._opcode(number) in {0x94, 0x95}
 
@@ -375,13 +372,11 @@ class Segment:
         demand(zlib.crc32(record) == place.crc, "the checksum of a chunk")
         is_indexed = zlib.crc32(trailer) == place.trailer_crc
         ((_, opcode, body),) = records(record)
-        demand(opcode in {0x06, 0x93, 0x94, 0x95}, "no chunk")
+        demand(opcode in {0x06, 0x94, 0x95}, "no chunk")
         left: list[tuple[int, bytes]] = []
         if opcode in {0x94, 0x95}:
             left = self._expired(number, Content(body[: 36 if opcode == 0x94 else -1]), place)
             content = b"".join(record for _, record in left)
-        elif opcode == 0x93:
-            content = self._moved(number, Content(body), place)
         else:
             content = self._content(Content(body), place)
         messages = list(records(content))
@@ -420,23 +415,10 @@ class Segment:
 
     @staticmethod
     def _head(record: bytes) -> int:
-        if record[0] in {0x93, 0x94, 0x95}:
+        if record[0] in {0x94, 0x95}:
             return len(record)
         body = Content(record[37:])
         return 37 + 4 + len(body.text()) + 8
-
-    def _moved(self, number: int, body: Content, place: Chunk) -> bytes:
-        times = body.take("<Q"), body.take("<Q")
-        demand(times == (place.first, place.last), "the times of a moved chunk")
-        size, crc = body.take("<Q"), body.take("<I")
-        demand(not body.rest() and self.columns is not None, "the record of a moved chunk")
-        assert self.columns is not None
-        try:
-            content = self.columns.content(self.about["segment"], number)
-        except WrongColumnsError as error:
-            raise Damaged(str(error)) from error
-        demand(len(content) == size and zlib.crc32(content) == crc, "the content of a moved chunk")
-        return content
 
     def _expired(self, number: int, body: Content, place: Chunk) -> list[tuple[int, bytes]]:
         """What is left of messages as records, and where they were in the content."""
@@ -537,7 +519,7 @@ class Recording:
         self.end = self._end()
         self.damage = dict(self._damage())
         self.lost = [*self._lost_segments(listed), *self._lost_in_crash(), *self._lost_chunks()]
-        self.lost += self._lost_columns()
+        self.lost += self._lost_fields()
         self.status = self._status()
 
     def _id(self, sealed: Mapping[int, Segment | None]) -> str:
@@ -603,7 +585,7 @@ class Recording:
     def _lost_chunks(self) -> Iterator[dict[str, Any]]:
         for number, chunk in self.damage:
             segment = self.segments[number]
-            if segment.is_moved(chunk) or segment.is_expired(chunk):
+            if segment.is_expired(chunk):
                 continue
             place = segment.chunks[chunk]
             for part in segment.parts_of(chunk):
@@ -611,18 +593,16 @@ class Recording:
                 about = (part.messages, topic, part.first, part.last)
                 yield _row(segment.path.name, place.offset, place.length, *about)
 
-    def _lost_columns(self) -> Iterator[dict[str, Any]]:
-        moved: dict[tuple[str, bool], list[Part]] = {}
+    def _lost_fields(self) -> Iterator[dict[str, Any]]:
+        gone: dict[str, list[Part]] = {}
         for segment in self.segments.values():
             for chunk in range(len(segment.chunks)):
-                is_gone = segment.is_expired(chunk)
-                for part in segment.parts_of(chunk) if is_gone or segment.is_moved(chunk) else ():
-                    key = segment.channels[part.channel][1], is_gone
-                    moved.setdefault(key, []).append(part)
+                for part in segment.parts_of(chunk) if segment.is_expired(chunk) else ():
+                    gone.setdefault(segment.channels[part.channel][1], []).append(part)
         for file in self.journal.files.values() if self.journal is not None else ():
             path = self.path / "payloads" / file["file"]
             is_there = path.is_file() and path.stat().st_size == file["bytes"]
-            parts = moved.get((file["topic"], file["file"].startswith("fields=")), [])
+            parts = gone.get(file["topic"], [])
             if parts and not is_there:
                 times = min(p.first for p in parts), max(p.last for p in parts)
                 about = (file["messages"], file["topic"], *times)

@@ -94,7 +94,6 @@ PLACES = {
     "bucket_retry_s": "hybridlog_storage.remote.bucket._RETRY_S",
     "sync": "hybridlog_storage.disk.files.System.sync",
     "edit_lock_wait_s": "hybridlog.maintenance.edit.LOCK_WAIT_S",
-    "compact_lock_wait_s": "hybridlog.maintenance.compact.LOCK_WAIT_S",
     "connection_patience_s": "hybridlog.view.server.BoundedConnection.patience_s",
     "directory_is_writable": "hybridlog_storage.disk.directory.StoreDirectory.is_writable",
     "index_interval": "hybridlog.live.recording._index_interval_s",

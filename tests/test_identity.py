@@ -475,7 +475,6 @@ CHANGES: dict[str, Callable[[hl.Store, str], object]] = {
     "note": lambda store, one: store.edit(one, note="seen"),
     "rename": lambda store, one: store.edit(one, name="new"),
     "mark": lambda store, one: store.mark(one, "start", "seen"),
-    "compact": lambda store, one: store.compact([one], ["/scan"], drop_mcap=True),
     "repair": lambda store, one: store.verify([one], repair=True),
 }
 
@@ -582,12 +581,11 @@ def test_twenty_commands_at_once_wait_for_each_other(
         *(partial(hl.Store.edit, recording=one, note=f"note {n}") for n in range(4)),
         *(partial(hl.Store.mark, recording=one, moment="+0s", note=f"mark {n}") for n in range(4)),
         *(partial(hl.Store.edit, recording=one, name=f"name {n}") for n in range(3)),
-        partial(hl.Store.compact, recordings=[one], topics=["/scan"]),
     ]
     waiting: set[int] = set()
 
     calls(directory_module, "pause", lambda _: waiting.add(threading.get_ident()))
-    limit(edit_lock_wait_s=250, compact_lock_wait_s=250)  # however slow the machine is
+    limit(edit_lock_wait_s=250)  # however slow the machine is
 
     def run(command: Callable[[hl.Store], object]) -> None:
         with hl.open(path, mongo=NOWHERE) as store:
@@ -607,7 +605,6 @@ def test_twenty_commands_at_once_wait_for_each_other(
         assert sorted(mark["text"] for mark in entry.marks) == [f"mark {n}" for n in range(4)]
         assert entry.name in {f"name {n}" for n in range(3)}
         assert entry.label == entry.name.replace(" ", "-")
-        assert entry.payloads
         assert not store.verify().findings
 
 

@@ -17,6 +17,7 @@ import hybridlog as hl
 from hybridlog_storage import journal
 from tests import odd_values
 from tests.cli.within import answer
+from tests.copying.conftest import expire
 from tests.payloads.logs import BASE, SETTINGS, STEP, robot, write_log
 
 NOWHERE = "mongodb://127.0.0.1:9/x?serverSelectionTimeoutMS=20&connectTimeoutMS=20"
@@ -53,7 +54,6 @@ CHANGING: Sequence[Sequence[str]] = (
     ("tag", "odd", "k=v"),
     ("edit", "odd", "--note", "x"),
     ("mark", "odd", "--at", "+1s", "m"),
-    ("compact", "odd", "--drop-mcap"),
     ("edit", "odd", "--name", "even"),
     ("rm", "odd", "--yes"),
 )
@@ -68,7 +68,7 @@ def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for name, count in (("odd", 60), ("other", COUNT)):
             log = write_log(place / f"{name}.mcap", robot(count))
             store.record(log, name=name, settings=SETTINGS)
-        store.compact(topics=["scan"], drop_mcap=True)
+        expire(store, "odd", [0])
         store.edit("odd", note="wind")
         store.edit("odd", tag={"place": "lab"})
         store.edit("odd", untag=["place"])

@@ -212,7 +212,7 @@ def commands_side(*, store: str, directory: str, times: int, **_: Any) -> Values
     rows = {"`record` of the log": _recorded(log, fresh)}
     stored = disk_bytes(fresh)
     segments = sum(path.stat().st_size for path in fresh.rglob("*.mcap"))
-    rows["`compact`"] = command(("compact",), fresh)
+    rows["`index arrays` of the scans"] = command(("index", "arrays", "scan"), fresh)
     for name, arguments in COMMANDS.items():
         rows[name] = _commands(arguments, place, times)
     about = {"log_bytes": log.stat().st_size, "disk_bytes": stored, "segment_bytes": segments}

@@ -67,7 +67,6 @@ GROUPS: Final = {
         "keep": "keep",
         "index": "index",
         "verify": "maintain",
-        "compact": "maintain",
         "rm": "edit",
         "demo": "record",
     },

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -17,16 +17,18 @@ from hybridlog.cli.options import AsJson, Choosing, InStore, Quiet, cache_size
 from hybridlog.cli.progress import Stages, progress_bar
 from hybridlog.cli.signals import if_stopped
 from hybridlog.cli.watching import watch
+from hybridlog.wording import listed
 from hybridlog_storage.errors import StoreError, UsageError
 
 if TYPE_CHECKING:
     from hybridlog.index.field_indexes import FieldIndex
+    from hybridlog.maintenance.report import ArraysOfTopic
     from hybridlog.store import Store
 
 
 @click.group()
 def index_command() -> None:
-    """Index fields in MongoDB, for MongoDB filters and other programs."""
+    """Index fields in MongoDB for MongoDB filters and other programs, or arrays in tables."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,6 +159,56 @@ def rebuild(given: _Rebuild) -> None:
             f"{output.counted(messages, 'message')} indexed in {elapsed:.2f} s"
             f"{output.without_documents(without)}"
         )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Arrays(_Shared):
+    topic: tuple[str, ...] = argument(
+        "Topics.", "TOPIC...", required=True, shell_complete=complete_topic
+    )
+    off: bool = option("Make their tables without arrays again.")
+
+
+@command(_Arrays, to=index_command)
+def arrays(given: _Arrays) -> None:
+    """Keep long arrays in the tables of topics.
+
+    Tables have a summary of an array with more than 32 elements. Of these topics they get the
+    array, too, and of point clouds a list for each field of the points. Elements in predicates
+    and SQL are then read from columns. New recordings follow, and tables of ended ones are made
+    anew at once. Segments stay as they are, so this costs room. MongoDB is not needed.
+    """
+    with (
+        given.opened(quiet=given.quiet) as store,
+        if_stopped("The setting is made; run it again for the tables that are left."),
+        progress_bar("index arrays", 0, quiet=given.quiet) as bar,
+    ):
+        found = store.index.arrays(*given.topic, off=given.off, progress=Stages(bar))
+        known = {*store.all_topics().topics} if store.recordings() else set()
+    if given.as_json:
+        output.print_json([asdict(one) for one in found])
+        return
+    for one in found:
+        if not given.quiet:
+            output.say(_told(one, is_known=one.topic in known, off=given.off))
+        if one.left:
+            output.note(
+                f"Tables of {one.topic} in {listed(one.left)} stay as they are: a recording in "
+                "progress, or one that cannot be read. Run it again later."
+            )
+
+
+def _told(one: ArraysOfTopic, *, is_known: bool, off: bool) -> str:
+    """A line about a topic."""
+    without = "without" if off else "with"
+    if not is_known:
+        return f"{one.topic}: no recording has it yet; its tables will be {without} arrays"
+    size = output.size(one.bytes_after)
+    if not one.recordings:
+        return f"{one.topic}: tables {without} arrays, {size}"
+    made = output.counted(len(one.recordings), "recording")
+    before = output.size(one.bytes_before)
+    return f"{one.topic}: tables {without} arrays, {size}, before {before}; {made} made anew"
 
 
 @dataclass(frozen=True, kw_only=True)

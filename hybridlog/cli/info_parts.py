@@ -69,6 +69,8 @@ def _print_topic(item: dict[str, Any]) -> None:
             output.say("  " + (line[: output.console().width - 2] if is_rule else line))
     if item["not_indexed"]:
         output.say(f"not indexed: {item['not_indexed']}")
+    if item["arrays"]:
+        output.say("Its tables have long arrays, not only their summaries.")
     if item["fields"]:
         output.say()
         if item["observed"]:
@@ -106,6 +108,7 @@ def _topic_as_dict(store: Store, recorded: RecordedChannel) -> dict[str, Any]:
         "recordings": [recorded.recording.label],
         "not_indexed": codec.reason,
         "observed": observed,
+        "arrays": channel.topic in store.directory.settings.arrays,
         "fields": fields,
     }
 
@@ -224,7 +227,7 @@ def _print_sizes(rows: Sequence[Size], total: Size, *, recordings: bool, topics:
     if topics:
         columns.append(("topic", "left"))
     has_columns = bool(total.column_bytes)
-    columns_too = ("columns",) if has_columns else ()
+    columns_too = ("fields",) if has_columns else ()
     headings = ("messages", "payload", "segments", *columns_too, "tables", "MongoDB", "total")
     names: list[output.Column] = [(heading, "right") for heading in headings]
     if output.is_narrow():

@@ -1,4 +1,4 @@
-"""`hybridlog verify` and `compact`."""
+"""`hybridlog verify`."""
 
 from __future__ import annotations
 
@@ -8,16 +8,14 @@ from typing import TYPE_CHECKING
 
 import click
 
-from hybridlog.cli import options, output
+from hybridlog.cli import output
 from hybridlog.cli.binder import command, option
-from hybridlog.cli.options import AsJson, Choosing, InStore, Named, Quiet
+from hybridlog.cli.options import AsJson, InStore, Named, Quiet
 from hybridlog.cli.progress import Stages, progress_bar
-from hybridlog.cli.signals import if_stopped
 from hybridlog.wording import listed
 from hybridlog_storage.errors import DatabaseError, UsageError, WithoutMongoError
 
 if TYPE_CHECKING:
-    from hybridlog.maintenance.report import CompactedTopic
     from hybridlog.maintenance.verify import Verification
 
 
@@ -114,60 +112,3 @@ def _repair(given: _Verify) -> None:
             output.say("nothing to mend")
     if left:
         raise click.exceptions.Exit(1)
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Compact(Choosing, InStore, AsJson, Quiet):
-    topic: tuple[str, ...] = options.topics()
-    drop_mcap: bool = option("Take payloads that are in columns out of the segments.")
-    dry_run: bool = option("Only say what would be done.")
-
-
-@command(_Compact)
-def compact_command(given: _Compact) -> None:
-    """Write payloads into columns that any reader opens.
-
-    Of ended recordings: laser scans, point clouds by their own fields, images, and other
-    arrays of numbers. Every message is rebuilt from its columns and compared byte for byte
-    before the columns are used. Without --topic, topics are chosen that consist of arrays
-    mostly.
-    """
-    choice = given.choice
-    with (
-        given.opened(quiet=given.quiet) as store,
-        if_stopped("Recordings that were finished have their columns; run it again."),
-        progress_bar("compact", 0, quiet=given.quiet) as bar,
-    ):
-        found = store.compact(
-            None if choice.is_everything else given.recordings_in(store),
-            given.topic or None,
-            drop_mcap=given.drop_mcap,
-            dry_run=given.dry_run,
-            progress=Stages(bar),
-        )
-    if given.as_json:
-        output.print_json([asdict(one) for one in found])
-        return
-    for one in found:
-        output.say(_told(one, dry_run=given.dry_run))
-    if not found and not given.quiet:
-        output.say("nothing to compact")
-
-
-def _told(one: CompactedTopic, *, dry_run: bool) -> str:
-    """A line about a topic."""
-    parts = []
-    if one.messages and dry_run:
-        parts.append(f"{one.messages} messages would get columns")
-    elif one.messages:
-        parts.append(
-            f"{one.messages} messages, {output.size(one.payload_bytes)}, in columns of "
-            f"{output.size(one.column_bytes)}"
-        )
-    if one.dropped:
-        parts.append(f"{one.dropped} messages taken out of the segments")
-    if one.both:
-        parts.append(f"{one.both} stay there, too: their chunks hold messages without columns")
-    if one.kept:
-        parts.append(f"{one.kept} without columns: {one.reason}")
-    return f"{one.recording} {one.topic}: {'; '.join(parts)}"

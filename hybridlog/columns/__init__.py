@@ -1,1 +1,1 @@
-"""Messages as columns in Parquet files: tables of fields, and payloads with their arrays."""
+"""Messages as columns in Parquet files: tables of topics, and fields of expired messages."""

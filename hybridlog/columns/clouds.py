@@ -1,252 +1,107 @@
-"""Points of a PointCloud2 as one column for each of its fields, and back.
-
-A point is `step` bytes; its fields say which of them are numbers. Bytes that no field
-covers are *padding*; it is kept where it is not zero.
-"""
+"""Points of a PointCloud2 as one list for each of their fields."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from itertools import pairwise
+from itertools import groupby
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
+import pyarrow as pa
 
-from hybridlog.arrays.point_arrays import MAX_FIELDS, POINT_TYPES
-from hybridlog.columns.layout import column_names
-from hybridlog.schema.column import Arrays, Records, Scalars, Strings
+from hybridlog.arrays.point_arrays import MAX_FIELDS, POINT_MAKERS
+from hybridlog.columns.fields import joined, without
+from hybridlog.columns.layout import OWN, POINTS, column_names
+from hybridlog.schema.arrow_columns import lists, numbers, structs
+from hybridlog_storage.errors import PayloadError
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
     from numpy.typing import NDArray
 
-CLOUD_TYPES: Final = frozenset({"sensor_msgs/PointCloud2", "sensor_msgs/msg/PointCloud2"})
-DATA: Final = "data"
-"""Field of a cloud that holds its points."""
-_MAX_STEP = 1 << 16
+    from hybridlog_storage.messages import Channel
+
+_CLOUDS: Final = frozenset({"sensor_msgs/PointCloud2", "sensor_msgs/msg/PointCloud2"})
+_make = POINT_MAKERS["sensor_msgs/PointCloud2"]
+_NUMBERS = ("height", "width", "point_step", "row_step", "is_bigendian")
+NEEDED: Final = (*_NUMBERS, "fields", "data")
+"""Fields of a cloud that its points are made from."""
 
 
-@dataclass(frozen=True, slots=True)
-class PointField:
-    """A field of a point.
-
-    Attributes:
-        column: Name of its column.
-        offset: Byte of the point where it starts.
-        dtype: Type of its elements on the wire, with byte order, as numpy spells it.
-        count: Its elements.
-    """
-
-    column: str
-    offset: int
-    dtype: str
-    count: int
-
-    @property
-    def end(self) -> int:
-        """Byte of the point behind it."""
-        return self.offset + self.count * np.dtype(self.dtype).itemsize
+def is_cloud(channel: Channel) -> bool:
+    """True for a channel of clouds whose points become columns."""
+    is_ros = channel.message_encoding in {"ros1", "cdr"}
+    return is_ros and channel.schema is not None and channel.schema.name in _CLOUDS
 
 
-@dataclass(frozen=True, slots=True)
-class PointLayout:
-    """The layout of the points of a cloud.
+class PointColumns:
+    """Makes the column of points of one topic."""
 
-    Attributes:
-        step: Bytes of a point.
-        fields: By offset, apart.
-    """
+    def __init__(self) -> None:
+        self._names: set[str] = set()  # of fields of points
 
-    step: int
-    fields: tuple[PointField, ...]
-
-    @property
-    def gaps(self) -> list[tuple[int, int]]:
-        """Begin and end of the bytes of a point that no field covers."""
-        edges = [0, *(edge for f in self.fields for edge in (f.offset, f.end)), self.step]
-        pairs = zip(edges[::2], edges[1::2], strict=True)
-        return [(begin, end) for begin, end in pairs if begin < end]
-
-    def to_json(self) -> dict[str, Any]:
-        """As values for JSON."""
-        fields = [[f.column, f.offset, f.dtype, f.count] for f in self.fields]
-        return {"step": self.step, "fields": fields}
-
-    @classmethod
-    def from_json(cls, value: Mapping[str, Any]) -> PointLayout:
-        """The opposite of `to_json`.
-
-        Raises:
-            KeyError, TypeError, ValueError: The value is invalid.
-        """
-        fields = [PointField(str(n), int(o), str(d), int(c)) for n, o, d, c in value["fields"]]
-        found = cls(int(value["step"]), tuple(fields))
-        known = {order + name for order in "<>" for name in POINT_TYPES.values()}
-        if not {f.dtype for f in fields} <= known or not found.is_sound():
-            raise ValueError("the layout of points contradicts itself")
-        return found
-
-    def is_sound(self) -> bool:
-        """True if all fields lie within the point, in order and apart."""
-        if not (0 < self.step <= _MAX_STEP and 0 < len(self.fields) <= MAX_FIELDS):
-            return False
-        if any(f.offset < 0 or f.count < 1 or f.end > self.step for f in self.fields):
-            return False
-        return all(a.end <= b.offset for a, b in pairwise(self.fields))
-
-    @property
-    def dtype(self) -> np.dtype[Any]:
-        """A point, as numpy describes it."""
-        fields = self.fields
-        return np.dtype(
-            {
-                "names": [f.column for f in fields],
-                "formats": [(f.dtype, (f.count,)) for f in fields],
-                "offsets": [f.offset for f in fields],
-                "itemsize": self.step,
-            }
-        )
-
-    def unpack(self, data: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
-        """Points as columns.
+    def with_points(self, columns: pa.StructArray, clouds: pa.StructArray) -> pa.StructArray:
+        """Columns of clouds, and one more with their points, null where they are malformed.
 
         Args:
-            data: uint8[points * step].
-
-        Returns:
-            For each field its elements in native byte order, `count` for each point.
+            columns: The columns.
+            clouds: The clouds, as codecs give them.
         """
-        points = np.ascontiguousarray(data).view(self.dtype)
-        columns = {field.column: points[field.column] for field in self.fields}
-        return {
-            name: values.astype(values.dtype.newbyteorder("=")).ravel()
-            for name, values in columns.items()
-        }
-
-    def padding(self, data: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The bytes that no field covers, point by point; empty if all are zero."""
-        table = data.reshape(-1, self.step)
-        parts = [table[:, begin:end] for begin, end in self.gaps]
-        if not any(part.any() for part in parts):
-            return np.empty(0, np.uint8)
-        return np.concatenate(parts, axis=1).ravel()
-
-    def pack(self, columns: Mapping[str, NDArray[Any]], points: int) -> NDArray[np.uint8]:
-        """The opposite of `unpack`: uint8[points * step]; padding is zero.
-
-        Raises:
-            ValueError: Columns have another length.
-        """
-        packed = np.zeros(points, self.dtype)
-        for field in self.fields:
-            packed[field.column] = columns[field.column].reshape(points, field.count)
-        return packed.view(np.uint8)
-
-    def pad(self, data: NDArray[np.uint8], padding: NDArray[np.uint8]) -> None:
-        """Put the padding back into points.
-
-        Raises:
-            ValueError: It has another size.
-        """
-        table, at = data.reshape(-1, self.step), 0
-        given = padding.reshape(len(table), -1)
-        if given.shape[1] != sum(end - begin for begin, end in self.gaps):
-            raise ValueError("the padding has another size")
-        for begin, end in self.gaps:
-            table[:, begin:end] = given[:, at : at + end - begin]
-            at += end - begin
-
-
-def layout_of(records: Records) -> PointLayout | None:
-    """The layout that all clouds of a batch share.
-
-    Args:
-        records: Their fields; one cloud at least.
-
-    Returns:
-        None if they differ, if fields overlap or lie outside of the points, or if the data
-        are not exactly the points, row after row.
-    """
-    try:
-        width, height, step, row_step, is_big = (
-            _numbers(records, name)
-            for name in ("width", "height", "point_step", "row_step", "is_bigendian")
+        found = self.points(clouds)
+        field = pa.field(POINTS, found.type, metadata={OWN: b"1"})
+        return pa.StructArray.from_arrays(
+            [*columns.flatten(), found], fields=[*columns.type, field], mask=columns.is_null()
         )
-        fields, data = records.fields["fields"], records.fields[DATA]
-    except KeyError:
-        return None
-    if not isinstance(fields, Arrays) or not isinstance(data, Arrays):
-        return None
-    sizes, first = np.diff(data.offset), int(step[0])
-    is_even = (
-        bool((step == first).all())
-        and bool((is_big == is_big[0]).all())
-        # In floating point, since products of untrusted numbers overflow.
-        and bool((width.astype(float) * height * first == sizes).all())
-        and bool(((height <= 1) | (row_step == width * first)).all())
-    )
-    if not is_even:
-        return None
-    described = _described(fields)
-    if described is None:
-        return None
-    return _layout(first, ">" if is_big[0] else "<", described)
+
+    def points(self, clouds: pa.StructArray) -> pa.StructArray:
+        """For each cloud a struct of lists; null if it is malformed.
+
+        An element of a field with a `count` follows the one before it: points x count numbers.
+        """
+        try:
+            arrays = [*enumerate(self._arrays(clouds))]
+        except (KeyError, TypeError, AttributeError):  # another type of this name
+            arrays = []
+        readable = [(row, array) for row, array in arrays if array is not None]
+        runs = groupby((array for _, array in readable), _layout)
+        pieces = [_columns([*run]) for _, run in runs]
+        found = joined(pieces) if pieces else pa.nulls(0, pa.struct([]))
+        return without(found, np.array([row for row, _ in readable], np.intp), len(clouds))
+
+    def _arrays(self, clouds: pa.StructArray) -> Iterator[NDArray[Any] | None]:
+        single = {name: clouds.field(name).to_pylist() for name in _NUMBERS}
+        fields, data = clouds.field("fields"), clouds.field("data")
+        for row in range(len(clouds)):
+            about = {name: values[row] for name, values in single.items()}
+            given = [SimpleNamespace(**one) for one in fields[row].as_py()]
+            pixels = data[row].values.to_numpy(zero_copy_only=False)
+            try:
+                array = _make(SimpleNamespace(fields=given, data=pixels, **about))
+            except PayloadError:
+                yield None
+                continue
+            names = self._names | {*(array.dtype.names or ())}
+            is_usual = len(names) <= MAX_FIELDS and bool(array.dtype.names)
+            self._names = names if is_usual else self._names
+            yield array.reshape(-1) if is_usual else None
 
 
-def _numbers(records: Records, name: str) -> NDArray[Any]:
-    column = records.fields[name]
-    if not isinstance(column, Scalars):
-        raise KeyError(name)
-    return column.values.astype(np.int64)
+def _layout(cloud: NDArray[Any]) -> list[tuple[str, str, tuple[int, ...]]]:
+    kinds = ((name, cloud.dtype[name]) for name in cloud.dtype.names or ())
+    return [(name, str(kind.base), kind.shape) for name, kind in kinds]
 
 
-def _described(fields: Arrays) -> list[tuple[str, int, int, int]] | None:
-    """Name, offset, type and count of each field; None if the clouds differ."""
-    inner, rows = fields.values, len(fields)
-    count, rest = divmod(int(fields.offset[-1]), rows)
-    is_even = rest == 0 and bool((np.diff(fields.offset) == count).all())
-    if not is_even or not isinstance(inner, Records) or not 0 < count <= MAX_FIELDS:
-        return None
-    columns = []
-    for name in ("offset", "datatype", "count"):
-        table = _numbers(inner, name).reshape(rows, count)
-        if (table != table[0]).any():
-            return None
-        columns.append(table[0].tolist())
-    names = inner.fields["name"]
-    assert isinstance(names, Strings)
-    spelled = [_text(names, place) for place in range(count)]
-    lengths = np.diff(names.offset).reshape(rows, count)
-    data = names.data[int(names.offset[0]) : int(names.offset[-1])]
-    is_same = (
-        bool((lengths == lengths[0]).all())
-        and not ((table := data.reshape(rows, -1)) != table[0]).any()
-    )
-    return list(zip(spelled, *columns, strict=True)) if is_same else None
-
-
-def _text(names: Strings, place: int) -> str:
-    raw = names.data[int(names.offset[place]) : int(names.offset[place + 1])]
-    return raw.tobytes().decode("utf-8", "replace")
-
-
-def _layout(
-    step: int, order: str, described: Sequence[tuple[str, int, int, int]]
-) -> PointLayout | None:
-    known = [one for one in described if one[2] in POINT_TYPES]
-    if len(known) < len(described):
-        return None
-    ordered = sorted(known, key=lambda one: one[1])
-    names: list[str] = []
-    for name, *_ in ordered:
-        label = name.replace("\0", "_").replace(".", "_") or "field"
-        while label in names:
-            label += "_"
-        names.append(label)
-    columns = [column for _, column in column_names(names, ())]
-    fields = tuple(
-        PointField(column, offset, order + POINT_TYPES[kind], count or 1)
-        for column, (_, offset, kind, count) in zip(columns, ordered, strict=True)
-    )
-    found = PointLayout(step, fields)
-    return found if found.is_sound() else None
+def _columns(clouds: Sequence[NDArray[Any]]) -> pa.StructArray:
+    """Points of clouds of one layout."""
+    counts = np.array([len(cloud) for cloud in clouds], np.int64)
+    names = clouds[0].dtype.names or ()
+    spelled = [name.replace("\0", "_").replace(".", "_") for name in names]
+    columns = {}
+    for name, (_, column) in zip(names, column_names(spelled, ()), strict=True):
+        values = np.concatenate([cloud[name].reshape(-1) for cloud in clouds])
+        values = values.astype(values.dtype.newbyteorder("="), copy=False)
+        each = int(np.prod(clouds[0].dtype[name].shape, dtype=np.int64))
+        bounds = np.concatenate([[0], np.cumsum(counts)]) * each
+        columns[column] = lists(numbers(values), bounds)
+    return structs(columns, len(clouds))

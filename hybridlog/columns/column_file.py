@@ -4,29 +4,21 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from itertools import chain
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 import pyarrow as pa
 
-from hybridlog.columns.fields import SUMMARY_FIELDS
+from hybridlog.columns.fields import SUMMARY_FIELDS, is_of_bytes
 from hybridlog.columns.layout import Section, TopicCounts
 from hybridlog.columns.parquet_file import Leaf, ParquetFileReader, leaves
-from hybridlog_storage.cache import Cache
 from hybridlog_storage.disk import files
-from hybridlog_storage.errors import StoreError
 from hybridlog_storage.lazy import lazy
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
-
-    from hybridlog.columns.zones import Zone
     from hybridlog_storage.cache import Cache
-    from hybridlog_storage.journal import PayloadFile
-
 
 _OPEN_FILES: Final = 256
 _MAX_FIELD_SETS: Final = 64  # sets of fields whose columns are known for a file
@@ -37,8 +29,6 @@ LAST: Final = (1 << 63) - 1, (1 << 63) - 1
 
 Key = tuple[int, int]
 """Log time and arrival number: the order of messages."""
-
-RESTORE = " Restore it from a copy; `hybridlog verify` shows what is affected."
 
 
 class TablePart(NamedTuple):
@@ -69,11 +59,6 @@ class ColumnFile(ParquetFileReader):
         """Its columns in Parquet's order."""
         return list(leaves(self.schema))
 
-    @property
-    def zones(self) -> Sequence[Mapping[str, Zone]]:
-        """For each row group the zones of its arrays; empty where there are none."""
-        return ()
-
     @lazy
     def summaries(self) -> dict[tuple[str, ...], int]:
         """Paths of arrays with summaries, and the number of a column of each."""
@@ -86,6 +71,21 @@ class ColumnFile(ParquetFileReader):
         return {path[:end] for path in names for end in range(1, len(path) + 1)}
 
     @lazy
+    def own(self) -> set[str]:
+        """Columns of the table itself."""
+        return {leaf.top for leaf in self.leaves if leaf.is_own}
+
+    @lazy
+    def arrays(self) -> set[tuple[str, ...]]:
+        """Paths of arrays with summaries that tables with arrays have in full."""
+        of_bytes = {
+            leaf.names
+            for leaf in self.leaves
+            if leaf.array is None and not leaf.is_own and is_of_bytes(leaf.kind)
+        }
+        return self.summaries.keys() - of_bytes
+
+    @lazy
     def summary_paths(self) -> set[tuple[str, ...]]:
         """Paths of the numbers of summaries."""
         return {leaf.names for leaf in self.leaves if leaf.array is not None}
@@ -95,35 +95,53 @@ class ColumnFile(ParquetFileReader):
         """Stored bytes of columns that were asked about."""
         return {}
 
-    def stored(self, group: int, paths: Collection[str] | None, own: Collection[str]) -> int:
-        """Stored bytes of some fields in a row group."""
-        key = group, None if paths is None else frozenset(paths), frozenset(own)
+    def stored(
+        self,
+        group: int,
+        paths: Collection[str] | None,
+        own: Collection[str],
+        *,
+        arrays: bool = False,
+    ) -> int:
+        """Stored bytes of some fields in a row group; see `choose`."""
+        key = group, None if paths is None else frozenset(paths), frozenset(own), arrays
         found = self.sizes.get(key)
         if found is None:
             if len(self.sizes) >= _MAX_FIELD_SETS:
                 self.sizes.clear()
-            found = self.sizes[key] = self.size(group, self.choose(paths, own))
+            found = self.sizes[key] = self.size(group, self.choose(paths, own, arrays=arrays))
         return found
 
     @lazy
-    def chosen(self) -> dict[tuple[Any, Any], list[int]]:
-        """Numbers of columns that were chosen, by fields and columns of ours."""
+    def chosen(self) -> dict[tuple[Any, ...], list[int]]:
+        """Numbers of columns that were chosen, by what `choose` was asked for."""
         return {}
 
-    def choose(self, paths: Collection[str] | None, own: Collection[str]) -> list[int]:
-        """Numbers of the columns for some fields."""
-        key = None if paths is None else frozenset(paths), frozenset(own)
+    def choose(
+        self, paths: Collection[str] | None, own: Collection[str], *, arrays: bool = False
+    ) -> list[int]:
+        """Numbers of the columns for some fields.
+
+        Args:
+            paths: Dotted paths of fields; None for all.
+            own: Columns of the table itself.
+            arrays: True if all rows have `arrays` in full, and their summaries.
+        """
+        key = None if paths is None else frozenset(paths), frozenset(own), arrays
         found = self.chosen.get(key)
         if found is None:
             wanted = None if paths is None else list(map(names_of, paths))
+            full = self.arrays if arrays else set()
             found = [
                 number
                 for number, leaf in enumerate(self.leaves)
-                if (leaf.top in own if leaf.is_own else self._is_wanted(leaf, wanted))
+                if (leaf.top in own if leaf.is_own else self._is_wanted(leaf, wanted, full))
             ]
             # A summary tells whether the array is there.
             known = {self.leaves[number].array for number in found}
             for array, number in self.summaries.items():
+                if array in full:
+                    continue
                 if array not in known and any(p[: len(array)] == array for p in wanted or ()):
                     found.append(number)
             found.sort()
@@ -133,21 +151,29 @@ class ColumnFile(ParquetFileReader):
         return found
 
     def by_top(
-        self, paths: Collection[str] | None, own: Collection[str]
+        self, paths: Collection[str] | None, own: Collection[str], *, arrays: bool = False
     ) -> dict[str, tuple[int, ...]]:
         """The numbers of `choose` by the table's column that contains them."""
         found: dict[str, tuple[int, ...]] = {}
-        for number in self.choose(paths, own):
+        for number in self.choose(paths, own, arrays=arrays):
             top = self.leaves[number].top
             found[top] = (*found.get(top, ()), number)
         return found
 
-    def _is_wanted(self, leaf: Leaf, wanted: Sequence[tuple[str, ...]] | None) -> bool:
+    def _is_wanted(
+        self,
+        leaf: Leaf,
+        wanted: Sequence[tuple[str, ...]] | None,
+        full: Collection[tuple[str, ...]],
+    ) -> bool:
+        if leaf.array in full:
+            return wanted is not None and leaf.names in wanted
         if wanted is None or any(leaf.names[: len(path)] == path for path in wanted):
             return True
         # A summary is worked out from the array where that is there.
+        summarised = self.summaries.keys() - full
         return any(
-            leaf.names[: len(path) - 1] == path[:-1] and path[:-1] in self.summaries
+            leaf.names[: len(path) - 1] == path[:-1] and path[:-1] in summarised
             for path in wanted
             if leaf.array is None and path[-1] in SUMMARY_FIELDS
         )
@@ -176,7 +202,10 @@ class ColumnFile(ParquetFileReader):
         """Counts of all its rows."""
         topics = [section.topics.values() for section in self.about.recordings]
         return TopicCounts(
-            *np.array([*chain(*topics)], np.int64).reshape(-1, 3).sum(axis=0).tolist()
+            *np.array([*chain(*topics)], np.int64)
+            .reshape(-1, len(TopicCounts._fields))
+            .sum(axis=0)
+            .tolist()
         )
 
     def all_parts(self) -> list[TablePart]:
@@ -224,63 +253,3 @@ class OpenFiles:
 def names_of(path: str) -> tuple[str, ...]:
     """Names on a dotted path of a field, without brackets."""
     return tuple(path.replace("[]", "").split("."))
-
-
-class Place(NamedTuple):
-    """Rows of a chunk in a file.
-
-    Attributes:
-        group: Row group.
-        begin: Its first row in the group.
-        rows: Number of rows.
-    """
-
-    group: int
-    begin: int
-    rows: int
-
-
-class ChunkFile(ColumnFile):
-    """One file that the journal lists, of a topic. Thread safe.
-
-    Attributes:
-        listed: As above.
-        places: Rows of each chunk, by segment and number.
-
-    Raises:
-        StoreError: It is missing, damaged, or another file than the listed one.
-    """
-
-    def __init__(self, folder: Path, listed: PayloadFile, cache: Cache | None = None) -> None:
-        self.listed = listed
-        self.cache = cache or Cache()
-        path = folder / listed.file
-        try:
-            super().__init__(path)
-        except FileNotFoundError as error:
-            raise StoreError(f"The payload file {path} is missing.{RESTORE}") from error
-        if (self.size_bytes, self.digest) != (listed.bytes, listed.digest):
-            raise StoreError(
-                f"The payload file {path} is not the one that the journal lists.{RESTORE}"
-            )
-        try:
-            self._take(self.about.payloads)
-        except (AttributeError, KeyError, TypeError, ValueError) as error:
-            raise StoreError(f"The description in {path} is invalid: {error!r}.") from error
-
-    def _take(self, values: Mapping[str, Any]) -> None:
-        """Parse what the file says of itself; errors of any kind say that it is invalid."""
-        self.places = self._read_places(values["chunks"])
-
-    def _read_places(self, chunks: Any) -> dict[tuple[int, int], Place]:
-        found: dict[tuple[int, int], Place] = {}
-        if len(chunks) != self.groups:
-            raise ValueError("its row groups and its chunks differ")
-        for group, inside in enumerate(chunks):
-            at = 0
-            for segment, chunk, rows in inside:
-                found[int(segment), int(chunk)] = Place(group, at, int(rows))
-                at += int(rows)
-            if at != self.about.bounds[group][0]:
-                raise ValueError("its row groups and its chunks differ")
-        return found

@@ -16,43 +16,42 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from hybridlog.columns.column_file import ChunkFile
+from hybridlog.columns.column_file import ColumnFile
 from hybridlog.columns.fields import FieldShape, without
 from hybridlog.columns.layout import OWN_COLUMNS
-from hybridlog.columns.payload_rows import Piece, bytes_of
 from hybridlog.columns.rows import Messages, own_columns
 from hybridlog.columns.rows import Piece as TablePiece
 from hybridlog.schema.arrow_columns import structs
 from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.reduced_codec import expired_payloads
 from hybridlog.schema.states import State, state_of
-from hybridlog_storage.journal import FIELDS
+from hybridlog_storage.cache import Cache
+from hybridlog_storage.errors import StoreError
 from hybridlog_storage.messages import Batch
 from hybridlog_storage.mongo.collection_names import collection_of
 from hybridlog_storage.segments.chunk import ExpiredMessages
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
+    from pathlib import Path
 
     from numpy.typing import NDArray
 
-    from hybridlog.columns.column_file import Place
+    from hybridlog_storage.journal import PayloadFile
     from hybridlog_storage.messages import Channel
     from hybridlog_storage.segments.chunk import StoredChunk
 
-_ROW_BYTES: Final = 160  # about what a message takes besides its fields
 _OWN: Final = frozenset(OWN_COLUMNS)
+RESTORE: Final = " Restore it from a copy; `hybridlog verify` shows what is affected."
 
 
 def fields_folder(topic: str) -> str:
     """Name of the folder of what is left of a topic's expired messages."""
-    return f"{FIELDS}{collection_of(topic)}"
+    return f"fields={collection_of(topic)}"
 
 
 class FieldColumns:
     """Turns messages of one type into rows of what is left of them."""
-
-    arrays: Sequence[Any] = ()
 
     def __init__(self, channel: Channel) -> None:
         self.folder = fields_folder(channel.topic)
@@ -62,14 +61,14 @@ class FieldColumns:
         self.replaces: Sequence[str] = ()
         """Paths of the files whose rows the new one has, if there are any."""
 
-    def about(self, layout: object) -> dict[str, Any]:
+    def about(self) -> dict[str, Any]:
         """Further metadata of a file."""
         return {"replaces": [*self.replaces]} if self.replaces else {}
 
-    def piece(
+    def table(
         self, chunk: StoredChunk, rows: NDArray[np.intp], has_publish_time: Mapping[int, bool]
-    ) -> Piece:
-        """Rows of messages.
+    ) -> pa.Table:
+        """Rows of messages, in the order of the chunk.
 
         Args:
             chunk: The chunk that holds them.
@@ -102,23 +101,66 @@ class FieldColumns:
         if piece.fields is not None:
             schema += list(piece.fields.type)
             arrays += piece.fields.flatten()
-        table = pa.Table.from_arrays(arrays, schema=pa.schema(schema))
-        size = _ROW_BYTES * len(rows) + sum(map(len, left))
-        return Piece(table, table.schema, size)
+        return pa.Table.from_arrays(arrays, schema=pa.schema(schema))
 
 
-class FieldFile(ChunkFile):
+class Place(NamedTuple):
+    """Rows of a chunk in a file.
+
+    Attributes:
+        group: Row group.
+        begin: Its first row in the group.
+        rows: Number of rows.
+    """
+
+    group: int
+    begin: int
+    rows: int
+
+
+class FieldFile(ColumnFile):
     """One file with what is left of the expired messages of a topic. Thread safe.
 
     Attributes:
+        listed: As the journal lists it.
+        places: Rows of each chunk, by segment and number.
         replaces: Paths of the files that it was joined of.
+
+    Raises:
+        StoreError: It is missing, damaged, or another file than the listed one.
     """
 
-    replaces: frozenset[str] = frozenset()
+    def __init__(self, folder: Path, listed: PayloadFile, cache: Cache | None = None) -> None:
+        self.listed = listed
+        self._cache = cache or Cache()
+        path = folder / listed.file
+        try:
+            super().__init__(path)
+        except FileNotFoundError as error:
+            raise StoreError(f"The file of fields {path} is missing.{RESTORE}") from error
+        if (self.size_bytes, self.digest) != (listed.bytes, listed.digest):
+            raise StoreError(
+                f"The file of fields {path} is not the one that the journal lists.{RESTORE}"
+            )
+        values = self.about.payloads
+        try:
+            self.places = self._read_places(values["chunks"])
+            self.replaces = frozenset(map(str, values.get("replaces", ())))
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            raise StoreError(f"The description in {path} is invalid: {error!r}.") from error
 
-    def _take(self, values: Mapping[str, Any]) -> None:
-        super()._take(values)
-        self.replaces = frozenset(map(str, values.get("replaces", ())))
+    def _read_places(self, chunks: Any) -> dict[tuple[int, int], Place]:
+        found: dict[tuple[int, int], Place] = {}
+        if len(chunks) != self.groups:
+            raise ValueError("its row groups and its chunks differ")
+        for group, inside in enumerate(chunks):
+            at = 0
+            for segment, chunk, rows in inside:
+                found[int(segment), int(chunk)] = Place(group, at, int(rows))
+                at += int(rows)
+            if at != self.about.bounds[group][0]:
+                raise ValueError("its row groups and its chunks differ")
+        return found
 
     def rows(self, segment: int, chunk: int) -> pa.StructArray:
         """The rows of a chunk; a struct has all columns.
@@ -130,7 +172,7 @@ class FieldFile(ChunkFile):
         return self._group(place).slice(place.begin, place.rows)
 
     def _group(self, place: Place) -> pa.StructArray:
-        return self.cache.made(
+        return self._cache.made(
             "column",
             self.number,
             place.group,
@@ -220,7 +262,7 @@ def _batch(part: pa.StructArray) -> Batch:
         return array.to_numpy(zero_copy_only=False).astype(kind)
 
     ref = part.field("ref")
-    data, bounds = bytes_of(ref.field("left"))
+    data, bounds = _bytes_of(ref.field("left"))
     place = [numbers(ref.field(name), np.int64) for name in ("off", "len")]
     return Batch(
         data.tobytes(),
@@ -232,3 +274,19 @@ def _batch(part: pa.StructArray) -> Batch:
         numbers(ref.field("sequence"), np.uint32),
         np.stack(place, axis=1),
     )
+
+
+def _bytes_of(array: pa.Array[Any]) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
+    """Binary values without a copy: all bytes, and bounds of each row, from 0 on.
+
+    Raises:
+        ValueError: Some are null.
+    """
+    if not pa.types.is_binary(array.type) or array.null_count:
+        raise ValueError("a column of bytes has nulls, or another type")
+    _, places, data = array.buffers()
+    if places is None or not len(array):
+        return np.empty(0, np.uint8), np.zeros(len(array) + 1, np.int64)
+    bounds = np.frombuffer(places, np.int32, len(array) + 1, array.offset * 4).astype(np.int64)
+    content = np.frombuffer(data, np.uint8) if data is not None else np.empty(0, np.uint8)
+    return content[int(bounds[0]) : int(bounds[-1])], bounds - bounds[0]

@@ -1,7 +1,8 @@
 """Conversion of message fields to columns of a table, and back.
 
 An array has two columns: the list, null where it has more than `LIMIT` elements, and its
-summary, null where the list is there. Summaries are `{n, min, max, mean}`, as in the index;
+summary, null where the list is there. In tables with arrays both are always there, but for
+arrays of bytes. Summaries are `{n, min, max, mean}`, as in the index;
 of strings, bytes and messages `{n}`. A message without fields becomes a boolean, because
 Parquet has no column for it. The columns follow from the types of the fields alone. A column
 renamed from its field has the field's name in its metadata.
@@ -27,6 +28,7 @@ from hybridlog.schema.arrow_types import (
     common_type,
     converted,
     is_array,
+    is_bytes,
     is_list,
     lengths_of,
     missing_of,
@@ -48,12 +50,12 @@ class FieldShape:
     """Turns fields of messages into columns.
 
     Args:
-        limit: Most elements of an array that is kept in full; None for no limit.
+        arrays: True to keep arrays in full, of any length.
         reserved: Names that no field may have.
     """
 
-    def __init__(self, limit: int | None = LIMIT, reserved: Collection[str] = RESERVED) -> None:
-        self._limit = limit
+    def __init__(self, *, arrays: bool = False, reserved: Collection[str] = RESERVED) -> None:
+        self._has_arrays = arrays
         self._reserved = reserved
         self._plain: set[Any] = set()  # types of messages that are columns as they are
 
@@ -85,7 +87,7 @@ class FieldShape:
         about: list[tuple[str, bool]] = []
         for number, field in enumerate(kind):
             values = array.field(number)
-            if self._has_summary(field.type):
+            if _has_summary(field.type):
                 columns += self._split(values)
                 about += [(field.name, False), (f"{field.name}_summary", True)]
             else:
@@ -106,21 +108,30 @@ class FieldShape:
             fields,
         )
 
-    def _has_summary(self, kind: Any) -> bool:
-        if self._limit is None or not is_array(kind):
-            return False
-        return not pa.types.is_fixed_size_list(kind) or kind.list_size > self._limit
-
     def _split(self, array: Array) -> tuple[Array, Array]:
-        """Arrays within the limit, and summaries of the others."""
-        assert self._limit is not None
-        is_long = _over(array, self._limit)
+        """Arrays within the limit, and summaries of the others; or both of all."""
+        if self._has_arrays and not is_of_bytes(array.type):
+            return self._column(array), summary(array)
+        is_long = _over(array, LIMIT)
         if not is_long.any():
             return self._column(array), pa.nulls(len(array), summary(array.slice(0, 0)).type)
         rows = np.flatnonzero(is_long)
         short = array.take(pa.array(np.arange(len(array)), mask=is_long))
         long = array if len(rows) == len(array) else array.take(pa.array(rows))
         return self._column(short), without(summary(long), rows, len(array))
+
+
+def _has_summary(kind: Any) -> bool:
+    if not is_array(kind):
+        return False
+    return not pa.types.is_fixed_size_list(kind) or kind.list_size > LIMIT
+
+
+def is_of_bytes(kind: Any) -> bool:
+    """True for bytes, and arrays of them: tables have these in full up to the limit only."""
+    while is_list(kind):
+        kind = kind.value_type
+    return is_bytes(kind) or kind == pa.uint8()
 
 
 def _over(array: Array, limit: int) -> Any:

@@ -17,7 +17,6 @@ from hybridlog.columns import payload_files
 from hybridlog.columns.field_files import FieldColumns, FieldFile, newest
 from hybridlog.columns.layout import PAYLOAD_PARTS, table_schema_of
 from hybridlog.columns.payload_files import RecordingPayloads, next_number
-from hybridlog.columns.payload_rows import Piece
 from hybridlog.columns.payload_writer import TopicWriter
 from hybridlog_storage import journal
 from hybridlog_storage.disk import files
@@ -86,8 +85,7 @@ def _join(
         for segment, chunk in sorted(having):
             digest = having[segment, chunk][0].about.recordings[0].segments[str(segment)]
             for table in _tables(having[segment, chunk], (segment, chunk)):
-                piece = Piece(table, table.schema, table.nbytes)
-                writer.add(piece, segment, chunk, digest)
+                writer.add(table, segment, chunk, digest)
         writer.close()
         made = writer.written
         new: dict[_Chunk, list[FieldFile]] = {}
@@ -98,7 +96,7 @@ def _join(
             if not _are_same(_tables(found, key), _tables(new.get(key, ()), key)):
                 raise StoreError(f"The joined fields of {path} do not come back.")
         deleted = [file.file for file in old]
-        payload_files.announce(path, made, journal.EXPIRED, Journal(path), deleted)
+        payload_files.announce(path, made, Journal(path), deleted)
     except BaseException:
         payload_files.take_back(path, state)
         raise
@@ -107,8 +105,7 @@ def _join(
 
 
 def _readers(payloads: RecordingPayloads, listed: Sequence[PayloadFile]) -> list[FieldFile]:
-    found = (payloads.reader(file) for file in listed)
-    return [reader for reader in found if isinstance(reader, FieldFile)]
+    return [payloads.reader(file) for file in listed]
 
 
 def _tables(having: Sequence[FieldFile], key: _Chunk) -> list[pa.Table]:

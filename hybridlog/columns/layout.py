@@ -5,7 +5,7 @@ tables/<type>~<shape8>/shared-<number>.parquet   several recordings
 tables/<type>~<shape8>/<id>-<number>.parquet     a long topic of one recording
 tables.part/r<id>/                               unfinished files
 tables.part/r<id>/<type>~<shape8>/               sealed segments of a recording in progress
-recordings/<label>/payloads/topic=<collection>/<schema8>-<number>.parquet
+recordings/<label>/payloads/fields=<collection>/<schema8>-<number>.parquet
 recordings/<label>/payloads.part/                unfinished files
 ```
 
@@ -26,7 +26,6 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 from hybridlog.schema.states import encoding_of
 from hybridlog_storage.catalog import schema_hash
 from hybridlog_storage.errors import StoreError
-from hybridlog_storage.mongo.collection_names import collection_of
 
 if TYPE_CHECKING:
     from hybridlog_storage.catalog import RecordingEntry
@@ -65,13 +64,9 @@ VERSION: Final = 2
 RESERVED: Final = frozenset(OWN_COLUMNS)
 """Names that no column of a field has."""
 PAYLOAD_PARTS: Final = "payloads.part"
-"""Folder of a recording that holds unfinished files of payloads."""
-RECIPE: Final = "recipe"
-"""Column with what the original bytes need besides the arrays."""
+"""Folder of a recording that holds unfinished files of fields."""
 POINTS: Final = "points"
-"""Column of the points of clouds, in place of their `data`."""
-PAYLOAD_RESERVED: Final = RESERVED | {"sequence", RECIPE, POINTS}
-"""Names that no column of a field has in a file of payloads."""
+"""Column of the points of clouds, a list for each of their fields."""
 _ODD: Final = re.compile(r"[^A-Za-z0-9_]")
 
 
@@ -118,11 +113,6 @@ def _described(column: Any) -> list[Any]:
     return [names, "struct", inner]
 
 
-def topic_folder(topic: str) -> str:
-    """Name of the folder of a topic's columns of payloads."""
-    return f"topic={collection_of(topic)}"
-
-
 def table_schema(message_encoding: str, schema: str | None, metadata: Mapping[str, str]) -> str:
     """Hash of everything that determines the columns of a channel: 64 hexadecimal digits.
 
@@ -147,7 +137,7 @@ def topics_of(entry: RecordingEntry) -> set[str]:
 
 
 def replacement_name(segment: str) -> str:
-    """Name of a segment without moved chunks until it takes the place of the whole one."""
+    """Name of a segment with expired chunks until it takes the place of the whole one."""
     return f"{segment}.thinned"
 
 
@@ -195,11 +185,18 @@ class TopicCounts(NamedTuple):
         rows: All rows.
         unreadable: Rows without fields, because their messages do not fit their definition.
         reduced: Rows without fields, because their messages were reduced under pressure.
+        arrays: Rows with arrays in full.
     """
 
     rows: int
     unreadable: int = 0
     reduced: int = 0
+    arrays: int = 0
+
+    @property
+    def has_arrays(self) -> bool:
+        """True if all rows have arrays in full."""
+        return self.arrays == self.rows
 
     def plus(self, other: TopicCounts) -> TopicCounts:
         """The counts of the rows of both."""
@@ -248,7 +245,7 @@ class About:
         body: Bytes before the footer.
         checksums: CRC-32 of each block of the body, 8 hexadecimal digits each.
         version: Version of the format.
-        payloads: What a file of payloads needs besides; empty in a table.
+        payloads: What a file of fields needs besides; empty in a table.
     """
 
     recordings: Sequence[Section]

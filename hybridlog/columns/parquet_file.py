@@ -28,13 +28,10 @@ from hybridlog.schema.arrow_types import is_list
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk import durability, files
 from hybridlog_storage.errors import HybridlogError, StoreError, exhausted
-from hybridlog_storage.ordering import order_of
 
 if TYPE_CHECKING:
     from hybridlog_storage.messages import Buffer
 
-DICTIONARY: Final = "dictionary"
-"""Encoding of a column with a dictionary."""
 BLOCK: Final = 32 << 10
 """Bytes of the body with one checksum."""
 _WRITTEN: Final = 1 << 20  # bytes buffered before a write
@@ -97,18 +94,17 @@ class ParquetFileWriter:
         in_front: bool = False,
     ) -> None:
         self.path = path
-        self.is_ordered = True
-        """True if rows are in order of time and arrival."""
         self._bounds: list[tuple[int, int, int, int, int]] = []
         self._sink = _Sink(path)
         kinds = {leaf.path: leaf.kind for leaf in leaves(sample.schema)}
-        chosen = dict(encodings or {})
-        for leaf, kind in kinds.items():
-            if _runs(leaf, kind):
-                chosen.setdefault(leaf, "DELTA_BINARY_PACKED")
-        for leaf, array in _leaf_values(sample.slice(0, _SAMPLE)):
-            if leaf not in chosen and _repeats(array):
-                chosen[leaf] = DICTIONARY
+        encodings = {
+            leaf: "DELTA_BINARY_PACKED" for leaf, kind in kinds.items() if _runs(leaf, kind)
+        }
+        repeating = [
+            leaf
+            for leaf, array in _leaf_values(sample.slice(0, _SAMPLE))
+            if leaf not in encodings and _repeats(array)
+        ]
         ordered = {leaf for leaf, kind in kinds.items() if _is_ordered(kind)}
         if is_all:
             ordered |= {leaf for leaf, array in _leaf_values(sample) if _has_no_nan(array)}
@@ -119,8 +115,8 @@ class ParquetFileWriter:
                 sample.schema,
                 compression="zstd",
                 compression_level=level,
-                use_dictionary=[leaf for leaf, how in chosen.items() if how == DICTIONARY],
-                column_encoding={leaf: how for leaf, how in chosen.items() if how != DICTIONARY},
+                use_dictionary=repeating,
+                column_encoding=encodings,
                 write_statistics=[leaf for leaf in kinds if leaf in ordered],
             )
             self._behind = reused if in_front else None
@@ -140,8 +136,6 @@ class ParquetFileWriter:
         self._writer.write_table(table, row_group_size=max(table.num_rows, 1))
         time, seq = (table.column(name).to_numpy() for name in ("t", "seq"))
         first, last = ((int(time[row]), int(seq[row])) if len(time) else (0, 0) for row in (0, -1))
-        is_later = not self._bounds or self._bounds[-1][3:] < first
-        self.is_ordered = self.is_ordered and is_later and order_of(time, seq) is None
         self._bounds.append((len(time), *first, *last))
 
     def close(
@@ -155,7 +149,7 @@ class ParquetFileWriter:
 
         Args:
             sections: The recordings with rows in it, in its order.
-            payloads: What a file of payloads needs besides.
+            payloads: What a file of fields needs besides.
             sync: True to force it to the disk.
 
         Returns:

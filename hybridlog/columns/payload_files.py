@@ -1,4 +1,4 @@
-"""The files of payloads of a recording: their names, and the content of moved chunks."""
+"""The files of fields of a recording: their names, and what is left of expired chunks."""
 
 from __future__ import annotations
 
@@ -6,10 +6,8 @@ import re
 import threading
 from collections import defaultdict
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Final
-
-import numpy as np
 
 from hybridlog.columns.layout import PAYLOAD_PARTS
 from hybridlog_storage import journal
@@ -27,26 +25,23 @@ if TYPE_CHECKING:
 
     from hybridlog.columns.column_file import OpenFiles
     from hybridlog.columns.field_files import FieldFile
-    from hybridlog.columns.payload_reader import PayloadReader
     from hybridlog.columns.topic_table import TopicTable
     from hybridlog_storage.journal import Journal, JournalState, PayloadFile
-    from hybridlog_storage.messages import Buffer
     from hybridlog_storage.segments.chunk import ExpiredMessages, StoredChunk
     from hybridlog_storage.segments.segment_reader import ChunkPlace, SegmentSummary
 
 REPLACEMENT: Final = re.compile(r"(?P<number>\d{6,9})\.mcap\.thinned")
 """Name of a segment that is about to replace the whole one."""
-_REBUILT_BYTES: Final = 32 << 20  # messages in memory: neighbouring chunks share a row group
 
 
 def next_number(state: JournalState) -> int:
-    """The least number that no file of columns of a recording has had."""
+    """The least number that no file of fields of a recording has had."""
     names = (name.rpartition("-")[2] for name in state.payloads.keys() | state.deleted)
     return 1 + max((int(name.partition(".")[0]) for name in names), default=-1)
 
 
 def announce(
-    recording: Path, made: Sequence[PayloadFile], event: str, log: Journal, deleted: Sequence[str]
+    recording: Path, made: Sequence[PayloadFile], log: Journal, deleted: Sequence[str] = ()
 ) -> None:
     """List new files, still among unfinished ones, and files that go, in the journal.
 
@@ -60,7 +55,7 @@ def announce(
     files.sync_folder(parts)
     files.sync_folder(recording)
     gone = {"deleted": deleted} if deleted else {}
-    log.append(journal.event(event, files=[asdict(file) for file in made], **gone))
+    log.append(journal.event(journal.EXPIRED, files=[asdict(file) for file in made], **gone))
 
 
 def take_back(recording: Path, before: JournalState) -> None:
@@ -100,13 +95,13 @@ def publish(recording: Path, state: JournalState | None) -> None:
         for name in sorted(deleted):
             files.unlink(final / name)
     except OSError as error:
-        raise durability.explain(error, final, "moving payloads to") from error
+        raise durability.explain(error, final, "moving fields to") from error
 
 
 def replace_segments(
     recording: Path, names: Iterable[str], thinned: Mapping[int, Sequence[tuple[str, int]]]
 ) -> list[str]:
-    """Put finished segments without moved chunks in the place of the whole ones.
+    """Put finished segments with expired chunks in the place of the whole ones.
 
     Those that the journal does not list are removed.
 
@@ -152,21 +147,8 @@ def _is_listed(path: Path, number: int, listed: Sequence[tuple[str, int]]) -> bo
     return (summary.digest, summary.size) == listed[-1]
 
 
-@dataclass(frozen=True, slots=True)
-class _Files:
-    """Files with messages of a chunk.
-
-    Attributes:
-        payloads: Those of payloads.
-        fields: Those of what is left of expired messages, as the journal lists them.
-    """
-
-    payloads: list[PayloadReader] = field(default_factory=list)
-    fields: list[FieldFile] = field(default_factory=list)
-
-
 class RecordingPayloads:
-    """The files of payloads of one recording. Thread safe.
+    """The files of fields of one recording. Thread safe.
 
     Nothing is read before it is needed.
 
@@ -174,7 +156,7 @@ class RecordingPayloads:
         recording: The recording's directory.
         listed: The files; None for those that its journal lists.
         folder: Name of the folder that holds them.
-        cache: Keeps messages that were rebuilt.
+        cache: Keeps rows that were read.
     """
 
     def __init__(
@@ -187,9 +169,9 @@ class RecordingPayloads:
         self._recording = recording
         self._given = listed
         self._folder = recording / folder
-        self._cache = cache or Cache(_REBUILT_BYTES)
-        self._readers: dict[str, PayloadReader | FieldFile] = {}
-        self._places: dict[tuple[int, int], _Files] | None = None
+        self._cache = cache or Cache()
+        self._readers: dict[str, FieldFile] = {}
+        self._places: dict[tuple[int, int], list[FieldFile]] | None = None
         self._problem = ""  # of a file that cannot be read
         self._lock = threading.RLock()
 
@@ -205,52 +187,20 @@ class RecordingPayloads:
         state = journal.read(self._recording)
         return [] if state is None else list(state.payloads.values())
 
-    def reader(self, listed: PayloadFile) -> PayloadReader | FieldFile:
+    def reader(self, listed: PayloadFile) -> FieldFile:
         """The reader of a file.
 
         Raises:
             StoreError: The file is missing or damaged.
         """
+        from hybridlog.columns.field_files import FieldFile
+
         with self._lock:
             found = self._readers.get(listed.file)
             if found is None:
-                found = open_file(self._folder, listed, self._cache)
+                found = FieldFile(self._folder, listed, self._cache)
                 self._readers[listed.file] = found
             return found
-
-    def ordered(self, topic: str) -> list[PayloadReader]:
-        """The readers of a topic; none if rows of a file are in another order than of time.
-
-        Raises:
-            StoreError: A file is missing or damaged.
-        """
-        from hybridlog.columns.payload_reader import PayloadReader
-
-        own = [self.reader(file) for file in self.listed if file.topic == topic]
-        readers = [reader for reader in own if isinstance(reader, PayloadReader)]
-        return readers if all(reader.is_ordered for reader in readers) else []
-
-    def __call__(self, segment: int, chunk: int, size: int) -> Buffer:
-        """As `content`."""
-        return self.content(segment, chunk, size)
-
-    def content(self, segment: int, chunk: int, size: int) -> Buffer:
-        """The uncompressed content of a chunk.
-
-        Args:
-            segment: Number of its segment.
-            chunk: Its number there.
-            size: Its bytes.
-
-        Raises:
-            SegmentError: Its messages are missing or damaged.
-        """
-        try:
-            return self._content(segment, chunk, size)
-        except SegmentError:
-            raise
-        except StoreError as error:
-            raise SegmentError(str(error)) from error
 
     def expired(self, segment: int, chunk: int) -> ExpiredMessages:
         """The remains of an expired chunk.
@@ -261,7 +211,7 @@ class RecordingPayloads:
         from hybridlog.columns.field_files import expired_messages, newest
 
         try:
-            found = self._having(segment, chunk).fields
+            found = self._having(segment, chunk)
             if not found:
                 raise SegmentError(self._problem or "its fields are in no file")
             files = newest(found, (segment, chunk))
@@ -282,76 +232,31 @@ class RecordingPayloads:
 
         parts = []
         for key in chunks:
-            own = [file for file in self._having(*key).fields if file.listed.topic == topic]
+            own = [file for file in self._having(*key) if file.listed.topic == topic]
             parts += [TablePart(file, *file.places[key], FIRST, LAST) for file in newest(own, key)]
         return TopicTable(topic, parts, TopicCounts(sum(part.rows for part in parts)), opened)
 
-    def _content(self, segment: int, chunk: int, size: int) -> Buffer:
-        readers = self.having(segment, chunk)
-        content = np.empty(size, np.uint8)
-        filled = 0
-        for reader in readers:
-            place = reader.places[segment, chunk]
-            rebuilt = reader.rebuilt(place.group)
-            rows = slice(place.begin, place.begin + place.rows)
-            starts, bounds = rebuilt.place[rows].tolist(), rebuilt.offset
-            ends = bounds[place.begin + 1 : place.begin + place.rows + 1].tolist()
-            for start, begin, end in zip(starts, bounds[rows].tolist(), ends, strict=True):
-                if not 0 <= start <= size - (end - begin):
-                    raise SegmentError("a message lies outside of its chunk")
-                content[start : start + end - begin] = rebuilt.data[begin:end]
-                filled += end - begin
-        if filled != size:
-            raise SegmentError(
-                self._problem or f"{size - filled} bytes of its content are in no file of columns"
-            )
-        return content.data
-
-    def having(self, segment: int, chunk: int) -> list[PayloadReader]:
-        """The readers of files with messages of a chunk, but for damaged or missing files."""
-        return self._having(segment, chunk).payloads
-
-    def _having(self, segment: int, chunk: int) -> _Files:
+    def _having(self, segment: int, chunk: int) -> list[FieldFile]:
+        """The files with messages of a chunk, but for damaged or missing ones."""
         with self._lock:
             if self._places is None:
-                places: defaultdict[tuple[int, int], _Files] = defaultdict(_Files)
+                places: defaultdict[tuple[int, int], list[FieldFile]] = defaultdict(list)
                 for listed in self.listed:
                     try:
-                        self._find(listed, places)
+                        reader = self.reader(listed)
                     except StoreError as error:
                         self._problem = str(error)
+                        continue
+                    for key in reader.places:
+                        places[key].append(reader)
                 self._places = dict(places)
-            return self._places.get((segment, chunk), _Files())
-
-    def _find(self, listed: PayloadFile, places: dict[tuple[int, int], _Files]) -> None:
-        from hybridlog.columns.field_files import FieldFile
-
-        reader = self.reader(listed)
-        for key in reader.places:
-            if isinstance(reader, FieldFile):
-                places[key].fields.append(reader)
-            else:
-                places[key].payloads.append(reader)
-
-
-def open_file(
-    folder: Path, listed: PayloadFile, cache: Cache | None = None
-) -> PayloadReader | FieldFile:
-    """The reader of a file that the journal lists.
-
-    Raises:
-        StoreError: It is missing, damaged, or another file.
-    """
-    from hybridlog.columns.field_files import FieldFile
-    from hybridlog.columns.payload_reader import PayloadReader
-
-    return (FieldFile if listed.has_fields else PayloadReader)(folder, listed, cache)
+            return self._places.get((segment, chunk), [])
 
 
 def open_segment(
     path: Path, number: int, contents: RecordingPayloads | None = None
 ) -> SegmentReader:
-    """Open a sealed segment whose chunks may have been moved to columns.
+    """Open a sealed segment whose chunks may have expired.
 
     Args:
         path: The file, in its recording's directory.

@@ -81,6 +81,7 @@ class Piece:
         fields: Their columns, a struct each; None without columns.
         errors: Unreadable rows, each with the reason.
         state: State of all other rows.
+        has_arrays: True if they have arrays in full.
     """
 
     segment: int
@@ -88,6 +89,7 @@ class Piece:
     fields: Any
     errors: list[tuple[NDArray[np.intp], str]] = field(default_factory=list)
     state: State = State.WHOLE
+    has_arrays: bool = False
 
     @property
     def rows(self) -> int:

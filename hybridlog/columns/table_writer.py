@@ -24,6 +24,8 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from hybridlog.columns.layout import (
+    POINTS,
+    RESERVED,
     SUFFIX,
     Section,
     TopicCounts,
@@ -41,6 +43,7 @@ from hybridlog.schema.states import State, encoding_of, state_of
 from hybridlog_storage.buffers import buffers
 from hybridlog_storage.disk import files
 from hybridlog_storage.ordering import order_of
+from hybridlog_storage.settings import read_settings
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -73,6 +76,7 @@ def load() -> None:
     """Import what tables need: amid a recording, that would hold up all threads for a while."""
     import pyarrow as pa
 
+    import hybridlog.columns.clouds
     import hybridlog.columns.fields
     import hybridlog.columns.parquet_file
     import hybridlog.schema.arrow_objects  # noqa: F401
@@ -83,13 +87,18 @@ def load() -> None:
 class _Topic:
     """Messages of one topic and definition."""
 
-    def __init__(self, recording: str, channel: Channel) -> None:
+    def __init__(self, recording: str, channel: Channel, *, arrays: bool = False) -> None:
+        from hybridlog.columns.clouds import PointColumns, is_cloud
         from hybridlog.columns.fields import FieldShape
 
         self.recording = recording
         self.name = channel.topic
         self.type = channel.schema.name if channel.schema is not None else ""
-        self.shape: FieldShape = FieldShape()
+        self.has_arrays = arrays
+        whole = replace(channel, message_encoding=_encoding_of(channel))
+        self.points = PointColumns() if arrays and is_cloud(whole) else None
+        reserved = RESERVED if self.points is None else RESERVED | {POINTS}
+        self.shape: FieldShape = FieldShape(arrays=arrays, reserved=reserved)
         self.kind = _defined_fields(channel, self.shape)
         """Type of the columns of fields, as far as the definition fixes it."""
         self.is_wanted = True
@@ -169,8 +178,7 @@ class _Topic:
 
 def _defined_fields(channel: Channel, shape: FieldShape) -> Any:
     """Type of the columns of the fields that a definition fixes; None without any."""
-    encoding = encoding_of(channel.message_encoding, channel.metadata)
-    codec = codec_for(replace(channel, message_encoding=encoding))
+    codec = codec_for(replace(channel, message_encoding=_encoding_of(channel)))
     if not codec.indexed:
         return None
     none = np.empty(0, np.int64)
@@ -178,11 +186,16 @@ def _defined_fields(channel: Channel, shape: FieldShape) -> Any:
     return kind if kind.num_fields else None
 
 
+def _encoding_of(channel: Channel) -> str:
+    return encoding_of(channel.message_encoding, channel.metadata)
+
+
 def _counts(pieces: Sequence[Piece]) -> TopicCounts:
     return TopicCounts(
         sum(piece.rows for piece in pieces),
         sum(len(rows) for piece in pieces for rows, _ in piece.errors),
         sum(piece.rows for piece in pieces if piece.state is State.REDUCED),
+        sum(piece.rows for piece in pieces if piece.has_arrays),
     )
 
 
@@ -247,6 +260,8 @@ class _File:
 class TableWriter:
     """Writes the tables of one recording, which this process has locked for writing.
 
+    Those of the topics that the store's settings name have arrays in full.
+
     Args:
         root: The store.
         recording: Id of the recording.
@@ -269,6 +284,7 @@ class TableWriter:
         self._label = label
         self._wanted = topics
         self._is_new = is_new
+        self._arrays = frozenset(read_settings(root).arrays)
         self._parts = parts_folder(root, recording)
         self._has_parts = False
         self._numbers = 0
@@ -421,7 +437,8 @@ class TableWriter:
             schema = table_schema_of(channel)
             topic = self._topics.get((channel.topic, schema))
             if topic is None:
-                topic = _Topic(self._recording, channel)
+                arrays = channel.topic in self._arrays
+                topic = _Topic(self._recording, channel, arrays=arrays)
                 self._topics[channel.topic, schema] = topic
                 topic.is_wanted = self._wanted is None or channel.topic in self._wanted
             state = state_of(channel.message_encoding)
@@ -437,7 +454,7 @@ class TableWriter:
         messages: Messages,
         data: NDArray[np.uint8],
     ) -> Piece:
-        piece = Piece(self._held_segment, messages, None, state=state)
+        piece = Piece(self._held_segment, messages, None, state=state, has_arrays=topic.has_arrays)
         if codec.indexed and state is State.WHOLE:
             self._add_fields(piece, topic, codec, data)
         return piece
@@ -451,7 +468,10 @@ class TableWriter:
         piece.errors += [(bad.rows, bad.reason) for bad in decoded.unreadable]
         if not len(decoded.rows):
             return
-        columns = topic.shape.columns(decoded.arrow())
+        records = decoded.arrow()
+        columns = topic.shape.columns(records)
+        if topic.points is not None:
+            columns = topic.points.with_points(columns, records)
         begin = data.ctypes.data
         columns = detached(columns, begin, begin + data.nbytes)
         piece.fields = without(columns, decoded.rows, piece.rows)

@@ -39,6 +39,7 @@ from hybridlog.columns.topic_table import TopicTable
 from hybridlog_storage.cache import Cache
 from hybridlog_storage.errors import StoreError
 from hybridlog_storage.lazy import lazy
+from hybridlog_storage.messages import EXPIRED_IDS
 
 if TYPE_CHECKING:
     from hybridlog_storage.catalog import ChannelEntry, RecordingEntry
@@ -267,9 +268,15 @@ class Tables:
                 while len(self._found) > _MAX_FOUND:
                     self._found.popitem(last=False)
 
-    def whole(self, file: ColumnFile) -> TopicTable:
-        """All rows of a file, as if they were of one topic."""
-        return TopicTable("", file.all_parts(), file.counts, self.opened)
+    def whole(self, file: ColumnFile, *, arrays: bool) -> TopicTable:
+        """All rows of a file, as if they were of one topic.
+
+        Args:
+            file: The file.
+            arrays: True if the rows that count have arrays in full.
+        """
+        counts = file.counts._replace(arrays=file.counts.rows if arrays else 0)
+        return TopicTable("", file.all_parts(), counts, self.opened)
 
     def check(self, recording: RecordingEntry, topic: str) -> TopicTable:
         """The table of a topic in a recording.
@@ -387,6 +394,8 @@ class Tables:
                 return None
             counts = counts.plus(rows.section.topics[topic])
             parts += rows.of(topic)
+        if any(one.id >= EXPIRED_IDS for one in self._channels_of(recording, topic)):
+            counts = counts._replace(arrays=0)  # what has expired is in no answer
         table = TopicTable(topic, parts, counts, self.opened)
         if len(table.files) > 1:
             try:

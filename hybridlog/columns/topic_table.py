@@ -12,7 +12,7 @@ import pyarrow.compute as pc
 
 from hybridlog.columns.column_file import FIRST, names_of
 from hybridlog.columns.fields import alike, records_of
-from hybridlog.columns.zones import may_hold
+from hybridlog.columns.layout import POINTS
 from hybridlog.schema.arrow_columns import structs
 from hybridlog.schema.arrow_types import is_list
 from hybridlog.schema.column import ranges
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from hybridlog.columns.column_file import ColumnFile, Key, OpenFiles, TablePart
     from hybridlog.columns.layout import TopicCounts
     from hybridlog.query.intervals import Span
-    from hybridlog.query.predicate.tree import Node
 
 _MAX_TYPES: Final = 64  # sets of fields whose types are kept for a table
 
@@ -93,6 +92,7 @@ class TopicTable:
         rows: Number of messages.
         unreadable: Messages without fields, because they do not fit their definition.
         reduced: Messages without fields, because they were reduced under pressure.
+        has_arrays: True if arrays are there in full, but for those of bytes.
         files: The files with its rows.
     """
 
@@ -100,7 +100,8 @@ class TopicTable:
         self, topic: str, parts: Sequence[TablePart], counts: TopicCounts, opened: OpenFiles
     ) -> None:
         self.topic = topic
-        self.rows, self.unreadable, self.reduced = counts
+        self.rows, self.unreadable, self.reduced, _ = counts
+        self.has_arrays = counts.has_arrays
         self.files = list({part.file.number: part.file for part in parts}.values())
         self._opened = opened
         self._parts = parts
@@ -127,11 +128,29 @@ class TopicTable:
         """True if the messages have any field."""
         return any(not leaf.is_own for file in self.files for leaf in file.leaves)
 
-    def has(self, path: str) -> bool:
-        """True if every file has the field: an array is a summary in some, a list in others."""
+    @property
+    def points(self) -> Any:
+        """Type of the column of points that all rows have; None without."""
+        if not self.has_arrays or any(POINTS not in file.own for file in self.files):
+            return None
+        kinds = [pa.nulls(0, file.schema.field(POINTS).type) for file in self.files]
+        return alike(kinds)[0].type
+
+    def has(self, path: str, *, summaries: bool = True) -> bool:
+        """True if every file has the field: an array is a summary in some, a list in others.
+
+        Args:
+            path: Dotted path.
+            summaries: True if it may be a number of the summary of an array.
+        """
         names = names_of(path)
         return all(
-            names in file.paths or (names in file.summary_paths and self._is_summarised(names[:-1]))
+            names in file.paths
+            or (
+                summaries
+                and names in file.summary_paths
+                and (self._is_full(names[:-1]) or self._is_summarised(names[:-1]))
+            )
             for file in self.files
         )
 
@@ -139,20 +158,16 @@ class TopicTable:
         self,
         paths: Collection[str] | None = None,
         own: Collection[str] = (),
-        where: Node | None = None,
     ) -> int:
         """Stored bytes to read for some fields.
 
         Args:
             paths: As for `fields`.
             own: Columns of the table itself.
-            where: As for `scan`.
         """
         own = {"t", "seq", *own}
         return sum(
-            part.file.stored(part.group, paths, own)
-            for part in self._parts
-            if self.may_hold(part, where)
+            part.file.stored(part.group, paths, own, arrays=self.has_arrays) for part in self._parts
         )
 
     def scan(
@@ -161,8 +176,6 @@ class TopicTable:
         *,
         own: Collection[str] = (),
         spans: Sequence[Span] | None = None,
-        where: Node | None = None,
-        every: bool = True,
     ) -> Iterator[TableRows]:
         """Messages by log time and arrival, one row group at a time.
 
@@ -170,19 +183,16 @@ class TopicTable:
             paths: Dotted paths of fields, including all fields below them; None for all.
             own: Columns of the table itself besides log time and arrival number.
             spans: Ranges of log time, ns, disjoint, in order; None for all times.
-            where: A predicate. Row groups in which it holds for no row have null fields.
-            every: False to leave such row groups out.
 
         Raises:
             StoreError: the data read is damaged.
         """
         kind = self.empty(paths)
-        runs = [[p for p in run if every or self.may_hold(p, where)] for run in self._runs]
 
         def read(part: TablePart) -> TableRows:
-            return self._read(part, paths, own, kind, where)
+            return self._read(part, paths, own, kind)
 
-        streams = [self._read_run(run, spans, read) for run in runs]
+        streams = [self._read_run(run, spans, read) for run in self._runs]
         return streams[0] if len(streams) == 1 else _merged(streams)
 
     def _read_run(
@@ -215,19 +225,10 @@ class TopicTable:
         paths: Collection[str] | None,
         own: Collection[str],
         kind: Any,
-        where: Node | None,
     ) -> TableRows:
-        is_excluded = not self.may_hold(part, where)
-        ours, records = self.read(part, () if is_excluded else paths, {"t", "seq", *own})
+        ours, records = self.read(part, paths, {"t", "seq", *own})
         t, seq = (ours.pop(name).to_numpy() for name in ("t", "seq"))
-        if is_excluded:
-            nulls = {field.name: pa.nulls(len(t), field.type) for field in kind.type}
-            return TableRows(t, seq, ours, structs(nulls, len(t)))
-        return TableRows(t, seq, ours, self._fitted(records, kind))
-
-    def _fitted(self, records: Any, kind: Any) -> Any:
-        """Fields of a row group in the type of all."""
-        return alike([kind, records], by_type=True)[1]
+        return TableRows(t, seq, ours, alike([kind, records], by_type=True)[1])
 
     @property
     def parts(self) -> list[TablePart]:
@@ -252,7 +253,7 @@ class TopicTable:
             StoreError: the data read is damaged.
         """
         check_wanted()
-        by_top = part.file.by_top(paths, own)
+        by_top = part.file.by_top(paths, own, arrays=self.has_arrays)
         columns = {top: self._column(part, top, numbers) for top, numbers in by_top.items()}
         ours = {name: columns.pop(name) for name in own if name in columns}
         return ours, self._records(part.file, columns, part.rows)
@@ -269,8 +270,16 @@ class TopicTable:
         array = pa.StructArray.from_arrays(list(columns.values()), fields=fields)
         return records_of(array, self._is_summarised)
 
+    def _is_full(self, array: tuple[str, ...]) -> bool:
+        """True if an array is there in full in all rows, and its summary, too."""
+        return self.has_arrays and all(
+            array in file.arrays or array not in file.summaries for file in self.files
+        )
+
     def _is_summarised(self, array: tuple[str, ...]) -> bool:
-        """True if an array is over the limit in some row."""
+        """True if an array is a summary in some row."""
+        if self._is_full(array):
+            return False
         if array not in self._summarised:
             self._summarised[array] = any(self._has_summary(part, array) for part in self._parts)
         return self._summarised[array]
@@ -302,15 +311,10 @@ class TopicTable:
     def _find_type(self, paths: Collection[str] | None) -> Any:
         found = []
         for file in self.files:
-            table = file.read(None, file.choose(paths, ()))
+            table = file.read(None, file.choose(paths, (), arrays=self.has_arrays))
             columns = [(field.name, pa.nulls(0, field.type)) for field in table.schema]
             found.append(self._records(file, dict(columns), 0))
         return alike(found, by_type=True)[0].slice(0, 0)
-
-    def may_hold(self, part: TablePart, where: Node | None) -> bool:
-        """False if zones tell that a predicate holds for no row of a row group."""
-        zones = part.file.zones
-        return where is None or not zones or may_hold(where, zones[part.group])
 
 
 def _has_values(column: Any) -> bool:

@@ -9,10 +9,11 @@ from hybridlog.index import field_indexes
 from hybridlog.index.connection import IndexAddress, again_if_lost
 from hybridlog.query.query import Query
 from hybridlog.query.question import Question
+from hybridlog_storage.errors import TopicError
 
 if TYPE_CHECKING:
     from hybridlog.index.field_indexes import FieldIndex
-    from hybridlog.maintenance.report import Progress
+    from hybridlog.maintenance.report import ArraysOfTopic, Progress
     from hybridlog.session import Session
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.mongo.topic_places import TopicPlace
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 # `list` is a method below.
 _Entries: TypeAlias = "list[RecordingEntry]"
 _FieldIndexes: TypeAlias = "list[FieldIndex]"
+_Arrays: TypeAlias = "list[ArraysOfTopic]"
 _CLIENTS_WAIT_S: Final = 600.0
 """Seconds for which a published MongoDB waits for clients."""
 
@@ -108,6 +110,45 @@ class Index:
         database = self._session.database_for("Indexes")
         names = self._about(*topics).topics if topics else self._session.topics()
         return field_indexes.of_topics(database, names)
+
+    def arrays(self, *topics: str, off: bool = False, progress: Progress | None = None) -> _Arrays:
+        """Keep long arrays in the tables of topics, beside their summaries.
+
+        Predicates on elements, SQL and other readers of Parquet then read columns in place of
+        messages. Of a PointCloud2 tables get the points, a list for each of their fields.
+        Arrays of bytes stay in the segments alone. The setting is kept in `hybridlog.toml`: new
+        recordings follow it, and tables of ended ones are made anew. No MongoDB is needed.
+
+        Args:
+            topics: Topics, as for `topic`; the full name of one that no recording has yet.
+            off: True for tables without arrays, as at first.
+            progress: Called after each chunk.
+
+        Returns:
+            What was done for each topic, and the bytes of its tables.
+
+        Raises:
+            TopicError: No recording has a topic, and this is no full name.
+            StoreError: The store cannot be written.
+        """
+        from hybridlog.maintenance.arrays import index_arrays
+
+        session = self._session
+        session.directory.check_changes()
+        session.invalidate()
+        names: dict[str, None] = {}
+        for name in topics:
+            try:
+                names |= dict.fromkeys(self._about(name).topics)
+            except TopicError:
+                if not name.startswith("/") or {*name} & {*"*?[]"}:
+                    raise
+                names[name] = None
+        snapshot = session.snapshot()
+        places = snapshot.having([*names]).tolist()
+        entries = [session.entry_of(snapshot.summaries[place]) for place in places]
+        directory, tables = session.directory, session.tables
+        return index_arrays(directory, entries, [*names], tables, off=off, progress=progress)
 
     @again_if_lost
     def address(self) -> IndexAddress:

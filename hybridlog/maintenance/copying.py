@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 
 _READ: Final = 1 << 20  # bytes read at once
 _ASKED_AT_ONCE: Final = 1000  # recordings in a question
-_TRIES: Final = 3  # of a recording that is compacted or expires meanwhile
+_TRIES: Final = 3  # of a recording that expires meanwhile
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,9 +13,6 @@ chunks that are still there do no harm: readers use them for expired chunks alon
 next expiry writes them anew.
 
 Each expiry writes files of fields; where a topic has many, they are joined (`columns/joining.py`).
-
-Columns of payloads belong to a whole recording. A file of them is deleted when the last of its
-messages expires; until then it keeps the others, and room is freed in segments only.
 """
 
 from __future__ import annotations
@@ -38,7 +35,7 @@ from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk import durability, files
 from hybridlog_storage.errors import HybridlogError, SegmentError, StoreError
 from hybridlog_storage.journal import Journal
-from hybridlog_storage.segments.segment_format import MOVED_SIZE, expired_record
+from hybridlog_storage.segments.segment_format import expired_record
 from hybridlog_storage.settings import EXPIRED
 
 if TYPE_CHECKING:
@@ -177,8 +174,7 @@ class _Expiry:
         if place.is_expired:
             return False
         parts = _parts_of(summary, place)
-        size = place.length if place.length != MOVED_SIZE else int(parts["payload_bytes"].sum())
-        if size < self._min_bytes * int(parts["messages"].sum()):
+        if place.length < self._min_bytes * int(parts["messages"].sum()):
             return False
         names = {summary.channels[number].topic for number in place.channels}
         return self._topics is None or names <= {*self._topics}
@@ -192,7 +188,7 @@ class _Expiry:
             if not self._chosen:
                 return done
             directory.require(EXPIRED)
-            payload_files.announce(self._path, made, journal.EXPIRED, self._log, ())
+            payload_files.announce(self._path, made, self._log)
         except BaseException as error:
             payload_files.take_back(self._path, self._state)
             if isinstance(error, OSError):
@@ -200,6 +196,8 @@ class _Expiry:
             raise
         self._state = self._journal()
         payload_files.publish(self._path, self._state)
+        if self._state.end is not None:
+            self._remove_arrays(directory)
         done.field_bytes = sum(file.bytes for file in made)
         done.freed = -done.field_bytes
         for segment in walk(self._path, self._chosen, known=self._summaries):
@@ -207,8 +205,23 @@ class _Expiry:
             done.segments.append(segment.number)
             for place in self._places(segment.number):
                 self._count(place, segment.summary, done)
-        done.freed += self._delete_columns()
         return done
+
+    def _remove_arrays(self, directory: StoreDirectory) -> None:
+        """Remove tables with arrays that expire; they are made again without these."""
+        from hybridlog.columns.folders import TableFolders
+        from hybridlog.columns.layout import type_prefix
+
+        gone = {
+            channel.topic: "" if channel.schema is None else channel.schema.name
+            for channel in (writer.channel for writer in self._writers.values())
+            if channel.topic in directory.settings.arrays
+        }
+        if gone:
+            digests = {str(number): one.digest for number, one in self._state.sealed.items()}
+            folders = TableFolders(directory.path, self._state.id, digests)
+            with suppress(OSError):
+                folders.add({}, {*gone}, {type_prefix(kind) for kind in gone.values()})
 
     def _places(self, number: int) -> Iterator[ChunkPlace]:
         chosen = self._chosen[number]
@@ -263,9 +276,8 @@ class _Expiry:
             has_publish_time = {n: summary.channels[n].has_publish_time for n in numbers}
             rows = np.flatnonzero(np.isin(chunk.batch.channel, numbers))
             writer = self._writer(key, channel)
-            piece = writer.columns.piece(chunk, rows, has_publish_time)
-            assert piece is not None
-            writer.add(piece, chunk.segment, chunk.number, summary.whole_digest)
+            table = writer.columns.table(chunk, rows, has_publish_time)
+            writer.add(table, chunk.segment, chunk.number, summary.whole_digest)
         self._written[chunk.segment, chunk.number] = _checksums(chunk.batch)
 
     def _writer(self, key: _Key, channel: Channel) -> TopicWriter:
@@ -298,32 +310,9 @@ class _Expiry:
             segment.summary,
             dict.fromkeys(chosen, self._record),
             files=self._state.payloads.values(),
-            event=journal.EXPIRED,
             log=self._log,
-            contents=RecordingPayloads(self._path, [*self._columns(), *self._made]),
+            contents=RecordingPayloads(self._path, self._made),
         )
-
-    def _columns(self) -> list[PayloadFile]:
-        return [file for file in self._state.payloads.values() if not file.has_fields]
-
-    def _delete_columns(self) -> int:
-        """Delete files of payloads of which every message has expired; returns their bytes."""
-        columns = self._columns()
-        if not columns:
-            return 0
-        gone = {
-            (segment.number, place.number)
-            for segment in walk(self._path, sorted(self._state.sealed))
-            for place in segment.summary.chunks
-            if place.is_expired
-        }
-        payloads = RecordingPayloads(self._path, columns)
-        expired = [file for file in columns if payloads.reader(file).places.keys() <= gone]
-        if expired:
-            line = journal.event(journal.EXPIRED, deleted=[file.file for file in expired])
-            self._log.append(line)
-            payload_files.publish(self._path, self._journal())
-        return sum(file.bytes for file in expired)
 
 
 def _parts_of(summary: SegmentSummary, place: ChunkPlace) -> NDArray[np.void]:

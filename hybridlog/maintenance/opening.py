@@ -431,7 +431,7 @@ def recover(directory: StoreDirectory, label: str, report: RepairReport) -> str:
         inventory = take_inventory(directory, label)
     state = inventory.state
     if inventory.stored and (missing := unlisted_lines(inventory)):
-        lines += missing  # moved chunks are read from the files that the journal lists
+        lines += missing  # expired chunks are read from the files that the journal lists
         report.journals.append(label)
     if state is not None and state.end is None:
         lines.append(journal.event(journal.ENDED, end=_end_of(inventory)))

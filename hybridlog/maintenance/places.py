@@ -17,7 +17,6 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
 
-from hybridlog.columns.payload_files import open_file
 from hybridlog.entries import take_inventory
 from hybridlog_storage import journal
 from hybridlog_storage.disk import durability, files
@@ -68,7 +67,7 @@ class RefusedError(StoreError):
 
 @dataclass(frozen=True, slots=True)
 class CopiedFile(journal.PayloadFile):
-    """A file of payloads or fields; or a segment, whose `file` is its name."""
+    """A file of fields; or a segment, whose `file` is its name."""
 
     topic: str = ""
     messages: int = 0
@@ -100,7 +99,9 @@ class CopiedFile(journal.PayloadFile):
         """True if the file is there, byte for byte."""
         try:
             if not self.is_segment:
-                open_file(recording / PAYLOADS, self).check()
+                from hybridlog.columns.field_files import FieldFile
+
+                FieldFile(recording / PAYLOADS, self).check()
                 return True
             with SegmentCheck(recording / self.file) as check:
                 found = check.summary
@@ -411,7 +412,7 @@ class DirectoryPlace:
         path, state = self._path, journal.parse(lines)
         check_proven(state, self._recording, self._proven)
         self._clear(state)
-        if any(file.has_fields for file in state.payloads.values()):
+        if state.payloads:
             self._directory.require(EXPIRED)
         added = [adopted_line(self._directory, state, lacks_payloads=lacks_payloads)]
         with ExitStack() as held:

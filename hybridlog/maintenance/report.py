@@ -54,28 +54,20 @@ class RepairReport:
 
 
 @dataclass(slots=True)
-class CompactedTopic:
-    """The result of `compact` for a topic of a recording.
+class ArraysOfTopic:
+    """What `Index.arrays` did for a topic.
 
     Attributes:
-        recording: Label of the recording.
-        topic: The topic.
-        messages: Messages whose payloads are in columns now.
-        payload_bytes: Bytes of these payloads.
-        column_bytes: Bytes of the files of columns; 0 in a dry run.
-        dropped: Messages whose payloads were taken out of the segments.
-        both: After a removal from segments, messages that are in columns and still in segments,
-            because their chunks hold messages without columns, too.
-        kept: Messages that stay in segments alone.
-        reason: Why they do; empty if there are none.
+        topic: Full name.
+        recordings: Labels of the recordings whose tables were made anew.
+        bytes_before: Bytes of the topic's tables before.
+        bytes_after: Bytes of them now.
+        left: Labels of recordings whose tables are as before: they are being written, or
+            cannot be read.
     """
 
-    recording: str
     topic: str
-    messages: int = 0
-    payload_bytes: int = 0
-    column_bytes: int = 0
-    dropped: int = 0
-    both: int = 0
-    kept: int = 0
-    reason: str = ""
+    recordings: list[str] = field(default_factory=list)
+    bytes_before: int = 0
+    bytes_after: int = 0
+    left: list[str] = field(default_factory=list)

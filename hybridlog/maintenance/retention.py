@@ -224,7 +224,6 @@ def held_of(label: str, state: JournalState, now: int) -> Held:
         now: The time, ns.
     """
     found: list[HeldSegment] = []
-    columns = _column_shares(state)
     later, last = now, 0
     for number, sealed in sorted(state.sealed.items(), reverse=True):
         channels = [channel for channel in sealed.channels if channel["messages"]]
@@ -234,24 +233,11 @@ def held_of(label: str, state: JournalState, now: int) -> Held:
         last = max(last, written)
         expired = state.retained.get(number, frozenset())
         if channels and expired is not None:
-            segment = _segment(sealed, later, state, expired, columns)
+            segment = _segment(sealed, later, state, expired)
             found += [segment] if segment.topics or not segment.small else []
     found.reverse()
     tags, created = state.tags, int(state.begun.get("created", 0))
     return Held(state.id, label, created, last, tags, found, state.end is not None, len(state.pins))
-
-
-def _column_shares(state: JournalState) -> dict[str, float]:
-    """Bytes of columns for a byte of payload, by topic; they go with the last of a file."""
-    in_columns: Counter[str] = Counter()
-    payload: Counter[str] = Counter()
-    for file in state.payloads.values():
-        if not file.has_fields:
-            in_columns[file.topic] += file.bytes
-    for sealed in state.sealed.values() if in_columns else ():
-        for channel in sealed.channels:
-            payload[channel["topic"]] += channel["payload_bytes"]
-    return {topic: count / max(payload[topic], 1) for topic, count in in_columns.items()}
 
 
 def _segment(
@@ -259,7 +245,6 @@ def _segment(
     written: int,
     state: JournalState,
     expired: AbstractSet[str],
-    columns: Mapping[str, float],
 ) -> HeldSegment:
     topics: Counter[str] = Counter()
     messages: Counter[str] = Counter()
@@ -272,7 +257,6 @@ def _segment(
     small = [t for t, count in topics.items() if count * packed < MIN_BYTES * messages[t]]
     stays = sum(topics.pop(topic) for topic in small)
     _, held = state.thinned.get(sealed.segment, [("", sealed.bytes)])[-1]
-    held += round(sum(columns.get(topic, 0) * count for topic, count in topics.items()))
     pinned = frozenset(pinned_topics(sealed, state))
     return HeldSegment(sealed.segment, written, held, topics, pinned, stays)
 

@@ -47,7 +47,7 @@ class Size:
         messages: Number of messages.
         payload_bytes: Their payloads, uncompressed.
         segment_bytes: Their share of the segments.
-        column_bytes: Their columns of payloads.
+        column_bytes: What is left of those that have expired.
         table_bytes: Their share of the tables.
         index_bytes: Their share of MongoDB, estimated; None if it is unavailable.
     """
@@ -63,7 +63,7 @@ class Size:
 
     @property
     def total_bytes(self) -> int:
-        """Sum of segments, columns, tables and MongoDB."""
+        """Sum of segments, fields of expired messages, tables and MongoDB."""
         return self.segment_bytes + self.column_bytes + self.table_bytes + (self.index_bytes or 0)
 
 
@@ -109,7 +109,7 @@ def sizes_of(
     if database is not None and places is not None:
         index = _index_bytes(entries, database, places)
     rows: list[Size] = []
-    tables = _table_bytes(directory.path, entries)
+    tables = table_bytes(directory.path, entries)
     for entry in entries:
         segments = _segment_bytes(directory, catalog, entry)
         columns: Counter[str] = Counter()
@@ -201,7 +201,7 @@ def _chunk_shares(table: ChunkTable) -> NDArray[np.float64]:
     return np.bincount(parts["channel"], shares).astype(np.float64)
 
 
-def _table_bytes(root: Path, entries: Sequence[RecordingEntry]) -> Mapping[tuple[str, str], int]:
+def table_bytes(root: Path, entries: Sequence[RecordingEntry]) -> Mapping[tuple[str, str], int]:
     """Bytes of the tables by recording and topic: their share of the rows of each file."""
     from hybridlog.columns.folders import files_of, list_bytes
 

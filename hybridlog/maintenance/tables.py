@@ -12,13 +12,14 @@ from typing import TYPE_CHECKING
 
 from hybridlog.columns.layout import PARTS, parts_folder, topics_of, type_prefix
 from hybridlog.columns.payload_files import walk
+from hybridlog.maintenance.report import reporter
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import SegmentError, StoreError, TopicError
 
 if TYPE_CHECKING:
     from hybridlog.columns.parquet_file import ParquetFileReader
     from hybridlog.columns.tables import Tables
-    from hybridlog.maintenance.report import RepairReport
+    from hybridlog.maintenance.report import Progress, RepairReport
     from hybridlog.snapshot import Snapshot
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
@@ -57,6 +58,7 @@ def make(
     *,
     until: float = math.inf,
     is_new: bool = False,
+    progress: Progress | None = None,
 ) -> bool:
     """Create tables of a recording again from its segments.
 
@@ -66,6 +68,7 @@ def make(
         topics: Topics of the tables; None for those that are missing.
         until: When this is given up, by `time.monotonic`.
         is_new: Whether there are no rows of the recording yet, so none are looked for.
+        progress: Called after each chunk.
 
     Returns:
         True if tables were created; False if the recording is being written, or the store is
@@ -92,7 +95,8 @@ def make(
             try:
                 channels = channels_of(entry, wanted)
                 numbers = [number for number, _, _ in entry.spans]
-                for segment in walk(directory.recording(label), numbers):
+                report = reporter(progress, label, entry.stored_bytes)
+                for segment in walk(directory.recording(label), numbers, report=report):
                     for _, chunk in segment.chunks(lambda p: not channels.isdisjoint(p.channels)):
                         if time.monotonic() > until:
                             raise TimeoutError

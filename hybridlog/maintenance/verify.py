@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
-from hybridlog.columns import column_file
+from hybridlog.columns import field_files
 from hybridlog.columns.payload_files import RecordingPayloads, walk
 from hybridlog.entries import describe, take_inventory
 from hybridlog.index.indexing import ChunkIndexer, Documents
@@ -115,13 +115,13 @@ def verify(
 
 
 def damaged_files(path: Path, inventory: Inventory) -> Iterator[tuple[str, str]]:
-    """Read every byte of the columns of payloads; yield damaged files and their problems."""
+    """Read every byte of the files of fields; yield damaged ones and their problems."""
     payloads = RecordingPayloads(path, list(inventory.payloads.values()))
     for file in inventory.payloads.values():
         try:
             payloads.reader(file).check()
         except StoreError as error:
-            yield file.file, str(error).removesuffix(column_file.RESTORE)
+            yield file.file, str(error).removesuffix(field_files.RESTORE)
 
 
 class _Index:
@@ -295,12 +295,11 @@ class _Check:
                 self.found(name, "it is not a file of a recording", "move it out of the store")
 
     def _payloads(self, inventory: Inventory) -> None:
-        """Check every byte of the columns of payloads."""
+        """Check every byte of the files of fields."""
         listed = inventory.payloads
         if not listed and PAYLOADS not in inventory.listing.others:
             return
         for file, problem in damaged_files(self._path, inventory):
-            # A chunk whose content lies there cannot be read, either.
             self._is_damaged = True
             self.found(f"{PAYLOADS}/{file}", problem, RESTORE)
         self._result.bytes_read += sum(file.bytes for file in listed.values())

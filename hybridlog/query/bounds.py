@@ -9,21 +9,20 @@ answer: not for messages without fields, for running recordings, or for lost seg
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from itertools import takewhile
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from hybridlog.columns.zones import Zone, may_hold
-from hybridlog.query.predicate.numbers import is_nan
-from hybridlog.query.predicate.tree import Compare, Field, Member, is_meta, nodes
+from hybridlog.query.predicate.numbers import is_nan, is_number
+from hybridlog.query.predicate.tree import And, Compare, Field, Member, Or, is_meta, nodes
 
 if TYPE_CHECKING:
     import pyarrow as pa
     from numpy.typing import NDArray
 
-    from hybridlog.query.predicate.tree import Node, Predicate
+    from hybridlog.query.predicate.tree import Node, Parts, Predicate
     from hybridlog.query.question import Part, Question
     from hybridlog.query.ranges import Ranges
     from hybridlog.session import Session
@@ -31,7 +30,15 @@ if TYPE_CHECKING:
 
 MIN_RECORDINGS: Final = 16
 """Fewer recordings are asked by their columns: to leave some out saves little."""
-_WHOLE: Final = 1 << 62  # elements of a region: all
+_ROUNDED = 1e-6  # most relative error of a mean
+_MAY: Final[Mapping[str, Callable[[float, float, float], bool]]] = {
+    "<": lambda low, _, wanted: low < wanted,
+    "<=": lambda low, _, wanted: low <= wanted,
+    ">": lambda _, high, wanted: high > wanted,
+    ">=": lambda _, high, wanted: high >= wanted,
+    "==": lambda low, high, wanted: low <= wanted <= high,
+}
+"""Whether a number between two ends may satisfy a comparison."""
 _NONE: Final[Ends] = (None, None)
 
 
@@ -57,12 +64,8 @@ def within_bounds(session: Session, question: Question, found: Ranges) -> Ranges
             may |= has
         for row in np.flatnonzero(has & ~may).tolist():
             recording = snapshot.summaries[found.places[row]].id
-            zones = {
-                path: Zone(_WHOLE, (ends[recording][0],), (ends[recording][1],))
-                for path, ends in known.items()
-                if recording in ends
-            }
-            may[row] = may_hold(root, zones)
+            here = {path: ends[recording] for path, ends in known.items() if recording in ends}
+            may[row] = may_hold(root, here)
     return found if may.all() else found.take(np.flatnonzero(may))
 
 
@@ -79,6 +82,47 @@ def _paths(target: Field) -> list[str]:
     """The paths of which bounds tell about a field: its own, and those it goes through."""
     names = [*takewhile(lambda part: isinstance(part, str), target.parts)]
     return [".".join(map(str, names[:end])) for end in range(1, len(names) + 1)]
+
+
+def may_hold(node: Node, bounds: Mapping[str, Ends]) -> bool:
+    """False if a predicate holds for no message.
+
+    Args:
+        node: The predicate.
+        bounds: The fields with bounds, by their path.
+    """
+    if isinstance(node, And | Or):
+        combine = all if isinstance(node, And) else any
+        return combine(may_hold(item, bounds) for item in node.items)
+    if isinstance(node, Member) and not node.negated:
+        return any(_may_compare(Compare(node.field, "==", value), bounds) for value in node.values)
+    return not isinstance(node, Compare) or _may_compare(node, bounds)
+
+
+def _may_compare(node: Compare, bounds: Mapping[str, Ends]) -> bool:
+    ends, rest = _ends_of(node.field.parts, bounds)
+    if ends is None or not is_number(node.value) or is_nan(node.value) or node.order not in _MAY:
+        return True
+    if rest and not isinstance(rest[0], str):  # elements of an array
+        rest = rest[1:]
+    if rest not in {(), ("min",), ("max",), ("mean",)}:
+        return True
+    low, high = ends
+    if low is None or high is None:
+        return False
+    slack = _ROUNDED * max(abs(low), abs(high)) if rest == ("mean",) else 0
+    return _MAY[node.order](low - slack, high + slack, node.value)
+
+
+def _ends_of(parts: Parts, bounds: Mapping[str, Ends]) -> tuple[Ends | None, Parts]:
+    """The bounds of the field that a path leads to, and the rest of the path."""
+    for count in range(len(parts), 0, -1):
+        names = parts[:count]
+        if all(isinstance(name, str) for name in names):
+            ends = bounds.get(".".join(map(str, names)))
+            if ends is not None:
+                return ends, parts[count:]
+    return None, ()
 
 
 class BoundsFinder:

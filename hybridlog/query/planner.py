@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from hybridlog.query.counters import Counters
     from hybridlog.query.engines import Engine, MatchColumns, Objects, Values
     from hybridlog.query.engines.running import RunningTables
-    from hybridlog.query.engines.tables import ArraysEngine, TablesEngine
+    from hybridlog.query.engines.tables import TablesEngine
     from hybridlog.query.index_reader import IndexReader
     from hybridlog.query.message_filter import MessageFilter
     from hybridlog.query.question import Question, RecordedChannel, Span
@@ -95,12 +95,6 @@ class Planner:
         return TablesEngine(self.session, self.counters, bounds=bounds)
 
     @lazy
-    def _columns(self) -> ArraysEngine:
-        from hybridlog.query.engines.tables import ArraysEngine
-
-        return ArraysEngine(self.session, self.counters)
-
-    @lazy
     def _running(self) -> RunningTables:
         from hybridlog.query.engines.running import RunningTables
 
@@ -115,8 +109,6 @@ class Planner:
             return *self._counting, self._tables, self._scan
         if part.predicate is None and need is not Need.VALUES:
             return *self._counting, self._scan
-        if part.recording.payloads:
-            return *self._counting, self._tables, self._columns, self._scan
         return *self._counting, self._tables, self._scan
 
     def parts(self) -> list[Part]:
@@ -275,17 +267,16 @@ class Planner:
     def values_of_tables(
         self, parts: Sequence[Part], fields: Collection[str] | None
     ) -> list[Iterator[Values]] | None:
-        """The same of each part, if tables or columns of all of them have the fields."""
+        """The same of each part, if tables of all of them have the fields."""
         found = []
         for part in self._decided(parts):
             engines = self._choose(part, Need.VALUES, fields)
-            if engines[0] is self._tables:
-                try:
-                    if part.predicate is not None:
-                        self._tables.check(part)
-                except _FALLBACK_ERRORS:
-                    return None
-            elif not part.recording.payloads or engines[0] is not self._columns:
+            if engines[0] is not self._tables:
+                return None
+            try:
+                if part.predicate is not None:
+                    self._tables.check(part)
+            except _FALLBACK_ERRORS:
                 return None
             found.append(self._values(part, fields, engines))
         return found

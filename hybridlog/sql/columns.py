@@ -73,6 +73,7 @@ class ViewColumn:
         type: Its type in SQL.
         inner: Fields of a struct.
         is_summary: True for the twin of an array.
+        is_points: True for the points of clouds.
     """
 
     name: str
@@ -81,6 +82,7 @@ class ViewColumn:
     type: Any
     inner: tuple[ViewColumn, ...] = ()
     is_summary: bool = False
+    is_points: bool = False
 
     def leaves(self, above: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], ViewColumn]]:
         """Its fields that are no structs, each with the names on the way in SQL, folded."""

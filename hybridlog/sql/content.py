@@ -12,6 +12,7 @@ import numpy as np
 
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.snapshot import UNFINISHED
+from hybridlog.sql.columns import merged
 from hybridlog.sql.names import ViewNames
 from hybridlog.sql.pieces import TopicOfRecording
 from hybridlog.sql.topic_view import TopicView
@@ -105,6 +106,7 @@ class StoreContent:
             spans=[self._span(summary) for summary in found],
             windows=[self.window(summary.id) for summary in found],
             kinds=kinds,
+            points=self._points(topic, found),
             size=self._size(topic, found),
         )
 
@@ -124,6 +126,19 @@ class StoreContent:
         if not all(one.is_fixed for one in some):
             some = [self.topic_of(one, topic) for one in found]
         return [kind for one in some for kind in one.kinds]
+
+    def _points(self, topic: str, found: Sequence[RecordingSummary]) -> Any:
+        """Type of the points of clouds of a topic whose tables have them; None without."""
+        if topic not in self.session.directory.settings.arrays:
+            return None
+        clouds = [self.topic_of(one, topic) for one in found]
+        tables = (one.table for one in clouds)
+        kinds = [table.points for table in tables if table is not None]
+        kinds = [kind for kind in kinds if kind is not None]
+        if not kinds:  # no table is there yet, or payloads have expired
+            first = (one.first_points() for one in clouds[:_SAMPLED])
+            kinds = [kind for kind in first if kind is not None]
+        return merged(kinds) if kinds else None
 
     def _span(self, summary: RecordingSummary) -> tuple[int, int] | None:
         first, end = summary.extent

@@ -8,6 +8,7 @@ same columns.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
 
@@ -15,6 +16,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from hybridlog.columns.clouds import NEEDED, PointColumns, is_cloud
 from hybridlog.columns.fields import without
 from hybridlog.columns.rows import Messages, Piece, own_columns
 from hybridlog.query.engines import places_of
@@ -33,7 +35,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.columns.column_file import TablePart
-    from hybridlog.columns.payload_reader import ArrayTable
     from hybridlog.columns.topic_table import TopicTable
     from hybridlog.session import Session
     from hybridlog_storage.catalog import RecordingEntry
@@ -52,7 +53,7 @@ class ScanCounts:
     """Counts of what was read for a query.
 
     Attributes:
-        files: Paths of the files of tables, and of payloads, that were read.
+        files: Paths of the files that were read.
         groups: Files and numbers of the row groups that were read.
         chunks: Chunks that were read.
         payload_bytes: Bytes of payloads that were decoded.
@@ -115,6 +116,14 @@ class RowSource(Protocol):
     def is_whole(self) -> bool:
         """True if it has all arrays; else some may be summaries."""
 
+    @property
+    def has_summaries(self) -> bool:
+        """True if it has summaries of all arrays that it has in full."""
+
+    @property
+    def has_points(self) -> bool:
+        """True if it has the points of clouds."""
+
     def kinds(self, paths: Paths) -> Sequence[Any]:
         """Types of the fields that it holds, at least at some paths."""
 
@@ -137,11 +146,6 @@ class TopicOfRecording:
             channel.channel_id: channel
             for channel in self.session.channels_of(self.entry, [self.topic])
         }
-
-    @lazy
-    def arrays(self) -> ArrayTable | None:
-        """The columns of its arrays."""
-        return self.session.arrays(self.entry, self.topic)
 
     @property
     def is_fixed(self) -> bool:
@@ -218,6 +222,21 @@ class TopicOfRecording:
                 found[state] = _keys(*np.array(gone, np.int64).T)
         return found
 
+    def first_points(self) -> Any:
+        """Type of the points of the first clouds that can be read; None of other messages."""
+        channels = {i: one for i, one in self.channels.items() if is_cloud(one.channel)}
+        for (segment, number), place in self.places.items():
+            if channels.keys().isdisjoint(place.channels):
+                continue
+            with suppress(StoreError):
+                batch = self.chunk(segment, number, ScanCounts()).batch
+                index = next(one for one in place.channels if one in channels)
+                own = batch.take(np.flatnonzero(batch.channel == index))
+                codec = channels[index].codec
+                decoded = codec.columns(own.buffer, own.offset, own.length, NEEDED)
+                return PointColumns().points(decoded.arrow()).type
+        return None
+
     def chunk(self, segment: int, number: int, counts: ScanCounts) -> StoredChunk:
         """A chunk; see `Session.chunk`."""
         return self.session.chunk(
@@ -259,6 +278,8 @@ class _TableRows:
         self._table = table
         self._part = part
         is_known = part.first[0] > -(1 << 63)
+        self.has_summaries = table.has_arrays
+        self.has_points = table.points is not None
         self.first = part.first[0] if is_known else None
         self.last = part.last[0] if is_known else None
 
@@ -298,6 +319,7 @@ class _ChunkRows:
     """The messages of a topic in a chunk."""
 
     is_whole = True
+    has_summaries = has_points = False
 
     def __init__(
         self,

@@ -15,7 +15,9 @@ import pyarrow.compute as pc
 import pyarrow.dataset as ds
 from pyarrow import acero, fs
 
+from hybridlog.columns.clouds import NEEDED, PointColumns
 from hybridlog.columns.fields import without
+from hybridlog.columns.layout import POINTS
 from hybridlog.schema.states import State
 from hybridlog.sql.columns import (
     OWN,
@@ -23,6 +25,7 @@ from hybridlog.sql.columns import (
     fitted,
     lacks,
     merged,
+    sql_type,
     summary_values,
     view_columns,
 )
@@ -87,6 +90,7 @@ class TopicView:
         spans: First and last log time of each recording, ns; None if unknown.
         windows: The log time `[begin, end)` of each that has rows, ns; None for all times.
         kinds: Types of the messages.
+        points: Type of the points of clouds; None without.
         size: Number of rows, nearly.
     """
 
@@ -99,6 +103,7 @@ class TopicView:
         spans: Sequence[tuple[int, int] | None],
         windows: Sequence[tuple[int, int] | None],
         kinds: Sequence[Any],
+        points: Any,
         size: int,
     ) -> None:
         self.topic = topic
@@ -108,6 +113,9 @@ class TopicView:
         self._made: dict[int, tuple[TopicOfRecording, _Chooser]] = {}
         kind = merged(list(kinds)) if kinds else pa.struct([])
         self._columns = {column.name: column for column in view_columns(kind)}
+        if points is not None and POINTS not in self._columns:
+            own = ViewColumn(POINTS, (POINTS,), points, sql_type(points), is_points=True)
+            self._columns[POINTS] = own
         fields = [pa.field(column.name, column.type) for column in self._columns.values()]
         self.schema = pa.schema([*OWN, *fields])
         self._chooser = _RecordingChooser(self.schema, labels, spans)
@@ -293,7 +301,11 @@ class _Plan:
             leaf for key, leaf in self._leaves.items() if key not in absent or len(leaf.source) > 1
         ]
         own = self._own | ({"ref", "channel"} if absent else set())
-        for rows in source.read(_paths(held), own, self._reading.counts):
+        own |= {POINTS for leaf in held if leaf.is_points}
+        held = [leaf for leaf in held if not leaf.is_points]
+        for rows in source.read(
+            _paths(held, summaries=source.has_summaries), own, self._reading.counts
+        ):
             self._remark(recording.topic, rows, lacks_arrays=bool(absent))
             if absent:
                 yield from self._with_payloads(recording, rows, absent)
@@ -353,6 +365,8 @@ class _Plan:
             if key in payloads:
                 return payloads[key]
             array = _at(rows.records, column.source)
+            if column.is_points:
+                array = rows.own[POINTS]
             if array is None:
                 return None
             return (summary_values if column.is_summary else fitted)(array, column.kind)
@@ -404,17 +418,31 @@ def _named(text: str, names: Sequence[str]) -> list[str]:
 
 def _is_absent(leaf: ViewColumn, source: RowSource) -> bool:
     """True if a source has only summaries of an array."""
+    if leaf.is_points:
+        return not source.has_points
     if leaf.is_summary or source.is_whole:
         return False
     kinds = (_type_at(kind, leaf.source) for kind in source.kinds(_paths([leaf])))
     return any(kind is not None and lacks(kind, leaf.kind) for kind in kinds)
 
 
-def _paths(leaves: Collection[ViewColumn]) -> list[str] | None:
-    """Dotted paths of fields; None if a name has a dot itself."""
+def _paths(leaves: Collection[ViewColumn], *, summaries: bool = False) -> list[str] | None:
+    """Dotted paths of fields; None if a name has a dot itself.
+
+    Args:
+        leaves: Columns of the fields.
+        summaries: True for the paths of the numbers of summaries, in place of their arrays.
+    """
     if any("." in name or "[" in name for leaf in leaves for name in leaf.source):
         return None
-    return list(dict.fromkeys(".".join(leaf.source) for leaf in leaves))
+    found: dict[str, None] = {}
+    for leaf in leaves:
+        path = ".".join(leaf.source)
+        if summaries and leaf.is_summary:
+            found |= dict.fromkeys(f"{path}.{field.name}" for field in leaf.kind)
+        else:
+            found[path] = None
+    return list(found)
 
 
 def _at(records: Any, path: Sequence[str]) -> Any:
@@ -481,22 +509,20 @@ def _from_payloads(
     keys = np.stack([ref["seg"][order], ref["chunk"][order], channel[order]])
     edges = np.flatnonzero((keys[:, 1:] != keys[:, :-1]).any(axis=0)) + 1
     found: dict[tuple[str, ...], list[Any]] = {key: [] for key in leaves}
-    paths = _paths(list(leaves.values()))
+    paths = _paths([leaf for leaf in leaves.values() if not leaf.is_points])
+    if paths is not None and any(leaf.is_points for leaf in leaves.values()):
+        paths += NEEDED
     for group in np.split(order, edges) if len(order) else ():
         place = int(ref["seg"][group[0]]), int(ref["chunk"][group[0]])
         own = recording.channels[int(channel[group[0]])]
-        good = np.arange(len(group))
-        arrays, records = recording.arrays, None
-        if arrays is not None:
-            records = arrays.at(place, ref["off"][group], paths, counts.add_group)
-        if records is None:
-            chunk = recording.chunk(*place, counts)
-            buffer, at, length = chunk.batch.buffer, ref["off"][group], ref["len"][group]
-            decoded = own.codec.columns(buffer, at, length, paths)
-            counts.payload_bytes += int(length.sum())
-            records, good = decoded.arrow(), decoded.rows
+        chunk = recording.chunk(*place, counts)
+        buffer, at, length = chunk.batch.buffer, ref["off"][group], ref["len"][group]
+        decoded = own.codec.columns(buffer, at, length, paths)
+        counts.payload_bytes += int(length.sum())
+        records, good = decoded.arrow(), decoded.rows
         for key, leaf in leaves.items():
-            values = _at(records, leaf.source)
+            points = PointColumns().points(records) if leaf.is_points else None
+            values = _at(records, leaf.source) if points is None else points
             if values is None:
                 made = pa.nulls(len(group), leaf.type)
             else:

@@ -199,7 +199,7 @@ class RecordingEntry:
             the recording), or `unproven` (the journal was lost).
         end: The state at its end: losses, damage.
         channels: Its channels.
-        stored_bytes: Size of its segments and of its columns of payloads.
+        stored_bytes: Size of its segments and of the fields of its expired messages.
         segments: Number of segments.
         chunks: Number of chunks.
         attachments: Number of attachments of its log.
@@ -209,10 +209,11 @@ class RecordingEntry:
         pins: What is never deleted to make room: `id`, `from`, `to`, `topics`, `reason`.
         spans: Number, first and last log time (ns) of each segment that has messages.
         digests: Digest of each valid segment, by its number as text.
-        stored: Digest of the files of those with moved or expired chunks.
+        stored: Digest of the files of those with expired chunks.
         is_decoded: Whether messages were decoded. Otherwise header stamps, and messages that
         do not fit their definition, are unknown.
-        payloads: Files with columns of payloads: `file`, `bytes`, `digest`, `topic`, `messages`.
+        payloads: Files with fields of expired messages: `file`, `bytes`, `digest`, `topic`,
+            `messages`.
         flushed: Content of segments that are not sealed, by number, at one moment; the
             catalog's file does not have it.
     """

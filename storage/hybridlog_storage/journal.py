@@ -46,16 +46,12 @@ UNMARKED: Final = "unmarked"
 ADOPTED: Final = "adopted"
 REMOVING: Final = "removing"
 REBUILT: Final = "rebuilt"
-COMPACTED: Final = "compacted"
 EXPIRED: Final = "expired"
 PINNED: Final = "pinned"
 UNPINNED: Final = "unpinned"
 RETAINED: Final = "retained"
 RESERVED: Final = ("signature",)
 """Events of later versions; this version preserves and ignores them."""
-
-FIELDS: Final = "fields="
-"""Beginning of the paths of files with what is left of expired messages."""
 
 Event = Mapping[str, Any]
 """The content of a line: `event`, `at` (ns since the epoch), and values of the event."""
@@ -117,7 +113,7 @@ class SealedSegment:
 
 @dataclass(frozen=True, slots=True)
 class PayloadFile:
-    """A file with payloads of a topic as columns, or with the fields of expired ones.
+    """A file with the fields of expired messages of a topic.
 
     Attributes:
         file: Its path below the recording's `payloads`.
@@ -132,11 +128,6 @@ class PayloadFile:
     digest: str
     topic: str
     messages: int
-
-    @property
-    def has_fields(self) -> bool:
-        """True if it has what is left of expired messages."""
-        return self.file.startswith(FIELDS)
 
 
 @dataclass(slots=True)
@@ -156,10 +147,10 @@ class JournalState:
         pins: Pins by id: `id`, `from` and `to` (log times, ns), `topics`, `reason`; None for all.
         sealed: Segments by number.
         replaced: Segments that a crash shortened: as listed before, and as they are.
-        payloads: Files of payloads, and of fields of expired ones, by path.
-        deleted: Files of payloads that have expired, too.
+        payloads: Files of fields of expired messages, by path.
+        deleted: Such files that others have replaced.
         expired: Topics with expired messages, by the number of their segment.
-        thinned: Digest and size of each segment without moved or expired chunks, by its number;
+        thinned: Digest and size of each segment with expired chunks, by its number;
             a later one follows an earlier one.
         retained: Segments that a rule of retention was applied to: topics whose payloads have
             expired, None for all.
@@ -222,8 +213,8 @@ class JournalState:
         elif name == ADOPTED:
             self.store = _text(line["store"])
             self.lacks_payloads |= line.get("lacks") == "payloads"
-        elif name in {COMPACTED, EXPIRED}:
-            self._compact(line)
+        elif name == EXPIRED:
+            self._expire(line)
         elif name in {REMOVING, REBUILT}:
             self.removing |= name == REMOVING
             self.rebuilt = _text(line["reason"]) if name == REBUILT else self.rebuilt
@@ -303,7 +294,7 @@ class JournalState:
         self.sealed[number] = sealed
         self.unmarked.discard(number)
 
-    def _compact(self, line: Event) -> None:
+    def _expire(self, line: Event) -> None:
         found = payload_files(line.get("files", ()))
         values = line.get("segments", ())
         segments = [_values(value, _REPLACED) for value in values]
@@ -312,7 +303,7 @@ class JournalState:
         self.payloads.update({file.file: file for file in found})
         for one in segments:
             self.thinned.setdefault(one["segment"], []).append((one["digest"], one["bytes"]))
-        for segment, topics in expired if line["event"] == EXPIRED else ():
+        for segment, topics in expired:
             self.expired.setdefault(segment, set()).update(topics)
         self.deleted |= self.payloads.keys() & deleted
         for path in deleted:
@@ -328,7 +319,7 @@ def _written(line: Event) -> int:
 
 
 def payload_files(values: Iterable[Mapping[str, Any]]) -> list[PayloadFile]:
-    """Files of payloads as an event or a segment lists them.
+    """Files of fields as an event or a segment lists them.
 
     Raises:
         KeyError, TypeError, ValueError: A value is missing or invalid.
@@ -355,7 +346,7 @@ def end_of(value: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def compacted_of(value: Mapping[str, Any]) -> dict[str, Any]:
-    """The statement of a segment with moved chunks.
+    """The statement of a segment with expired chunks.
 
     Raises:
         KeyError, TypeError, ValueError: A value is missing or invalid.

@@ -59,6 +59,7 @@ class StoreSettings:
             for the embedded one.
         requires: Features that a reader must know to read the store.
         optional: Features that a reader may ignore.
+        arrays: Topics whose tables have arrays in full.
         cache_mb: Size of the embedded MongoDB's cache in MiB; None for the smallest one.
         retention: The table `[retention]`, as it stands there.
         remote: The table `[remote]`, the same; None without it.
@@ -68,6 +69,7 @@ class StoreSettings:
     mongo: str | None = None
     requires: tuple[str, ...] = ()
     optional: tuple[str, ...] = ()
+    arrays: tuple[str, ...] = ()
     cache_mb: int | None = None
     retention: Mapping[str, Any] = field(default_factory=dict)
     remote: Mapping[str, Any] | None = None
@@ -110,7 +112,10 @@ def read_settings(path: Path) -> StoreSettings:
             raise StoreError(str(error)) from None
     optional = _names(file, values, "optional")
     retention, remote = _table(file, values, "retention"), _table(file, values, "remote")
-    return StoreSettings(store_id, mongo, requires, optional, cache_mb, retention or {}, remote)
+    arrays = _names(file, values, "arrays")
+    return StoreSettings(
+        store_id, mongo, requires, optional, arrays, cache_mb, retention or {}, remote
+    )
 
 
 def _table(file: Path, values: Mapping[str, Any], name: str) -> dict[str, Any] | None:
@@ -142,9 +147,8 @@ def settings_text(settings: StoreSettings) -> bytes:
         lines.append(f"mongo = {_quoted(mongo)}")
     if settings.cache_mb is not None:
         lines.append(f"cache_mb = {settings.cache_mb}")
-    for name, features in (("requires", settings.requires), ("optional", settings.optional)):
-        if features:
-            lines.append(f"{name} = {_as_toml(features)}")
+    lists = {name: getattr(settings, name) for name in ("requires", "optional", "arrays")}
+    lines += [f"{name} = {_as_toml(names)}" for name, names in lists.items() if names]
     for name, table in (("retention", settings.retention or None), ("remote", settings.remote)):
         if table is not None:
             lines.append(f"\n[{name}]")
@@ -367,7 +371,7 @@ def _read(path: Path, file: Path) -> dict[str, object]:
 
 
 def _names(file: Path, values: dict[str, object], key: str) -> tuple[str, ...]:
-    """A list of feature names."""
+    """A list of names."""
     found = values.get(key, [])
     if not isinstance(found, list) or not all(isinstance(name, str) for name in found):
         raise StoreError(f"{file}: {key} must be a list of names in quotes.")

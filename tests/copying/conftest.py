@@ -23,7 +23,7 @@ from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.payloads.logs import robot, write_log
 
 SETTINGS = SegmentSettings(chunk_size=8 << 10, segment_size=14 << 10)
-STATES = ("recorded", "damaged", "compacted", "dropped", "expired", "noted")
+STATES = ("recorded", "damaged", "calm", "driven", "expired", "noted")
 PlaceAt = Callable[[Path], AbstractContextManager[Place]]
 
 
@@ -37,8 +37,6 @@ def robots(tmp_path_factory: pytest.TempPathFactory) -> Path:
             if name == "damaged":
                 log.write_bytes(log.read_bytes()[: log.stat().st_size * 2 // 3])
             store.record(log, name=name, settings=SETTINGS)
-        store.compact(["compacted"])
-        store.compact(["dropped"], drop_mcap=True)
         expire(store, "expired")
         store.edit("noted", tag={"place": "field"})
         store.edit("noted", note="it rained")

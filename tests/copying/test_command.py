@@ -180,15 +180,15 @@ def _told(path: Path) -> Counter[State]:
 
 def test_copies_over_ssh(robots: Path, tmp_path: Path, ssh: Path) -> None:
     url = "ssh://me@lab:22/~/lab%20store"
-    words = ("copy", "dropped", url, "--store", robots, "--ssh", f"{ssh} -x y")
+    words = ("copy", "driven", url, "--store", robots, "--ssh", f"{ssh} -x y")
     missing = run(*words, "--program", "nosuch-program", code=5)
     assert "Name hybridlog on the server" in missing.err
     cut = run(*words, "--program", HYBRIDLOG, code=5, CUT="9000")
     assert "run the command again" in cut.err
-    assert run(*words, "--program", HYBRIDLOG).lines == ["copied dropped"]
-    assert run(*words, "--program", HYBRIDLOG).lines == ["dropped is there already"]
+    assert run(*words, "--program", HYBRIDLOG).lines == ["copied driven"]
+    assert run(*words, "--program", HYBRIDLOG).lines == ["driven is there already"]
     there = tmp_path / "lab store"
-    assert answers(there, "dropped") == answers(robots, "dropped")
+    assert answers(there, "driven") == answers(robots, "driven")
     away = run(*words[:-1], "sh -c 'echo no route to lab >&2; exit 255'", code=5)
     assert "no route to lab" in away.err
     assert f"{url} could not be reached." in away.err
@@ -203,12 +203,12 @@ def test_follows_a_store(robots: Path, tmp_path: Path) -> None:
     words = ("copy", lab, "--store", store, "--watch")
     with started(*words, output=told) as process:
         wait_for(lambda: told.read_text().splitlines()[1:] == ["copied noted"])
-        run("record", robots.parent / "dropped.mcap", "--store", store, "--mongo", "none")
-        wait_for(lambda: told.read_text().splitlines()[1:] == ["copied noted", "copied dropped"])
+        run("record", robots.parent / "driven.mcap", "--store", store, "--mongo", "none")
+        wait_for(lambda: told.read_text().splitlines()[1:] == ["copied noted", "copied driven"])
         process.send_signal(signal.SIGINT)
         assert process.wait(60) == 0
     assert "What arrived stays there" in told.read_text()
-    assert answers(lab, "dropped") == answers(store, "dropped")
+    assert answers(lab, "driven") == answers(store, "driven")
 
 
 def test_a_watch_goes_on_after_a_cut(
@@ -224,20 +224,20 @@ def test_a_watch_goes_on_after_a_cut(
 
     monkeypatch.setattr(watching, "pause", pause)
     monkeypatch.setenv("CUT", "9000")
-    words = ("copy", "dropped", "ssh://me@lab/~/lab", "--ssh", ssh, "--program", HYBRIDLOG)
+    words = ("copy", "driven", "ssh://me@lab/~/lab", "--ssh", ssh, "--program", HYBRIDLOG)
     told = answer(*words, "--watch", "--json", store=robots)
     assert pauses == [10, 2]
     assert "The next try is in 10 s." in told.err
-    assert [line for line in told.lines if '"copied": ["dropped"]' in line] == told.lines[-1:]
-    assert answers(tmp_path / "lab", "dropped") == answers(robots, "dropped")
+    assert [line for line in told.lines if '"copied": ["driven"]' in line] == told.lines[-1:]
+    assert answers(tmp_path / "lab", "driven") == answers(robots, "driven")
 
 
 def test_a_signal_ends_a_watch_amid_a_recording(robots: Path, tmp_path: Path) -> None:
     lab, told = tmp_path / "lab", tmp_path / "told"
-    words = ("copy", "dropped", lab, "--store", robots, "--watch")
+    words = ("copy", "driven", lab, "--store", robots, "--watch")
     with started(*words, "--limit-rate", "1kB/s", output=told) as process:
         wait_for(lambda: any(file.stat().st_size for file in lab.rglob("*.mcap*")))
         process.terminate()
         assert process.wait(60) == 0
     assert "What arrived stays there" in told.read_text()
-    assert run("copy", "dropped", lab, "--store", robots).lines == ["copied dropped"]
+    assert run("copy", "driven", lab, "--store", robots).lines == ["copied driven"]

@@ -75,7 +75,7 @@ def labels_in(path: Path) -> list[str]:
 def test_a_copy_that_was_cut_goes_on(
     robots: Path, tmp_path: Path, place_at: PlaceAt, step: int
 ) -> None:
-    label = "dropped"  # segments, and files of columns
+    label = "driven"  # segments, and files of columns
     with place_at(tmp_path / "whole") as place:
         whole = Disturbed(place)
         total = copied(robots, whole, label).bytes_copied
@@ -176,10 +176,10 @@ def test_damaged_recordings_are_refused_and_others_are_copied(
     (source / "recordings" / "noted" / "000000.mcap").unlink()
     with place_at(tmp_path / "lab") as place:
         report = copied(source, place)
-    assert sorted(report.copied) == ["compacted", "damaged", "dropped", "expired"]
+    assert sorted(report.copied) == ["calm", "damaged", "driven", "expired"]
     assert "does not match its checksums" in report.refused["recorded"]
     assert "is incomplete" in report.refused["noted"]
-    assert labels_in(tmp_path / "lab") == ["compacted", "damaged", "dropped", "expired"]
+    assert labels_in(tmp_path / "lab") == ["calm", "damaged", "driven", "expired"]
 
 
 def test_a_place_believes_nothing(robots: Path, tmp_path: Path, place_at: PlaceAt) -> None:
@@ -226,10 +226,10 @@ def test_fields_come_first_and_payloads_later(
     lab = tmp_path / "lab"
     before = sorted(path.name for path in robots.iterdir())
     with place_at(lab) as place:
-        report = copied(robots, place, "recorded", "dropped", "noted", only_fields=True)
+        report = copied(robots, place, "recorded", "driven", "noted", only_fields=True)
         assert len(report.copied) == 3
         rest = copied(robots, place, only_fields=True)
-        assert rest.copied == ["damaged", "compacted", "expired"]
+        assert rest.copied == ["damaged", "calm", "expired"]
     assert sorted(path.name for path in robots.iterdir()) == before
     right = answers(robots, "noted")
     fields = answers(lab, "noted")
@@ -244,9 +244,9 @@ def test_fields_come_first_and_payloads_later(
     # What was added there stays, and the robot's own later tags do not come.
     with place_at(lab) as place:
         report = copied(robots, place)
-    assert sorted(report.copied) == ["compacted", "damaged", "drive", "dropped", "noted"]
+    assert sorted(report.copied) == ["calm", "damaged", "drive", "driven", "noted"]
     assert report.known == ["expired"]
-    for there, here in (("dropped", "dropped"), ("drive", "recorded"), ("noted", "noted")):
+    for there, here in (("driven", "driven"), ("drive", "recorded"), ("noted", "noted")):
         found, right = answers(lab, there), answers(robots, here)
         own = {"entry", "notes", "marks"} if there == "noted" else set()
         assert {k: v for k, v in found.items() if k not in own} == {
@@ -265,20 +265,20 @@ def test_payloads_expire_here_when_they_are_proved_there(robots: Path, tmp_path:
     shutil.copytree(robots, robot)
     right = {label: answers(robot, label) for label in STATES}
     with hl.open(robot, mongo="none") as store:
-        store.copy(lab, ["compacted"])
-        _flip_a_bit(lab / "recordings" / "compacted" / "000000.mcap")
+        store.copy(lab, ["calm"])
+        _flip_a_bit(lab / "recordings" / "calm" / "000000.mcap")
         report = store.copy(lab, None, CopyOptions(then_expire=True))
         assert len(report.problems) == 1
-        assert "compacted stay" in report.problems[0]
+        assert "calm stay" in report.problems[0]
         assert report.freed_bytes > 0
         with pytest.raises(UsageError, match="cannot expire"):
             store.copy(lab, None, CopyOptions(then_expire=True, only_fields=True))
     for label in STATES:
-        is_gone = label in {"recorded", "damaged", "dropped"}  # a pin keeps the noted one
+        is_gone = label in {"recorded", "damaged", "driven"}  # a pin keeps the noted one
         found = answers(robot, label)
         assert (found != right[label]) == is_gone, label
         assert found == {key: value for key, value in right[label].items() if key in found}
-        if label != "compacted":
+        if label != "calm":
             assert answers(lab, label) == right[label]
 
 
@@ -348,7 +348,7 @@ def test_marks_of_both_sides(robots: Path, tmp_path: Path, place_at: PlaceAt) ->
     """What the lab removed again goes; one that both have set keeps no other recording waiting."""
     robot, lab = tmp_path / "robot", tmp_path / "lab"
     shutil.copytree(robots, robot)
-    names = ["recorded", "noted", "dropped"]
+    names = ["recorded", "noted", "driven"]
     with place_at(lab) as place:
         assert len(copied(robot, place, *names, only_fields=True).copied) == 3
     with hl.open(lab, mongo="none") as store:
@@ -360,7 +360,7 @@ def test_marks_of_both_sides(robots: Path, tmp_path: Path, place_at: PlaceAt) ->
             store.mark(name, "end", "robot's")
     with place_at(lab) as place:
         report = copied(robot, place, *names)
-    assert sorted(report.copied) == ["dropped", "recorded"]
+    assert sorted(report.copied) == ["driven", "recorded"]
     assert "was marked here and in" in report.refused["noted"]
     assert answers(lab, "recorded") == answers(robot, "recorded")
     with hl.open(lab, mongo="none") as store:
@@ -374,7 +374,7 @@ def test_recordings_that_are_held_or_gone_keep_no_others_waiting(
     robot, lab = tmp_path / "robot", tmp_path / "lab"
     shutil.copytree(robots, robot)
     with hl.open(robot, mongo="none") as store:
-        held, gone = store.entry("noted").id, store.entry("dropped").id
+        held, gone = store.entry("noted").id, store.entry("driven").id
 
     class Busy(Disturbed):
         def begin(self, recording: str, **options: Any) -> Any:
@@ -384,17 +384,17 @@ def test_recordings_that_are_held_or_gone_keep_no_others_waiting(
             assert any(path.name.startswith(".copying-") for path in robot.iterdir())
             begun = self.__getattr__("begin")(recording, **options)
             if recording == gone:
-                shutil.rmtree(robot / "recordings" / "dropped")
+                shutil.rmtree(robot / "recordings" / "driven")
                 raise StoreError("a file is gone")
             return begun
 
     with place_at(lab) as place:
-        report = copied(robot, Busy(place), "noted", "dropped", "recorded", only_fields=True)
+        report = copied(robot, Busy(place), "noted", "driven", "recorded", only_fields=True)
     assert report.copied == ["recorded"]
     assert report.held == [held]
     assert report.refused == {
         "noted": "Recording 'noted' is not copied: another process copies it",
-        "dropped": "Recording 'dropped' is no longer in the store.",
+        "driven": "Recording 'driven' is no longer in the store.",
     }
     assert [path.name for path in (lab / "recordings").iterdir()] == ["recorded"]
 
@@ -436,14 +436,14 @@ def test_two_copies_at_once_end_with_one(robots: Path, tmp_path: Path, place_at:
         def copy(_: int) -> CopyReport:
             with place_at(lab) as place:
                 barrier.wait()
-                return copied(robots, place, "dropped", piece=1000)
+                return copied(robots, place, "driven", piece=1000)
 
         with ThreadPoolExecutor(2) as pool:
             found = [*pool.map(copy, range(2))]
-        assert sorted([*one.copied, *one.known] for one in found) == [["dropped"]] * 2
-        assert [one.label for one in reader.summaries()] == ["dropped"]
+        assert sorted([*one.copied, *one.known] for one in found) == [["driven"]] * 2
+        assert [one.label for one in reader.summaries()] == ["driven"]
         assert reader.topic("/number").count() > 20
-    assert answers(lab, "dropped") == answers(robots, "dropped")
+    assert answers(lab, "driven") == answers(robots, "driven")
 
 
 def test_the_rate_is_limited(robots: Path, tmp_path: Path) -> None:

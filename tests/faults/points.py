@@ -27,8 +27,6 @@ CHANGES: Final = {
     "mark": 60,
     "import": 70,
     "repair": 220,
-    "compact": 50,
-    "drop": 120,
 }
 INDEX: Final = {
     "reindex": 290,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from pathlib import Path
 
 from hybridlog_storage import journal
@@ -22,8 +21,7 @@ from tests.faults.stores import Prepared, State
 FIRST = logs.content(0, 40)
 SECOND = logs.content(15, 12)
 THIRD = logs.content(100, 24)
-SCANS = logs.content(0, 24, scans=True)
-_LOGS = {"a": FIRST, "b": SECOND, "c": THIRD, "d": SCANS}
+_LOGS = {"a": FIRST, "b": SECOND, "c": THIRD}
 
 
 def scenario(bench: Bench, name: str) -> Scenario:
@@ -134,41 +132,6 @@ def _record(bench: Bench) -> Scenario:
     )
 
 
-def _scans(bench: Bench) -> Prepared:
-    path = bench.path / "scans"
-    if not path.exists():
-        uri = bench.server.new()
-        settings = replace(logs.SETTINGS, segment_size=14_000)
-        logs.record(path, uri, _log(bench, "d"), "d", settings)
-        bench.scans = Prepared.of(bench.server, path, uri)
-    assert bench.scans is not None
-    return bench.scans
-
-
-def _compact(command: str) -> Callable[[Bench], Scenario]:
-    def make(bench: Bench) -> Scenario:
-        return bench.scenario(
-            command,
-            [command, "/scan"],
-            _scans(bench),
-            allowed=_has_columns_of_some if command == "drop" else None,
-            truth={"d": SCANS},
-        )
-
-    return make
-
-
-def _has_columns_of_some(state: State, before: State, _outcome: str) -> bool:
-    """Columns are there, and some segments still hold what they hold."""
-    return (
-        not state.findings
-        and bool(state.recordings["d"].entry["payloads"])
-        and state.recordings["d"].messages == before.recordings["d"].messages
-        and state.recordings["d"].entry["status"] == "complete"
-        and not any(".thinned" in name or "payloads.part" in name for name in state.files)
-    )
-
-
 def _crashed(bench: Bench, name: str, step: str, number: int) -> Prepared:
     """A store with a recording that died before a step: the n-th of its kind, from 0."""
     recorded = scenario(bench, "record")
@@ -246,8 +209,6 @@ SCENARIOS: Mapping[str, Callable[[Bench], Scenario]] = {
     "tag": _simple("tag", "a", "x", "y", a=FIRST, b=SECOND),
     "mark": _simple("mark", "a", "+0.1s", "here", b=SECOND),
     "import": _import,
-    "compact": _compact("compact"),
-    "drop": _compact("drop"),
     "repair": _repair,
     "reindex": _simple("reindex", a=FIRST, b=SECOND),
     "reindex one": _simple("reindex", "a", a=FIRST, b=SECOND),

@@ -401,8 +401,6 @@ COMMANDS: Mapping[str, Command] = {
     "import": _on_store(lambda store, args: bring(store, args[0])),
     "repair": _on_store(_repair),
     "record": _on_store(_record),
-    "compact": _on_store(lambda store, args: store.compact(topics=args)),
-    "drop": _on_store(lambda store, args: store.compact(topics=args, drop_mcap=True)),
 }
 
 

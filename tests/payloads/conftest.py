@@ -1,4 +1,4 @@
-"""Stores with and without columns."""
+"""A store of one recording."""
 
 from __future__ import annotations
 
@@ -13,17 +13,16 @@ from tests.payloads.logs import SETTINGS, robot, write_log
 
 @pytest.fixture(scope="session")
 def plain(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A store of one recording, without columns."""
+    """A store of one recording."""
     path = tmp_path_factory.mktemp("plain")
     log = write_log(path / "log.mcap", robot())
     with hl.open(path / "store", create=True) as store:
         store.record(log, name="log", settings=SETTINGS)
-    shutil.rmtree(path / "store" / "mongod")
     return path / "store"
 
 
 @pytest.fixture
 def copy(plain: Path, tmp_path: Path) -> Path:
-    """A store without columns that a test may change."""
+    """A copy that a test may change."""
     shutil.copytree(plain, tmp_path / "store")
     return tmp_path / "store"

@@ -1,4 +1,4 @@
-"""`import` of recordings with columns: what is listed, and nothing else; again after a mending."""
+"""`import` of recordings with fields of expired messages: what is listed, and nothing else."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ import pytest
 
 import hybridlog as hl
 from tests.copies import bring
-from tests.payloads.logs import messages, recording_of
+from tests.payloads.logs import recording_of
+from tests.payloads.test_expiry import expire
 
 NOWHERE = "mongodb://127.0.0.1:9/x?serverSelectionTimeoutMS=50&connectTimeoutMS=50"
 
 
 @pytest.fixture(scope="module")
 def thin(plain: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A store whose scans and clouds are in columns alone."""
+    """A store whose scans and clouds have expired."""
     path = tmp_path_factory.mktemp("thin") / "store"
     shutil.copytree(plain, path)
-    with hl.open(path, mongo=NOWHERE) as store:
-        store.compact(drop_mcap=True)
+    expire(path, [0, 1], ["/cloud", "/scan"])
     return path
 
 
@@ -39,10 +39,14 @@ def mine(tmp_path: Path) -> Iterator[hl.Store]:
 
 
 def files_of(store: Path) -> dict[str, int]:
-    """Sizes of the segments and columns of the recording."""
+    """Sizes of the segments and files of fields of the recording."""
     recording = recording_of(store)
     found = [*recording.glob("*.mcap"), *recording.glob("payloads/*/*")]
     return {str(path.relative_to(recording)): path.stat().st_size for path in found}
+
+
+def fields_of(store: hl.Store) -> list[tuple[object, ...]]:
+    return [(m.topic, m.log_time_ns, m.seq, m.state, m.fields) for m in store.all_topics()]
 
 
 def flip(path: Path) -> None:
@@ -56,11 +60,13 @@ def cut(path: Path) -> None:
 
 
 @pytest.mark.parametrize("fault", [flip, cut, Path.unlink])
-@pytest.mark.parametrize("name", ["payloads/topic=cloud/*", "payloads/topic=scan/*", "000001.mcap"])
+@pytest.mark.parametrize(
+    "name", ["payloads/fields=cloud/*", "payloads/fields=scan/*", "000001.mcap"]
+)
 def test_a_source_that_was_mended_is_imported(
     source: Path, mine: hl.Store, thin: Path, name: str, fault: Callable[[Path], None]
 ) -> None:
-    (path,) = recording_of(source).glob(name)
+    path = next(recording_of(source).glob(name))
     whole = path.read_bytes()
     fault(path)
     for _ in range(2):
@@ -72,16 +78,21 @@ def test_a_source_that_was_mended_is_imported(
     assert mine.recordings()[0].status == "complete"
     assert files_of(mine.directory.path) == files_of(thin)
     with hl.open(thin, mongo=NOWHERE) as store:
-        assert messages(mine) == messages(store)
+        assert fields_of(mine) == fields_of(store)
 
 
 def test_only_what_is_listed_is_copied(source: Path, mine: hl.Store, thin: Path) -> None:
     recording = recording_of(source)
-    (columns,) = recording.glob("payloads/topic=scan/*")
-    for name in ("secret", "000000.mcap.old", "payloads/loose", "payloads/topic=scan/more.parquet"):
+    columns = next(recording.glob("payloads/fields=scan/*"))
+    for name in (
+        "secret",
+        "000000.mcap.old",
+        "payloads/loose",
+        "payloads/fields=scan/more.parquet",
+    ):
         (recording / name).write_bytes(b"not listed")
-    (recording / "payloads" / "topic=other").mkdir()
-    (recording / "payloads" / "topic=other" / "link").symlink_to("/etc/passwd")
+    (recording / "payloads" / "fields=other").mkdir()
+    (recording / "payloads" / "fields=other" / "link").symlink_to("/etc/passwd")
     with columns.open("ab") as file:
         file.write(b"behind its end" * 1000)
     report = bring(mine, source)
@@ -100,8 +111,8 @@ def test_what_an_earlier_import_left_is_checked(source: Path, mine: hl.Store, th
         hidden = mine.directory.recording(f".importing-{store.recordings()[0].id}")
     shutil.copytree(recording_of(source), hidden)
     shutil.copy(hidden / "000000.mcap", hidden / "000077.mcap")
-    (hidden / "payloads" / "topic=scan" / "stale.parquet").write_bytes(b"stale")
-    for path in hidden.glob("payloads/topic=cloud/*"):
+    (hidden / "payloads" / "fields=scan" / "stale.parquet").write_bytes(b"stale")
+    for path in hidden.glob("payloads/fields=cloud/*"):
         flip(path)
     cut(hidden / "000001.mcap")
     bring(mine, source)

@@ -20,7 +20,7 @@ SECOND = 10**9
 BEGIN = 1_700_000_000 * SECOND
 ARM = Channel("/arm", "ros1", Schema("a/Arm", "ros1msg", b"uint32 n\nfloat64 x\n"), {})
 SCAN = Channel("/scan", "ros1", Schema("a/Scan", "ros1msg", b"uint32 n\nfloat32[] ranges\n"), {})
-RECORDINGS = ("run", "moved", *(f"short-{number}" for number in range(3)))
+RECORDINGS = ("run", "more", *(f"short-{number}" for number in range(3)))
 
 
 @pytest.fixture(scope="session")
@@ -68,14 +68,14 @@ def new_address(proxy: Proxy) -> str:
 
 @pytest.fixture(scope="session")
 def here(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A store on the disk: a long recording, one whose payloads were moved, and short ones."""
+    """A store on the disk: long recordings and short ones."""
     path = tmp_path_factory.mktemp("here") / "store"
     noise = np.random.default_rng(1)
     settings = SegmentSettings(chunk_size=4096, segment_size=400_000)
     with hl.open(path, mongo="none", create=True) as store:
         for place, name in enumerate(RECORDINGS):
             recording = store.start(name, settings=settings)
-            count = 400 if name in {"run", "moved"} else 20
+            count = 400 if name in {"run", "more"} else 20
             for number in range(count):
                 at = BEGIN + (place * 1000 + number) * SECOND // 10
                 scan = struct.pack("<II", number, 500) + noise.random(500, np.float32).tobytes()
@@ -84,7 +84,6 @@ def here(tmp_path_factory: pytest.TempPathFactory) -> Path:
             recording.close()
         store.edit("run", tag={"place": "lab"})
         store.mark("run", "+1s", "slipped", {"trigger": "bump"})
-        store.compact(["moved"], ["/scan"], drop_mcap=True)
     return path
 
 

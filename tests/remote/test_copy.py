@@ -102,7 +102,7 @@ def test_a_copy_is_cut_after_each_request(
             proxy.requests.clear()
             proxy.spoil = lambda number, last=allowed: "403" if number > last else ""
             try:
-                assert store.copy(address, ["dropped"]).copied == ["dropped"]
+                assert store.copy(address, ["driven"]).copied == ["driven"]
                 break
             except BucketError:
                 proxy.reset()
@@ -115,9 +115,9 @@ def test_a_copy_is_cut_after_each_request(
         read = [name for method, name, _ in proxy.requests if method == "GET"]
         assert not [name for name in read if "tables" in name]
         proxy.reset()
-        assert store.copy(address, ["dropped"]).known == ["dropped"]
+        assert store.copy(address, ["driven"]).known == ["driven"]
     files.mounted.clear()
-    assert all_answers(Path(address), "dropped") == all_answers(robots, "dropped")
+    assert all_answers(Path(address), "driven") == all_answers(robots, "driven")
 
 
 def test_fields_come_first_and_payloads_go_here(
@@ -129,8 +129,8 @@ def test_fields_come_first_and_payloads_go_here(
     """And what was added to a copy stays."""
     here = tmp_path / "here"
     with hl.open(robots, mongo="none") as robot:
-        robot.copy(here, ["recorded", "dropped", "noted"])
-    right = all_answers(here, "recorded", "dropped")
+        robot.copy(here, ["recorded", "driven", "noted"])
+    right = all_answers(here, "recorded", "driven")
     with hl.open(here, mongo="none") as store:
         how = CopyOptions(only_fields=True, limit_rate=1e6)
         assert sorted(store.copy(address, ["recorded", "noted"], how).copied) == [
@@ -146,12 +146,12 @@ def test_fields_come_first_and_payloads_go_here(
             assert not there.verify().findings
         size = sum(path.stat().st_size for path in (here / "recordings").glob("*/**/*.*"))
         report = store.copy(address, options=CopyOptions(then_expire=True, limit_rate=2 * size))
-        assert (sorted(report.copied), report.problems) == (["dropped", "known", "recorded"], [])
+        assert (sorted(report.copied), report.problems) == (["driven", "known", "recorded"], [])
         assert report.freed_bytes > 0
         with hl.open(robots, mongo="none") as robot:
             assert sorted(robot.copy(address, ["recorded", "noted"]).known) == ["known", "recorded"]
     files.mounted.clear()
-    found = all_answers(Path(address), "recorded", "dropped")
+    found = all_answers(Path(address), "recorded", "driven")
     assert found["recorded"]["entry"][4] == {"seen": "yes"}
     for label, known in right.items():
         assert {k: v for k, v in found[label].items() if k != "entry"} == {

@@ -180,18 +180,18 @@ def test_two_who_change_at_once(here: Path, address: str, proxy: Proxy) -> None:
 
 def test_marks_pins_and_rules(here: Path, address: str, proxy: Proxy) -> None:
     """Objects are added, and those that are not listed any more can be tidied away."""
-    publish_all(here, address, ("run", "moved"))
+    publish_all(here, address, ("run", "more"))
     with hl.open(address) as store:
         directory = store.directory
         assert isinstance(directory, RemoteDirectory)
-        whole = {label: {*directory.files_of(label).values()} for label in ("run", "moved")}
+        whole = {label: {*directory.files_of(label).values()} for label in ("run", "more")}
         raw = [message.raw for message in store.topic("/scan").in_recording("run")]
         kept = store.mark("run", "+2s", "seen", {"by": "lab"}, until="+3s").marks
         assert [mark["text"] for mark in kept] == ["slipped", "seen"]
         store.mark("run", "+4s", "wrong")
         assert len(store.unmark("run", "wrong").marks) == 2
         pin = store.pin("run", "+0s", "+5s", reason="to keep")
-        assert store.unpin(store.pin("moved")) is None
+        assert store.unpin(store.pin("more")) is None
         rule = ("keep", "--min-free", "1GB", "--save")
         answer(*rule, store=Path(address), code=2)
         assert not directory.settings.retention
@@ -209,7 +209,7 @@ def test_marks_pins_and_rules(here: Path, address: str, proxy: Proxy) -> None:
         (entry,) = store.recordings("run")
         assert ([one["id"] for one in entry.pins], entry.marks) == ([pin], kept)
         assert not store.verify().findings
-        for label, topic in (("run", "/scan"), ("moved", "/scan"), ("run", "/arm")):
+        for label, topic in (("run", "/scan"), ("more", "/scan"), ("run", "/arm")):
             assert store.topic(topic).in_recording(label).count() == 400
         found = [*store.topic("/scan").in_recording("run")]
         states = [message.state for message in found]
@@ -504,7 +504,7 @@ def test_a_forked_process_says_what_to_do(published: str, proxy: Proxy) -> None:
 def test_what_does_not_work_says_so(published: str, proxy: Proxy) -> None:
     with hl.open(published) as store:
         refused: list[Callable[[], Any]] = [
-            store.compact,
+            lambda: store.index.arrays("/scan"),
             store.repair,
             lambda: bring(store, published),
             lambda: store.start("new"),
@@ -512,7 +512,7 @@ def test_what_does_not_work_says_so(published: str, proxy: Proxy) -> None:
         for change in refused:
             with pytest.raises(StoreError, match=r"is a store in a bucket.*hybridlog copy"):
                 change()
-    assert answer("compact", store=Path(published), code=5).out == ""
+    assert answer("index", "arrays", "/scan", store=Path(published), code=5).out == ""
     with pytest.raises(StoreError, match="There is no store at"):
         hl.open(published + "/none")
     with pytest.raises(UsageError, match="without MongoDB"):

@@ -370,10 +370,8 @@ COMMANDS: dict[str, list[Asked]] = {
     "index": [
         asked("index list --json", lambda a, _: a.json, lambda _: []),
         refused(f"index rebuild -r {LABEL}", 5),
-    ],
-    "compact": [
-        refused(f"compact -r {LABEL} -q", 5),
-        asked("compact --json", lambda a, _: a.json, lambda _: []),
+        asked("index arrays arm --json", lambda a, _: a.json[0]["left"], lambda _: [LABEL]),
+        asked("index arrays arm --off --json", lambda a, _: a.json[0]["topic"], lambda _: "/arm"),
     ],
     "keep": [
         # Sealed segments of a running recording are left to its recorder.

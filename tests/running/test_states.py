@@ -244,16 +244,6 @@ def test_renamed_meanwhile(ended: tuple[hl.Store, Known]) -> None:
     assert [r.label for r in store.summaries()] == ["other"]
 
 
-def test_compacted_meanwhile(ended: tuple[hl.Store, Known]) -> None:
-    store, known = ended
-    steps = iter(store.topic("arm", "cam"))
-    first = next(steps)
-    with hl.open(store.directory.path, mongo=NO_MONGODB) as other:
-        assert other.compact([LABEL], ["arm", "cam"], drop_mcap=True)
-    assert rows([first, *steps]) == sent(known.of("/arm", "/cam"))
-    check(store, known)
-
-
 def test_removed_meanwhile(ended: tuple[hl.Store, Known]) -> None:
     store, known = ended
     with store.at_one_moment():

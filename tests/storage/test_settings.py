@@ -31,6 +31,7 @@ def write(store: Path, text: str | bytes) -> Path:
         StoreSettings("ab12"),
         StoreSettings("ab12", "mongodb://me@h1:1,h2/db?tls=true"),
         StoreSettings("ab12", cache_mb=300),
+        StoreSettings("ab12", arrays=("/scan", "/points")),
         StoreSettings(
             "ab12",
             requires=(),
@@ -74,6 +75,7 @@ def test_the_umask_says_who_may_read_it(tmp_path: Path, umask: int, mode: int) -
         (b"format = 3\nstore_id = 'x'\nmongo = 'nowhere'", "mongo"),
         (b"format = 3\nstore_id = 'x'\nrequires = 'a'", "requires"),
         (b"format = 3\nstore_id = 'x'\noptional = [1]", "optional"),
+        (b"format = 3\nstore_id = 'x'\narrays = '/scan'", "arrays"),
         (b"format = 3\nstore_id = 'x'\nrequires = ['payload tables']", "'payload tables'.*newer"),
         (b"format = 3\nstore_id = 'x'\nretention = 5", "retention"),
         (b"format = 3\nstore_id = 'x'\nremote = 'yes'", "remote"),

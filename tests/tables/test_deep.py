@@ -39,11 +39,11 @@ def store(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
         yield opened, request.param
 
 
-@pytest.mark.parametrize("state", ["plain", "compacted", "thinned"])
+@pytest.mark.parametrize("state", ["plain", "arrays"])
 def test_deep_values(store: tuple[hl.Store, str], state: str) -> None:
     opened, kind = store
     if state != "plain":
-        opened.compact(topics=["/t*"], drop_mcap=state == "thinned")
+        opened.index.arrays("/t*")
     assert not opened.verify().findings
     for depth in DEPTHS:
         query = opened.topic(f"/t{depth}")

@@ -290,12 +290,6 @@ def test_reduced_messages_have_null_fields(store: hl.Store) -> None:
     )
 
 
-def test_compacted_and_dropped_recordings_stay(many: hl.Store) -> None:
-    before = {folder.name: sorted(count_duckdb(folder)) for folder in folders_of(many)}
-    many.compact(drop_mcap=True)
-    assert {folder.name: sorted(count_duckdb(folder)) for folder in folders_of(many)} == before
-
-
 @needs_data
 @pytest.mark.parametrize(
     ("log", "topic", "path"),

@@ -92,19 +92,19 @@ def assert_stops(
     assert said[0]["status"] == 200
 
 
-@pytest.mark.parametrize("is_compact", [False, True])
+@pytest.mark.parametrize("has_arrays", [False, True])
 def test_reading_payloads_is_given_up(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: Limit, *, is_compact: bool
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: Limit, *, has_arrays: bool
 ) -> None:
-    """By threads that read ahead, and from columns of payloads."""
+    """By threads that read ahead, and from tables with arrays."""
     limit(min_threaded_bytes=0)
     write_bag(tmp_path / "robot.bag", duration_s=5, config=ROBOT)
     with hl.open(tmp_path / "store", create=True) as store:
         store.record(tmp_path / "robot.bag", name="robot")
-        if is_compact:
-            assert store.compact()
+        if has_arrays:
+            store.index.arrays("scan")
         asked = {**SCAN, "where": "ranges[7] < 3 or ranges[7] > 3.1"}
-        module = "hybridlog/columns/" if is_compact else "query/chunk_scan"
+        module = "hybridlog/columns/" if has_arrays else "query/chunk_scan"
         assert_stops(store, monkeypatch, "ask", asked, module)
 
 

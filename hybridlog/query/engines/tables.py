@@ -28,19 +28,17 @@ if TYPE_CHECKING:
     import pyarrow as pa
     from numpy.typing import NDArray
 
-    from hybridlog.columns.payload_reader import ArrayTable
     from hybridlog.columns.topic_table import TableRows, TopicTable
     from hybridlog.query.bounds import BoundsFinder
     from hybridlog.query.chunk_scan import ChunkTask
     from hybridlog.query.counters import Counters
-    from hybridlog.query.predicate.tree import Node
     from hybridlog.query.question import Part
     from hybridlog.session import Session
 
 _OPEN_S = 2e-4  # seconds to query an open table
 _BYTE_S = 1.5e-9  # seconds to read and decode a stored byte
-_ARRAY_BYTE_S = 4e-9  # the same for arrays
 _WHOLE = 32  # elements; longer arrays are summaries in tables
+_IN_FULL = SINGLE - {"uint8", "byte", "char"}  # elements of arrays in tables with arrays
 
 
 class _Count(NamedTuple):
@@ -75,8 +73,6 @@ class TablesEngine:
         self._counted: set[Part] = set()
         self._places: dict[Part, dict[ChunkKey, NDArray[np.int64]]] = {}
 
-    _byte_s = _BYTE_S
-
     def cost(self, part: Part, need: Need, fields: Collection[str] | None = ()) -> float | None:
         """By the stored bytes of the columns; None without a table that can tell."""
         table = self._valid_table(part, need, fields)
@@ -88,8 +84,8 @@ class TablesEngine:
         except StoreError:
             self._reject(part)
             return None
-        size = table.size(wanted, own, _root(part))
-        return _OPEN_S + self._byte_s * size * max(part.share, 0.01)
+        size = table.size(wanted, own)
+        return _OPEN_S + _BYTE_S * size * max(part.share, 0.01)
 
     def _valid_table(
         self, part: Part, need: Need, fields: Collection[str] | None
@@ -102,33 +98,18 @@ class TablesEngine:
         if asks_publish and len({c.channel.has_publish_time for c in part.channels}) > 1:
             return None  # the table does not say which messages have one
         is_lossy = any(True for _ in lost_spans(part.recording))  # lost rows must not answer
-        if is_lossy or (need is Need.VALUES and not self._are_whole(part, fields)):
+        asks_arrays = need is Need.VALUES and not _are_whole(part, fields, arrays=False)
+        if is_lossy or (asks_arrays and not _are_whole(part, fields, arrays=True)):
             return None
         table = self._table_of(part)
         is_whole = table is not None and not (table.reduced or part.undecodable)
         if table is None or not is_whole or (table.unreadable and part.predicate is None):
             return None  # fields of such messages are not in the table
+        if asks_arrays and not table.has_arrays:
+            return None
         # A table may be older than the package that reads the messages.
         is_older = not table.has_fields and any(c.codec.indexed for c in part.channels)
         return None if is_older else table
-
-    def _are_whole(self, part: Part, fields: Collection[str] | None) -> bool:
-        """True if tables hold these fields in full: no array that may be a summary."""
-        types = part.field_types
-        if types is None:
-            return False
-        paths = list(types) if fields is None else list(fields)
-        for path in paths:
-            below = [p for p in types if p == path or p.startswith((f"{path}.", f"{path}["))]
-            if not below:
-                return False
-            for name in below:
-                inner = any(other.startswith((f"{name}.", f"{name}[")) for other in types)
-                kind, width = types[name], width_of(types[name])
-                is_short = width is not None and width <= _WHOLE and element_of(kind) in SINGLE
-                if not (kind in SINGLE or is_short) and not (inner and not kind.endswith("]")):
-                    return False
-        return True
 
     def count(self, parts: Sequence[Part]) -> int:
         """Number of rows for which the predicate holds.
@@ -144,7 +125,7 @@ class TablesEngine:
 
     def _count_by_file(self, parts: Sequence[Part]) -> None:
         """Count whole parts that lie in one file: the predicate is evaluated once for all rows."""
-        by_file: dict[int, list[tuple[Part, TopicTable]]] = defaultdict(list)
+        by_file: dict[tuple[int, bool], list[tuple[Part, TopicTable]]] = defaultdict(list)
         for part in parts:
             if part in self._counts or part.predicate is None or not part.is_unbounded:
                 continue
@@ -152,7 +133,7 @@ class TablesEngine:
                 continue  # known of the part, not of a row
             table = self._table_of(part)
             if table is not None and len(table.files) == 1:
-                by_file[table.files[0].number].append((part, table))
+                by_file[table.files[0].number, table.has_arrays].append((part, table))
         for group in by_file.values():
             if len(group) > 1:
                 with suppress(UndecidedError, StoreError):  # then part by part
@@ -161,7 +142,7 @@ class TablesEngine:
     def _count_in_file(self, group: Sequence[tuple[Part, TopicTable]]) -> None:
         part, table = group[0]
         types = part.field_types
-        whole = self._session.tables.whole(table.files[0])
+        whole = self._session.tables.whole(table.files[0], arrays=table.has_arrays)
         matched, unreadable, before = [np.zeros(1, np.int64)], [np.zeros(1, np.int64)], [0]
         alike = [(part, table) for part, table in group if part.field_types == types]
         bounds = None if self._bounds is None else self._bounds.of([part for part, _ in alike])
@@ -217,7 +198,7 @@ class TablesEngine:
     def outcomes(self, part: Part) -> Iterator[MatchColumns]:
         """The outcome for each row, in order."""
         self._confirm([part])
-        for rows, holds in self._rows(part, every=True):
+        for rows, holds in self._rows(part):
             yield MatchColumns(rows.t, rows.seq, holds)
 
     def values(self, part: Part, fields: Collection[str] | None) -> Iterator[Values]:
@@ -253,7 +234,6 @@ class TablesEngine:
         fields: Collection[str] | None = (),
         own: Collection[str] = (),
         *,
-        every: bool = False,
         whole: TopicTable | None = None,
     ) -> Iterator[tuple[TableRows, NDArray[np.bool_]]]:
         """Rows of the part's time, with the outcome for each.
@@ -262,7 +242,6 @@ class TablesEngine:
             part: The part.
             fields: Fields to read.
             own: Columns of the table itself.
-            every: True for rows of all row groups, whatever is known of them.
             whole: All rows of its file, in place of its table.
 
         Raises:
@@ -280,11 +259,10 @@ class TablesEngine:
         if asks_fields and table.unreadable:
             columns.add("state")
         paths = _wanted(table, part, fields)
-        where = _root(part)
-        size = table.size(paths, own, where)
+        size = table.size(paths, own)
         self._counters.bytes_read += int(size * min(part.share * 1.2, 1.0))
         try:
-            for rows in table.scan(paths, own=columns, spans=spans, where=where, every=every):
+            for rows in table.scan(paths, own=columns, spans=spans):
                 yield rows, self._holds(part, rows) & ~rows.is_unreadable()
         except StoreError:
             if whole is None:
@@ -311,58 +289,30 @@ class TablesEngine:
         return found
 
 
-class ArraysEngine(TablesEngine):
-    """Reads arrays in full from the columns of a recording.
+def _are_whole(part: Part, fields: Collection[str] | None, *, arrays: bool) -> bool:
+    """True if a table holds these fields in full: no array that may be a summary.
 
     Args:
-        session: The open store.
-        counters: Count the bytes that are read.
+        part: The part.
+        fields: Paths of the fields; None for all.
+        arrays: True if the table has arrays in full, but for those of bytes.
     """
-
-    _byte_s = _ARRAY_BYTE_S
-
-    def __init__(self, session: Session, counters: Counters) -> None:
-        super().__init__(session, counters, self._arrays_of)
-        self._arrays: dict[tuple[str, str], ArrayTable | None] = {}
-
-    def _arrays_of(self, part: Part) -> ArrayTable | None:
-        key = part.recording.id, part.topic
-        if key not in self._arrays:
-            self._arrays[key] = self._session.arrays(part.recording, part.topic)
-        return self._arrays[key]
-
-    def _valid_table(
-        self, part: Part, need: Need, fields: Collection[str] | None
-    ) -> TopicTable | None:
-        """The columns of a part, if they hold all of its messages and all fields asked for."""
-        tested = part.predicate.fields() if part.predicate is not None else ()
-        if part.field_types is None or any(map(is_meta, tested)):
-            return None
-        table = self._arrays_of(part)
-        if table is None or super()._valid_table(part, need, fields) is None:
-            return None
-        if table.rows != part.messages:
-            return None
-        paths = _wanted(table, part, fields if need is Need.VALUES else ())
-        return table if table.covers(paths) else None
-
-    def _are_whole(self, part: Part, fields: Collection[str] | None) -> bool:
-        """True if all fields exist."""
-        types = part.field_types or {}
-        return all(
-            any(name == path or name.startswith((f"{path}.", f"{path}[")) for name in types)
-            for path in fields or ()
-        )
-
-    def _confirm(self, parts: Sequence[Part]) -> None:
-        """Nothing: the types of the columns tell at the first row group."""
-
-    def _reject(self, part: Part) -> None:
-        """Nothing: other engines answer this time."""
-
-
-def _root(part: Part) -> Node | None:
-    return part.predicate.root if part.predicate is not None else None
+    types = part.field_types
+    if types is None:
+        return False
+    paths = list(types) if fields is None else list(fields)
+    for path in paths:
+        below = [p for p in types if p == path or p.startswith((f"{path}.", f"{path}["))]
+        if not below:
+            return False
+        for name in below:
+            inner = any(other.startswith((f"{name}.", f"{name}[")) for other in types)
+            kind, width, element = types[name], width_of(types[name]), element_of(types[name])
+            is_short = width is not None and width <= _WHOLE and element in SINGLE
+            is_full = arrays and element is not None and (element in _IN_FULL or inner)
+            if not (kind in SINGLE or is_short or is_full) and not (inner and element is None):
+                return False
+    return True
 
 
 def _paths(table: TopicTable, part: Part) -> set[str]:
@@ -373,7 +323,10 @@ def _paths(table: TopicTable, part: Part) -> set[str]:
         if is_meta(condition.field.path):
             continue
         # `ranges.min` is a column of its own, or the least element of an array.
-        while "." in path and not table.has(path):
+        is_of_some = len(condition.field.parts) > 1 and not isinstance(
+            condition.field.parts[-2], str
+        )
+        while "." in path and not table.has(path, summaries=not is_of_some):
             path = path.rpartition(".")[0]
         found.add(path)
     return found

@@ -43,7 +43,7 @@ LOCK: Final = "writer.lock"
 LOCK_WAIT_S: Final = 10.0
 """Seconds that a command waits for another one that holds its recording."""
 PAYLOADS: Final = "payloads"
-"""Folder of a recording that holds its columns of payloads."""
+"""Folder of a recording that holds the fields of its expired messages."""
 REMOVED: Final = ".removed-"
 """Prefix of the directory of a recording that is being deleted."""
 SENDING: Final = ".copying-"
@@ -80,7 +80,7 @@ class Listing:
         sealed: Names of sealed segments, by number.
         open: Names of segments that were never sealed, by number.
         others: All other names.
-        payloads: Sizes of files of payloads, by path below `payloads`.
+        payloads: Sizes of files of fields, by path below `payloads`.
         look: As of `StoreDirectory.looks`, before the names were read.
         print: A value that changes whenever a relevant file changes.
     """
@@ -706,7 +706,7 @@ def _is_a_tick_ago(changed: int) -> bool:
 
 
 def payload_names(recording: Path, folder: str = PAYLOADS) -> dict[str, os.stat_result]:
-    """Files of payloads of a recording, by path below their folder.
+    """Files of fields of a recording, by path below their folder.
 
     Raises:
         OSError: It cannot be read.

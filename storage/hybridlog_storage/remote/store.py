@@ -557,12 +557,9 @@ class RemoteDirectory(StoreDirectory):
             StoreError: An object that is needed is lost.
         """
         objects, bucket = self.files_of(label), self.source.bucket
-        names = {sealed_name(number) for number in segments}
-        wanted = set(names)
-        if wanted:  # payloads belong to all segments
+        wanted = {sealed_name(number) for number in segments}
+        if wanted:  # fields of expired messages belong to all segments
             wanted |= {path for path in objects if path.startswith(f"{PAYLOADS}/")}
-        if any(not path.startswith(f"{PAYLOADS}/{journal.FIELDS}") for path in wanted - names):
-            wanted |= {path for path in objects if path.endswith(".mcap")}
         with tempfile.TemporaryDirectory(prefix="hybridlog-") as place:
             there = StoreDirectory.create(Path(place) / "store")
             folder = there.recording(label)

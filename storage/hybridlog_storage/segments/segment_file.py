@@ -372,7 +372,7 @@ class SegmentFile:
         self.table.stretch(length, crc)
 
     def append_copy(self, record: Buffer, trailer: Buffer, parts: NDArray[np.void]) -> None:
-        """Append a chunk of another segment, or the record of a moved or expired one.
+        """Append a chunk of another segment, or the record of an expired one.
 
         Args:
             record: Its record.

@@ -63,28 +63,23 @@ PADDING_OPCODE: Final = 0x91
 CHUNK_TABLE_OPCODE: Final = 0x92
 """Record of the summary: the chunk table, see `chunk_table`."""
 
-MOVED_OPCODE: Final = 0x93
-"""Record in place of a chunk whose content lies in columns of payloads."""
 EXPIRED_OPCODE: Final = 0x94
 """Record in place of a chunk whose payloads were deleted; what is left lies in files of fields."""
 NOT_COPIED_OPCODE: Final = 0x95
 """The same, of payloads that are to be copied later."""
 COMPACTED_METADATA: Final = "hybridlog.compacted"
-"""Metadata record of a segment with moved or expired chunks."""
+"""Metadata record of a segment with expired chunks."""
 DATA_END_SIZE: Final = 13
 """Bytes of the record of the end of the data."""
 CHUNK_HEAD: Final = struct.Struct("<BQQQQI")
-MOVED_SIZE: Final = CHUNK_HEAD.size
-"""Bytes of the record of a moved chunk; every chunk record has more."""
 _EXPIRED_TAIL = struct.Struct("<Q")  # bytes of the chunk record that was there
-EXPIRED_SIZE: Final = MOVED_SIZE + _EXPIRED_TAIL.size
+EXPIRED_SIZE: Final = CHUNK_HEAD.size + _EXPIRED_TAIL.size
 """Bytes of the record of an expired chunk; every chunk record has more."""
 NOT_COPIED_SIZE: Final = EXPIRED_SIZE + 1
 """The same of one that is to be copied later: chunk tables have no opcodes, only sizes."""
 ADDED_IDS: Final = {EXPIRED_SIZE: EXPIRED_IDS, NOT_COPIED_SIZE: 2 * EXPIRED_IDS}
 """What is added to ids of channels of expired chunks, by the bytes of their records."""
 CONTENT_ELSEWHERE: Final = {
-    MOVED_OPCODE: MOVED_SIZE,
     EXPIRED_OPCODE: EXPIRED_SIZE,
     NOT_COPIED_OPCODE: NOT_COPIED_SIZE,
 }
@@ -247,29 +242,15 @@ def compression_of(record: Buffer) -> tuple[str, int]:
 
 
 def head_length(record: Buffer) -> int:
-    """Bytes of a chunk record before its content; all of that of a moved or expired chunk."""
+    """Bytes of a chunk record before its content; all of that of an expired chunk."""
     if record[0] in CONTENT_ELSEWHERE:
         return CONTENT_ELSEWHERE[record[0]]
     (name,) = struct.unpack_from("<I", record, CHUNK_HEAD.size)
     return int(CHUNK_HEAD.size + 4 + name + 8)
 
 
-def moved_record(chunk: Buffer) -> bytes:
-    """The record in place of a chunk record whose content lies elsewhere.
-
-    Args:
-        chunk: The chunk record, or such a record already.
-    """
-    _, _, first, last, size, crc = CHUNK_HEAD.unpack_from(chunk)
-    return CHUNK_HEAD.pack(MOVED_OPCODE, MOVED_SIZE - RECORD_HEAD.size, first, last, size, crc)
-
-
 def expired_record(chunk: Buffer) -> bytes:
-    """The record in place of a chunk record whose payloads are deleted.
-
-    Args:
-        chunk: The chunk record, or that of a moved chunk.
-    """
+    """The record in place of a chunk record whose payloads are deleted."""
     _, _, first, last, size, crc = CHUNK_HEAD.unpack_from(chunk)
     length = EXPIRED_SIZE - RECORD_HEAD.size
     head = CHUNK_HEAD.pack(EXPIRED_OPCODE, length, first, last, size, crc)

@@ -55,8 +55,6 @@ from hybridlog_storage.segments.segment_format import (
     FORMAT_VERSION,
     LOSSES_METADATA,
     MAGIC,
-    MOVED_OPCODE,
-    MOVED_SIZE,
     OUR_NAMES,
     RECORDING_METADATA,
     arrivals_of,
@@ -129,8 +127,8 @@ class SegmentSummary:
         losses: Rows of the loss ledger written with its messages.
         attachments: Attachments of the source, in file order.
         metadata: Metadata records of the source, in file order.
-        compacted: `digest` and `bytes` of a segment before chunks were moved or expired, and the
-            `files` of columns that it needs; None in others.
+        compacted: `digest` and `bytes` of a segment before chunks expired, and the `files`
+            of fields that it needs; None in others.
         table: The chunk table.
         digest: Digest of the bytes from the start of the summary on, as in `Sealed`.
         size: Bytes of the file.
@@ -156,8 +154,13 @@ class SegmentSummary:
 
     @property
     def whole_digest(self) -> str:
-        """Its digest before chunks of it were moved."""
+        """Its digest before chunks of it expired."""
         return (self.compacted or {}).get("digest", self.digest)  # type: ignore[no-any-return]
+
+    def topics_in(self, chunks: Iterable[ChunkPlace]) -> list[str]:
+        """Topics of some chunks, in order."""
+        numbers = {number for chunk in chunks for number in chunk.channels}
+        return sorted({self.channels[number].topic for number in numbers})
 
 
 @dataclass(slots=True)
@@ -173,14 +176,7 @@ class _Records:
 
 
 class Contents(Protocol):
-    """Finds the content of chunks that is not in the segment. The caller checks it."""
-
-    def __call__(self, segment: int, chunk: int, size: int) -> Buffer:
-        """The content of a moved chunk.
-
-        Raises:
-            SegmentError: It is missing or damaged.
-        """
+    """Finds what is left of chunks that are not in the segment. The caller checks it."""
 
     def expired(self, segment: int, chunk: int) -> ExpiredMessages:
         """The remains of an expired chunk.
@@ -198,7 +194,7 @@ class SegmentReader:
         number: Its number in the recording.
         direct: Read past the page cache, if the file system allows it: for data that was
             just written that way and will not be read again soon.
-        contents: Has the content of moved chunks, and what is left of expired ones.
+        contents: Has what is left of expired chunks.
 
     Raises:
             SegmentError: The file is missing or cannot be opened.
@@ -463,10 +459,7 @@ class SegmentReader:
                 left = self._expired(place, record)
                 batch, fields = left.batch, left.fields
             else:
-                if len(record) == MOVED_SIZE:
-                    content = self._moved_content(place, record)
-                else:
-                    content, compressed = open_chunk(record)
+                content, compressed = open_chunk(record)
                 batch = self._messages(place, content, trailer)
             seq = check_arrivals(trailer, place.offset, len(batch))
         except SegmentError as error:
@@ -515,22 +508,10 @@ class SegmentReader:
             raise SegmentError("its messages are not those in the files of fields")
         return left
 
-    def _moved_content(self, place: ChunkPlace, record: memoryview) -> Buffer:
-        """The content of a moved chunk, checked."""
-        opcode, length, _, _, size, crc = CHUNK_HEAD.unpack_from(record)
-        if opcode != MOVED_OPCODE or length + RECORD_HEAD.size != len(record):
-            raise SegmentError("no chunk record is there")
-        if self._contents is None:
-            raise SegmentError("its messages lie in columns of payloads")
-        content = self._contents(self.number, place.number, size)
-        if len(content) != size or crc32(content) != crc:
-            raise SegmentError("its messages do not come back from their columns")
-        return content
-
     def _at_its_place(self, place: ChunkPlace, read: Callable[[ChunkPlace], _T]) -> _T:
         """Read something of a chunk, whose place may be listed as before a rewriting.
 
-        A segment is written again when chunks are moved. Numbers of chunks stay.
+        A segment is written again when chunks expire. Numbers of chunks stay.
         """
         check_wanted()
         try:

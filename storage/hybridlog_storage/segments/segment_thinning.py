@@ -1,9 +1,7 @@
-"""Writes a segment again without the content of some chunks.
+"""Writes a segment again without the content of some chunks, which *expire*.
 
-The content of a *moved* chunk lies elsewhere, that of an *expired* one was deleted. Such a
-chunk keeps its number, its times, its message indexes and its arrival numbers. In place of the
-chunk record stands a short record with the size and the checksum of the content, by which a
-reader checks what it gets from elsewhere.
+Such a chunk keeps its number, its times, its message indexes and its arrival numbers. In place
+of the chunk record stands a short record with the size and the checksum of the content.
 """
 
 from __future__ import annotations
@@ -61,8 +59,7 @@ def thin(
     Args:
         reader: The segment.
         target: The new file; it must not exist.
-        records: What makes the record in place of that of a chunk, by the chunk's number:
-            `moved_record` or `expired_record`.
+        records: What makes the record in place of that of a chunk, by the chunk's number.
         about: Content of the metadata record that says so.
 
     Returns:

@@ -1,0 +1,517 @@
+"""Tables with arrays answer as messages do, and other readers find the arrays in them."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import duckdb
+import numpy as np
+import polars as pl
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rosbags.typesys import Stores, get_typestore
+
+import hybridlog as hl
+from hybridlog.columns.clouds import PointColumns
+from hybridlog.columns.fields import FieldShape
+from hybridlog.query.engines import Need
+from hybridlog.query.planner import Planner
+from hybridlog.schema.codecs import codec_for
+from hybridlog_storage.errors import PayloadError, StoreError, TopicError
+from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests.cli.within import answer
+from tests.payloads.logs import (
+    BASE,
+    CLOUD,
+    COUNT,
+    SCAN,
+    STEP,
+    XYZ,
+    cloud,
+    points_of,
+    ranges_of,
+    scan,
+    standard_channel,
+    write_log,
+)
+from tests.payloads.test_expiry import expire
+from tests.waiting import wait_for
+
+TYPES = get_typestore(Stores.ROS2_HUMBLE)
+TOPICS = ("scan", "cloud", "image")
+
+
+@pytest.fixture(scope="module")
+def stores(
+    plain: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[tuple[hl.Store, hl.Store]]:
+    """A store whose tables have no long arrays, and the same with them."""
+    path = tmp_path_factory.mktemp("arrays") / "store"
+    shutil.copytree(plain, path)
+    with hl.open(path, mongo="none") as arrays, hl.open(plain, mongo="none") as store:
+        arrays.index.arrays(*TOPICS)
+        yield store, arrays
+
+
+def files_of(store: hl.Store, kind: str) -> list[Path]:
+    return sorted((store.directory.path / "tables").glob(f"sensor_msgs_msg_{kind}~*/*.parquet"))
+
+
+FIELDS = [
+    ("scan", ["ranges"], True),
+    ("scan", ["ranges", "intensities", "header.stamp", "angle_min"], True),
+    ("scan", ["header", "ranges"], True),
+    ("scan", None, True),
+    ("image", ["data"], False),
+    ("cloud", ["fields", "width"], True),
+    ("cloud", ["data"], False),
+]
+
+
+@pytest.mark.parametrize(("topic", "fields", "in_tables"), FIELDS)
+def test_arrays_come_from_tables(
+    stores: tuple[hl.Store, hl.Store], topic: str, fields: list[str] | None, *, in_tables: bool
+) -> None:
+    answers, read = [], []
+    for store in stores:
+        query = store.topic(topic)
+        query = query if fields is None else query.fields(*fields)
+        answers.append(query.to_arrow())
+        read.append(query.counters.chunks_read)
+    assert answers[0].equals(answers[1])
+    assert answers[0].schema == answers[1].schema
+    assert answers[0].num_rows in {COUNT, COUNT // 10}
+    assert read[0] > 0
+    assert (read[1] == 0) == in_tables
+
+
+PREDICATES = [
+    "ranges < 1.002",
+    "ranges.min < 1.0005",
+    "ranges[350] < 1.5",
+    "ranges[340:380].min < 1.5",
+    "ranges[17] > 2.4 and header.stamp > 30",
+    "ranges[17] > 2.4 and ranges.min < 1.001",
+    "not ranges.max > 2.9",
+    "intensities.n == 200",
+    "ranges[10:20] > 2.95",
+    "not ranges[190:].mean < 2.5 and ranges[5:17].n == 12",
+    "ranges[400] exists",
+]
+
+
+@pytest.mark.parametrize("predicate", PREDICATES)
+def test_predicates_on_elements(stores: tuple[hl.Store, hl.Store], predicate: str) -> None:
+    answers: list[list[Any]] = []
+    for store in stores:
+        query = store.topic("scan").where(predicate)
+        tables = query.fields("ranges").to_arrow()
+        times = [m.log_time_ns for m in query]
+        spans = [(i.begin_ns, i.end_ns) for i in query.intervals()]
+        answers.append([query.count(), times, tables.to_pylist(), spans])
+    # Lists, since NaN is in no scan of these.
+    assert answers[0] == answers[1]
+    store = stores[1]
+    query = store.topic("scan").where(predicate)
+    planner = Planner(store.session, query.question, query.counters)
+    (part,) = planner.parts()
+    tables, scanned = planner._tables, planner._scan
+    assert tables.cost(part, Need.COUNT) is not None
+    assert tables.count([part]) == scanned.count([part])
+    assert query.count() == answers[0][0]
+    assert query.counters.chunks_read == 0
+
+
+def test_only_columns_that_are_asked_for_are_read(stores: tuple[hl.Store, hl.Store]) -> None:
+    read = []
+    for predicate in ("ranges.min < 1.5", "ranges[3] < 1.5"):
+        query = stores[1].topic("scan").where(predicate)
+        query.count()
+        read.append(query.counters.bytes_read)
+    assert 5 * read[0] < read[1]
+
+
+@pytest.mark.parametrize(
+    ("query", "from_chunks"),
+    [
+        ("select t, ranges, intensities from scan order by t", False),
+        ("select t, ranges[21:40] from scan where angle_min < 0 and seq % 7 = 0 order by t", False),
+        ("select t, ranges[350], ranges_summary.min from scan where ranges[351] < 2", False),
+        ("select t, ranges_summary from scan order by t", None),
+        ("select t, data from image order by t", True),
+        ("select t, height, data from cloud order by t", True),
+    ],
+)
+def test_sql(stores: tuple[hl.Store, hl.Store], query: str, *, from_chunks: bool | None) -> None:
+    paths = [store.directory.path for store in stores]
+    with (
+        hl.open(paths[0], mongo="none") as plain,  # which have no chunk in memory
+        hl.open(paths[1], mongo="none") as arrays,
+    ):
+        answers = [store.sql(query) for store in (plain, arrays)]
+        expected, found = (one.to_arrow() for one in answers)
+    assert found.equals(expected)
+    assert found.num_rows > 10
+    assert (answers[0].counts.chunks > 0) == (from_chunks is not None)
+    assert (answers[1].counts.chunks > 0) == (from_chunks is True)
+
+
+def test_other_readers(stores: tuple[hl.Store, hl.Store]) -> None:
+    """Each array as rosbags reads it from the payload; points as numpy reads them."""
+    store = stores[1]
+    (scans,), (clouds,) = files_of(store, "LaserScan"), files_of(store, "PointCloud2")
+    rows = duckdb.execute(
+        "select ranges, ranges_summary, intensities from read_parquet(?) order by t", [str(scans)]
+    ).fetchall()
+    sent = [TYPES.deserialize_cdr(m.raw, SCAN) for m in store.topic("scan")]
+    assert [np.float32(row[0]).tolist() for row in rows] == [s.ranges.tolist() for s in sent]
+    assert [np.float32(row[2]).tolist() for row in rows] == [s.intensities.tolist() for s in sent]
+    finite = [s.ranges[np.isfinite(s.ranges)] for s in sent]
+    assert [row[1]["n"] for row in rows] == [len(s.ranges) for s in sent]
+    assert [row[1]["min"] for row in rows] == [float(one.min()) for one in finite]
+    frame = pl.scan_parquet(clouds).sort("t").select(pl.col("points").struct.unnest()).collect()
+    assert frame.columns == ["x", "y", "z", "ring"]
+    for n in range(COUNT):
+        points = points_of(n)
+        for place, axis in enumerate("xyz"):
+            assert frame[axis][n].to_numpy().tolist() == points["xyz"][:, place].tolist()
+        assert frame["ring"][n].to_list() == points["ring"].tolist()
+
+
+def columns_of(path: Path) -> dict[str, Any]:
+    return {
+        f"{file.parent.name}/{file.name}": pq.read_table(file)
+        for file in sorted((path / "tables").glob("*~*/*.parquet"))
+    }
+
+
+def test_off_gives_the_columns_back(copy: Path) -> None:
+    before = {name: one.replace_schema_metadata() for name, one in columns_of(copy).items()}
+    with hl.open(copy, mongo="none") as store:
+        (made,) = store.index.arrays("scan")
+        assert (made.topic, made.recordings, made.left) == ("/scan", ["log"], [])
+        assert made.bytes_after > made.bytes_before > 0
+        assert store.index.arrays("scan")[0].recordings == []
+        assert 'arrays = ["/scan"]' in (copy / "hybridlog.toml").read_text()
+        (gone,) = store.index.arrays("scan", off=True)
+        assert gone.recordings == ["log"]
+        assert "arrays" not in (copy / "hybridlog.toml").read_text()
+        assert not store.verify().findings
+    after = {name: one.replace_schema_metadata() for name, one in columns_of(copy).items()}
+    assert before.keys() == after.keys()
+    assert all(before[name].equals(after[name]) for name in before)
+
+
+def answers_of(path: Path) -> list[Any]:
+    with hl.open(path, mongo="none") as store:
+        scans = store.topic("scan")
+        found: list[Any] = [scans.where(text).count() for text in PREDICATES]
+        found += [scans.fields("ranges").to_arrow().to_pylist()]
+        found += [store.sql("select ranges[350], ranges_summary from scan order by t").rows()]
+        return found
+
+
+def test_deleted_tables_change_no_answer(copy: Path) -> None:
+    right = answers_of(copy)
+    with hl.open(copy, mongo="none") as store:
+        store.index.arrays(*TOPICS)
+    assert answers_of(copy) == right
+    shutil.rmtree(copy / "tables")
+    assert answers_of(copy) == right  # and tables with arrays were made again
+    (file,) = (copy / "tables").glob("sensor_msgs_msg_LaserScan~*/*.parquet")
+    assert pq.read_table(file)["ranges"].null_count == 0
+    data = bytearray(file.read_bytes())
+    data[len(data) // 3] ^= 4
+    file.write_bytes(data)
+    assert answers_of(copy) == right
+    (copy / "tables").chmod(0o500)
+    assert answers_of(copy) == right
+
+
+def test_arrays_expire_with_their_payloads(copy: Path) -> None:
+    """What tables had of them is in no answer, and in no table."""
+    with hl.open(copy, mongo="none") as store:
+        store.index.arrays("scan")
+    shutil.copytree(copy, copy.with_name("plain"))
+    with hl.open(copy.with_name("plain"), mongo="none") as store:
+        store.index.arrays("scan", off=True)
+    for path in (copy, copy.with_name("plain")):
+        expire(path, [0])
+    answers_of(copy)  # makes tables again
+    assert answers_of(copy) == answers_of(copy.with_name("plain"))
+    with hl.open(copy, mongo="none") as store:
+        assert store.index.arrays("scan")[0].recordings == []
+        (file,) = files_of(store, "LaserScan")
+    table = pq.read_table(file, columns=["ranges", "ranges_summary", "state"])
+    gone = pa.compute.equal(table["state"], "expired")
+    assert 0 < pa.compute.sum(gone).as_py() < COUNT
+    assert table.filter(gone)["ranges"].null_count == pa.compute.sum(gone).as_py()
+
+
+def test_new_recordings_follow_the_setting(tmp_path: Path) -> None:
+    path, channel = tmp_path / "store", standard_channel(SCAN)
+    settings_ = SegmentSettings(chunk_size=8 << 10, segment_size=30 << 10)
+    with hl.open(path, mongo="none", create=True) as store:
+        (found,) = store.index.arrays("/topic")
+        assert (found.recordings, found.bytes_after) == ([], 0)
+        for wrong in ("topic", "/t*"):
+            with pytest.raises(TopicError):
+                store.index.arrays(wrong)
+        recording = store.start("run", settings=settings_, flush_interval_s=0.05)
+        for n in range(60):
+            recording.write(channel, scan(ranges_of(n), n=n), log_time=BASE + n * STEP)
+        wait_for(lambda: (store.refresh(), store.topics())[1])
+        wait_for(lambda: (store.refresh(), store.topic("/topic").count())[1] == 60)
+        query = store.topic("/topic").where("ranges[350] < 2.5")
+        expected = sum(float(ranges_of(n)[350]) < 2.5 for n in range(60))
+        assert query.count() == expected
+        assert query.counters.bytes_read > 0
+        assert store.index.arrays("/topic")[0].left == ["run"]
+        recording.close()
+        store.refresh()
+        assert query.count() == expected
+        assert store.index.arrays("/topic")[0].recordings == []
+        (file,) = files_of(store, "LaserScan")
+    assert pq.read_table(file)["ranges"].null_count == 0
+
+
+def test_the_command(copy: Path) -> None:
+    said = answer("index", "arrays", "scan", "/later", store=copy).out
+    assert "/scan: tables with arrays, " in said
+    assert "1 recording made anew" in said
+    assert "/later: no recording has it yet" in said
+    again = answer("index", "arrays", "scan", "--json", store=copy).json
+    assert [(one["topic"], one["recordings"]) for one in again] == [("/scan", [])]
+    assert "Its tables have long arrays" in answer("info", "-t", "scan", store=copy).out
+    assert "without arrays" in answer("index", "arrays", "scan", "--off", store=copy).out
+    answer("index", "arrays", "later", store=copy, code=2)
+
+
+def test_a_store_that_cannot_be_written_is_refused(
+    copy: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with hl.open(copy, mongo="none") as store:
+        monkeypatch.setattr(type(store.directory), "is_writable", False)
+        with pytest.raises(StoreError):
+            store.index.arrays("scan")
+
+
+# Points of clouds.
+
+_FIELD = st.tuples(
+    st.sampled_from(["x", "y", "Z", "z", "rgb", "", "a.b", "x"]),
+    st.integers(0, 20),  # offset
+    st.integers(0, 9),  # type; 0 and 9 are none
+    st.integers(0, 3),  # count
+)
+
+
+@settings(max_examples=200)
+@given(
+    layout=st.lists(_FIELD, max_size=5),
+    step=st.integers(0, 40),
+    shape=st.tuples(st.integers(1, 3), st.integers(0, 4)),
+    pad=st.integers(0, 5),
+    big=st.booleans(),
+    lost=st.sampled_from([0, 0, 0, 1]),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_points_are_those_of_the_messages(
+    layout: list[tuple[str, int, int, int]],
+    step: int,
+    shape: tuple[int, int],
+    pad: int,
+    lost: int,
+    seed: int,
+    *,
+    big: bool,
+) -> None:
+    """As numpy reads each point; a cloud that contradicts itself is null."""
+    rows, width = shape
+    row_step = width * step + pad
+    data = np.random.default_rng(seed).bytes(max(rows * row_step - lost, 0))
+    kinds = TYPES.types
+    fields = [kinds["sensor_msgs/msg/PointField"](*one) for one in layout]
+    stamp = kinds["builtin_interfaces/msg/Time"](1, 2)
+    message = kinds[CLOUD](
+        kinds["std_msgs/msg/Header"](stamp, "lidar"), rows, width, fields, big, step, row_step,
+        np.frombuffer(data, np.uint8), True,
+    )  # fmt: skip
+    payload = bytes(TYPES.serialize_cdr(message, CLOUD))
+    good = cloud([("w", 0, 8, 1)], 8, np.arange(3.0).tobytes())
+    codec = codec_for(standard_channel(CLOUD))
+    sizes = np.array([len(good), len(payload)])
+    records = codec.columns(good + payload, np.cumsum(sizes) - sizes, sizes).arrow()
+    maker = PointColumns()
+    columns = maker.with_points(FieldShape(arrays=True).columns(records), records)
+    found = columns.field("points")
+    assert found[0].as_py()["w"] == [0.0, 1.0, 2.0]
+    try:
+        points = _loop(layout, step, shape, row_step, data, big=big)
+    except ValueError:
+        assert not found[1].is_valid
+        return
+    values = [v for name, v in found[1].as_py().items() if name != "w"]
+    assert len(values) == len(points)
+    for have, want in zip(values, points, strict=True):
+        np.testing.assert_array_equal(np.array(have, want.dtype), want)
+
+
+def _loop(
+    layout: list[tuple[str, int, int, int]],
+    step: int,
+    shape: tuple[int, int],
+    row_step: int,
+    data: bytes,
+    *,
+    big: bool,
+) -> list[np.ndarray[Any, Any]]:
+    """Numbers of each field, a point at a time."""
+    rows, width = shape
+    if not layout or (rows * width and not step):
+        raise ValueError
+    row_step = row_step if rows > 1 and row_step else width * step
+    names = ["i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8"]
+    found = []
+    for _, offset, kind, count in layout:
+        if not 1 <= kind <= 8:
+            raise ValueError
+        dtype = np.dtype((">" if big else "<") + names[kind - 1])
+        if offset + (count or 1) * dtype.itemsize > step:
+            raise ValueError
+        values = [np.empty(0, dtype)]
+        for row in range(rows):
+            for column in range(width):
+                at = row * row_step + column * step + offset
+                values.append(np.frombuffer(data, dtype, count or 1, at))
+        found.append(np.concatenate(values).astype(dtype.newbyteorder("=")))
+    if width and (rows - 1) * row_step + width * step > len(data):
+        raise ValueError
+    return found
+
+
+def test_clouds_of_several_layouts(tmp_path: Path) -> None:
+    """Fields that a cloud lacks are null, and malformed clouds do not hurt the others."""
+    clouds = [
+        cloud([("x", 0, 7, 1)], 4, np.arange(40, dtype="<f4").tobytes()),
+        cloud([("x", 0, 8, 1), ("ring", 8, 4, 1)], 10, bytes(20)),
+        cloud([("x", 90, 7, 1)], 4, bytes(8)),
+        cloud([("x", 0, 5, 2)], 8, np.arange(4, dtype="<i4").tobytes()),
+        cloud([("x", 0, 7, 1), ("X", 0, 7, 1)], 4, np.ones(1, "<f4").tobytes()),
+    ]
+    rows = [("/cloud", CLOUD, BASE + n * STEP, one) for n, one in enumerate(clouds * 3)]
+    log = write_log(tmp_path / "log.mcap", rows)
+    with hl.open(tmp_path / "store", mongo="none", create=True) as store:
+        store.index.arrays("/cloud")
+        store.record(log, name="log")
+        (file,) = files_of(store, "PointCloud2")
+        points = pq.read_table(file)["points"].to_pylist()
+        assert store.topic("cloud").fields("width").to_arrow()["width"].to_pylist()[:2] == [40, 2]
+        assert not store.verify().findings
+    assert [one is None for one in points[:5]] == [False, False, True, False, False]
+    assert points[0]["x"] == [float(n) for n in range(40)]
+    assert points[1] == points[1] | {"x": [0.0, 0.0], "ring": [0, 0]}
+    assert points[3]["x"] == [0.0, 1.0, 2.0, 3.0]
+    assert points[4]["X_2"] == [1.0]
+
+
+def test_points_in_sql(copy: Path) -> None:
+    """From tables where these have them, and from messages elsewhere."""
+    query = "select t, points.x[2] as x, len(points.ring) as n from cloud where seq % 3 = 1"
+    with hl.open(copy, mongo="none") as store:
+        store.index.arrays("cloud")
+        answer_ = store.sql(query + " order by t")
+        right = answer_.rows()
+        assert answer_.counts.chunks == 0
+        points = [points_of(n) for n in range(COUNT)]
+        want = [(float(one["xyz"][1, 0]), len(one)) for one in points]
+        assert {row[1:] for row in right} <= {*want}
+        with store.start("now", flush_interval_s=0.05) as recording:
+            channel = replace(standard_channel(CLOUD), topic="/cloud")
+            late = BASE + 1000 * STEP
+            recording.write(channel, cloud(XYZ, 20, points[5].tobytes()), log_time=late)
+            recording.write(channel, cloud([("x", 9, 7, 1)], 8, bytes(8)), log_time=late + 1)
+            wait_for(lambda: (store.refresh(), store.topic("cloud").count())[1] == COUNT + 2)
+            found = store.sql("select points.x[2], points is null from cloud order by t").rows()
+            assert found[-2:] == [(want[5][0], False), (None, True)]
+        store.remove("now")
+    expire(copy, [0], ["/cloud"])
+    with hl.open(copy, mongo="none") as store:
+        gone = store.sql("select count(*) from cloud where points is null").rows()
+        assert gone[0][0] > 1
+
+
+# Scans as one array.
+
+
+@pytest.fixture(scope="module")
+def scans(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
+    """Topics of scans, one of them of one length."""
+    path = tmp_path_factory.mktemp("scans")
+    said = []
+    for n in range(30):
+        values = np.sin(np.arange(60) + n).astype(np.float32)
+        values[n] = (np.inf, np.nan, -np.inf)[n % 3]
+        for topic, size, measured in (
+            ("/even", 60, 60),
+            ("/without", 60, 0),
+            ("/some", 60, 60 * (n % 2)),
+            ("/fewer", 60, 59),
+            ("/longer", 60 - n % 2, 60 - n % 2),
+            ("/none", 0, 0),
+        ):
+            payload = scan(values[:size], n=n, big=n % 4 == 0, measured=measured)
+            said.append((topic, SCAN, BASE + n * STEP, payload))
+    said.append(("/even", SCAN, BASE + 40 * STEP, b"odd"))
+    log = write_log(path / "log.mcap", said)
+    with hl.open(path / "store", mongo="none", create=True) as store:
+        store.record(log, name="log")
+        yield store
+
+
+@pytest.mark.parametrize("topic", ["/even", "/without", "/some", "/fewer", "/longer", "/none"])
+def test_scans_as_one_array(scans: hl.Store, topic: str) -> None:
+    """From columns where scans are alike, and as from the messages one by one."""
+    whole = scans.topic(topic).between(None, "+1s")
+    questions = [
+        whole,
+        whole.reverse(),
+        whole.every(3),
+        whole.limit(4),
+        whole.where("ranges > 0.9"),
+    ]
+    for query in questions:
+        expected = [message.to_numpy() for message in query]
+        found = query.to_numpy()
+        is_stack = len({(one.shape, one.dtype) for one in expected}) == 1
+        assert isinstance(found, np.ndarray) == is_stack
+        assert len(found) == len(expected)
+        for one, other in zip(found, expected, strict=True):
+            assert (one.dtype, one.shape) == (other.dtype, other.shape)
+            assert one.tobytes() == other.tobytes()
+
+
+def test_scans_come_from_tables_with_arrays(scans: hl.Store) -> None:
+    query = scans.topic("/without").between("+0.3s", "+1.2s")
+    expected = query.to_numpy()
+    assert query.counters.chunks_read > 0
+    scans.index.arrays("/without")
+    assert query.to_numpy().tobytes() == expected.tobytes()  # type: ignore[union-attr]
+    assert query.counters.chunks_read == 0
+    assert query.counters.messages == len(expected) == 18
+
+
+def test_odd_scans_are_counted(scans: hl.Store) -> None:
+    query = scans.topic("/even")
+    assert len(query.to_numpy()) == 30
+    assert query.counters.unreadable == 1
+    assert scans.topic("/even").between("+1.9s", None).limit(0).to_numpy() == []
+    with pytest.raises(PayloadError, match="does not fit"):
+        scans.topic("/even").between("+1.9s", None).to_numpy()
