@@ -24,7 +24,6 @@ from hybridlog_storage.errors import IncompleteError, PayloadError, StoreError
 from tests.cli.within import answer
 from tests.copies import bring
 from tests.format_reader import FormatReader
-from tests.indexed import documents_of
 from tests.payloads.logs import COUNT
 
 TOPICS = ["/cloud", "/image", "/number", "/scan"]
@@ -62,7 +61,6 @@ def answers(path: Path) -> dict[str, Any]:
             found[f"{topic} fields"] = [
                 (m.log_time_ns, m.publish_time_ns, m.sequence, m.seq, m.fields) for m in query
             ]
-            found[f"{topic} documents"] = documents_of(store, topic)
         scans = store.topic("/scan")
         found["where"] = scans.where("ranges.min < 1.3").count()
         found["intervals"] = [*scans.where("ranges.max > 2.8").intervals()]
