@@ -505,8 +505,7 @@ def test_what_does_not_work_says_so(published: str, proxy: Proxy) -> None:
     with hl.open(published) as store:
         refused: list[Callable[[], Any]] = [
             lambda: store.index.arrays("/scan"),
-            store.repair,
-            lambda: bring(store, published),
+            lambda: store.verify(repair=True),
             lambda: store.start("new"),
         ]
         for change in refused:
