@@ -134,7 +134,7 @@ class Index:
         from hybridlog.maintenance.arrays import index_arrays
 
         session = self._session
-        session.directory.check_changes()
+        session.directory.check_writable()
         session.invalidate()
         names: dict[str, None] = {}
         for name in topics:
