@@ -70,7 +70,6 @@ if TYPE_CHECKING:
     from hybridlog.contract.judge import Result
     from hybridlog.formats.reading import Source
     from hybridlog.live import LiveOptions, LiveRecording
-    from hybridlog.live.rehearsal import Rehearsal
     from hybridlog.maintenance.copying import CopyOptions, CopyReport
     from hybridlog.maintenance.keep import KeepReport
     from hybridlog.maintenance.places import DirectoryPlace, Place
@@ -773,38 +772,6 @@ class Store:
         if clock not in {"log", "publish", "header"}:
             raise UsageError(f"Unknown clock {clock!r}; choose log, publish or header.")
         return Synced(self.session, self._opener(), questions, tolerance, cast("Clock", clock))
-
-    @of_one_moment
-    def rehearse(
-        self,
-        trigger: str,
-        *,
-        since: TimeLike | None = None,
-        before: DurationLike = "10s",
-        after: DurationLike = 0,
-        recordings: Sequence[str] | None = None,
-    ) -> Rehearsal:
-        """Rehearse a trigger of live recordings on what is stored.
-
-        Args:
-            trigger: `/diagnostics: status[*].level >= 2`, or a topic alone.
-            since: Only messages from this time on, or from so long ago (`30d`); None for all.
-            before: Time before a message that fires, a duration.
-            after: Time after it.
-            recordings: Recordings by id, label or name; None for all.
-
-        Raises:
-            TopicError: the trigger matches no topic, or a recording does not exist.
-            UsageError: the trigger names no topic.
-            WhereError: its predicate cannot be parsed.
-            TimeError: no time, or no duration.
-        """
-        from hybridlog.live.rehearsal import rehearse
-
-        chosen = None if recordings is None else tuple(recordings)
-        return rehearse(
-            self.session, trigger, recordings=chosen, since=since, before=before, after=after
-        )
 
     def _opener(self) -> Callable[[], Store]:
         """Opens this store in another process."""

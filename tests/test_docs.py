@@ -631,7 +631,6 @@ def documented_classes() -> list[type]:
     from hybridlog.attachments import StoredAttachment
     from hybridlog.index.of_store import Index
     from hybridlog.live import LiveOptions, LiveRecording
-    from hybridlog.live.rehearsal import Rehearsal
     from hybridlog.maintenance.copying import CopyOptions, CopyReport
     from hybridlog.maintenance.repair import Repaired
     from hybridlog.maintenance.report import RepairReport
@@ -648,7 +647,7 @@ def documented_classes() -> list[type]:
 
     results = [Counters, RecordReport, RecordingEntry, ChannelEntry, ChannelStats]
     checks = [Index, Verification, Finding, Repaired, RepairReport, CopyReport, LerobotReport]
-    answers = [Rehearsal, Completeness, FieldStatistics, Aligned, Synced, Intervals, Interval]
+    answers = [Completeness, FieldStatistics, Aligned, Synced, Intervals, Interval]
     asking = [Recordings, hl.Query, hl.Message, StoredAttachment, *answers]
     recording = [hl.RecordOptions, CopyOptions, LiveOptions, LiveRecording, SegmentSettings]
     return [hl.Store, *asking, *recording, *results, *checks]

@@ -200,10 +200,7 @@ class _Trigger(Running):
 
 @command(_Trigger)
 def trigger_command(given: _Trigger) -> None:
-    """Make a recorder write its ring.
-
-    `hybridlog intervals --rehearse` says how often a trigger would have fired.
-    """
+    """Make a recorder write its ring."""
     from hybridlog.live.control_server import choose, request
     from hybridlog.store import store_path
 

@@ -91,7 +91,6 @@ def test_every_command_tells_it(tmp_path: Path, mongo: tuple[str, ...]) -> None:
             ["intervals", "-t", "/a", "--changes", "data"],
             ["export", tmp_path / "a.mcap", "-t", "/a", "--force"],
             ["sql", "select count(*) from a"],
-            ["intervals", "--rehearse", "/a: data == '1'"],
         ):
             done = run(*words, *mongo, store=path)
             assert told in done.err, (words, done.err)

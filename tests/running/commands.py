@@ -299,11 +299,6 @@ COMMANDS: dict[str, list[Asked]] = {
             lambda *told: between_messages(listed("begin_ns", "end_ns", "messages")(*told)),
             lambda k: between_messages(silent(k, "/cam", 100 * MS)),
         ),
-        asked(
-            "intervals --rehearse said:~x~>~124 --json",
-            lambda a, _: len(a.json) > 0,
-            lambda _: True,
-        ),
     ],
     "align": [
         asked(

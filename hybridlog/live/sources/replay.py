@@ -1,4 +1,4 @@
-"""Replay of a log in real time, for tests, benchmarks and rehearsals.
+"""Replay of a log in real time, for tests, benchmarks and trials.
 
 One thread reads ahead, another keeps time. A message is due at its time since the first
 message, divided by the speed. All due messages go out at once: many small messages do not
