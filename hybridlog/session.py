@@ -255,15 +255,15 @@ class Session:
                 self.connect(brings=brings)
         return self.connected
 
-    def index_as_it_is(self, purpose: str) -> Database:
-        """The index, which may lack recordings.
+    def index_as_it_is(self) -> Database:
+        """The index, for a MongoDB filter; it may lack recordings.
 
         Raises:
-            DatabaseError: it is unavailable; has the purpose and the reason.
+            DatabaseError: it is unavailable; has the reason.
         """
         database = self._reached(brings=False)
         if database is None:
-            raise self._missing_database(purpose)
+            raise self._missing_database("A MongoDB filter (a predicate needs none)")
         return database
 
     def connect(self, *, brings: bool = True) -> Database:

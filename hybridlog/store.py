@@ -771,12 +771,8 @@ class Store:
         questions = [narrowed(query, topic).question for query in queries for topic in query.topics]
         if clock not in {"log", "publish", "header"}:
             raise UsageError(f"Unknown clock {clock!r}; choose log, publish or header.")
-        return Synced(self.session, self._opener(), questions, tolerance, cast("Clock", clock))
-
-    def _opener(self) -> Callable[[], Store]:
-        """Opens this store in another process."""
-        mongo = self.session.connection.wanted
-        return partial(open_store, self.directory.address, mongo=mongo)
+        again = partial(open_store, self.directory.address, mongo=self.session.connection.wanted)
+        return Synced(self.session, again, questions, tolerance, cast("Clock", clock))
 
     def _query_of(self, name: str | Query, fields: dict[str, Sequence[str]]) -> Query:
         """A query about a topic, with its share of the fields, which is taken out of them."""

@@ -129,7 +129,7 @@ def test_shares_of_chunks_and_tables(store: hl.Store) -> None:
 
 
 def stats_of(documents: int, storage: int, index: int = 0) -> CollectionStats:
-    return CollectionStats(documents, 10 * storage, storage, index)
+    return CollectionStats(documents, storage, index)
 
 
 def test_shares_of_mongodb(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,15 +5,15 @@ The policy is `ApproximateTime` of ROS, see `approximate_sets`.
 
 from __future__ import annotations
 
+import os
 from array import array
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, overload
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
-from hybridlog.across.topic_reader import OpensAgain
 from hybridlog.message import messages_in
 from hybridlog.query.answers.last_message import message_at
 from hybridlog.query.answers.lost import completeness_of
@@ -34,30 +34,30 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from hybridlog.across.topic_reader import OpenedStore
     from hybridlog.message import Message
     from hybridlog.query.question import Clock, Question
     from hybridlog.session import Session
+    from hybridlog.store import Store
 
 
 @dataclass(frozen=True, slots=True)
-class _Topic:
+class _Found:
     """The messages of one topic that are in sets.
 
     Attributes:
-        question: The question about the topic.
+        time: int64[n], ns on the clock.
         log_time: int64[n], ns.
         number: int64[n], its place among the messages of that log time that the question finds.
         is_alone: bool[n], True if the topic has no other message of that log time.
     """
 
-    question: Question
+    time: NDArray[np.int64]
     log_time: NDArray[np.int64]
     number: NDArray[np.int64]
     is_alone: NDArray[np.bool_]
 
 
-class Synced(OpensAgain, Sequence[tuple["Message", ...]]):
+class Synced(Sequence[tuple["Message", ...]]):
     """Sets of messages with about the same time, one of each topic.
 
     A map-style data set: `len`, `[n]`, slices and iteration. Only times have been read; the
@@ -75,7 +75,7 @@ class Synced(OpensAgain, Sequence[tuple["Message", ...]]):
     def __init__(
         self,
         session: Session,
-        open_again: Callable[[], OpenedStore],
+        open_again: Callable[[], Store],
         questions: Sequence[Question],
         tolerance: DurationLike | None,
         clock: Clock,
@@ -86,7 +86,9 @@ class Synced(OpensAgain, Sequence[tuple["Message", ...]]):
             raise UsageError("Sets use all messages: leave out limit, every and reverse.")
         if any(q.frame is not None for q in questions):
             raise UsageError("Sets are of messages as they came: leave out in_frame.")
-        super().__init__(session, open_again)
+        self.counters = Counters()
+        self._open_again = open_again
+        self._sessions: dict[int, Session] = {os.getpid(): session}  # by process
         self.topics = tuple(question.topics[0] for question in questions)
         limit = None if tolerance is None else parse_duration(tolerance)
         snapshot = session.look()
@@ -115,20 +117,28 @@ class Synced(OpensAgain, Sequence[tuple["Message", ...]]):
         self._why_left_out = [why for _, why in left_out if why]
         by_topic = [_joined([part[n] for part in found]) for n in range(len(questions))]
         self.times: NDArray[np.int64] = np.stack([column.time for column in by_topic], axis=1)
-        self._topics = [
-            _Topic(question, column.log_time, column.number, column.is_alone)
-            for question, column in zip(questions, by_topic, strict=True)
-        ]
+        self._topics = list(zip(questions, by_topic, strict=True))
 
     def __repr__(self) -> str:
         left_out = ", ".join(map(str, self.left_out))
         return f"<Synced {', '.join(self.topics)}; {len(self)} sets, left out: {left_out}>"
 
+    def __getstate__(self) -> dict[str, Any]:
+        """All but the open store."""
+        return {**vars(self), "_sessions": {}, "counters": Counters()}
+
+    def _opened(self) -> Session:
+        """The store, opened by this process."""
+        process = os.getpid()
+        if process not in self._sessions:  # the parent's stays: closing it is not the child's
+            self._sessions[process] = self._open_again().session
+        return self._sessions[process]
+
     def remarks(self) -> list[str]:
         """Sentences about the sets: messages that are in none, and what the topics may lack."""
         session, found = self._opened(), list(self._why_left_out)
-        for topic in self._topics:
-            found += completeness_of(session, topic.question).sentences
+        for question, _ in self._topics:
+            found += completeness_of(session, question).sentences
         return [*dict.fromkeys(found)]
 
     def __len__(self) -> int:
@@ -152,16 +162,18 @@ class Synced(OpensAgain, Sequence[tuple["Message", ...]]):
         row = range(len(self))[place]
         session = self._opened()
         recording = self.recordings[row]
-        return tuple(self._read(session, topic, recording, row) for topic in self._topics)
+        return tuple(self._read(session, *topic, recording, row) for topic in self._topics)
 
     def __iter__(self) -> Iterator[tuple[Message, ...]]:
         """The sets, one after the other."""
         return (self[n] for n in range(len(self)))
 
-    def _read(self, session: Session, topic: _Topic, recording: str, row: int) -> Message:
+    def _read(
+        self, session: Session, question: Question, topic: _Found, recording: str, row: int
+    ) -> Message:
         time, number = int(topic.log_time[row]), int(topic.number[row])
         plain = replace(
-            topic.question,
+            question,
             recordings=(recording,),
             bounds=None,
             during=None,
@@ -173,7 +185,7 @@ class Synced(OpensAgain, Sequence[tuple["Message", ...]]):
             if found is not None and found.log_time_ns == time:
                 return found
         span = Intervals.of([(recording, np.array([[*span_of(time, time), 1]], np.int64))])
-        question = replace(topic.question, recordings=(recording,), during=span)
+        question = replace(question, recordings=(recording,), during=span)
         counters = Counters()
         runs = Planner(session, question, counters).runs()
         picture = picture_of(session)
@@ -181,20 +193,10 @@ class Synced(OpensAgain, Sequence[tuple["Message", ...]]):
         self.counters.add(counters)
         if number >= len(messages):
             raise StoreError(
-                f"A message of {topic.question.topics[0]} is not in the store any more: make the "
+                f"A message of {question.topics[0]} is not in the store any more: make the "
                 "sets again."
             )
         return messages[number]
-
-
-@dataclass(frozen=True, slots=True)
-class _Found:
-    """Messages of a topic that are in sets, as of `_Topic`, and their times on the clock."""
-
-    time: NDArray[np.int64]
-    log_time: NDArray[np.int64]
-    number: NDArray[np.int64]
-    is_alone: NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)

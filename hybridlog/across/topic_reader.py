@@ -1,16 +1,12 @@
-"""One topic of an alignment: its messages as tables, with their times on a clock.
-
-Other processes can use a data set over an open store, see `OpensAgain`.
-"""
+"""One topic of an alignment: its messages as tables, with their times on a clock."""
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import chain
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import pyarrow as pa
@@ -231,37 +227,3 @@ def concatenated(tables: Sequence[pa.Table]) -> pa.Table:
         ]
         columns[name] = pa.chunked_array(parts, kind)
     return pa.table(columns)
-
-
-class OpenedStore(Protocol):
-    """A store that a process has opened for itself."""
-
-    @property
-    def session(self) -> Session:
-        """Its state."""
-
-
-class OpensAgain:
-    """A data set for several processes, forked or pickled: each opens the store for itself.
-
-    Attributes:
-        counters: What reading has cost in this process.
-    """
-
-    def __init__(self, session: Session, open_again: Callable[[], OpenedStore]) -> None:
-        self.counters = Counters()
-        self._open_again = open_again
-        self._sessions: dict[int, Session] = {os.getpid(): session}  # by process
-
-    def __getstate__(self) -> dict[str, Any]:
-        """All but the open store."""
-        state = vars(self).copy()
-        state.update(_sessions={}, counters=Counters())
-        return state
-
-    def _opened(self) -> Session:
-        """The store, opened by this process."""
-        process = os.getpid()
-        if process not in self._sessions:  # the parent's stays: closing it is not the child's
-            self._sessions[process] = self._open_again().session
-        return self._sessions[process]

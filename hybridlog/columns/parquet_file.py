@@ -70,8 +70,6 @@ class ParquetFileWriter:
     Args:
         path: The file, in the folder of a recording's unfinished tables.
         sample: Example rows; their schema is the file's.
-        encodings: Encoding of columns, by their dotted paths: `dictionary` or a name of
-            Parquet's. Those of the other columns follow from the example rows.
         level: Level of zstd.
         is_all: True if the example rows are all rows of the file. Then floats without NaN
             have statistics: DuckDB answers wrongly from those of floats with NaN among them.
@@ -87,7 +85,6 @@ class ParquetFileWriter:
         path: Path,
         sample: pa.Table,
         *,
-        encodings: Mapping[str, str] | None = None,
         level: int = 1,
         is_all: bool = False,
         reused: ReusedBytes | None = None,

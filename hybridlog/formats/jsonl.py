@@ -98,10 +98,10 @@ class JsonWriter(JsonlWriter):
         super()._finish()
 
 
-def rows_within(size: int, rows: int, *, limit: int = 16 << 20) -> int:
-    """Rows that are about `limit` bytes, from 1 to 4096, when so many have a size together."""
+def rows_within(size: int, rows: int) -> int:
+    """Rows that are about 16 MiB, from 1 to 4096, when so many have a size together."""
     per_row = max(1, size // max(1, rows))
-    return int(min(_ROWS, max(1, limit // per_row)))
+    return int(min(_ROWS, max(1, (16 << 20) // per_row)))
 
 
 def json_rows(records: pa.StructArray) -> Iterator[Line]:

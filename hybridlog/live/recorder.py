@@ -56,7 +56,6 @@ if TYPE_CHECKING:
     from hybridlog.store import Store
     from hybridlog_storage.segments.segment_writer import SegmentSettings
 
-_LOOK_S = 1.0
 _MAX_REPORTS = 1000
 _MAX_CACHED = 4096  # channel objects that are found without comparing their content
 _MAX_EXPECTED = 1000  # channels that get a collection before their first message

@@ -18,8 +18,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Sequence
 
-from hybridlog.query.predicate.regex import Regex, RegexError, compile_regex, text_of
+from hybridlog.query.predicate.regex import Regex, RegexError, compile_regex
 from hybridlog.query.predicate.tokens import is_filter
+from hybridlog.schema.text import repaired_text
 from hybridlog.wording import listed
 from hybridlog_storage.errors import TopicError
 
@@ -162,7 +163,9 @@ def _matches(pattern: str) -> Callable[[str], bool]:
     _check_length(pattern)
     if pattern.startswith("re:"):
         compiled = _regex(pattern)
-        return lambda topic: topic == pattern or compiled.fullmatch(text_of(topic)) is not None
+        return lambda topic: (
+            topic == pattern or compiled.fullmatch(repaired_text(topic)) is not None
+        )
     if _is_plain(pattern):
         tail = pattern if pattern.startswith("/") else "/" + pattern
         if pattern.startswith("/"):

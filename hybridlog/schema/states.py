@@ -77,16 +77,10 @@ def expired_messages(entry: RecordingEntry) -> dict[State, int]:
     return {state: found[state] for state in GONE if found[state]}
 
 
-def without_payload(messages: int, state: State = State.REDUCED, cause: str = "") -> str:
-    """A number of messages without payload: `1 message has no payload, which was dropped ...`.
-
-    Args:
-        messages: The number.
-        state: Their state.
-        cause: The reason; without, that of the state.
-    """
+def without_payload(messages: int, state: State) -> str:
+    """A number of messages without payload: `1 message has no payload, which was dropped ...`."""
     has = "has" if messages == 1 else "have"
-    return f"{counted(messages, 'message')} {has} no payload, which was {cause or CAUSES[state]}"
+    return f"{counted(messages, 'message')} {has} no payload, which was {CAUSES[state]}"
 
 
 def without_fields(messages: int, state: State, cause: str = "") -> str:

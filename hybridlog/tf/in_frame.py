@@ -38,7 +38,6 @@ if TYPE_CHECKING:
 _STAMPS: Final = ("header.stamp", "timestamp")
 _FRAMES: Final = ("header.frame_id", "frame_id", "parent_frame_id")
 _XYZ: Final = ("x", "y", "z")
-_UNKNOWN: Final = "messages without a frame or a time"
 
 
 class _Pose(NamedTuple):

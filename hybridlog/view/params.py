@@ -108,13 +108,13 @@ class RequestParams:
         """
         return self.integer("pixels", 1, MAX_PIXELS)
 
-    def offset(self, name: str, default: int | None = None) -> int:
+    def offset(self, name: str) -> int:
         """A time since the start of the recording, ns.
 
         Raises:
             UsageError: It is missing, no whole number, or out of bounds.
         """
-        return self.integer(name, -MAX_OFFSET, MAX_OFFSET, default)
+        return self.integer(name, -MAX_OFFSET, MAX_OFFSET)
 
     def moment(self, start: int) -> int:
         """The time `at`, ns since 1970, cut to what is a time.

@@ -91,7 +91,7 @@ class Channel:
     is_indexed: bool = True
 
 
-def expired_channel(channel: Channel, encoding: str = EXPIRED) -> Channel:
+def expired_channel(channel: Channel, encoding: str) -> Channel:
     """The channel of a channel's expired messages; a reduced one has no payload to expire."""
     if channel.message_encoding == REDUCED:
         return channel

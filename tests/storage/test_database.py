@@ -306,10 +306,9 @@ def test_small_things(database: Database, name: str) -> None:
     assert database.create_index(name, [("b", 1), ("a", -1)]) == "b_1_a_-1"
     stats = database.stats(name)
     assert stats.documents == 1
-    assert stats.document_bytes == len(bson.encode({"_id": 1, "a": "y", "b": 2}))
     assert stats.storage_bytes > 0
     assert stats.index_bytes > 0
-    assert database.stats("none") == CollectionStats(0, 0, 0, 0)
+    assert database.stats("none") == CollectionStats(0, 0, 0)
     assert name in database.list_collections()
     assert database.delete(name, {"_id": 1}) == 1
     database.drop(name)

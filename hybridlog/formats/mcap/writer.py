@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import IO, TYPE_CHECKING, Any, Literal, cast
+from typing import IO, TYPE_CHECKING, Any, cast
 
 from mcap.writer import CompressionType, Writer
 
@@ -46,7 +46,6 @@ class McapWriter(FileWriter):
     Args:
         target: Path or binary stream.
         profile: MCAP profile: `ros1`, `ros2` or empty.
-        compression: Compression of chunks.
         chunk_size: Uncompressed bytes at which a chunk ends.
     """
 
@@ -55,7 +54,6 @@ class McapWriter(FileWriter):
         target: Target,
         *,
         profile: str = "",
-        compression: Literal["zstd", "lz4", "none"] = "zstd",
         chunk_size: int = 4 << 20,
     ) -> None:
         super().__init__()
@@ -67,7 +65,7 @@ class McapWriter(FileWriter):
             self._writer = _Writer(
                 cast("IO[Any]", self._sink),
                 chunk_size=chunk_size,
-                compression=CompressionType[compression.upper()],
+                compression=CompressionType.ZSTD,
             )
             self._writer.start(profile=profile, library="hybridlog")
         except BaseException:

@@ -73,15 +73,15 @@ class Header:
     op: int
     fields: dict[bytes, tuple[int, int]]
 
-    def u32(self, data: bytes, name: bytes, default: int = 0) -> int:
-        """A value as uint32, `default` if it is missing or of another length."""
+    def u32(self, data: bytes, name: bytes) -> int:
+        """A value as uint32, 0 if it is missing or of another length."""
         start, end = self.fields.get(name, (0, 0))
-        return int(_u32(data, start)[0]) if end - start == 4 else default
+        return int(_u32(data, start)[0]) if end - start == 4 else 0
 
-    def u64(self, data: bytes, name: bytes, default: int = 0) -> int:
-        """A value as uint64, `default` if it is missing or of another length."""
+    def u64(self, data: bytes, name: bytes) -> int:
+        """A value as uint64, 0 if it is missing or of another length."""
         start, end = self.fields.get(name, (0, 0))
-        return int(_u64(data, start)[0]) if end - start == 8 else default
+        return int(_u64(data, start)[0]) if end - start == 8 else 0
 
     def time(self, data: bytes, name: bytes) -> int:
         """A value as a time in ns, 0 if it is missing or of another length."""

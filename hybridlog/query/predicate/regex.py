@@ -8,7 +8,6 @@ from typing import Protocol
 MAX_LENGTH = 1_000
 """Maximum length of a pattern, characters."""
 _MAX_BYTES = 8 << 20  # of a compiled pattern; Arrow has the same limit
-_SPECIAL = frozenset("\\.[](){}*+?^$|\0")
 _BYTE = "matches a byte, and strings are characters"
 
 
@@ -62,24 +61,6 @@ def compile_regex(pattern: str, max_length: int = MAX_LENGTH) -> Regex:
     if (place := _byte_escape(pattern)) is not None:
         raise RegexError(f"\\C {_BYTE}", place)
     return compiled
-
-
-def text_of(value: str) -> str:
-    """The text, with U+FFFD for unpaired surrogates, which UTF-8 cannot encode."""
-    try:
-        value.encode()
-    except UnicodeEncodeError:
-        return value.encode("utf-16-le", "surrogatepass").decode("utf-16-le", "replace")
-    return value
-
-
-def is_literal(pattern: str) -> bool:
-    """True if a pattern is plain text, possibly anchored at the beginning.
-
-    Every engine finds such a text, within any limit on steps.
-    """
-    text = pattern.removeprefix("^")
-    return bool(text) and not _SPECIAL.intersection(text)
 
 
 def _refusal(pattern: str, reported: bytes | str) -> RegexError:

@@ -15,7 +15,7 @@ from functools import partial
 from typing import TypeAlias, TypeGuard, cast
 
 from hybridlog.query.predicate.numbers import equal, is_number, nearest, ordered
-from hybridlog.query.predicate.regex import compile_regex, text_of
+from hybridlog.query.predicate.regex import compile_regex
 from hybridlog.query.predicate.tree import (
     And,
     Compare,
@@ -36,6 +36,7 @@ from hybridlog.query.predicate.tree import (
     root_of,
 )
 from hybridlog.query.predicate.types import STATS, FieldTypes, Stat
+from hybridlog.schema.text import repaired_text
 from hybridlog_storage.errors import WhereError
 
 Message: TypeAlias = Mapping[str, object]
@@ -458,7 +459,7 @@ def _is_one_of(
     if isinstance(found, _Hidden):
         return None if any(map(found.may_equal, values)) else False
     if isinstance(found, str):
-        found = text_of(found)
+        found = repaired_text(found)
     return any(equal(found, value) for value in values)
 
 
@@ -466,7 +467,7 @@ def _is_ordered(order: str, value: Value, found: object, element: bool) -> Truth
     if isinstance(found, _Hidden):
         return found.is_ordered(order, value)
     if isinstance(found, str):
-        found = text_of(found)
+        found = repaired_text(found)
     if element and isinstance(found, float) and math.isinf(found):
         return False
     return ordered(order, found, value)
@@ -475,4 +476,4 @@ def _is_ordered(order: str, value: Value, found: object, element: bool) -> Truth
 def _matches(search: Callable[[str], object], found: object, _element: bool) -> Truth:  # noqa: FBT001
     if isinstance(found, _Hidden):
         return False if found.numeric else None
-    return isinstance(found, str) and search(text_of(found)) is not None
+    return isinstance(found, str) and search(repaired_text(found)) is not None

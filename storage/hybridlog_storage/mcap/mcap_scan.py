@@ -126,8 +126,6 @@ class ScannedChunk:
         offset: Byte of the record in the file.
         length: Bytes of the whole record, its head included.
         compression: MCAP name of the codec.
-        message_start: Smallest log time, ns, as stated by the chunk.
-        message_end: Largest log time, ns, as stated by the chunk.
         uncompressed_size: Bytes of the content, as stated by the chunk.
         uncompressed_crc: CRC-32 of the content, 0 for none.
         part: The compressed content, in the file.
@@ -137,8 +135,6 @@ class ScannedChunk:
     offset: int
     length: int
     compression: str
-    message_start: int
-    message_end: int
     uncompressed_size: int
     uncompressed_crc: int
     part: FilePart
@@ -639,8 +635,6 @@ class _Scanner:
                     at,
                     end - at,
                     fields.compression,
-                    fields.start,
-                    fields.last,
                     fields.size,
                     fields.crc,
                     data,

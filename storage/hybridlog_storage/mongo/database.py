@@ -107,13 +107,11 @@ class CollectionStats:
 
     Attributes:
         documents: Number of documents.
-        document_bytes: Their BSON size in bytes, uncompressed.
         storage_bytes: Bytes on disk.
         index_bytes: Bytes of the indexes on disk; a clustered collection needs none.
     """
 
     documents: int
-    document_bytes: int
     storage_bytes: int
     index_bytes: int
 
@@ -764,7 +762,6 @@ class Database:
         about = found.get("storageStats", {})
         return CollectionStats(
             documents=int(about.get("count", 0)),
-            document_bytes=int(about.get("size", 0)),
             storage_bytes=int(about.get("storageSize", 0)),
             index_bytes=int(about.get("totalIndexSize", 0)),
         )

@@ -287,13 +287,13 @@ class BucketFiles:
 _mounting = threading.Lock()
 
 
-def mount(address: str, cache: BlockCache | None = None) -> BucketFiles:
+def mount(address: str) -> BucketFiles:
     """The files of a store in a bucket; one for all who use it in this process."""
     path = Path(address)
     with _mounting:
         found = files.mounted.get(path)
         if not isinstance(found, BucketFiles):
-            found = files.mounted[path] = BucketFiles(Bucket(address), cache or BlockCache())
+            found = files.mounted[path] = BucketFiles(Bucket(address), BlockCache())
         return found
 
 
@@ -340,7 +340,6 @@ class RemoteDirectory(StoreDirectory):
 
     Args:
         address: Such as `s3://lab/store`.
-        cache: Keeps what was read; by default in the user's cache.
         read_only: Refuse all changes.
 
     Raises:
@@ -350,10 +349,8 @@ class RemoteDirectory(StoreDirectory):
 
     is_remote: ClassVar[bool] = True
 
-    def __init__(
-        self, address: str, cache: BlockCache | None = None, *, read_only: bool = False
-    ) -> None:
-        self.source = mount(address, cache)
+    def __init__(self, address: str, *, read_only: bool = False) -> None:
+        self.source = mount(address)
         try:
             self.source.read_settings()
         except FileNotFoundError as error:
@@ -368,13 +365,13 @@ class RemoteDirectory(StoreDirectory):
         self._after: StoreList | None = None
 
     @classmethod
-    def create_in(cls, address: str, cache: BlockCache | None = None) -> RemoteDirectory:
+    def create_in(cls, address: str) -> RemoteDirectory:
         """The store at an address; made if there is none.
 
         Raises:
             BucketError: The server does not answer, refuses, or ignores conditions.
         """
-        bucket = mount(address, cache).bucket
+        bucket = mount(address).bucket
         if bucket.head(SETTINGS) is None:
             with suppress(ObjectExistsError):  # another process makes it, too
                 bucket.create(
@@ -383,7 +380,7 @@ class RemoteDirectory(StoreDirectory):
                         StoreSettings(os.urandom(16).hex(), mongo=NONE, requires=(EXPIRED,))
                     ),
                 )
-        return cls(address, cache)
+        return cls(address)
 
     @property
     def address(self) -> str:

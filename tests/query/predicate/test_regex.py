@@ -6,7 +6,7 @@ import pyarrow as pa
 import pytest
 
 from hybridlog.query.predicate.parser import parse
-from hybridlog.query.predicate.regex import RegexError, compile_regex, is_literal
+from hybridlog.query.predicate.regex import RegexError, compile_regex
 from hybridlog.query.predicate.to_bool import to_bool
 from hybridlog.query.predicate.to_mask import to_mask
 
@@ -38,26 +38,6 @@ def test_long_lines_are_matched_to_their_end(pattern: str, found: list[bool]) ->
         mask = to_mask(predicate, None, pa.table({"s": lines}))
         assert mask is not None
         assert mask.tolist() == expected
-
-
-@pytest.mark.parametrize(
-    ("pattern", "is_exact"),
-    [
-        ("slip", True),
-        ("^gripper: ", True),
-        ("é 😀", True),
-        ("^", False),
-        ("a.c", False),
-        ("slip$", False),  # MongoDB finds it before a last end of line, too
-        (r"a\d", False),
-        ("a|b", False),
-        ("(?i)a", False),
-        ("a{2}", False),
-        ("^^a", False),
-    ],
-)
-def test_mongodb_matches_plain_text_only(pattern: str, *, is_exact: bool) -> None:
-    assert is_literal(pattern) is is_exact
 
 
 @pytest.mark.parametrize(
