@@ -176,6 +176,11 @@ def open_store(
     return store
 
 
+def _session_of(address: str | Path, mongo: str | None) -> Session:
+    """The state of a store that another process opens for itself."""
+    return open_store(address, mongo=mongo).session
+
+
 @contextmanager
 def receiving(store: Store) -> Iterator[DirectoryPlace]:
     """A store as a place that recordings are copied to."""
@@ -771,7 +776,7 @@ class Store:
         questions = [narrowed(query, topic).question for query in queries for topic in query.topics]
         if clock not in {"log", "publish", "header"}:
             raise UsageError(f"Unknown clock {clock!r}; choose log, publish or header.")
-        again = partial(open_store, self.directory.address, mongo=self.session.connection.wanted)
+        again = partial(_session_of, self.directory.address, self.session.connection.wanted)
         return Synced(self.session, again, questions, tolerance, cast("Clock", clock))
 
     def _query_of(self, name: str | Query, fields: dict[str, Sequence[str]]) -> Query:

@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from hybridlog.message import Message
     from hybridlog.query.question import Clock, Question
     from hybridlog.session import Session
-    from hybridlog.store import Store
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +74,7 @@ class Synced(Sequence[tuple["Message", ...]]):
     def __init__(
         self,
         session: Session,
-        open_again: Callable[[], Store],
+        open_again: Callable[[], Session],
         questions: Sequence[Question],
         tolerance: DurationLike | None,
         clock: Clock,
@@ -131,7 +130,7 @@ class Synced(Sequence[tuple["Message", ...]]):
         """The store, opened by this process."""
         process = os.getpid()
         if process not in self._sessions:  # the parent's stays: closing it is not the child's
-            self._sessions[process] = self._open_again().session
+            self._sessions[process] = self._open_again()
         return self._sessions[process]
 
     def remarks(self) -> list[str]:

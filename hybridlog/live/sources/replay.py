@@ -36,7 +36,6 @@ if TYPE_CHECKING:
 
 _MIN_PAUSE_S: Final = 0.001  # messages that are due within it go out together
 _MAX_PAUSE_S: Final = 3600.0
-_BETWEEN_S: Final = 0.1  # from the last message of a round to the first of the next
 _LATE_S: Final = 0.5
 _LONG_S: Final = 60.0
 _MAX_MESSAGES: Final = 1024  # messages between two reads of the clock
@@ -49,7 +48,6 @@ class _Step:
     """Messages that the reading thread passes to the playing one.
 
     Attributes:
-        number: Number of the round, from 0.
         rows: Messages, or None.
         channels: Channels of the log, as far as it is read.
         damage: Unreadable places.
@@ -57,7 +55,6 @@ class _Step:
         error: The error that ended reading.
     """
 
-    number: int
     rows: Rows | None
     channels: list[Channel]
     damage: list[Damage]
@@ -76,7 +73,6 @@ class ReplaySource(LiveSource):
         path: The log.
         speed: Seconds of the log per second: positive and finite. A sink or disk that
             cannot keep up is reported once.
-        loop: Start again at the end, until stopped.
 
     Raises:
         UsageError: The speed is not positive and finite.
@@ -84,7 +80,7 @@ class ReplaySource(LiveSource):
 
     kind = "replay"
 
-    def __init__(self, path: Path, *, speed: float = 1.0, loop: bool = False) -> None:
+    def __init__(self, path: Path, *, speed: float = 1.0) -> None:
         if not (math.isfinite(speed) and speed > 0):
             raise UsageError(
                 f"a log cannot be played at speed {speed:g}; give a number above zero, 1 for "
@@ -93,7 +89,6 @@ class ReplaySource(LiveSource):
         self.address = str(path)
         self._path = path
         self._speed = speed
-        self._loop = loop
         self._stop = threading.Event()
         self._steps: queue.Queue[_Step] = queue.Queue(maxsize=2)
         self._threads: list[threading.Thread] = []
@@ -155,36 +150,30 @@ class ReplaySource(LiveSource):
     # The reading thread.
 
     def _read(self, source: Source) -> None:
-        number = 0
         error: BaseException | None = None
         try:
-            while self._read_once(source, number) and self._loop:
-                number += 1
-                source = open_source(self._path)
+            self._read_all(source)
         except BaseException as caught:  # the playing thread raises or reports it
             error = caught
-        self._put(_Step(number, None, [], [], end=True, error=error))
+        self._put(_Step(None, [], [], end=True, error=error))
 
-    def _read_once(self, source: Source, number: int) -> bool:
-        """Read a log to its end; True if it had a message and the source is not stopped."""
+    def _read_all(self, source: Source) -> None:
+        """Read a log to its end, or until the source is stopped."""
         lookahead = Lookahead()
-        known = count = 0
+        known = 0
         with source:
             for batch in source.batches():
                 if self._stop.is_set():
-                    return False
-                count += len(batch)
+                    return
                 source.extras.clear()
                 rows = lookahead.add(batch)
                 if rows is None:
                     continue
-                step = _Step(number, rows, list(source.channels), source.damage[known:])
+                step = _Step(rows, list(source.channels), source.damage[known:])
                 known = len(source.damage)
                 if not self._put(step):
-                    return False
-            rest = lookahead.rest()
-            step = _Step(number, rest, list(source.channels), source.damage[known:])
-            return self._put(step) and count > 0
+                    return
+            self._put(_Step(lookahead.rest(), list(source.channels), source.damage[known:]))
 
 
 class _Player:
@@ -203,11 +192,8 @@ class _Player:
         self._speed = speed
         self._stop = stop
         self._is_late = False
-        self._number = 0
-        self._known: dict[tuple[object, ...], Channel | None] = {}
         self._publishers: Counter[str] = Counter()
         self._channels: list[Channel | None] = []
-        self._nth: Counter[tuple[object, ...]] = Counter()
         self._first: int | None = None
         self._newest = 0
         self._waited_for = -1
@@ -217,9 +203,8 @@ class _Player:
         """Play all steps."""
         try:
             for step in steps:
-                if step.end or step.number != self._number:
-                    self._wait_for_the_end()
                 if step.end:
+                    self._wait_for_the_end()
                     self._end(step.error)
                     return
                 self._begin(step)
@@ -242,36 +227,20 @@ class _Player:
     # Channels and damage.
 
     def _begin(self, step: _Step) -> None:
-        if step.number != self._number:
-            self._number, self._first = step.number, None
-            self._channels, self._nth = [], Counter()
         for channel in step.channels[len(self._channels) :]:
             self._channels.append(self._add(channel))
-        if step.number == 0:
-            for damage in step.damage:
-                self._report(damage)
+        for damage in step.damage:
+            self._report(damage)
 
     def _add(self, channel: Channel) -> Channel | None:
         """The channel that the sink knows, None if it does not want the topic."""
-        schema = channel.schema
-        key: tuple[object, ...] = (
-            channel.topic,
-            channel.message_encoding,
-            schema,
-            tuple(sorted(channel.metadata.items())),
-        )
-        self._nth[key] += 1
-        key = (*key, self._nth[key])
-        if key not in self._known:
-            type_name = "" if schema is None else schema.name
-            is_wanted = self._sink.wants(channel.topic, type_name)
-            self._known[key] = channel if is_wanted else None
-            if is_wanted:
-                self._publishers[channel.topic] += 1
-                count = self._publishers[channel.topic]
-                self._sink.topic_came(channel.topic, type_name, count)
-                self._sink.expect(channel)
-        return self._known[key]
+        type_name = "" if channel.schema is None else channel.schema.name
+        if not self._sink.wants(channel.topic, type_name):
+            return None
+        self._publishers[channel.topic] += 1
+        self._sink.topic_came(channel.topic, type_name, self._publishers[channel.topic])
+        self._sink.expect(channel)
+        return channel
 
     def _report(self, damage: Damage) -> None:
         place = str(damage.file)
@@ -292,8 +261,6 @@ class _Player:
         if self._first is None:
             self._first = self._newest = int(rows.table.log_time[0])
             self._start = time.monotonic()
-            if self._number:
-                self._start = self._last_due + _BETWEEN_S
         due = self._due(rows)
         self._last_due = max(self._last_due, float(due[-1]))
         wanted = np.array([channel is not None for channel in self._channels])
@@ -324,7 +291,7 @@ class _Player:
         return self._start + elapsed / (1e9 * self._speed)
 
     def _wait_for_the_end(self) -> None:
-        """Wait until the last message of the round is due, even if its topic is not recorded."""
+        """Wait until the last message is due, even if its topic is not recorded."""
         while not self._stop.is_set():
             pause = self._last_due - time.monotonic()
             if pause <= 0:

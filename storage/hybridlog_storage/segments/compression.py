@@ -36,6 +36,8 @@ _MAX_RATIO = {"zstd": 1 << 15, "lz4": 255}
 _RATIO_SLACK = 1 << 17
 
 _PIECE = 1 << 18
+_SAMPLE = 8192  # bytes of one sample of a chunk
+_SAMPLES = 6
 # In a hurry: compressing to this share or less is faster than writing uncompressed,
 _WORTH_IT = 0.2
 _FAST = 1  # at this level of either codec.
@@ -261,8 +263,6 @@ class Compressor:
     Args:
         name: The codec; `none` stores everything as it is.
         level: Level of the codec: 1 to 22 for zstd (negative: faster), 0 to 16 for lz4.
-        sample_size: Bytes of one sample.
-        samples: Number of samples, spread evenly over the chunk.
         min_gain: Share of the size that compressing must save, 0 to 1.
 
     Raises:
@@ -274,8 +274,6 @@ class Compressor:
         name: Literal["zstd", "lz4", "none"] = "zstd",
         level: int = 1,
         *,
-        sample_size: int = 8192,
-        samples: int = 6,
         min_gain: float = 0.03,
     ) -> None:
         if name not in {"zstd", "lz4", "none"}:
@@ -286,8 +284,6 @@ class Compressor:
             raise ValueError(f"lz4 has levels up to {lz4.frame.COMPRESSIONLEVEL_MAX}")
         self.name = name
         self.level = level
-        self._sample_size = sample_size
-        self._samples = samples
         self._max_ratio = 1.0 - min_gain
         self._own = threading.local()  # threads must not share a ZstdCompressor
 
@@ -318,14 +314,11 @@ class Compressor:
         They are compressed as the chunk would be: level 1 finds nothing in a noisy picture
         of which level 3 saves a third.
         """
-        tried = self._sample_size * self._samples
-        if len(data) < 4 * tried:
+        if len(data) < 4 * _SAMPLE * _SAMPLES:
             return True
         view = memoryview(data)
-        step = (len(data) - self._sample_size) // (self._samples - 1) if self._samples > 1 else 0
-        sample = b"".join(
-            view[i * step : i * step + self._sample_size] for i in range(self._samples)
-        )
+        step = (len(data) - _SAMPLE) // (_SAMPLES - 1)
+        sample = b"".join(view[i * step : i * step + _SAMPLE] for i in range(_SAMPLES))
         return len(self._pack(sample, level)) <= len(sample) * bound
 
     def _pack(self, data: Buffer, level: int) -> bytes:

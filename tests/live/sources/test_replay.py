@@ -290,12 +290,12 @@ def test_what_is_late_in_the_log_is_no_lateness_of_ours() -> None:
     def step(*times: int) -> replay._Step:
         rows = Lookahead()
         rows.add(batch(times, 20))
-        return replay._Step(0, rows.rest(), [Channel("/a", "json", None)], [])
+        return replay._Step(rows.rest(), [Channel("/a", "json", None)], [])
 
     hour = 3600 * SECOND
     heard = Heard()
     player = replay._Player(heard, "log", 1.0, threading.Event())
-    end = replay._Step(0, None, [], [], end=True)
+    end = replay._Step(None, [], [], end=True)
     player.play(iter([step(BEGIN, BEGIN + 1), step(BEGIN - hour), step(BEGIN + 2), end]))
     assert len(heard.taken) == 4
     assert heard.said == []
@@ -337,18 +337,6 @@ def test_a_long_pause_is_said_and_can_be_left(tmp_path: Path) -> None:
     assert heard.ends == []
 
 
-def test_rounds_follow_each_other_until_stopped(tmp_path: Path) -> None:
-    path = write(tmp_path / "a.mcap", [("/a", BEGIN + at, b"%d" % at) for at in range(3)])
-    heard = Heard()
-    with ReplaySource(path, speed=FAST, loop=True) as source:
-        source.start(heard)
-        heard.until(lambda h: len(h.taken) >= 7)
-    assert heard.payloads()[:7] == [b"0", b"1", b"2", b"0", b"1", b"2", b"0"]
-    assert len({id(taken.channel) for taken in heard.taken}) == 1
-    assert heard.topics == [("/a", "T", 1)]
-    assert heard.ends == []
-
-
 def test_what_is_not_wanted_takes_its_time_all_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -361,27 +349,6 @@ def test_what_is_not_wanted_takes_its_time_all_the_same(
         play_by(clock, path, heard, monkeypatch, speed=1.0)
         assert clock.now == pytest.approx(began + 0.2, abs=replay._MIN_PAUSE_S)
         assert heard.ends == [""]
-    with ReplaySource(path, loop=True) as source:
-        source.start(Heard(lambda *_: False))
-
-
-def test_a_log_without_messages_has_no_rounds(tmp_path: Path) -> None:
-    heard = Heard()
-    with ReplaySource(write(tmp_path / "a.mcap", []), loop=True) as source:
-        source.start(heard)
-        heard.until(lambda h: h.ends)
-    assert heard.ends == [""]
-
-
-def test_a_log_that_vanishes_between_rounds_ends_with_the_reason(tmp_path: Path) -> None:
-    path = write(tmp_path / "a.mcap", [("/a", BEGIN, b"x")])
-    heard = Heard()
-    with ReplaySource(path, loop=True) as source:
-        source.start(heard)
-        heard.until(lambda h: h.taken)
-        path.unlink()
-        heard.until(lambda h: h.ends)
-    assert "no such file" in heard.ends[0]
 
 
 @pytest.mark.parametrize("speed", [0.0, -1.0, float("inf"), float("nan")])
