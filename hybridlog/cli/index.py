@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 @click.group()
 def index_command() -> None:
-    """Index fields in MongoDB for MongoDB filters and other programs, or arrays in tables."""
+    """Index fields in MongoDB, or arrays in tables."""
 
 
 @dataclass(frozen=True, kw_only=True)
