@@ -28,6 +28,7 @@ from benchmarks.loads.base import PAYLOADS, Load
 from benchmarks.side import MARK
 from hybridlog_storage.messages import Channel
 from tests.imports import ROOT
+from tests.waiting import wait_for
 
 pytestmark = pytest.mark.mongo("embedded")
 
@@ -408,6 +409,7 @@ from benchmarks.harness.run import run
 from benchmarks.loads.base import Load
 from benchmarks.studies.runs import run_directory
 from tests.benchmarks.test_harness import Served
+from tests.waiting import wait_for
 with run_directory(Path(sys.argv[1])) as directory:
     run(Load.open(Path(sys.argv[2])), Served, directory)
 """
@@ -425,12 +427,12 @@ def test_who_is_interrupted_leaves_nobody(tmp_path: Path, number: signal.Signals
         text=True,
     )
     below = psutil.Process(process.pid)
-    _until(lambda: len(_runs(work)) == 1 and _published(_runs(work)[0]) > 0)
+    wait_for(lambda: len(_runs(work)) == 1 and _published(_runs(work)[0]) > 0)
     started = below.children(recursive=True)
     assert len(started) >= 3  # the logger, the publisher, the server
     process.send_signal(number)
     _, said = process.communicate(timeout=60)
-    _until(lambda: not any(child.is_running() for child in started))
+    wait_for(lambda: not any(child.is_running() for child in started))
     if number == signal.SIGINT:
         assert "KeyboardInterrupt" in said
         assert _runs(work) == []
@@ -443,13 +445,6 @@ def _runs(work: Path) -> list[Path]:
 def _published(directory: Path) -> int:
     path = directory / "counters"
     return sum(Counters(path).published()) if path.is_file() and path.stat().st_size else 0
-
-
-def _until(true: Callable[[], bool], limit_s: float = 30.0) -> None:
-    deadline = time.monotonic() + limit_s
-    while not true():
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
 
 
 # The parts.

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import socket
 import threading
-import time
 import xmlrpc.client
 from collections.abc import Callable
 from socketserver import ThreadingMixIn
@@ -14,7 +13,7 @@ from xmlrpc.server import SimpleXMLRPCRequestHandler, SimpleXMLRPCServer
 
 from hybridlog.live.sources.ros1.handshake import decode_header, encode_header
 from hybridlog_storage.messages import Channel
-from tests.live.sources.heard import DEADLINE_S, Heard
+from tests.live.sources.heard import Heard
 
 STRING = {"type": "std_msgs/String", "md5sum": "992ce8a1687cec8c8bd883ec73ca41d1"}
 
@@ -266,11 +265,3 @@ class Collector(Heard):
 
         self.wait(lambda: bool(found()))
         return found()[0]
-
-
-def eventually(condition: Callable[[], bool]) -> None:
-    """Waits until something outside a sink holds."""
-    deadline = time.monotonic() + DEADLINE_S
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.005)

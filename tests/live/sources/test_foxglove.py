@@ -196,6 +196,25 @@ class Server:
                 self.failures.append(error)
 
 
+def hear(until: Callable[[Heard], object], *scripts: Script) -> Heard:
+    """What a source hears of a server, until something has come."""
+    heard = Heard()
+    with Server(*scripts) as server, FoxgloveSource(server.url) as source:
+        source.start(heard)
+        heard.until(until)
+    return heard
+
+
+def saying(payload: bytes, time: int = 0, number: int = 1) -> Script:
+    """Plays one message on one channel."""
+
+    def script(peer: Peer) -> None:
+        peer.send(message(peer.offer(channel(number))[number], time, payload))
+        peer.wait()
+
+    return script
+
+
 @pytest.fixture(autouse=True)
 def _quick(limit: Limit) -> Iterator[None]:
     """Look more often and try again sooner; and nothing is left behind."""
@@ -366,10 +385,7 @@ def test_every_size_comes_byte_for_byte_however_it_is_cut() -> None:
         peer.wait()
 
     before = time.time_ns()
-    heard = Heard()
-    with Server(script) as server, FoxgloveSource(server.url) as source:
-        source.start(heard)
-        heard.until(lambda h: len(h.taken) > len(payloads))
+    heard = hear(lambda h: len(h.taken) > len(payloads), script)
     assert heard.payloads() == [*payloads, b"last"]
     assert {type(taken.payload) for taken in heard.taken} == {bytes}
     assert [taken.sent for taken in heard.taken] == list(range(len(payloads) + 1))
@@ -400,10 +416,7 @@ def test_messages_in_pieces_are_put_together() -> None:
         )
         peer.wait()
 
-    heard = Heard()
-    with Server(script) as server, FoxgloveSource(server.url) as source:
-        source.start(heard)
-        heard.until(lambda h: len(h.taken) == 2)
+    heard = hear(lambda h: len(h.taken) == 2, script)
     assert heard.payloads() == [bytes(100_000), b"next"]
     assert heard.said == []
 
@@ -448,10 +461,7 @@ def test_channels_that_go_and_come_again() -> None:
         peer.send(message(changed, 0, b"4"))
         peer.wait()
 
-    heard = Heard()
-    with Server(script) as server, FoxgloveSource(server.url) as source:
-        source.start(heard)
-        heard.until(lambda h: len(h.taken) == 4)
+    heard = hear(lambda h: len(h.taken) == 4, script)
     assert heard.payloads() == [b"1", b"2", b"3", b"4"]
     came = ("/a", "T", 1)
     assert heard.topics == [came, ("/a",), came, ("/a",), ("/a", "U", 1), ("/a",)]
@@ -471,10 +481,7 @@ def test_a_channel_that_is_offered_too_soon_is_asked_for_again(words: str) -> No
         peer.send(message(number, 0, b"1"))
         peer.wait()
 
-    heard = Heard()
-    with Server(script) as server, FoxgloveSource(server.url) as source:
-        source.start(heard)
-        heard.until(lambda h: h.taken)
+    heard = hear(lambda h: h.taken, script)
     assert heard.said == []
 
 
@@ -490,10 +497,7 @@ def test_a_channel_that_is_offered_and_never_sent_is_told(limit: Limit) -> None:
         peer.send(status, text({"op": "status", "message": REFUSALS[0].format(8)}))
         peer.wait()
 
-    heard = Heard()
-    with Server(script) as server, FoxgloveSource(server.url) as source:
-        source.start(heard)
-        heard.until(lambda h: len(h.said) == 2)
+    heard = hear(lambda h: len(h.said) == 2, script)
     assert "offers '/a', but does not send it" in heard.said[0]
     assert "says: Unknown channel ID: 8" in heard.said[1]
 
@@ -546,10 +550,7 @@ def test_who_gives_reason_to_complain_for_ever_is_not_listened_to_for_ever() -> 
         peer.send(message(number, 0, b"after"))
         peer.wait()
 
-    heard = Heard()
-    with Server(script) as server, FoxgloveSource(server.url) as source:
-        source.start(heard)
-        heard.until(lambda h: h.taken)
+    heard = hear(lambda h: h.taken, script)
     assert len(heard.said) == 101
 
 
@@ -562,22 +563,12 @@ def test_channels_without_end_are_bounded(limit: Limit) -> None:
         peer.send(message(found[9], 0, b"x"))
         peer.wait()
 
-    heard = Heard()
-    with Server(script) as server, FoxgloveSource(server.url) as source:
-        source.start(heard)
-        heard.until(lambda h: h.taken)
+    heard = hear(lambda h: h.taken, script)
     assert heard.said_of("more than 10 channels")
 
 
 def test_a_time_that_no_log_can_hold_is_replaced() -> None:
-    def script(peer: Peer) -> None:
-        peer.send(message(peer.offer(channel())[1], (1 << 64) - 1, b"x"))
-        peer.wait()
-
-    heard = Heard()
-    with Server(script) as server, FoxgloveSource(server.url) as source:
-        source.start(heard)
-        heard.until(lambda h: h.taken)
+    heard = hear(lambda h: h.taken, saying(b"x", (1 << 64) - 1))
     assert heard.taken[0].sent == heard.taken[0].received
     assert heard.said_of("2262")
 
@@ -625,14 +616,7 @@ def test_a_connection_that_ends_is_made_anew(sent: bytes, words: str) -> None:
         if sent:
             peer.wait()
 
-    def second(peer: Peer) -> None:
-        peer.send(message(peer.offer(channel(9))[9], 0, b"2"))
-        peer.wait()
-
-    heard = Heard()
-    with Server(first, second) as server, FoxgloveSource(server.url) as source:
-        source.start(heard)
-        heard.until(lambda h: len(h.taken) == 2)
+    heard = hear(lambda h: len(h.taken) == 2, first, saying(b"2", number=9))
     assert heard.payloads() == [b"1", b"2"]
     (line,) = heard.said
     assert words in line
@@ -656,10 +640,7 @@ def test_a_connection_that_breaks_in_a_message_is_a_row(*, size: int, is_in_piec
             whole = frame(Opcode.BINARY, body(number, 0, bytes(size)), is_last=False) + b"."
         peer.send(whole[: len(whole) - 1])
 
-    heard = Heard()
-    with Server(first, Peer.wait) as server, FoxgloveSource(server.url) as source:
-        source.start(heard)
-        heard.until(lambda h: h.losses)
+    heard = hear(lambda h: h.losses, first, Peer.wait)
     assert heard.taken == []
     (lost,) = heard.losses
     assert (lost.topic, lost.cause, lost.count) == ("/a", Cause.CONNECTION, 1)
@@ -667,12 +648,11 @@ def test_a_connection_that_breaks_in_a_message_is_a_row(*, size: int, is_in_piec
 
 
 def test_the_first_address_of_a_host_that_answers_is_taken() -> None:
-    def script(peer: Peer) -> None:
-        peer.send(message(peer.offer(channel())[1], 0, b"1"))
-        peer.wait()
-
     heard = Heard()
-    with Server(script) as server, FoxgloveSource(f"ws://localhost:{server.port}/x?y") as source:
+    with (
+        Server(saying(b"1")) as server,
+        FoxgloveSource(f"ws://localhost:{server.port}/x?y") as source,
+    ):
         source.start(heard)
         heard.until(lambda h: h.taken)
     assert heard.said == []
@@ -696,10 +676,7 @@ def test_a_server_that_falls_silent_is_asked_and_then_left(
         peer.send(message(number, 0, b"1"))
         peer.wait()
 
-    heard = Heard()
-    with Server(first, second) as server, FoxgloveSource(server.url) as source:
-        source.start(heard)
-        heard.until(lambda h: h.taken)
+    heard = hear(lambda h: h.taken, first, second)
     assert asked == [Opcode.PING]
     assert [line for line in heard.said if "has been silent for" in line] == heard.said
     assert len(heard.said) == 1
@@ -810,15 +787,11 @@ def test_a_server_that_comes_late_is_waited_for() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
 
-    def script(peer: Peer) -> None:
-        peer.send(message(peer.offer(channel())[1], 0, b"1"))
-        peer.wait()
-
     heard = Heard()
     with FoxgloveSource(f"ws://127.0.0.1:{port}") as source:
         source.start(heard)
         heard.until(lambda h: h.said_of("refuses connections"))
-        with Server(script, port=port):
+        with Server(saying(b"1"), port=port):
             heard.until(lambda h: h.taken)
             source.stop()
 
@@ -891,13 +864,9 @@ def test_a_sink_that_fails_is_told(monkeypatch: pytest.MonkeyPatch, calls: Calls
     seen: list[object] = []
     monkeypatch.setattr(threading, "excepthook", lambda args: seen.append(args.exc_value))
 
-    def script(peer: Peer) -> None:
-        peer.send(message(peer.offer(channel())[1], 0, b"1"))
-        peer.wait()
-
     heard = Heard()
     calls.fail(heard, "take", RuntimeError("no more"))
-    with Server(script) as server, FoxgloveSource(server.url) as source:
+    with Server(saying(b"1")) as server, FoxgloveSource(server.url) as source:
         source.start(heard)
         heard.until(lambda h: h.ends)
     assert "no more" in heard.ends[0]

@@ -268,16 +268,6 @@ def test_messages_come_out_as_they_went_in(seed: int, channel: Channel) -> None:
     assert pipe.ends == [""]
 
 
-def test_one_byte_at_a_time() -> None:
-    payloads = [b"", b"a", b"abcd" * 5, b"", b"xyz"]
-    pipe = _Pipe()
-    for byte in framed(*payloads):
-        pipe.send(bytes([byte]))
-    pipe.hang_up()
-    assert pipe.payloads() == payloads
-    assert not pipe.sink.losses
-
-
 def test_a_message_longer_than_a_piece() -> None:
     payloads = [random.Random(1).randbytes(10_000_000), b"after", bytes(5_000_000), b""]
     pipe = _Pipe()

@@ -20,7 +20,8 @@ import pytest
 from hybridlog.live.sources.base import Cause
 from hybridlog.live.sources.ros1.source import Ros1Source
 from tests.live.sources.ros1_debian import PACKAGES, Ros1, ros1
-from tests.live.sources.ros1_peers import Collector, eventually
+from tests.live.sources.ros1_peers import Collector
+from tests.waiting import wait_for
 
 PUBLISHER = """
 import hashlib, io, json, sys
@@ -94,7 +95,7 @@ class _Master:
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
         )
-        eventually(self._answers)
+        wait_for(self._answers)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -247,7 +248,7 @@ def test_the_master_is_started_anew(debian: Ros1) -> None:
             publisher.publish(5)
             sink.wait_said("no ROS master")
             master.__enter__()
-            eventually(lambda: bool(master.subscribers("/steady")))
+            wait_for(lambda: bool(master.subscribers("/steady")))
             publisher.publish(5)
             sink.wait(lambda: len(sink.taken) == 15)
             with _Publisher(master, "/steady", node="new") as other:

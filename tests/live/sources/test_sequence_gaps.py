@@ -73,17 +73,21 @@ def by_ros1_at_once(numbers: Sequence[int]) -> int:
     return by_ros1(numbers, at_once=True)
 
 
-def by_foxglove(numbers: Sequence[int]) -> int:
+def heard_by_foxglove(*payloads: bytes) -> Heard:
     heard = Heard()
     session = Session(heard, Notifier(heard, "server"), lambda _: None, {})
     session._advertise(
         [{"id": 1, "topic": "/a", "encoding": "ros1", "schemaName": "T", "schema": DEFINITION}]
     )
-    for number in numbers:
-        session.data(0, 1, payload(number))
+    for one in payloads:
+        session.data(0, 1, one)
     session.end(is_stopped=True)
-    assert len(heard.taken) == len(numbers)
-    return reported(heard)
+    assert len(heard.taken) == len(payloads)
+    return heard
+
+
+def by_foxglove(numbers: Sequence[int]) -> int:
+    return reported(heard_by_foxglove(*map(payload, numbers)))
 
 
 USERS = [by_the_detector, by_ros1_one_by_one, by_ros1_at_once, by_foxglove]
@@ -181,29 +185,12 @@ def test_joined_gaps_span_all() -> None:
 
 
 def test_foxglove_puts_close_gaps_into_few_rows() -> None:
-    heard = Heard()
-    session = Session(heard, Notifier(heard, "server"), lambda _: None, {})
-    session._advertise(
-        [{"id": 1, "topic": "/a", "encoding": "ros1", "schemaName": "T", "schema": DEFINITION}]
-    )
-    for number in [*range(100), *range(100, 400, 3)]:
-        session.data(0, 1, payload(number))
-    session.end(is_stopped=True)
+    heard = heard_by_foxglove(*map(payload, [*range(100), *range(100, 400, 3)]))
     assert reported(heard) == 2 * 99
     assert len(heard.losses) < 20
 
 
 @pytest.mark.parametrize("data", [b"", b"abc"])
 def test_a_payload_without_room_for_a_number_is_ignored(data: bytes) -> None:
-    heard = Heard()
-    session = Session(heard, Notifier(heard, "server"), lambda _: None, {})
-    session._advertise(
-        [{"id": 1, "topic": "/a", "encoding": "ros1", "schemaName": "T", "schema": DEFINITION}]
-    )
-    for number in range(20):
-        session.data(0, 1, payload(number))
-    session.data(0, 1, data)
-    session.data(0, 1, payload(20))
-    session.end(is_stopped=True)
+    heard = heard_by_foxglove(*map(payload, range(20)), data, payload(20))
     assert heard.losses == []
-    assert len(heard.taken) == 22
