@@ -5,6 +5,7 @@ import signal
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import NoReturn
 
 import pytest
@@ -42,35 +43,37 @@ def handled() -> Iterator[None]:
         signal.signal(signal.SIGINT, interrupt)
 
 
-def test_a_signal_waits_for_a_safe_point() -> None:
-    done = []
-
-    def work() -> None:
+@contextmanager
+def stopped(
+    number: signal.Signals = signal.SIGTERM, error: type[BaseException] = Stop
+) -> Iterator[list[str]]:
+    """What is done in a block that gets a signal, until that stops it."""
+    done: list[str] = []
+    try:
         with at_safe_points():
             safe_point()
-            signal.raise_signal(signal.SIGTERM)
-            done.append("more")
-            safe_point()
-            done.append("too much")
+            signal.raise_signal(number)
+            yield done
+    except error:
+        return
+    pytest.fail("Nothing stopped it.")
 
-    with pytest.raises(Stop):
-        work()
+
+def test_a_signal_waits_for_a_safe_point() -> None:
+    with stopped() as done:
+        done.append("more")
+        safe_point()
+        done.append("too much")
     assert done == ["more"]
     assert not is_delayed()
     assert not postpone(stop)
 
 
 def test_the_end_of_the_outermost_block_is_a_safe_point() -> None:
-    done = []
-
-    def work() -> None:
+    with stopped() as done:
         with at_safe_points():
-            with at_safe_points():
-                signal.raise_signal(signal.SIGTERM)
-            done.append("after the inner one")
-
-    with pytest.raises(Stop):
-        work()
+            signal.raise_signal(signal.SIGTERM)
+        done.append("after the inner one")
     assert done == ["after the inner one"]
 
 
@@ -86,33 +89,19 @@ def test_what_stops_is_raised_even_if_the_block_fails() -> None:
 
 
 def test_cleaning_up_is_not_stopped_by_the_same_signal() -> None:
-    done = []
-
-    def work() -> None:
-        with at_safe_points():
-            signal.raise_signal(signal.SIGTERM)
-            try:
-                safe_point()
-            finally:
-                safe_point()
-                done.append("clean")
-
-    with pytest.raises(Stop):
-        work()
+    with stopped() as done:
+        try:
+            safe_point()
+        finally:
+            safe_point()
+            done.append("clean")
     assert done == ["clean"]
 
 
 def test_ctrl_c_waits_in_a_block_and_not_beside_it() -> None:
-    done = []
-
-    def work() -> None:
-        with at_safe_points():
-            signal.raise_signal(signal.SIGINT)
-            done.append("more")
-            safe_point()
-
-    with pytest.raises(KeyboardInterrupt):
-        work()
+    with stopped(signal.SIGINT, KeyboardInterrupt) as done:
+        done.append("more")
+        safe_point()
     assert done == ["more"]
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
@@ -159,16 +148,11 @@ def test_other_threads_are_not_stopped() -> None:
             safe_point()
             done.append("all")
 
-    def work() -> None:
-        with at_safe_points():
-            signal.raise_signal(signal.SIGTERM)
-            thread = threading.Thread(target=elsewhere)
-            thread.start()
-            thread.join()
-            safe_point()
-
-    with pytest.raises(Stop):
-        work()
+    with stopped():
+        thread = threading.Thread(target=elsewhere)
+        thread.start()
+        thread.join()
+        safe_point()
     assert done == ["all"]
 
 
