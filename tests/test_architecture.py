@@ -311,6 +311,26 @@ def test_starting_loads_nothing_heavy(start: str) -> None:
     assert [name for name in loaded if name in HEAVY] == []
 
 
+@pytest.mark.parametrize(
+    ("modules", "heavy"),
+    [
+        ("hybridlog.demo.tour", "numpy rosbags pandas pyarrow"),
+        ("hybridlog.formats.detect", "rosbags yaml sqlite3 lz4 pandas pyarrow pymongo"),
+        (
+            "hybridlog.formats, hybridlog.query.times, hybridlog.query.topics, "
+            "hybridlog.query.predicate.parser, hybridlog.query.predicate.mongo_filter",
+            "pyarrow pandas rosbags mcap pymongo numpy re2",
+        ),
+        ("hybridlog_storage.mongo.mongod, hybridlog_storage.mongo.database", "pymongo bson"),
+        ("benchmarks.backends.registry", "psycopg pymongo mcap rosbags"),
+    ],
+)
+def test_importing_a_module_loads_no_library(modules: str, heavy: str) -> None:
+    script = f"import sys, {modules}\nprint(sorted({{*{heavy.split()}}} & {{*sys.modules}}))"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, cwd=ROOT, check=True)
+    assert done.stdout == b"[]\n"
+
+
 @pytest.mark.parametrize("package", [*PACKAGES, ROOT / "benchmarks"], ids=lambda p: p.name)
 def test_every_module_says_what_it_is_for(package: Path) -> None:
     paths = sorted(package.rglob("*.py"))

@@ -441,14 +441,6 @@ def test_registry() -> None:
         assert "\n" not in backend.about
 
 
-def test_importing_the_registry_imports_no_driver() -> None:
-    script = (
-        "import sys, benchmarks.backends.registry;"
-        "print([n for n in ('psycopg', 'pymongo', 'mcap', 'rosbags') if n in sys.modules])"
-    )
-    assert in_another_process(script).strip() == "[]"
-
-
 def test_table_names_stay_apart() -> None:
     topics = [*HOSTILE, "/long_name" * 29 + "/x", "/SQLITE_master", "/a/B", ""]
     for table_of in (postgres.table_of, sqlite.table_of):

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -149,13 +147,3 @@ def test_zstd_that_holds_no_log(tmp_path: Path, data: bytes) -> None:
     assert sniff(tmp_path / "a.zstd") == (UNKNOWN, True)
     with pytest.raises(SourceError, match="zstd"):
         open_source(tmp_path / "a.zstd")
-
-
-def test_loads_no_reader_before_it_is_needed() -> None:
-    code = (
-        "import sys, hybridlog.formats.detect\n"
-        "heavy = {'rosbags', 'yaml', 'sqlite3', 'lz4', 'pandas', 'pyarrow', 'pymongo'}\n"
-        "print(sorted(heavy & set(sys.modules)))"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"

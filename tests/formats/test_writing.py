@@ -192,17 +192,6 @@ def test_other_failures(tmp_path: Path, calls: Calls) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_table_of_formats_loads_no_library() -> None:
-    code = (
-        "import sys, hybridlog.formats, hybridlog.query.times, hybridlog.query.topics, "
-        "hybridlog.query.predicate.parser, hybridlog.query.predicate.mongo_filter; "
-        "print(sorted({'pyarrow', 'pandas', 'rosbags', 'mcap', 'pymongo', 'numpy', 're2'} "
-        "& set(sys.modules)))"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
-
-
 @pytest.mark.parametrize("name", ["parquet", "arrow", "csv", "npz", "mcap"])
 def test_an_aborted_stream_has_no_end(name: str) -> None:
     stream = io.BytesIO()

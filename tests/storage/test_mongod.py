@@ -776,15 +776,3 @@ def test_linger_time_of_the_environment(monkeypatch: pytest.MonkeyPatch, directo
         monkeypatch.setenv("HYBRIDLOG_MONGOD_LINGER_S", text)
         with pytest.raises(UsageError):
             EmbeddedMongod(directory)
-
-
-def test_nothing_heavy_is_imported() -> None:
-    code = (
-        "import sys, hybridlog_storage.mongo.mongod as m, hybridlog_storage.mongo.database;"
-        "m.find_mongod();"
-        "print([n for n in ('pymongo', 'bson', 'fiftyone') if n in sys.modules])"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
-    )
-    assert done.stdout == "[]\n"
