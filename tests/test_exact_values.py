@@ -36,7 +36,6 @@ LOGS = [
     "clouds_mixed_empty.mcap",
     "z_dup_stamp.bag",
 ]
-TABLES = ["arrow", "parquet", "csv", "npz"]
 
 
 @pytest.fixture(scope="module")

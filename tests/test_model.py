@@ -18,7 +18,6 @@ import zlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, fields, replace
-from datetime import UTC, datetime, timedelta
 from itertools import count, cycle
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -1061,32 +1060,6 @@ def seen(message: hl.Message) -> tuple[object, ...]:
         message.publish_time_ns,
         message.raw,
     )
-
-
-def document(message: Said) -> dict[str, Any]:
-    """The index document of a message but for its place in the segment."""
-    meta: dict[str, Any] = {"t": message.log_time}
-    if message.published is not None:
-        meta["pub"] = message.published
-    meta |= {
-        "rec": message.recording[:16],
-        "topic": message.topic,
-        "seq": message.seq,
-        "len": len(message.payload),
-        "error": message.torn,
-    }
-    time, recording, seq = message.order
-    key = struct.pack(">Q8sQ", time, bytes.fromhex(recording), seq)
-    return {"_id": key, **(message.fields or {}), "_meta": meta}
-
-
-def plain(found: dict[str, Any]) -> dict[str, Any]:
-    meta = found["_meta"]
-    inserted = meta.pop("inserted_at").replace(tzinfo=UTC)
-    assert inserted == datetime.fromtimestamp(0, UTC) + timedelta(microseconds=meta["t"] // 1000)
-    meta["len"] = meta.pop("ref")["len"]
-    meta["error"] = bool(meta.pop("error", ""))
-    return found
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,6 @@ from tests.independent import read
 
 pytestmark = pytest.mark.mongo
 
-SMALL_S = 5
 CLOCK = b"""builtin_interfaces/Time clock
 ================================================================================
 MSG: builtin_interfaces/Time

@@ -34,11 +34,6 @@ COUNTS = {"messages", "rate", "jitter"}
 LATE = START + 2 * SECOND
 
 
-def moved(ms: int) -> Change:
-    """One scan is late."""
-    return changed("/scan", 100, time=lambda m: m.time + ms * MS)
-
-
 def at(topic: str, **values: object) -> Change:
     """The message of a topic two seconds after the start has other values."""
 

@@ -7,7 +7,7 @@ import re
 import shutil
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -364,10 +364,3 @@ def _check_catalog(store: hl.Store) -> None:
         for number, summary in take_inventory(store.directory, label).summaries.items():
             found, wanted = store.catalog.table(described.entry, number), summary.table
             _check(found.to_bytes() == wanted.to_bytes(), f"the chunks of {label} {number} differ")
-
-
-def look_quietly(case: Case) -> State | None:
-    """What `look` says; None when the store contradicts itself."""
-    with suppress(WrongError):
-        return look(case)
-    return None

@@ -24,7 +24,6 @@ _READ = {
     "char": "i1", "uchar": "u1", "short": "<i2", "ushort": "<u2",
     "int": "<i4", "uint": "<u4", "float": "<f4", "double": "<f8",
 }  # fmt: skip
-S = 10**9
 
 
 def read_ply(data: bytes) -> np.ndarray[Any, Any]:

@@ -280,9 +280,6 @@ json_condition = _conditions(
 )
 
 
-lengths = st.integers(1, 8)
-
-
 @st.composite
 def questions(draw: st.DrawFn) -> dict[str, Any]:
     """A question as keyword arguments of `ask` and `expected`."""

@@ -20,7 +20,6 @@ from hybridlog_storage.messages import REPLACED, SUPPLIED, Channel, Schema
 from tests.calls import Calls
 from tests.ros_values import ROS1, message_of, same
 
-RULE = "=" * 80
 DIFFERENT = [
     ("visualization_msgs/msg/Marker", "ROS2_FOXY"),
     ("visualization_msgs/msg/Marker", "ROS2_HUMBLE"),

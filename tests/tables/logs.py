@@ -12,7 +12,6 @@ import numpy as np
 from mcap.writer import Writer
 
 import hybridlog as hl
-from hybridlog.schema.codecs import codec_for
 from hybridlog_storage.errors import PayloadError
 from hybridlog_storage.messages import Channel, Schema
 
@@ -195,8 +194,3 @@ def _summarises(cell: dict[str, Any], value: Any) -> bool:
         and cell["max"] == finite.max()
         and math.isclose(cell["mean"], mean, rel_tol=1e-9, abs_tol=1e-9)
     )
-
-
-def objects_of(encoding: str, schema: Schema, data: bytes) -> Any:
-    """A payload, decoded by itself."""
-    return codec_for(Channel("/x", encoding, schema)).decode(data)

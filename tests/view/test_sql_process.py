@@ -27,7 +27,6 @@ from tests.waiting import wait_for
 if TYPE_CHECKING:
     from starlette.testclient import TestClient
 
-LIMIT_S = 60
 START = 400 << 20  # what the process has before its first query, and files that it maps
 reserved: list[Any] = []
 

@@ -25,7 +25,6 @@ from hybridlog.view.tool_server import make_server
 from hybridlog_storage.messages import Channel
 
 ASK = Path(__file__).parents[2] / "docs" / "ask.md"
-CLOSED = "r_gripper_controller/command"
 
 
 class Told(NamedTuple):
