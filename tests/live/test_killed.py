@@ -95,7 +95,7 @@ def test_a_killed_recording_is_not_said_to_go_on(tmp_path: Path) -> None:
             time.sleep(0.02)
         assert [entry.status for entry in before.recordings()] == ["open"]
         with pytest.raises(HeldError, match=f"is being written by process {process.pid} "):
-            before.tag("load", a="1")
+            before.edit("load", tag={"a": "1"})
     finally:
         process.kill()
         process.communicate()
