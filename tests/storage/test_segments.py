@@ -7,7 +7,6 @@ import io
 import os
 import random
 import re
-import shutil
 import struct
 import threading
 import time
@@ -664,30 +663,6 @@ def test_a_chunk_that_holds_little_spans_more(tmp_path: Path, at_once: int) -> N
         assert set(counts[:-1]) == {want}, place
 
 
-@pytest.mark.parametrize("keep", [0.0, 0.3, 0.5, 0.8, 0.95, 0.999, 1.0])
-def test_a_cut_segment_is_recovered(tmp_path: Path, keep: float) -> None:
-    setup = SegmentSettings(chunk_size=4096)
-    (path,), chunks = write(tmp_path / "a", [many(500)], setup)
-    data = path.read_bytes()
-    last = chunks[-1].offset + chunks[-1].length + chunks[-1].trailer
-    cut = int(last * keep)
-    opened = tmp_path / "000000.mcap.open"
-    opened.write_bytes(data[:cut])
-    whole = [c for c in chunks if c.offset + c.length <= cut]
-    recovered = recover_segment(opened)
-    assert not opened.exists()
-    if recovered.path is None:
-        assert not whole
-        return
-    with SegmentReader(recovered.path, 0) as reader:
-        summary = reader.summary()
-        seqs = [s for p in summary.chunks for s in reader.read_chunk(p).seq.tolist()]
-    assert seqs == [s for c in whole for s in c.seq.tolist()]
-    assert recovered.messages == len(seqs)
-    official = make_reader(io.BytesIO(recovered.path.read_bytes()), validate_crcs=True)
-    assert len(list(official.iter_messages())) == len(seqs)
-
-
 def test_every_cut_of_a_small_segment_recovers(tmp_path: Path) -> None:
     (path,), chunks = write(tmp_path / "a", [many(30)], SegmentSettings(chunk_size=1024))
     data = path.read_bytes()
@@ -696,9 +671,18 @@ def test_every_cut_of_a_small_segment_recovers(tmp_path: Path) -> None:
         opened = tmp_path / "000000.mcap.open"
         opened.write_bytes(data[:cut])
         recovered = recover_segment(opened)
-        whole = sum(len(c.batch) for c in chunks if c.offset + c.length <= cut)
-        assert recovered.messages == whole, cut
-        (tmp_path / "000000.mcap").unlink(missing_ok=True)
+        whole = [seq for c in chunks if c.offset + c.length <= cut for seq in c.seq.tolist()]
+        assert recovered.messages == len(whole), cut
+        assert not opened.exists()
+        if recovered.path is None:
+            assert not whole
+            continue
+        with SegmentReader(recovered.path, 0) as reader:
+            places = reader.summary().chunks
+            assert [seq for p in places for seq in reader.read_chunk(p).seq.tolist()] == whole
+        official = make_reader(io.BytesIO(recovered.path.read_bytes()), validate_crcs=True)
+        assert len(list(official.iter_messages())) == len(whole)
+        recovered.path.unlink()
 
 
 @pytest.mark.parametrize("missing", [0, 1, 8, 37, 60, 200])
@@ -715,34 +699,6 @@ def test_a_segment_cut_in_its_summary_is_what_it_was(tmp_path: Path, missing: in
         assert reader.summary().end == {"status": "complete"}
     with SegmentCheck(recovered.path) as check:
         assert list(check.problems()) == []
-
-
-def test_a_flipped_bit_is_found_and_named(tmp_path: Path) -> None:
-    (path,), chunks = write(tmp_path, [many(500)], SegmentSettings(chunk_size=4096))
-    data = bytearray(path.read_bytes())
-    data[chunks[2].offset + chunks[2].length - 5] ^= 0x10
-    path.write_bytes(data)
-    with SegmentReader(path, 0) as reader:
-        places = reader.summary().chunks
-        reader.read_chunk(places[1])
-        with pytest.raises(SegmentError, match=f"byte {chunks[2].offset} of .*damaged"):
-            reader.read_chunk(places[2])
-
-
-def test_a_full_disk_is_said_to_be_full() -> None:
-    from hybridlog_storage.disk.durability import explain, write_all
-
-    with Path("/dev/full").open("wb", buffering=0) as file, pytest.raises(OSError) as caught:
-        write_all(file.fileno(), [b"x"])
-    assert explain(caught.value, Path("f"), "writing").exit_code == 7
-
-
-def test_zero_messages_make_a_valid_segment(tmp_path: Path) -> None:
-    (path,), _ = write(tmp_path, [])
-    assert (
-        list(make_reader(io.BytesIO(path.read_bytes()), validate_crcs=True).iter_messages()) == []
-    )
-    shutil.rmtree(tmp_path)
 
 
 def test_what_lies_in_the_place_of_a_segment(tmp_path: Path) -> None:
