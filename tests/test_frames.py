@@ -3,12 +3,10 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import bson
 import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pytest
-from bson.int64 import Int64
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -18,7 +16,6 @@ from hybridlog.schema.arrow_columns import records_array
 from hybridlog.schema.arrow_objects import values_array
 from hybridlog.schema.arrow_types import common_type, converted, extremes, plain_values
 from hybridlog.schema.column import Arrays, Column, Records, Scalars, Strings
-from tests.data import DATA, needs_data
 
 
 def strings(*cells: str | bytes) -> Strings:
@@ -220,18 +217,6 @@ def test_sorted_by_log_time_then_arrival(chunks: list[list[tuple[int, int]]], li
         assert [list(cell) for cell in frame["l"]] == [row["l"] for row in wanted]
 
 
-def test_equal_arrays_are_there_once() -> None:
-    rows, width = 3000, 9
-    builder = TableBuilder()
-    for n in range(10):
-        values = np.full(rows * width, np.nan)
-        column = Arrays(Scalars(values), np.arange(rows + 1) * width, width)
-        add(builder, np.arange(rows) + n, np.arange(rows), Records({"c": column}, rows))
-    column = builder.to_pandas()["c"]
-    assert len({id(cell) for cell in column}) == 1
-    assert np.isnan(column.iloc[-1]).all()
-
-
 def test_rows_that_stop_being_equal() -> None:
     frame = built(
         ([1, 2], {"c": arrays("f8", [1.0, 2.0], [1.0, 2.0])}),
@@ -424,55 +409,3 @@ def test_extremes_of_nested_arrays() -> None:
 
 
 # Index documents
-
-
-def document(n: int, /, **fields: Any) -> bytes:
-    reference = {"seg": 3, "chunk": Int64(100 + n), "off": Int64(7 * n), "len": Int64(n)}
-    key = (1000 + n).to_bytes(8, "big") + (9).to_bytes(8, "big") + n.to_bytes(8, "big")
-    meta = {"t": Int64(1000 + n), "seq": Int64(n), "ref": reference}
-    return bson.encode({"_id": key, **fields, "_meta": meta})
-
-
-@needs_data
-@pytest.mark.parametrize("topic", ["/imu_data", "/scan", "/tf", "/velocity"])
-def test_real_log_agrees_with_rosbags(topic: str) -> None:
-    from rosbags.highlevel import AnyReader
-
-    from hybridlog.schema.codecs import codec_for
-    from hybridlog_storage.messages import Channel, Schema
-
-    with AnyReader([DATA / "real/tilt_laser.bag"]) as reader:
-        (connection,) = [c for c in reader.connections if c.topic == topic][:1]
-        raw = [(time, bytes(data)) for _, time, data in reader.messages([connection])]
-        wanted = [reader.deserialize(data, connection.msgtype) for _, data in raw]
-    name = connection.msgtype.replace("/msg/", "/")
-    schema = Schema(name, "ros1msg", connection.msgdef.data.encode())
-    codec = codec_for(Channel(topic, "ros1", schema))
-    tables = [TableBuilder(), TableBuilder()]
-    for start in range(0, len(raw), 100):
-        part = raw[start : start + 100]
-        offset = offsets([data for _, data in part])
-        decoded = codec.columns(b"".join(data for _, data in part), offset[:-1], np.diff(offset))
-        time = times(*(time for time, _ in part))
-        seq = np.arange(start, start + len(part))
-        for builder in tables:
-            builder.append(Block(topic, time, seq, {}, decoded.arrow(), 0))
-    frame, table = tables[0].to_pandas(), tables[1].to_arrow()
-    table.validate(full=True)
-    assert frame.index.astype("int64").tolist() == sorted(time for time, _ in raw)
-    for path in frame.columns:
-        for got, message in zip(frame[path], wanted, strict=True):
-            value: Any = message
-            for part_name in path.split("."):
-                value = getattr(value, part_name)
-            if isinstance(value, np.ndarray):
-                assert got.dtype == value.dtype
-                assert np.array_equal(got, value, equal_nan=True)
-            elif isinstance(value, list):
-                assert len(got) == len(value)
-                assert got[0]["child_frame_id"] == value[0].child_frame_id
-                assert got[0]["transform"]["rotation"]["w"] == value[0].transform.rotation.w
-            elif hasattr(value, "nanosec"):
-                assert got.value == value.sec * 10**9 + value.nanosec
-            else:
-                assert got == value

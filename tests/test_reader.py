@@ -147,17 +147,6 @@ def test_summaries_beside_their_arrays(store: hl.Store, robot: Truth) -> None:
     assert frame.attrs["hybridlog"]["chunks_read"] > 0
 
 
-def test_summaries_over_several_topics(store: hl.Store, robot: Truth) -> None:
-    topics = ("/base/scan", "/odom")
-    frame = store.query(topics).in_recording("robot").fields("ranges.max", "header.seq")
-    table = frame.to_pandas()
-    assert list(table.columns) == ["topic", "ranges.max", "header.seq"]
-    scans = table[table["topic"] == "/base/scan"]
-    want = [m.message.ranges[np.isfinite(m.message.ranges)].max() for m in robot["/base/scan"]]
-    assert scans["ranges.max"].tolist() == [float(value) for value in want]
-    assert table[table["topic"] == "/odom"]["ranges.max"].isna().all()
-
-
 @pytest.mark.parametrize("topic", ["/base/scan", "/imu/data", "/camera/front/image_raw"])
 def test_each_chunk_is_read_once(store: hl.Store, robot: Truth, topic: str) -> None:
     query = store.topic(topic)
@@ -506,27 +495,6 @@ def test_a_header_that_can_be_read_in_a_message_that_cannot(tmp_path: Path) -> N
         assert store.verify().findings == []
 
 
-def test_predicates_as_text_and_as_filters(store: hl.Store, robot: Truth) -> None:
-    query = store.topic("/odom").in_recording("robot")
-    half = float(np.median([m.message.pose.pose.position.x for m in robot["/odom"]]))
-    want = [m.raw for m in robot["/odom"] if m.message.pose.pose.position.x > half]
-    text = query.where(f"pose.pose.position.x > {half!r}")
-    by_filter = query.where({"pose.pose.position.x": {"$gt": half}})
-    for each in (text, by_filter):
-        assert [m.raw for m in each] == want != []
-        assert each.count() == len(want)
-        assert len(each.to_pandas()) == len(want)
-    both = text.where("header.seq >= 50")
-    assert [m.raw for m in both] == [
-        m.raw
-        for m in robot["/odom"]
-        if m.message.pose.pose.position.x > half and m.message.header.seq >= 50
-    ]
-    assert text.every(3).limit(4).count() == len(want[::3][:4])
-    assert [m.raw for m in text.every(3).limit(4)] == want[::3][:4]
-    assert [m.raw for m in text.reverse().limit(2)] == want[::-1][:2]
-
-
 # What is refused.
 
 
@@ -762,18 +730,3 @@ def test_a_schema_of_many_recordings_is_asked_for_once(tmp_path: Path, calls: Ca
         store.refresh()
         assert store.topic("talk").where("data < 3").count() == 3
         assert asked == [1]  # it is known by its content
-
-
-def test_a_schema_that_the_catalog_lacks_is_in_the_segments(tmp_path: Path) -> None:
-    with hl.open(tmp_path / "store", create=True) as store:
-        with store.start("talk") as recording:
-            schema = Schema("std_msgs/Int32", "ros1msg", b"int32 data\n")
-            recording.write(Channel("/talk", "ros1", schema), struct.pack("<i", 7))
-        (schema_file,) = (tmp_path / "store" / "catalog").glob("schema-*")
-        schema_file.unlink()
-        store.refresh()
-        assert store.topic("talk").where("data == 7").count() == 1
-        (message,) = store.topic("talk")
-        assert message.decode().data == 7
-        # It is made again unasked.
-        assert not store.verify().findings

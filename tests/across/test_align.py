@@ -138,36 +138,6 @@ def test_joins_are_those_of_pandas(logs: Logs, how: str, direction: str, clock: 
             np.testing.assert_array_equal(mine[f"{topic}.distance"].to_numpy(), distance)
 
 
-def test_an_asof_join_is_that_of_duckdb(logs: Logs) -> None:
-    duckdb = pytest.importorskip("duckdb")
-    with duckdb.connect() as connection:
-        for name, topic in (("base", "/base"), ("others", "/left/pose")):
-            rows = [
-                {"r": label, "t": m.time, "n": m.number}
-                for label in logs.said
-                for m in logs.of(label, topic)
-            ]
-            connection.register(name, pa.Table.from_pylist(rows))
-        want = connection.sql(
-            "select base.r, base.n, others.t from base asof left join others "
-            "on base.r = others.r and base.t >= others.t order by base.r, base.n"
-        ).fetchall()
-    found = logs.store.align("base", "left/pose", fields={"base": ["header.seq"]}).to_arrow()
-    distance = found["left/pose.distance"].cast(pa.int64()).to_pylist()
-    times = found["log_time"].cast(pa.int64()).to_pylist()
-    rows = [
-        (label, number, None if apart is None else time + apart)
-        for label, number, time, apart in zip(
-            found["recording"].to_pylist(),
-            found["base.header.seq"].to_pylist(),
-            times,
-            distance,
-            strict=True,
-        )
-    ]
-    assert sorted(rows, key=lambda row: row[:2]) == want
-
-
 def on_the_sphere(low: np.ndarray, high: np.ndarray, part: float) -> np.ndarray:
     """Turning by a share of the angle between two rotations, by axis and angle."""
     x, y, z, w = low

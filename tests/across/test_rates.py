@@ -144,14 +144,6 @@ def test_gaps(
     assert query.counters.chunks_read == 0
 
 
-def test_a_mean_rate_of_some_messages(logs: Logs, blocks: None) -> None:
-    query = logs.store.topic("left/pose").where("on == true")
-    for row in query.rate().to_pylist():
-        times = [m.time for m in logs.of(row["recording"], "/left/pose") if m.fields["on"]]
-        assert (row["begin"].value, row["end"].value - 1) == (times[0], times[-1])
-        assert row["messages"] == len(times)
-
-
 def test_times_of_a_rare_topic_cost_no_payloads(tmp_path: Path, calls: Calls, limit: Limit) -> None:
     """Its messages lie in chunks full of others': these are not read for times."""
     settings = SegmentSettings(chunk_size=4096)

@@ -5,40 +5,7 @@ from __future__ import annotations
 import contextlib
 from pathlib import Path
 
-import pyarrow.parquet
-import pytest
-
-from tests.independent import read_bag, read_mcap
-
 from .running import run
-
-
-@pytest.mark.parametrize("form", ["mcap", "bag"])
-def test_whole_recordings_are_exact(form: str, logs: Path, store: Path, tmp_path: Path) -> None:
-    path = tmp_path / f"x.{form}"
-    done = run("export", path, "-r", "robot", store=store)
-    found = (read_mcap if form == "mcap" else read_bag)(path)
-    assert sorted(found) == sorted(read_bag(logs / "robot.bag"))
-    assert f"{path}: {len(found)} messages" in done.err
-    refused = run("export", path, "-r", "robot", store=store, code=2)
-    assert "--force" in refused.err
-
-
-@pytest.mark.parametrize("form", ["parquet", "csv"])
-def test_tables_get_one_file_a_topic(form: str, logs: Path, store: Path, tmp_path: Path) -> None:
-    directory = tmp_path / "new" / "tables"
-    topics = {"/imu/data": "imu__data", "/base/scan": "base__scan"}
-    options = [word for topic in topics for word in ("-t", topic)]
-    run("export", directory, "-F", form, "-r", "robot", *options, store=store)
-    assert {p.name for p in directory.iterdir()} == {f"{n}.{form}" for n in topics.values()}
-    seen = read_bag(logs / "robot.bag")
-    for topic, name in topics.items():
-        rows = sum(m.topic == topic for m in seen)
-        path = directory / f"{name}.{form}"
-        if form == "parquet":
-            assert pyarrow.parquet.read_metadata(path).num_rows == rows
-        else:
-            assert len(path.read_text().splitlines()) == rows + 1
 
 
 def test_what_is_no_table_is_said_and_left_out(store: Path, tmp_path: Path) -> None:
@@ -50,18 +17,6 @@ def test_what_is_no_table_is_said_and_left_out(store: Path, tmp_path: Path) -> N
     assert len(list((tmp_path / "x").glob("a__b*.csv"))) == 3
     run("export", tmp_path / "y", "-F", "csv", "-t", "/code", store=store, code=10)
     assert not (tmp_path / "y").exists()
-
-
-def test_between(logs: Path, store: Path, tmp_path: Path) -> None:
-    run(
-        *("export", tmp_path / "x.mcap", "-r", "robot", "-t", "/imu/data"),
-        *("--between", "+1s", "+2s", "--quiet"),
-        store=store,
-    )
-    seen = read_bag(logs / "robot.bag")
-    start = min(m.log_time for m in seen) + 10**9
-    wanted = [m for m in seen if m.topic == "/imu/data" and start <= m.log_time < start + 10**9]
-    assert read_mcap(tmp_path / "x.mcap") == wanted
 
 
 def test_a_topic_beside_the_range_is_said_and_left_out(store: Path, tmp_path: Path) -> None:

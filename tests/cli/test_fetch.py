@@ -59,19 +59,6 @@ def slice_of(scans: list[Seen], start: int) -> list[Seen]:
     return [m for m in scans if start + SECOND <= m.log_time < start + 2 * SECOND]
 
 
-def test_json_lines(store: Path, scans: list[Seen], decoded: list[Any]) -> None:
-    done = run(*SCAN, store=store)
-    rows = [json.loads(line) for line in done.lines]
-    assert [r["log_time_ns"] for r in rows] == [m.log_time for m in scans]
-    assert {r["topic"] for r in rows} == {"/base/scan"}
-    for row, message in zip(rows, decoded, strict=True):
-        assert row["header.frame_id"] == message.header.frame_id
-        # JSON has no infinities: they are strings, as protobuf writes them.
-        want = [float(v) for v in message.ranges]
-        got = [float(np.float32(v)) for v in row["ranges"]]
-        assert got == want
-
-
 def test_the_closing_line(store: Path, scans: list[Seen], start: int) -> None:
     wanted = slice_of(scans, start)
     done = run(*SCAN, "--between", "+1s", "+2s", "-F", "raw", "-v", store=store)
@@ -111,18 +98,6 @@ def test_clocks(store: Path, scans: list[Seen], decoded: list[Any], start: int) 
     assert "--clock log" in refused.err
 
 
-def test_where(store: Path, decoded: list[Any]) -> None:
-    nearest = [float(m.ranges[np.isfinite(m.ranges)].min()) for m in decoded]
-    limit = sorted(nearest)[len(nearest) // 3]
-    where = ("--where", f"ranges.min < {limit} and (angle_min < 0 or scan_time > 1000)")
-    done = run(*SCAN, *where, "--count", store=store)
-    assert int(done.out) == sum(n < limit for n in nearest) > 0
-    rows = run(*SCAN, *where, store=store)
-    assert len(rows.lines) == int(done.out)
-    both = run(*SCAN, *where, "--where", "angle_min > 0", store=store)
-    assert both.out == ""
-
-
 def test_a_wrong_predicate_is_pointed_at(store: Path) -> None:
     done = run(*SCAN, "--where", "ranges.min << 0.5", store=store, code=2)
     message, text, caret = done.err.splitlines()
@@ -159,17 +134,6 @@ def test_fields(store: Path) -> None:
     run(*SCAN, "--fields", "a,,b", store=store, code=2)
 
 
-def test_at(store: Path, scans: list[Seen]) -> None:
-    for option, want in (
-        (str(scans[9].log_time), scans[9]),
-        (str(scans[9].log_time - 1), scans[8]),
-    ):
-        done = run(*SCAN, "--at", option, "-F", "raw", store=store)
-        assert done.raw == want.payload
-    run(*SCAN, "--at", "2000-01-01", store=store, code=2)
-    run(*SCAN, "--at", "+1s", "--between", "+1s", "+2s", store=store, code=2)
-
-
 def test_topics(store: Path) -> None:
     assert "/base/scan" in run("fetch", "-t", "base", store=store, code=2).err
     ambiguous = run("fetch", "-t", "image_raw", store=store, code=2)
@@ -194,16 +158,6 @@ def test_topics(store: Path) -> None:
     assert {r["topic"] for r in rows} == {"/base/scan", "/imu/data"}
     assert [r["log_time_ns"] for r in rows] == sorted(r["log_time_ns"] for r in rows)
     run("fetch", "-t", "scan", "-r", "odd", store=store, code=2)
-
-
-def test_times_that_cannot_be(store: Path) -> None:
-    for between, words in (
-        (("+5s", "+1s"), "the range is empty"),
-        (("2000-01-01", "2000-01-02"), "spans"),
-        (("yesterday", "+1s"), "is not a time"),
-        (("1e400", "+1s"), "is not a time"),
-    ):
-        assert words in run(*SCAN, "--between", *between, store=store, code=2).err
 
 
 @pytest.mark.parametrize("form", ["csv", "parquet", "arrow", "npz", "mcap", "bag", "jsonl"])
@@ -239,13 +193,6 @@ def test_formats(
         assert table["log_time"].cast(pa.int64()).to_pylist() == times
         for got, want in zip(table["ranges"], ranges, strict=True):
             np.testing.assert_array_equal(got.values.to_numpy(), want)
-
-
-def test_raw_directory(store: Path, scans: list[Seen], tmp_path: Path) -> None:
-    path = tmp_path / "raw"
-    run(*SCAN, "-n", "3", "-F", "raw", "-o", path, store=store)
-    index = [json.loads(line) for line in (path / "index.jsonl").read_text().splitlines()]
-    assert [(path / i["file"]).read_bytes() for i in index] == [m.payload for m in scans[:3]]
 
 
 def test_latched_messages_stand_in_front(store: Path, seen: list[Seen], tmp_path: Path) -> None:
@@ -400,12 +347,6 @@ def test_damage_that_has_cost_no_message(logs: Path, tmp_path: Path) -> None:
     assert "messages lost" not in info
 
 
-def test_topics_that_map_to_one_name(store: Path) -> None:
-    for topic, text in (("/a/b", "one"), ("/a__b", "two"), ("a/b", "three")):
-        rows = [json.loads(r) for r in run("fetch", "-t", topic, store=store).lines]
-        assert [(r["topic"], r["data"]) for r in rows] == [(topic, text)] * odd_log.PER_TOPIC
-
-
 def test_a_type_that_changes_midway(store: Path, tmp_path: Path) -> None:
     rows = [json.loads(r) for r in run("fetch", "-t", "change", store=store).lines]
     assert [str(r["data"]) for r in rows] == ["x"] * 3 + ["7"] * 3
@@ -428,12 +369,6 @@ def test_messages_that_do_not_fit_are_counted(store: Path, tmp_path: Path) -> No
     assert "1 message does not fit its definition and is not in this answer" in one.err
     exact = run("fetch", "-t", "long", "-F", "raw", store=store)
     assert exact.raw == odd_log.claims_4_gb() * odd_log.PER_TOPIC
-
-
-def test_json_is_asked_as_it_stands(store: Path) -> None:
-    done = run("fetch", "-t", "json", "--where", "a == 1", "-n", "1", store=store)
-    assert json.loads(done.out)["b"] == [1, 2]
-    assert run("fetch", "-t", "json", "--where", "a == 2", store=store).out == ""
 
 
 def test_the_closing_line_counts_what_is_given(capsys: pytest.CaptureFixture[str]) -> None:

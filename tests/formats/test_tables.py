@@ -324,16 +324,6 @@ def test_jsonl_refuses() -> None:
             writer.write([json_line({"a": value})])
 
 
-def test_lines_that_are_made_already() -> None:
-    stream = io.BytesIO()
-    plain = table(10).drop_columns(["log_time", "d", "raw"])
-    with JsonlWriter(stream) as writer:
-        writer.write(json_column(plain.to_struct_array().combine_chunks()).to_pylist())
-    found = [json.loads(line) for line in stream.getvalue().splitlines()]
-    assert found == plain.to_pylist()
-    assert found[3]["u"] == 2**63 + 3
-
-
 def load(data: bytes) -> dict[str, np.ndarray]:
     with np.load(io.BytesIO(data), allow_pickle=False) as archive:
         return dict(archive)

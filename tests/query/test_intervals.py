@@ -18,16 +18,14 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.writer import Writer
-from rosbags.highlevel import AnyReader
 
 import hybridlog as hl
 from hybridlog.query.intervals import Changing, Holding, Interval, Intervals
 from hybridlog.query.rows_differ import rows_differ
 from hybridlog.schema.arrow_columns import array_of
 from hybridlog.schema.column import Arrays, Records, Scalars, Strings
-from hybridlog_storage.errors import TimeError, TopicError, UsageError, WhereError
+from hybridlog_storage.errors import TimeError, UsageError, WhereError
 from hybridlog_storage.segments.segment_writer import SegmentSettings
-from tests.data import DATA, needs_data
 
 pytestmark = pytest.mark.mongo
 
@@ -523,23 +521,6 @@ def plain(store: hl.Store) -> hl.Store:
     return store
 
 
-def test_what_held_before_the_range_holds_when_it_begins(plain: hl.Store) -> None:
-    query = plain.topic("/state").where("s == 1").between("+1500ms", "+2s")
-    (found,) = query.intervals()
-    assert (found.begin_ns, found.end_ns) == (BASE + 3 * SECOND // 2, BASE + 2 * SECOND)
-    assert found.messages == 0
-    assert query.count() == 0
-
-
-def test_the_last_state_holds_until_the_recording_ends(plain: hl.Store) -> None:
-    last = plain.topic("/state").where("s == 1").intervals()[-1]
-    assert (last.begin_ns, last.end_ns) == (BASE + 9 * SECOND, BASE + 20 * SECOND + 1)
-    believed = plain.topic("/state").where("s == 1").intervals(max_gap="2s")[-1]
-    assert believed.end_ns == BASE + 11 * SECOND
-    (alive,) = plain.topic("/state").intervals(max_gap="1s")
-    assert (alive.begin_ns, alive.end_ns, alive.messages) == (BASE, BASE + 10 * SECOND, 10)
-
-
 def test_nothing_found_is_no_error(plain: hl.Store) -> None:
     query = plain.topic("/state")
     none = query.where("s == 7")
@@ -551,14 +532,6 @@ def test_nothing_found_is_no_error(plain: hl.Store) -> None:
     assert list(nothing) == []
     assert nothing.during(query.intervals()).count() == 0
     assert len(query.during(none.intervals()).intervals()) == 0
-
-
-def test_a_message_in_two_windows_is_given_once(plain: hl.Store) -> None:
-    events = plain.topic("/state").where("s == 1")
-    near = plain.topic("/state").during(events.windows("3s"))
-    assert near.count() == len(list(near)) == 9
-    assert len(events.windows("3s")) == 5
-    assert len(events.windows("3s").merged()) == 1
 
 
 def test_times_within_windows_by_another_clock(plain: hl.Store) -> None:
@@ -619,45 +592,3 @@ def test_wrong_questions_say_what_is_wrong(plain: hl.Store) -> None:
 
 
 # --- real logs ------------------------------------------------------------------------
-
-
-@needs_data
-def test_a_real_log_against_a_loop(tmp_path: Path) -> None:
-    path = DATA / "real" / "auv_ros2.mcap"
-    topic = "/coug2/battery/data"
-    seen: list[tuple[int, float]] = []
-    errors: list[int] = []
-    times: list[int] = []
-    with AnyReader([path]) as reader:
-        for connection, time, raw in reader.messages():
-            times.append(time)
-            if connection.topic == topic:
-                seen.append((time, reader.deserialize(raw, connection.msgtype).voltage))
-            if connection.topic == "/rosout":
-                errors += [time] * (reader.deserialize(raw, connection.msgtype).level >= 30)
-    middle = float(np.median([v for _, v in seen]))
-    with hl.open(tmp_path / "store", create=True, require_database=True) as store:
-        store.record(path)
-        query = store.topic(topic)
-        found = query.where(f"voltage < {middle!r}").intervals()
-        want = []
-        ends = [*[t for t, _ in seen][1:], max(times) + 1]
-        for (time, value), end in zip(seen, ends, strict=True):
-            if value < middle and want and want[-1][1] == time:
-                want[-1] = (want[-1][0], end)
-            elif value < middle:
-                want.append((time, end))
-        assert len(want) > 10
-        assert [(row.begin_ns, row.end_ns) for row in found] == want
-
-        steps = [t for (t, v), (_, w) in zip(seen[1:], seen, strict=False) if v != w]
-        assert [row.begin_ns for row in query.changes("voltage", pause=0)] == steps
-        assert errors
-        before = store.all_topics().during(
-            store.topic("/rosout").where("level >= 30").windows("5s")
-        )
-        assert [m.log_time_ns for m in before] == sorted(
-            t for t in times if any(e - 5 * SECOND <= t < e for e in errors)
-        )
-        with pytest.raises(TopicError, match="voltag"):
-            query.changes("voltag")
