@@ -18,7 +18,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from bson.int64 import Int64
-from hypothesis import Phase, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from rosbags.interfaces import Nodetype
@@ -227,127 +227,7 @@ def same_object(ours: Any, theirs: Any) -> bool:
 
 # --- ROS: made-up types ---------------------------------------------------------------
 
-PRIMITIVES = "bool byte char int8 uint8 int16 uint16 int32 uint32 int64 uint64 float32 float64"
-names = st.sampled_from(["a", "b2", "c_d", "width", "from", "x"])
-
-
-@st.composite
-def definitions(draw: st.DrawFn) -> tuple[int, str]:
-    ros = draw(st.sampled_from([1, 2]))
-    times = ["time", "duration"] if ros == 1 else ["builtin_interfaces/Time"]
-    simple = st.sampled_from(PRIMITIVES.split() * 2 + ["string"] * 8 + times)
-
-    def lines(types: st.SearchStrategy[str], least: int) -> str:
-        chosen = draw(st.dictionaries(names, types, min_size=least, max_size=5))
-        suffixes = ["", "", "[]", "[2]", "[34]"]
-        return "".join(f"{t}{draw(st.sampled_from(suffixes))} {n}\n" for n, t in chosen.items())
-
-    inner = lines(simple, 1)
-    middle = lines(simple | st.just("pkg/Inner"), 1)
-    outer = lines(simple | st.sampled_from(["pkg/Inner", "Middle"]), 1)
-    rule = "=" * 80
-    text = f"{outer}{rule}\nMSG: pkg/Middle\n{middle}{rule}\nMSG: pkg/Inner\n{inner}"
-    return ros, text
-
-
-def random_value(desc: Any, store: Typestore, draw: st.DrawFn) -> Any:
-    kind, detail = desc
-    if kind == Nodetype.NAME:
-        make = store.types[detail]
-        return make(*[random_value(d, store, draw) for _, d in store.fielddefs[detail][1]])
-    if kind == Nodetype.BASE:
-        if detail[0] == "string":
-            return draw(st.sampled_from(["", "odom", "süß", "a\0b"]))
-        return draw(element("int8" if detail[0] == "byte" else detail[0]))
-    inner, size = detail
-    count = size if kind == Nodetype.ARRAY else draw(st.sampled_from([0, 1, 2, 3, 32, 33]))
-    if inner[0] == Nodetype.BASE and inner[1][0] != "string":
-        dtype = {"byte": "uint8", "char": "uint8"}.get(inner[1][0], inner[1][0])
-        seeds = draw(st.lists(element(inner[1][0]), min_size=1, max_size=4))
-        return np.resize(np.array(seeds, dtype), count)
-    seeds = [random_value(inner, store, draw) for _ in range(min(count, 2))]
-    return [seeds[i % len(seeds)] for i in range(count)]
-
-
-def element(name: str) -> st.SearchStrategy[Any]:
-    if name == "bool":
-        return st.booleans()
-    if name.startswith("float"):
-        # Of one size, so that the mean is the same in any order but for rounding.
-        usual = st.floats(-1e6, 1e6, width=int(name[5:]))  # type: ignore[arg-type]
-        return usual | st.sampled_from([-0.0, math.nan, math.inf, -math.inf])
-    info = np.iinfo({"byte": "uint8", "char": "uint8"}.get(name, name))
-    return st.integers(int(info.min), int(info.max))
-
-
 # Each example makes rosbags generate code, so shrinking a failure would take minutes.
-@settings(max_examples=60, deadline=None, phases=[Phase.explicit, Phase.reuse, Phase.generate])
-@given(definitions(), st.data())
-def test_random_types_through_rosbags(definition: tuple[int, str], data: st.DataObject) -> None:
-    ros, text = definition
-    store = Typestore()
-    store.register(
-        {
-            f"builtin_interfaces/msg/{n}": (
-                [],
-                [("sec", (Nodetype.BASE, ("int32", 0))), ("nanosec", (Nodetype.BASE, (w, 0)))],
-            )
-            for n, w in (("Time", "uint32"), ("Duration", "int32" if ros == 1 else "uint32"))
-        }
-    )
-    store.register(get_types_from_msg(text, "pkg/msg/Outer"))
-    if ros == 1:
-        channel = Channel("/t", "ros1", Schema("pkg/Outer", "ros1msg", text.encode()))
-        write, read = store.serialize_ros1, store.deserialize_ros1
-    else:
-        channel = Channel("/t", "cdr", Schema("pkg/msg/Outer", "ros2msg", text.encode()))
-        write, read = store.serialize_cdr, store.deserialize_cdr
-    codec = codec_for(channel)
-    assert codec.indexed, codec.reason
-    outer = (Nodetype.NAME, "pkg/msg/Outer")
-    payloads = []
-    for _ in range(data.draw(st.integers(1, 4))):
-        message = random_value(outer, store, data.draw)
-        for instant in times_in(message):
-            instant.sec %= 1 << 31  # rosbags reads the seconds of ROS 1 as signed
-        payloads.append(bytes(write(message, "pkg/msg/Outer")))
-    for payload, body in zip(payloads, bodies_of(codec, payloads), strict=True):
-        plain = {k.removesuffix("_"): v for k, v in vars(read(payload, "pkg/msg/Outer")).items()}
-        check(body, record_with(plain, store, ros))
-        assert bson.encode(index_fields(codec, payload)) == document_of(body)  # type: ignore[arg-type]
-
-
-def times_in(message: Any) -> Iterator[Any]:
-    if isinstance(message, list):
-        for each in message:
-            yield from times_in(each)
-    elif hasattr(message, "nanosec"):
-        yield message
-    elif hasattr(message, "__dataclass_fields__"):
-        for each in vars(message).values():
-            yield from times_in(each)
-
-
-def record_with(plain: dict[str, Any], store: Typestore, ros: int) -> dict[str, Any]:
-    fields = store.fielddefs["pkg/msg/Outer"][1]
-    return {n: python_of(d, plain[n], store, ros) for n, d in fields}
-
-
-def python_of(desc: Any, value: Any, store: Typestore, ros: int) -> Any:
-    """`field_of`, for names that rosbags spells `from_`."""
-    if desc[0] == Nodetype.NAME and not desc[1].startswith("builtin_interfaces/"):
-        return {
-            n: python_of(d, getattr(value, "from_" if n == "from" else n), store, ros)
-            for n, d in store.fielddefs[desc[1]][1]
-        }
-    if desc[0] in {Nodetype.ARRAY, Nodetype.SEQUENCE} and desc[1][0][0] == Nodetype.NAME:
-        if len(value) > LIMIT and not desc[1][0][1].startswith("builtin_interfaces/"):
-            return {"n": Int64(len(value))}
-        listed = [python_of(desc[1][0], v, store, ros) for v in value]
-        return summary_of("int64", listed) if len(listed) > LIMIT else listed
-    return field_of(desc, value, store, ros)
-
-
 # --- ROS: faults ----------------------------------------------------------------------
 
 
