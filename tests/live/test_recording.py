@@ -223,16 +223,6 @@ def test_an_interruption_leaves_no_half_message(tmp_path: Path) -> None:
     assert (done.stdout, done.stderr) == ("whole after 16\n", "")
 
 
-def test_what_is_written_can_be_asked_for_while_it_goes_on(store: hl.Store) -> None:
-    own = channel("/talk")
-    with store.start("talk", flush_interval_s=0.2) as recording:
-        recording.write(own, text(b"first"))
-        assert store.database is not None
-        wait_for(lambda: store.database and store.database.count("talk", {"data": "first"}))
-        recording.write(own, text(b"second"))
-        wait_for(lambda: store.database and store.database.count("talk", {}) == 2)
-
-
 @pytest.mark.parametrize(
     ("size", "topics", "messages", "batches"),
     [
@@ -300,25 +290,6 @@ def test_what_is_laid_down_together_keeps_its_order(
     assert [m.raw for m in store.query([one.topic for one in own])] == payloads
 
 
-def test_the_index_falls_behind_and_catches_up(store: hl.Store, limit: Limit) -> None:
-    busy = True
-    limit(recording_is_under_pressure=lambda *_: busy)
-    own = channel("/talk")
-    payloads = [text(os.urandom(50_000)) for _ in range(40)]
-    settings = SegmentSettings(chunk_size=100_000, segment_size=1_000_000)
-    with store.start("talk", settings=settings, flush_interval_s=0.2) as recording:
-        for number, payload in enumerate(payloads):
-            recording.write(own, payload, log_time=number)
-        wait_for(lambda: len(in_segments_so_far(store, recording.label)) >= 2)
-        assert store.database is not None
-        assert store.database.count("talk", {}) == 0
-        # Chunks of segments that were sealed meanwhile are read back as well.
-        busy = False
-    assert recording.close().indexed == 40
-    assert [m.raw for m in store.topic("/talk")] == payloads
-    assert store.verify().findings == []
-
-
 @pytest.mark.parametrize("size", [150_000, COPIED_AT_ONCE])
 @pytest.mark.parametrize("late", [False, True])
 def test_the_index_waits_while_messages_wait_for_their_turn(
@@ -345,25 +316,6 @@ def test_the_index_waits_while_messages_wait_for_their_turn(
             wait_for(lambda: recording.lag == 0)
         assert recording.lag == late
     assert recording.close().indexed == 1
-
-
-def in_segments_so_far(store: hl.Store, recording: str) -> list[Path]:
-    return list(store.directory.recording(recording).glob("*.mcap"))
-
-
-@pytest.mark.mongo("embedded")
-def test_mongod_killed_while_messages_come(store: hl.Store) -> None:
-    own = channel("/talk")
-    with store.start("talk", flush_interval_s=0.1) as recording:
-        for number in range(2000):
-            recording.write(own, text(b"%d" % number))
-            if number == 500:
-                time.sleep(0.5)
-                kill_mongod(store.directory.path)
-    report = recording.close()
-    assert (report.failure, report.missed, report.indexed) == (None, 0, 2000)
-    assert store.topic("/talk").where("data == '1999'").count() == 1
-    assert store.verify().findings == []
 
 
 @pytest.mark.mongo("embedded")
@@ -471,22 +423,6 @@ def test_no_mistake_of_ours_is_silent(store: hl.Store, calls: Calls) -> None:
         recording.close()
 
 
-KILLED = """
-import sys, time
-import hybridlog as hl
-from hybridlog_storage.messages import Batch, Channel, Schema
-
-own = Channel("/talk", "ros1", Schema("std_msgs/String", "ros1msg", b"string data\\n"))
-with hl.open(sys.argv[1], create=True) as store:
-    recording = store.start("talk", flush_interval_s=0.2)
-    for number in range(10**9):
-        recording.write(own, (8).to_bytes(4, "little") + b"%8d" % number, log_time=time.time_ns())
-        if number % 100 == 0:
-            print(number, time.time_ns(), flush=True)
-        time.sleep(0.0001)
-"""
-
-
 def test_chunks_are_flushed_within_the_interval(store: hl.Store, calls: Calls) -> None:
     """The age at which they are, and the pause between two looks, are no more together."""
     flushed = calls(RecordingWriter, "flush_older")
@@ -497,29 +433,6 @@ def test_chunks_are_flushed_within_the_interval(store: hl.Store, calls: Calls) -
             wait_for(lambda: recording._capture.writer.totals.chunks == 1)
         tick = min(live._TICK_S, interval / 10)
         assert {0 < age <= interval - 2 * tick for _, age in flushed} == {True}
-
-
-def test_kill_costs_no_more_than_the_flush_interval(tmp_path: Path) -> None:
-    place = tmp_path / "store"
-    process = subprocess.Popen(
-        [sys.executable, "-c", KILLED, str(place)], stdout=subprocess.PIPE, text=True
-    )
-    try:
-        assert process.stdout is not None
-        said = [process.stdout.readline().split() for _ in range(60)]
-    finally:
-        process.send_signal(signal.SIGKILL)
-        process.wait()
-        assert process.stdout is not None
-        process.stdout.close()
-    last_ns = int(said[-1][1])
-    with hl.open(place, require_database=True) as store:
-        found = [m.log_time_ns for m in store.topic("/talk")]
-        numbers = [int(m.raw[4:]) for m in store.topic("/talk")]
-        assert numbers == list(range(len(numbers)))
-        # On a busy machine threads wait, too; what matters is that it is not all.
-        assert last_ns - found[-1] < 2_000_000_000
-        assert store.verify().findings == []
 
 
 def test_misuse(store: hl.Store) -> None:
@@ -658,26 +571,6 @@ def test_an_error_in_the_block_keeps_what_came(store: hl.Store) -> None:
     with pytest.raises(ZeroDivisionError):
         speak()
     assert store.topic("/talk").count() == 1
-
-
-@pytest.mark.mongo("embedded")
-def test_a_mongod_that_dies_is_started_again_and_the_index_catches_up(store: hl.Store) -> None:
-    """Not at the end only: a recording may go on for hours."""
-    speech = channel("/speech")
-    with store.start("talk", flush_interval_s=0.2) as recording:
-        recording.write(speech, text(b"before"), log_time=1)
-        wait_for(lambda: recording.lag == 0 and recording.stored[0] == 1)
-        kill_mongod(store.directory.path)
-        recording.write(speech, text(b"while"), log_time=2)
-        wait_for(lambda: recording.index_failure is not None)
-        assert recording.lag == 1
-        wait_for(lambda: recording.index_failure is None and recording.lag == 0)
-        recording.write(speech, text(b"after"), log_time=3)
-        report = recording.close()
-    assert report.failure is None
-    assert (report.indexed, report.missed) == (3, 0)
-    assert store.topic("/speech").where("data == 'while'").count() == 1
-    assert not store.verify().findings
 
 
 def test_a_database_that_refuses_to_the_end_leaves_what_segments_know(

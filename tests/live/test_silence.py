@@ -4,15 +4,11 @@ from __future__ import annotations
 
 import json
 import random
-import struct
 from collections import defaultdict
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from operator import itemgetter
 from pathlib import Path
 
 import pytest
-from mcap.writer import Writer
 
 import hybridlog as hl
 from hybridlog.contract import Contract, TopicRules
@@ -20,10 +16,7 @@ from hybridlog.contract.judge import broken
 from hybridlog.live.recorder import Recorder, RecorderOptions, state_of, summary_of
 from hybridlog.live.silence import SilenceWatch
 from hybridlog.live.sources.replay import ReplaySource
-from hybridlog.query.asked import channels_of
-from hybridlog.query.topics import matcher
 from hybridlog.record.marks import MARKS
-from hybridlog_storage.messages import Channel
 from tests.across.test_check import write_mcap
 from tests.cli.running import run
 from tests.data import DATA, needs_data
@@ -132,173 +125,6 @@ def test_real_logs_have_one_verdict(name: str, tmp_path: Path) -> None:
         label, _, marked = played(store, log, contract, speed=20.0)
         silent = check_same(store, label, marked)
         assert {one.topic for one in broken(store.judge(contract, label))} == silent
-
-
-@dataclass(frozen=True)
-class Sent:
-    """A message of a real log, with another time, stamp, type or content."""
-
-    time: int
-    payload: bytes
-    type: str
-
-
-@dataclass(frozen=True)
-class Real:
-    """A topic of a real log: its first seconds, and where a field lies in its payload."""
-
-    log: str
-    topic: str
-    seconds: float
-    field: str
-    form: str
-    offset: int
-
-    def stamped(self, one: Sent, age: int) -> Sent:
-        """With a header stamp before its time."""
-        stamp = struct.pack("<II", *divmod(one.time - age, SECOND))
-        return replace(one, payload=one.payload[:4] + stamp + one.payload[12:])
-
-    def negative(self, one: Sent) -> Sent:
-        end = self.offset + struct.calcsize(self.form)
-        value = struct.pack(self.form, -1000.0)
-        return replace(one, payload=one.payload[: self.offset] + value + one.payload[end:])
-
-
-REAL = (
-    Real("sick_laser_radar.bag", "/sick_lms_1xx/scan", 2, "angle_min", "<f", 21),
-    Real("auv_ros2.mcap", "/coug2/dvl/velocity", 6, "twist.twist.linear.x", "<d", 20),
-)
-Change = Callable[[list[Sent]], list[Sent]]
-
-
-def some(every: int, change: Callable[[Sent], Sent]) -> Change:
-    return lambda sent: [change(one) if k % every == 1 else one for k, one in enumerate(sent)]
-
-
-def without(begin: float, end: float) -> Change:
-    """No messages between two shares of the time."""
-
-    def change(sent: list[Sent]) -> list[Sent]:
-        first, length = sent[0].time, sent[-1].time - sent[0].time
-        low, high = first + begin * length, first + end * length
-        return [one for one in sent if not low <= one.time < high]
-
-    return change
-
-
-def in_bursts(size: int) -> Change:
-    """Each so many messages come with the first of them."""
-
-    def change(sent: list[Sent]) -> list[Sent]:
-        times = [sent[k // size * size].time + k % size * 1000 for k in range(len(sent))]
-        return [replace(one, time=time) for one, time in zip(sent, times, strict=True)]
-
-    return change
-
-
-def breaches(real: Real) -> dict[str, tuple[Change, str]]:
-    """Changes of a topic, and the rule that each breaks."""
-    other = "test_msgs/msg/Other"
-    return {
-        "good": (lambda sent: sent, ""),
-        "few_negative": (some(20, real.negative), ""),
-        "type": (lambda sent: [replace(one, type=other) for one in sent], "type"),
-        "types": (some(9, lambda one: replace(one, type=other)), "type"),
-        "half": (lambda sent: sent[::2], "rate"),
-        "three_of_four": (lambda sent: [one for k, one in enumerate(sent) if k % 4], "rate"),
-        "twice": (lambda sent: [x for one in sent for x in (one, one)], "rate"),
-        "once": (lambda sent: sent[:1], "rate"),
-        "gap": (without(0.4, 0.7), "longest_gap"),
-        "gap_early": (without(0.05, 0.35), "longest_gap"),
-        "gap_late": (without(0.65, 0.95), "longest_gap"),
-        "bursts": (in_bursts(8), "jitter"),
-        "long_bursts": (in_bursts(20), "longest_gap"),
-        "late": (without(0, 0.4), "late_start"),
-        "early": (without(0.6, 2), "early_stop"),
-        "from_the_future": (some(8, lambda one: real.stamped(one, -SECOND)), "stamps_in_order"),
-        "old_stamps": (some(8, lambda one: real.stamped(one, SECOND)), "stamps_in_order"),
-        "one_old_stamp": (some(30, lambda one: real.stamped(one, SECOND)), "stamps_in_order"),
-        "negative": (some(5, real.negative), "share"),
-        "all_negative": (lambda sent: [*map(real.negative, sent)], "share"),
-        "absent": (lambda _: [], "messages"),
-        "far": (lambda sent: sent, "offset"),  # from a topic with a gap
-    }
-
-
-@needs_data
-def test_breaches_in_real_logs_have_one_verdict(tmp_path: Path) -> None:
-    """Topics with the messages of a real one, all but two with a breach: played, and stored.
-
-    A log that is played has the times of now, so ages of its stamps are no rule.
-    """
-    for real in REAL:
-        log = tmp_path / f"{real.log}.mcap"
-        with hl.open(tmp_path / real.log, create=True, mongo="none") as store:
-            store.record(DATA / "real" / real.log, name="real", matcher=matcher([real.topic]))
-            query = store.topic(real.topic).between("start", f"+{real.seconds}s")
-            channel = channels_of(query)[0].channel
-            assert channel.schema is not None
-            usual = channel.schema.name
-            sent = [real.stamped(Sent(m.log_time_ns, m.raw, usual), 5 * MS) for m in query]
-            planted = breaches(real)
-            changed = {f"/{name}": change(sent) for name, (change, _) in planted.items()}
-            write_changed(log, channel, changed)
-            (one,) = query.check()
-            assert one.gap_ns is not None
-            assert one.rate_hz is not None
-            assert one.jitter_ns is not None
-            rules = TopicRules(
-                type=usual,
-                rate=one.rate_hz,
-                tolerance=0.1,
-                longest_gap=3 * one.gap_ns // 2,
-                jitter=round(1.5 * one.jitter_ns),
-                late_start=2 * one.gap_ns,
-                early_stop=4 * one.gap_ns,
-                lost=0,
-                stamps_in_order=True,
-                offset={"/good": one.gap_ns},
-                share={f"{real.field} > -100": 0.9},
-            )
-            far = {"/far": replace(rules, offset={"/gap": one.gap_ns})}
-            contract = Contract(dict.fromkeys(changed, rules) | far, lost=0)
-            store.record(log, name="stored")
-            label, _, _ = played(store, log, contract)
-            verdicts = [
-                {(one.topic, one.rule) for one in broken(store.judge(contract, name))}
-                for name in ("stored", label)
-            ]
-            # A busy machine plays late: rules of time are compared where one is broken on purpose.
-            for found in verdicts:
-                found -= {
-                    (topic, one)
-                    for topic, one in found
-                    if one in {"longest_gap", "jitter"} and planted[topic[1:]][1] != one
-                }
-            assert verdicts[0] == verdicts[1]
-            for name, (_, rule) in planted.items():
-                of_topic = {rule for topic, rule in verdicts[0] if topic == f"/{name}"}
-                assert (rule in of_topic) if rule else not of_topic, (name, of_topic)
-
-
-def write_changed(log: Path, channel: Channel, changed: dict[str, list[Sent]]) -> None:
-    """A log with the topics, messages in order of time."""
-    assert channel.schema is not None
-    with log.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        ids: dict[tuple[str, str], int] = {}
-        rows = [(one.time, topic, one) for topic, sent in changed.items() for one in sent]
-        for time, topic, one in sorted(rows, key=itemgetter(0)):
-            if (topic, one.type) not in ids:
-                schema = writer.register_schema(
-                    one.type, channel.schema.encoding, channel.schema.data
-                )
-                encoding = channel.message_encoding
-                ids[topic, one.type] = writer.register_channel(topic, encoding, schema)
-            writer.add_message(ids[topic, one.type], time, one.payload, time)
-        writer.finish()
 
 
 def test_a_silence_is_told_within_twice_its_limit() -> None:
