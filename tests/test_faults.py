@@ -415,18 +415,6 @@ def data_end(segment: bytes) -> int:
     return at
 
 
-def test_a_disk_that_is_full_when_the_segment_is_sealed(path: Path, short: Path) -> None:
-    run("record", short, "--quiet", store=path, code=0)
-    sealed = (path / "recordings/short/000000.mcap").read_bytes()
-    limit = (data_end(sealed) + len(sealed)) // 2
-    run("rm", "short", "--yes", store=path, code=0)
-    done = run("record", short, "--quiet", store=path, code=7, before=at_most(limit))
-    assert "No space left" in done.stderr
-    assert list((path / "recordings").iterdir()) == []
-    run("record", short, "--quiet", store=path, code=0)
-    run("verify", store=path, code=0)
-
-
 def test_a_disk_that_is_full_when_a_crash_is_mended(
     path: Path, short: Path, said: Counter[Message]
 ) -> None:
@@ -592,84 +580,6 @@ def test_a_recording_without_any_segment_is_told(store: hl.Store, said: Counter[
         opened.index.rebuild()
         (entry,) = opened.recordings()
         assert (entry.status, lost(entry)) == ("damaged", topics_of(said))
-
-
-def test_no_flipped_bit_gives_another_message(store: hl.Store, tmp_path: Path) -> None:
-    """Whatever bit of a segment flips: its messages come as they were, or an error does."""
-    number, path = store.directory.segments("short")[-1]
-    whole = path.read_bytes()
-
-    def read(where: Path) -> dict[int, list[tuple[int, str, int, int, bytes]]]:
-        found = {}
-        with SegmentReader(where, number) as reader:
-            summary = reader.summary()
-            for place in summary.chunks:
-                try:
-                    chunk = reader.read_chunk(place)
-                except SegmentError:
-                    continue
-                batch = chunk.batch
-                found[place.offset] = [
-                    (
-                        int(chunk.seq[row]),
-                        summary.channels[int(batch.channel[row])].topic,
-                        int(batch.log_time[row]),
-                        int(batch.publish_time[row]),
-                        bytes(batch.payload(row)),
-                    )
-                    for row in range(len(batch))
-                ]
-        return found
-
-    sound = read(path)
-    with SegmentReader(path, number) as reader:
-        chunks = reader.summary().chunks
-    rng = random.Random(1)
-    # All of the head, the last chunk's head and trailer, and the summary; samples elsewhere.
-    last = chunks[-1]
-    end = data_end(whole)
-    spots = {
-        *range(0, len(whole), 997),
-        *range(end - 120, end),
-        *range(last.offset, last.offset + 60),
-    }
-    trailer = range(last.offset + last.length, end)
-    spots |= {
-        *rng.sample(trailer, min(150, len(trailer))),
-        *rng.sample(range(end, len(whole)), 200),
-    }
-    broken = tmp_path / path.name
-    for spot in sorted(spots):
-        data = bytearray(whole)
-        data[spot] ^= 1 << rng.randrange(8)
-        broken.write_bytes(data)
-        try:
-            found = read(broken)
-        except SegmentError:
-            continue
-        for offset, messages in found.items():
-            assert messages == sound[offset], f"byte {spot} of {len(whole)}, chunk {offset}"
-
-
-def test_damage_that_hybridlog_can_read_around_is_found(store: hl.Store) -> None:
-    """Records around the chunks, which have no checksum and other readers may need."""
-    number, path = store.directory.segments("short")[1]
-    whole = path.read_bytes()
-    with SegmentReader(path, number) as reader:
-        chunks = reader.summary().chunks
-    first, last = chunks[0], chunks[-1]
-    at = whole.index(b"hybridlog", 8)
-    schema = whole.rindex(b"frame_id", 0, first.offset)
-    topic = whole.rindex(b"/", 0, first.offset)
-    indexes = last.offset + last.length
-    places = [at, schema, topic, last.offset + 10, indexes + 1, indexes + 9, indexes + 20]
-    for place in [*places, data_end(whole), data_end(whole) + 1]:
-        data = bytearray(whole)
-        data[place] ^= 1
-        path.write_bytes(data)
-        assert any(path.name in f.place for f in store.verify().findings), place
-    path.write_bytes(whole)
-    assert store.verify().findings == []
 
 
 def damage_summary(path: Path) -> None:
@@ -891,37 +801,7 @@ def shared(tmp_path_factory: pytest.TempPathFactory, short: Path) -> Iterator[hl
         yield opened
 
 
-def test_verify_and_reindex_as_commands(store: hl.Store) -> None:
-    assert store.database is not None
-    store.database.delete("imu__data", {"_meta.seq": {"$lt": 100}})
-    path = store.directory.path
-    done = run("verify", store=path, code=1)
-    assert "imu__data" in done.stdout
-    run("index", "rebuild", store=path, code=0)
-    run("verify", store=path, code=0)
-
-
 # Stores and databases that are not what they should be.
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        (b"\xff\xfe\x00garbage", "damaged"),
-        (b"format = [", "damaged"),
-        (b"", "format"),
-        (b'format = 4\nstore_id = "x"\n', "knows format 3"),
-        (b"format = 3\n", "store_id"),
-        (b'format = 3\nstore_id = "x"\nmongo = 3\n', "mongo"),
-    ],
-)
-def test_settings_that_cannot_be_used(tmp_path: Path, text: bytes, words: str) -> None:
-    place = tmp_path / "store"
-    (place / "recordings").mkdir(parents=True)
-    (place / "hybridlog.toml").write_bytes(text)
-    done = run("ls", store=place, code=5)
-    assert words in done.stderr
-    assert (place / "hybridlog.toml").read_bytes() == text
 
 
 def test_the_database_of_another_store_is_refused(
@@ -939,31 +819,6 @@ def test_the_database_of_another_store_is_refused(
 
 
 # Several at once.
-
-
-def test_two_recorders_at_once_make_one_store(tmp_path: Path, short: Path, robot: Path) -> None:
-    place = tmp_path / "store"
-    logs = [short, robot, short]
-    processes = [
-        subprocess.Popen(
-            [*COMMAND, "record", str(log), "--again", "--quiet"],
-            env={**os.environ, "HYBRIDLOG_STORE": str(place)},
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        for log in logs
-    ]
-    said = [p.communicate(timeout=LIMIT_S)[1] for p in processes]
-    assert [p.returncode for p in processes] == [0, 0, 0], said
-    with hl.open(place, require_database=True) as store:
-        assert sorted(r.name for r in store.recordings()) == ["robot", "short", "short"]
-        assert len({r.key for r in store.recordings()}) == 3
-        for recording in store.recordings():
-            log = short if recording.name == "short" else robot
-            assert content(fetched(store, recording.id)) == Counter(independent.read_bag(log))
-        assert store.verify().findings == []
 
 
 class Writing:
@@ -997,18 +852,6 @@ class Writing:
     def __exit__(self, *_: object) -> None:
         self.go.set()
         self._thread.join(LIMIT_S)
-
-
-def test_opening_leaves_a_running_recording_alone(path: Path, robot: Path) -> None:
-    with Writing(path, robot) as writing:
-        for _ in range(3):
-            with hl.open(path, require_database=True) as store:
-                assert not store.repairs.recovered
-                assert not store.repairs.removed
-    (report,) = writing.result
-    assert not isinstance(report, Exception), report
-    with hl.open(path, require_database=True) as store:
-        assert store.verify().findings == []
 
 
 def test_reindex_does_not_cost_a_running_recording_its_index(
@@ -1053,17 +896,6 @@ def test_while_the_index_is_made_anew_others_answer_as_always(
         store.index.rebuild(progress=ask)
         assert asked > 14
     assert store.verify().findings == []
-
-
-def test_a_running_recording_cannot_be_removed(path: Path, robot: Path) -> None:
-    with Writing(path, robot) as writing, hl.open(path, require_database=True) as store:
-        with pytest.raises(StoreError, match="being written"):
-            store.remove("robot")
-    (report,) = writing.result
-    assert not isinstance(report, Exception), report
-    with hl.open(path, require_database=True) as store:
-        assert [r.label for r in store.recordings()] == ["robot"]
-        assert store.verify().findings == []
 
 
 def test_opening_does_not_take_the_directory_of_a_recording_that_begins(

@@ -111,14 +111,6 @@ def test_a_renamed_directory_changes_the_label_alone(place: Path, uri: str) -> N
         assert answers(store) == right()
 
 
-def test_a_directory_renamed_under_an_open_store(place: Path, uri: str) -> None:
-    with hl.open(place, mongo=uri) as store:
-        assert store.topic("/n").where("n >= 130").count() == 30
-        (place / "recordings" / "one").rename(place / "recordings" / "other")
-        store.refresh()
-        assert answers(store) == right()
-
-
 @pytest.mark.parametrize("copy", ["a-copy", "z-copy"])
 def test_a_copy_inside_a_store_is_told_and_one_answers(place: Path, uri: str, copy: str) -> None:
     shutil.copytree(place / "recordings" / "one", place / "recordings" / copy)
@@ -140,16 +132,6 @@ def test_a_copy_inside_a_store_is_told_and_one_answers(place: Path, uri: str, co
         assert not store.repairs.copies
         assert answers(store) == right()
         assert not store.verify().findings
-
-
-def test_the_copy_that_is_whole_answers(place: Path, uri: str) -> None:
-    shutil.copytree(place / "recordings" / "one", place / "recordings" / "two")
-    (place / "recordings" / "one" / "000001.mcap").unlink()
-    with hl.open(place, mongo=uri) as store:
-        (entry,) = store.recordings()
-        assert (entry.label, entry.status) == ("two", "complete")
-        assert store.repairs.copies == {"one": "two"}
-        assert answers(store) == right()
 
 
 def test_a_recording_from_another_store_is_adopted(place: Path, uri: str, tmp_path: Path) -> None:

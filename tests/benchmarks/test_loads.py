@@ -113,17 +113,6 @@ def truth_of(decoded: Decoded) -> Truth:
 # --- the four questions, and the three that the paper finds hard ---
 
 
-def test_q1_q3(sessions: Decoded) -> None:
-    truth = truth_of(sessions)
-    closed = sum(m.position == 0.0 for _, _, m in sessions(hcr.RIGHT_GRIPPER))
-    assert closed == truth.q1 > 5
-    inside = 0
-    for _, _, message in sessions(hcr.RIGHT_ARM):
-        p = message.pose.position
-        inside += p.z > 1 and -0.5 < p.y < 0.5 and 0.5 < p.x < 1
-    assert inside == truth.q3 > 500
-
-
 def test_q2(sessions: Decoded) -> None:
     truth = truth_of(sessions)
     behind = [m.position for _, _, m in sessions(hcr.VIEWPOINT) if m.position.x <= 0]
@@ -136,20 +125,6 @@ def test_q2(sessions: Decoded) -> None:
     assert any(p.x == 0 for p in behind)
 
 
-@pytest.mark.parametrize("unit", [1, 1_000_000], ids=["ns", "ms"])
-def test_q4(sessions: Decoded, unit: int) -> None:
-    truth = truth_of(sessions)
-    front = [t // unit for _, t, m in sessions(hcr.VIEWPOINT) if m.position.x >= 0]
-    closings = [t // unit for _, t, m in sessions(hcr.RIGHT_GRIPPER) if m.position == 0.0]
-    found = [
-        sum(any(abs(t - c) < window // unit for t in front) for c in closings)
-        for window in (SECOND // 10, SECOND // 2)
-    ]
-    assert found == [truth.q4_near, truth.q4_wide]
-    # Each kind of closing is there: near, only wide, and neither.
-    assert 0 < truth.q4_near < truth.q4_wide < truth.q1
-
-
 def test_q4_has_nothing_near_the_edges_of_its_windows(sessions: Decoded) -> None:
     front = np.array([t for _, t, m in sessions(hcr.VIEWPOINT) if m.position.x >= 0])
     for _, time, message in sessions(hcr.RIGHT_GRIPPER):
@@ -157,16 +132,6 @@ def test_q4_has_nothing_near_the_edges_of_its_windows(sessions: Decoded) -> None
             nearest = int(np.abs(front - time).min())
             assert nearest < SECOND // 20 or nearest > SECOND // 5
             assert nearest < 2 * SECOND // 5 or nearest > 6 * SECOND // 10
-
-
-def test_viewpoint_changes(sessions: Decoded) -> None:
-    changes, before, moving = 0, None, False
-    for _, _, message in sessions(hcr.VIEWPOINT):
-        now = (message.position, message.orientation)
-        moves = before is not None and now != before
-        changes += moves and not moving
-        before, moving = now, moves
-    assert changes == truth_of(sessions).viewpoint_changes > 20
 
 
 def test_the_viewpoint_turns_only_when_it_moves(sessions: Decoded) -> None:
