@@ -18,7 +18,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.cli.running import Done
+from tests.cli.within import Answer
 from tests.imports import SOURCE_ROOTS
 
 _LIMIT_S = 120
@@ -49,7 +49,7 @@ class User:
     def home(self) -> Path:
         return self.place / f"h{self.uid}"
 
-    def python(self, *arguments: object, code: int | None = 0, **env: str) -> Done:
+    def python(self, *arguments: object, code: int | None = 0, **env: str) -> Answer:
         """Run Python, as this user, to its end."""
         if not self.home.exists():
             self.home.mkdir(mode=0o700)
@@ -82,12 +82,12 @@ class User:
                 **env,
             },
         )
-        done = Done(ended.returncode, ended.stdout.decode(), ended.stderr.decode(), ended.stdout)
+        done = Answer(ended.stdout.decode(), ended.stderr.decode(), ended.returncode, ended.stdout)
         if code is not None:
             assert done.code == code, (done.code, done.out[-2000:], done.err[-2000:])
         return done
 
-    def run(self, *arguments: object, code: int | None = 0, **env: str) -> Done:
+    def run(self, *arguments: object, code: int | None = 0, **env: str) -> Answer:
         """Run a command of hybridlog's, as this user, to its end."""
         done = self.python("-m", "hybridlog", *arguments, code=code, **env)
         assert "Traceback" not in done.err, done.err

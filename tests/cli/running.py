@@ -2,38 +2,20 @@
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
 
 from tests.cli.fork_server import fork_server
+from tests.cli.within import Answer
 
 COMMAND = [sys.executable, "-m", "hybridlog"]
 BACKGROUND = ("sh", "-c", 'trap "" INT; exec "$@"', "sh")
 """A wrapper: SIGINT is ignored, as for background jobs of scripts."""
 _LIMIT_S = 120
-
-
-class Done(NamedTuple):
-    """How a command ended."""
-
-    code: int
-    out: str
-    err: str
-    raw: bytes
-
-    @property
-    def json(self) -> Any:
-        return json.loads(self.out)
-
-    @property
-    def lines(self) -> list[str]:
-        return self.out.splitlines()
 
 
 def environment(**extra: str) -> dict[str, str]:
@@ -43,7 +25,7 @@ def environment(**extra: str) -> dict[str, str]:
     return {**kept, "LC_ALL": "C.UTF-8", **extra}
 
 
-def run(*arguments: object, store: Path | None = None, code: int | None = 0, **env: str) -> Done:
+def run(*arguments: object, store: Path | None = None, code: int | None = 0, **env: str) -> Answer:
     """Run a command to its end.
 
     Args:
@@ -64,10 +46,10 @@ def run(*arguments: object, store: Path | None = None, code: int | None = 0, **e
         timeout=_LIMIT_S,
         check=False,
     )
-    done = Done(
-        ended.returncode,
+    done = Answer(
         ended.stdout.decode("utf-8", "replace"),
         ended.stderr.decode("utf-8", "replace"),
+        ended.returncode,
         ended.stdout,
     )
     assert "Traceback" not in done.err, done.err

@@ -19,6 +19,7 @@ class Answer(NamedTuple):
     out: str
     err: str
     code: int = 0
+    raw: bytes = b""
 
     @property
     def json(self) -> Any:
