@@ -1217,30 +1217,22 @@ def test_whatever_happens_happens(machine: type[Machine], is_bag: bool) -> None:
         model.teardown()
 
 
-@pytest.mark.exhaustive
-@pytest.mark.timeout(3600)
-def test_the_store_is_its_model_whatever_chance_brings(machine: type[Machine]) -> None:
+@pytest.mark.parametrize(
+    ("examples", "steps"),
+    [
+        (4, 20),
+        pytest.param(60, 30, marks=[pytest.mark.exhaustive, pytest.mark.timeout(3600)]),
+    ],
+)
+def test_the_store_is_its_model(machine: type[Machine], examples: int, steps: int) -> None:
     run_state_machine_as_test(
         machine,
         settings=settings(
-            max_examples=60,
-            stateful_step_count=30,
+            max_examples=examples,
+            stateful_step_count=steps,
             deadline=None,
             phases=(Phase.generate,),
-            suppress_health_check=list(HealthCheck),
-        ),
-    )
-
-
-def test_the_store_is_its_model(machine: type[Machine]) -> None:
-    run_state_machine_as_test(
-        machine,
-        settings=settings(
-            max_examples=4,
-            stateful_step_count=20,
-            deadline=None,
-            phases=(Phase.generate,),
-            derandomize=True,
+            derandomize=examples == 4,
             suppress_health_check=list(HealthCheck),
         ),
     )
