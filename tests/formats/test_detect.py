@@ -94,12 +94,6 @@ def test_refused(name: str, words: str) -> None:
     assert str(DATA / name) in str(caught.value)
 
 
-def test_refused_old_bag(tmp_path: Path) -> None:
-    (tmp_path / "a.bag").write_bytes(b"#ROSBAG V1.2\n" + bytes(500))
-    with pytest.raises(SourceError, match=r"version 1\.2"):
-        open_source(tmp_path / "a.bag")
-
-
 @pytest.mark.skipif(os.geteuid() == 0, reason="the next test does the same as another user")
 def test_permission(tmp_path: Path) -> None:
     file = tmp_path / "a.bag"

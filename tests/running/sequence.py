@@ -235,10 +235,6 @@ class Known:
         times = [time_by(one, clock) for one in self.of(*topics)]
         return min(times), max(times) + 1
 
-    def up_to(self, counts: dict[str, int]) -> Known:
-        """A shorter beginning."""
-        return Known(self.sent, counts)
-
 
 def time_by(one: Sent, clock: str) -> int:
     """The time of a message by a clock, ns."""

@@ -228,18 +228,10 @@ def sends(*payloads: bytes) -> Callable[[socket.socket], None]:
 class Collector(Heard):
     """A sink that keeps everything, and lets a test wait for it."""
 
-    def take(
-        self,
-        channel: Channel,
-        payload: bytes,
-        *,
-        received: int,
-        sent: int | None = None,
-        sequence: int | None = None,
-    ) -> None:
+    def take(self, channel: Channel, payload: bytes, **about: Any) -> None:
         assert type(payload) is bytes
-        assert sent is None
-        super().take(channel, payload, received=received, sequence=sequence)
+        assert about.get("sent") is None
+        super().take(channel, payload, **about)
 
     def say(self, text: str) -> None:
         assert "\n" not in text

@@ -18,7 +18,8 @@ from hybridlog.live.sources.ros2.source import Ros2Source
 from hybridlog_storage.errors import MissingDependencyError, SourceError, UsageError
 from tests.limits import Limit
 from tests.live.sources.heard import must_return
-from tests.live.sources.ros2_peers import Memory, fake_child, is_alive, starts, wait_until
+from tests.live.sources.ros2_peers import Memory, fake_child, is_alive, starts
+from tests.waiting import wait_for
 
 
 @pytest.fixture(autouse=True)
@@ -169,7 +170,7 @@ def test_nothing_outlives_a_recorder_that_is_killed(tmp_path: Path) -> None:
     )
     assert done.returncode < 0
     [pid] = starts(tmp_path)
-    wait_until(lambda: not is_alive(pid), "the child should have ended")
+    wait_for(lambda: not is_alive(pid))
 
 
 # Children that break.
@@ -304,7 +305,7 @@ def test_stop_does_not_wait_for_a_child_that_does_not_greet(tmp_path: Path) -> N
     )
     source = Ros2Source(child)
     source.start(Memory())
-    wait_until(lambda: len(starts(tmp_path)) == 2, "it should be started again")
+    wait_for(lambda: len(starts(tmp_path)) == 2)
     must_return(source.stop)
 
 

@@ -28,8 +28,8 @@ from tests.live.sources.ros2_peers import (
     is_alive,
     robot,
     ros2_python,
-    wait_until,
 )
+from tests.waiting import wait_for
 
 pytestmark = pytest.mark.peer("ROS 2")
 
@@ -384,7 +384,7 @@ def test_nothing_outlives_a_recorder_that_is_killed(python: str, number: int) ->
         assert recorder.stdout is not None
         child = int(recorder.stdout.readline())
         recorder.send_signal(number)
-    wait_until(lambda: not is_alive(child), "the child should have ended")
+    wait_for(lambda: not is_alive(child))
 
 
 def test_a_child_ends_when_it_is_told_to(python: str) -> None:

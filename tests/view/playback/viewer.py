@@ -9,7 +9,6 @@ import struct
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from types import TracebackType
 from typing import Any, NamedTuple, Self
 
 from websockets.sync.client import ClientConnection, connect
@@ -93,12 +92,7 @@ class Viewer:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         with suppress(OSError):  # it goes without a farewell, as a closed tab does
             self.connection.socket.shutdown(socket.SHUT_RDWR)
         self._stack.close()
