@@ -599,18 +599,12 @@ class Machine(RuleBasedStateMachine):
         content = {"text": text, "tags": {"k": text}}
         payload = json.dumps(content, ensure_ascii=False).encode()
         # Its arrival number is one that no message ever had.
-        (told,) = self.store.query([MARKS], [recording]).where(
-            {"_meta.seq": self.newest(recording)}
-        )
+        told = max(self.store.query([MARKS], [recording]), key=lambda message: message.seq)
         taken = [*known.messages, *(m for lost in known.lost.values() for m in lost.messages)]
         assert all(m.seq < told.seq for m in taken)
         said = Said(MARKS, payload, moment, moment, None, content, torn=False, has_header=False)
         known.messages.append(replace(said, recording=recording, seq=told.seq))
         self.changed = True
-
-    def newest(self, recording: str) -> dict[str, int]:
-        query = self.store.query([MARKS], [recording])
-        return {"$eq": max(message.seq for message in query)}
 
     # What happens to directories and files.
 
