@@ -102,7 +102,9 @@ def _fetch_where(store: hl.Store, entry: RecordingEntry) -> list[tuple[int, byte
 
 
 def _documents(store: hl.Store, entry: RecordingEntry) -> int:
-    return store.query(_topics(entry), [entry.id]).where(EVERYTHING).count()
+    """Documents, and messages of which it is told that they have none."""
+    query = store.query(_topics(entry), [entry.id]).where(EVERYTHING)
+    return query.count() + query.counters.unindexed
 
 
 def _fetch(store: hl.Store, entry: RecordingEntry) -> list[tuple[int, bytes]]:

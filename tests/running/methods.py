@@ -579,7 +579,7 @@ METHODS: dict[str, Rule] = {
 
 EXEMPT_METHODS: dict[str, str] = {
     "follow": "it gives what comes later; see tests/live/test_follow.py",
-    "documents": "MongoDB answers it, which has what is indexed; see test_states",
+    "session": "the open store, which is asked by all others",
 }
 """Methods without a rule here, and why."""
 
