@@ -71,7 +71,7 @@ PLACES = {
     "document_slab_bytes": "hybridlog.schema.document._SLAB",
     "sql_tree_size": "hybridlog.sql.engine._MAX_TREE",
     "sql_trees": "hybridlog.sql.engine._MAX_TREES",
-    "clients_wait_s": "hybridlog.store._CLIENTS_WAIT_S",
+    "clients_wait_s": "hybridlog.index.of_store._CLIENTS_WAIT_S",
     "playback_sent": "hybridlog.view.playback.server._MAX_SENT",
     "sql_seconds": "hybridlog.view.routes.ask.SQL_SECONDS",
     "export_piece_bytes": "hybridlog.view.routes.export.PIECE",

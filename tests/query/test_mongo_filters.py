@@ -6,10 +6,12 @@ import json
 import pickle
 import re
 from collections.abc import Iterator
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 import pytest
+from bson import Decimal128, Int64, MinKey
 from pymongo import MongoClient
 
 import hybridlog as hl
@@ -38,6 +40,8 @@ THINGS = Schema(
     b"""float64 x
 uint64 u
 string s
+time at
+bool odd
 float32[] ranges
 float64[2] two
 float64[40] many
@@ -66,6 +70,8 @@ def thing(n: int, ranges: int = 100, data: int = 2) -> bytes:
             np.float64(n).tobytes(),
             np.uint64(2**64 - 1 if n == 7 else n).tobytes(),
             np.uint32(len(text)).tobytes() + text.encode(),
+            np.array([1_748_937_610 + n, 0], "<u4").tobytes(),
+            bytes([n % 2]),
             array([n] * ranges, "<f4"),
             np.array([n, n + 1], "<f8").tobytes(),
             np.full(40, n, "<f8").tobytes(),
@@ -127,7 +133,11 @@ def seqs(query: Query) -> list[tuple[str, int]]:
         {"parts.v": {"$all": [40]}},
         {"parts.0.data.1": 6},
         {"$expr": {"$gt": [{"$add": ["$x", {"$arrayElemAt": ["$two", 0]}]}, 30]}},
-        {"_meta.t": {"$gte": 105 * SECOND}},
+        {"_meta.t": {"$gte": Int64(105 * SECOND)}},
+        {"_meta.inserted_at": {"$gt": datetime(2020, 1, 1, tzinfo=UTC)}, "x": 3},
+        {"at": {"$gt": 1_748_937_620 * SECOND}, "odd": {"$ne": True}},
+        {"at": {"$ne": None}, "x": {"$in": [None, 3]}, "s": {"$gt": MinKey()}},
+        {"x": Decimal128("3")},
         {"_meta.seq": {"$lt": 9}},
         {"_meta.ref.len": {"$gt": 10}, "_meta.error": {"$exists": False}, "x": 3},
         {},
@@ -183,7 +193,11 @@ def test_it_is_joined_with_all_else(store: hl.Store) -> None:
 @pytest.mark.parametrize(
     ("topic", "own", "says"),
     [
-        ("/t", {"ranges": {"$gt": 3}}, r"ranges of more than 32 .*ask for ranges\.min"),
+        (
+            "/t",
+            {"ranges": {"$gt": 3}},
+            r"ranges of more than 32 .*predicate, .*, or, if all .*ranges\.min",
+        ),
         ("/t", {"ranges.5": 3}, r"ranges\.min"),
         ("/t", {"ranges.5": {"$exists": True}}, r"ranges\.min"),
         ("/t", {"ranges": {"$size": 100}}, r"ranges\.n"),
@@ -232,6 +246,27 @@ def test_short_arrays_are_whole(tmp_path: Path) -> None:
         ({"$expr": {"$eq": ["$rangs", 1]}}, "no field rangs; did you mean.* ranges"),
         ({"two.2": 1}, "two has 2 elements"),
         ({"s": re.compile("(?=a)")}, "RE2"),
+        (
+            {"at": {"$gt": 1_748_937_610}},
+            r"nanoseconds here; .*10\*\*9, or .*1748937610ns",
+        ),
+        ({"at": {"$lt": 1_748_937_610.5}}, "a number is nanoseconds here"),
+        ({"_meta.t": 1_748_937_610}, "a number is nanoseconds here"),
+        ({"at": "2025-06-03"}, "is a time, the value is a string; write it in nanoseconds"),
+        ({"at": {"$lte": datetime(2025, 6, 3)}}, "is a time, the value is a datetime"),
+        ({"_meta.inserted_at": {"$gt": "2025"}}, "is a datetime, the value is a string"),
+        ({"x": {"$gt": "a"}}, "the field is a number, the value is a string"),
+        ({"x": {"$in": [1, "a"]}}, "the field is a number, the value is a string"),
+        ({"$or": [{"x": 1}, {"u": {"$not": {"$gte": b"a"}}}]}, "is a number, the value is a bytes"),
+        ({"x": True}, "the field is a number, the value is a bool"),
+        ({"odd": {"$ne": 1}}, "the field is a bool, the value is a number; write true or false"),
+        ({"s": {"$nin": [5]}}, "the field is a string, the value is a number; write it in quotes"),
+        ({"x": {"$regex": "5"}}, "the field is a number, not a string"),
+        ({"ranges.min": re.compile("5")}, "the field is a number, not a string"),
+        ({"parts": {"$elemMatch": {"n": "a"}}}, "the field is a number, the value is a string"),
+        ({"two": {"$elemMatch": {"$gt": "a"}}}, "the field is a number, the value is a string"),
+        ({"parts": 5}, "parts is a message, not a value; .*parts.n"),
+        ({"x": 1, "u": "a"}, r"\n  \{'x': 1, 'u': 'a'\}\n           \^"),
     ],
 )
 def test_what_is_refused(store: hl.Store, own: dict[str, object], says: str) -> None:

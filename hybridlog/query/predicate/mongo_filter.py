@@ -11,20 +11,26 @@ import json
 import math
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 from datetime import datetime
+from typing import cast
 
 from hybridlog.query.predicate.numbers import HIGH, LOW
 from hybridlog.query.predicate.regex import RegexError, compile_regex
+from hybridlog.query.predicate.tokens import MAX_TEXT
 from hybridlog.query.predicate.tree import (
     And,
+    Compare,
     Field,
+    Match,
     MongoFilter,
     Predicate,
     Reach,
+    Value,
     frozen,
     is_meta,
 )
-from hybridlog.query.predicate.types import STATS, FieldTypes, check_name
+from hybridlog.query.predicate.types import STATS, FieldTypes, check, check_name
 from hybridlog.schema.kinds import width_of
 from hybridlog_storage.errors import WhereError
 
@@ -75,6 +81,8 @@ _EXPRESSIONS = frozenset(
     }
 )
 _OPTIONS = set("ims")
+_UNCHECKED = {"NoneType", "dict", "list", "Decimal128", "MinKey", "MaxKey"}
+"""Types of values that are compared with fields of any type."""
 _BSON_VALUES = {"Int64", "ObjectId", "Decimal128", "Timestamp", "MinKey", "MaxKey"}
 
 
@@ -113,7 +121,8 @@ def mongo_filter(
         types: Types of the fields by path; None where no definition fixes them.
 
     Raises:
-        WhereError: a part is not allowed, with its place; or there is no such field.
+        WhereError: a part is not allowed, with its place; there is no such field; or a value
+            does not fit its type.
     """
     if not isinstance(query, Mapping):
         raise WhereError(f"a filter is a mapping, not {type(query).__name__}")
@@ -122,6 +131,12 @@ def mongo_filter(
     for path in checker.paths:
         if path.split(".")[0] != "_id":
             check_name(text, _field(path), types)
+    compared = [
+        replace(one, position=max(0, text.find(repr(one.field.path), 0, MAX_TEXT)))
+        for one in checker.compared
+        if one.field.parts[0] != "_id"
+    ]
+    check(Predicate(And(tuple(compared)), text), types)
     if not found:
         return Predicate(And(()), text)
     return Predicate(MongoFilter(frozen(found), tuple(checker.paths.items())), text)
@@ -156,9 +171,9 @@ def misjudged(node: MongoFilter, types: FieldTypes | Mapping[str, str] | None) -
             width = width_of(known.types.get(array, ""))
             if (is_above or is_it or is_below) and (width is None or width > WHOLE):
                 found[
-                    f"{array} of more than {WHOLE} elements is a summary in the index: ask for "
-                    f"{array}.min, {array}.max, {array}.mean or {array}.n, or write a predicate, "
-                    f"such as '{array} > 0'."
+                    f"{array} of more than {WHOLE} elements is a summary in the index: write a "
+                    f"predicate, such as '{array} > 0', or, if all are so long, ask for "
+                    f"{array}.min, {array}.max, {array}.mean or {array}.n."
                 ] = _summaries_of(array, known)
     return found
 
@@ -194,10 +209,12 @@ class _Checker:
 
     Attributes:
         paths: How the filter asks for each path.
+        compared: Fields and the values that they are compared with, as `==`, and patterns.
     """
 
     def __init__(self) -> None:
         self.paths: dict[str, Reach] = {}
+        self.compared: list[Compare | Match] = []
         self._nodes = 0
         self._characters = 0
 
@@ -236,14 +253,20 @@ class _Checker:
         if self.paths.get(name, "exists") == "exists" or reach == "whole":
             self.paths[name] = reach
 
+    def _compared(self, name: str, value: object, path: _Path, depth: int) -> object:
+        """A value that a field is compared with, in plain Python values."""
+        found = self._literal(value, path, depth)
+        if type(found).__name__ not in _UNCHECKED:
+            self.compared.append(Compare(_field(name), "==", cast("Value", found)))
+        return found
+
     def _condition(self, name: str, value: object, path: _Path, depth: int) -> object:
         if isinstance(value, Mapping) and _has_operators(value, path):
             return self._operators(name, value, path, depth)
         if _is_pattern(value):
-            self._ask(name, "value")
-            return self._regex(value, "", path)
+            return self._regex(name, value, "", path)
         self._ask(name, "whole" if isinstance(value, Mapping | list | tuple) else "value")
-        return self._literal(value, path, depth)
+        return self._compared(name, value, path, depth)
 
     def _operators(
         self, name: str, operators: Mapping[str, object], path: _Path, depth: int
@@ -254,8 +277,7 @@ class _Checker:
             if key == "$not":
                 found[key] = self._not(name, value, inner, depth)
             elif key == "$regex":
-                self._ask(name, "value")
-                found |= self._regex(value, operators.get("$options", ""), inner)
+                found |= self._regex(name, value, operators.get("$options", ""), inner)
             elif key != "$options" or "$regex" not in operators:
                 found[key] = self._operand(name, key, value, inner, depth)
         return found
@@ -270,7 +292,9 @@ class _Checker:
             raise _refused(path, "the operator is not allowed here")
         is_nested = isinstance(value, Mapping | list | tuple) and operator in _LITERAL
         self._ask(name, "exists" if operator == "$exists" else "whole" if is_nested else "value")
-        return self._literal(value, path, depth + 1)
+        if operator in _PLAIN:
+            return self._literal(value, path, depth + 1)
+        return self._compared(name, value, path, depth + 1)
 
     def _members(self, name: str, value: object, path: _Path, depth: int) -> list[object]:
         if not isinstance(value, list | tuple):
@@ -284,13 +308,12 @@ class _Checker:
                 element = self._element(name, item["$elemMatch"], inner, depth + 1)
                 members.append({"$elemMatch": element})
             else:
-                members.append(self._literal(item, path, depth + 1))
+                members.append(self._compared(name, item, path, depth + 1))
         return members
 
     def _not(self, name: str, value: object, path: _Path, depth: int) -> Filter:
         if _is_pattern(value):
-            self._ask(name, "value")
-            return self._regex(value, "", path)
+            return self._regex(name, value, "", path)
         inner = _mapping(value, path)
         if not inner or not all(isinstance(key, str) and key[:1] == "$" for key in inner):
             raise _refused(path, "needs operators")
@@ -305,7 +328,8 @@ class _Checker:
             return self._operators(name, inner, path, depth + 1)
         return self.query(inner, path, depth + 1, f"{name}.")
 
-    def _regex(self, value: object, options: object, path: _Path) -> Filter:
+    def _regex(self, name: str, value: object, options: object, path: _Path) -> Filter:
+        self._ask(name, "value")
         if _is_pattern(value):
             if options:
                 raise _refused(path, "has options twice")
@@ -325,6 +349,7 @@ class _Checker:
             compile_regex(f"(?{flags}){value}" if flags else str(value))
         except RegexError as error:
             raise _refused(path, f"the pattern is refused: {error}") from None
+        self.compared.append(Match(_field(name), str(value), negated=False))
         found: Filter = {"$regex": str(value)}
         return {**found, "$options": flags} if flags else found
 

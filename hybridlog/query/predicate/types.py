@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Literal
 
-from hybridlog.query.predicate.tokens import error_at
+from hybridlog.query.predicate.tokens import error_at, is_filter
 from hybridlog.query.predicate.tree import (
     Compare,
     Condition,
@@ -26,7 +26,7 @@ from hybridlog.wording import listed
 from hybridlog_storage.errors import WhereError
 
 Stat = Literal["n", "min", "max", "mean"]
-Kind = Literal["number", "string", "bool", "time", "other"]
+Kind = Literal["number", "string", "bool", "time", "datetime", "other"]
 
 STATS: dict[str, Stat] = {"n": "n", "min": "min", "max": "max", "mean": "mean"}
 """Names of the statistics in the summary of an array."""
@@ -40,6 +40,7 @@ _KINDS: dict[str, Kind] = {
     "bool": "bool",
     "boolean": "bool",
     "string": "string",
+    "date": "datetime",
     **dict.fromkeys(TIMES, "time"),
     **dict.fromkeys({*NUMBERS, "number", "integer"}, "number"),
 }
@@ -239,8 +240,10 @@ class _Checker:
             given = "bool"
         elif isinstance(value, str):
             given = "string"
-        else:
+        elif isinstance(value, int | float):
             given = "number"
+        else:  # in a filter alone
+            given = type(value).__name__
         if given == "number" and kind == "time":
             self._check_time(value, self._types.base(path), position)
             return
@@ -251,6 +254,8 @@ class _Checker:
             "time": '; write a time as t"2015-03-03T18:28:33Z", a duration as 5ms',
             "string": "; write it in quotes",
         }
+        if is_filter(self._text):
+            hints["time"] = "; write it in nanoseconds"
         raise error_at(
             self._text,
             position,
@@ -260,6 +265,9 @@ class _Checker:
     def _check_time(self, value: Value, kind: str, position: int) -> None:
         """Refuse a number without a unit that is seconds since 1970 rather than nanoseconds."""
         is_odd = kind != "duration" and _SECONDS <= value < _NANOSECONDS  # type: ignore[operator]
+        if is_odd and is_filter(self._text) and type(value) in {int, float}:
+            cure = f'multiply seconds since 1970 by 10**9, or write a predicate with t"{value}ns"'
+            raise error_at(self._text, position, f"a number is nanoseconds here; {cure}")
         bare = _BARE.match(self._text, position)
         if is_odd and bare:
             raise error_at(
