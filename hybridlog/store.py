@@ -1159,10 +1159,22 @@ class Store:
             untag: Keys of tags to remove.
 
         Raises:
-            UsageError: A tag to remove does not exist.
+            UsageError: A tag to remove does not exist; a name, note or key is empty; or
+                something is no text.
         """
         from hybridlog.maintenance import edit, index
 
+        for what, given in (("name", name), ("note", note)):
+            if given is not None and not (isinstance(given, str) and given.strip()):
+                raise UsageError(f"A {what} needs a text: give one that is not empty.")
+        tags = {} if tag is None else tag
+        if not isinstance(tags, Mapping) or not all(
+            isinstance(key, str) and key and "\0" not in key and isinstance(value, str)
+            for key, value in tags.items()
+        ):
+            raise UsageError(
+                'Tags are texts by keys, not empty and without NUL: tag={"place": "lab"}.'
+            )
         self.session.catch_up()
         (entry,) = self.select([recording])
         lines = []
@@ -1171,7 +1183,7 @@ class Store:
                 known = ", ".join(sorted(entry.tags)) or "none"
                 raise UsageError(f"{entry.label} has no tag {key!r}. Its tags: {known}.")
             lines.append(journal.event(journal.UNTAGGED, key=key))
-        for key, value in (tag or {}).items():
+        for key, value in tags.items():
             lines.append(journal.event(journal.TAGGED, key=text(key), value=text(value)))
         if note is not None:
             lines.append(journal.event(journal.NOTED, text=text(note)))

@@ -285,6 +285,12 @@ def test_names_tags_notes_and_marks_are_kept(place: Path, uri: str) -> None:
         store.edit("second-floor", note="the wheel slipped")
         with pytest.raises(UsageError, match="no tag 'x'"):
             store.edit("second-floor", untag=["x"])
+        for odd in ({"name": ""}, {"name": " "}, {"note": ""}, {"note": 5}, {"name": b"a"}):
+            with pytest.raises(UsageError, match=f"A {next(iter(odd))} needs a text"):
+                store.edit("second-floor", tag={"a": "4"}, **odd)  # type: ignore[arg-type]
+        for tags in ({"": "x"}, {"a\0": "x"}, "a=b", {"a": 1}, {1: "a"}, ["a"]):
+            with pytest.raises(UsageError, match="Tags are texts by keys, not empty"):
+                store.edit("second-floor", name="x", tag=tags)  # type: ignore[arg-type]
         store.mark("second-floor", "+10s", "slip", {"kind": "odd"})
         store.mark("second-floor", "110.5", "after")
         with pytest.raises(TimeError):

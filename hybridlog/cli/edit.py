@@ -52,9 +52,6 @@ def edit_command(given: _Edit) -> None:
     """
     if given.name is None and given.note is None:
         raise UsageError("Say what to change: --name NAME or --note TEXT.")
-    for word, text in (("name", given.name), ("note", given.note)):
-        if text is not None and not text.strip():
-            raise UsageError(f"A {word} needs a text: give one that is not empty.")
     with given.opened() as store:
         (entry,) = store.select([given.recording])
         entry = store.edit(entry.id, name=given.name, note=given.note)
