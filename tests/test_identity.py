@@ -43,6 +43,7 @@ from hybridlog_storage.mongo.database import Database
 from hybridlog_storage.mongo.index_state import IndexState
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.calls import Calls
+from tests.cli.within import answer
 from tests.copies import bring
 from tests.faults import logs
 from tests.limits import Limit
@@ -240,7 +241,9 @@ def test_a_copy_with_an_embedded_index_gets_one_of_its_own(tmp_path: Path) -> No
         store.record(log, name="one")
     copy = tmp_path / "copy"
     shutil.copytree(tmp_path / "store", copy)
-    become_another(copy, None)
+    done = answer("verify", "--repair", "--new-id", store=copy)
+    assert (done.out, done.err.count("The store has a new id now.")) == ("", 1)
+    assert answer("verify", "--repair", store=copy).out == "nothing to mend\n"
     with hl.open(copy, require_database=True) as store:
         assert store.verify().index
         assert store.record(log, name="two", again=True).indexed == COUNT

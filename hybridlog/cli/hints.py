@@ -128,8 +128,10 @@ class Command(click.Command):
         """The options that a word may belong to, asked about: the store has such a thing."""
         taken = (argument.metavar or "").casefold() if argument is not None else ""
         options = {one.name: one for one in self.params if isinstance(one, click.Option)}
+        topic, _, field = word.rpartition(":")
+        with_topic = {"fields": f"{context.info_name} {topic} --fields {field}"} if topic else {}
         found = [
-            f"{short} {word}"
+            with_topic.get(name, f"{short} {word}")
             for name, short in _NAMED.items()
             if name in options and name not in taken and options[name].shell_complete(context, word)
         ]

@@ -92,11 +92,11 @@ def _repair(given: _Verify) -> None:
         from hybridlog.store import store_path
 
         become_another(store_path(given.store), given.mongo)
-        output.say("the store has a new id now")
+        output.note("The store has a new id now.")
     with given.opened(quiet=given.quiet) as store:
         if given.moved:
             store.session.take_over()
-            output.say("the index belongs to the store at this place now")
+            output.note("The index belongs to the store at this place now.")
         chosen = None if given.choice.is_everything else given.recordings_in(store)
         with progress_bar("repair", 0, quiet=given.quiet) as bar:
             done = store.verify(chosen, Stages(bar), repair=True)
@@ -108,7 +108,7 @@ def _repair(given: _Verify) -> None:
             result = "mended" if one.is_cured else "left"
             of = f"{one.recording}: " if one.recording else ""
             output.say(f"{of}{one.place}: {result}: {one.done}")
-        if not done and not given.quiet:
+        if not (done or given.moved or given.new_id or given.quiet):
             output.say("nothing to mend")
     if left:
         raise click.exceptions.Exit(1)

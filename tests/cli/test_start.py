@@ -252,6 +252,10 @@ def test_paths_are_checked_by_the_library() -> None:
         ("fetch --betwee", "'--between'"),
         ("check robot", "robot is a recording: -r robot."),
         ("plot scan ranges.min", "\nDid you mean --fields ranges.min?"),
+        (
+            "plot odom:twist.twist.linear.x",
+            "\nDid you mean plot odom --fields twist.twist.linear.x?",
+        ),
         ("fetch robot", "\nrobot is a recording: -r robot.\n"),
         ("fetch nosuch", " more\n"),
         (f"fetch {__file__}", f" is a file: `hybridlog record {__file__}` makes it a recording."),
