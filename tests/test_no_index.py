@@ -122,8 +122,9 @@ def test_copies_and_other_readers(store: hl.Store, tmp_path: Path) -> None:
         channels = make_reader(file).get_summary().channels.values()  # type: ignore[union-attr]
     marked = {c.topic for c in channels if c.metadata.get("hybridlog.no_index") == "1"}
     assert marked == set(LEFT_OUT)
-    with hl.open(tmp_path / "other", create=True, require_database=True) as other:
+    with hl.open(tmp_path / "other", create=True) as other:
         bring(other, store.directory.path)
+    with hl.open(tmp_path / "other", require_database=True) as other:
         assert documents(other) == INDEXED
         # A slice is a new log.
         run("fetch", "-t", "**", "-o", tmp_path / "slice.mcap", store=store.directory.path)

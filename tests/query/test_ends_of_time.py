@@ -153,7 +153,7 @@ def test_header_stamps_before_1970(store: hl.Store, way: str) -> None:
 
 
 def test_exports_by_stamps_before_1970(store: hl.Store, tmp_path: Path) -> None:
-    place = store.topic("/point").directory
+    place = store.directory.path
     query = store.topic("/point").in_recording("stamps").clock("header")
     query = query.between("1969-12-31", "1970-01-02")
     assert payload_bytes(query) > 0

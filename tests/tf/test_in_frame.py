@@ -256,9 +256,7 @@ def test_formats_and_refusals(demo: Path, store: hl.Store) -> None:
     for ask in (
         lambda: store.sync([odom, "scan"]),
         lambda: next(iter(odom)),
-        odom.first,
         lambda: odom.at("+1s"),
-        odom.documents,
         lambda: odom.changes("pose.pose.position.x"),
     ):
         with pytest.raises(UsageError, match="as they came: leave out in_frame"):
