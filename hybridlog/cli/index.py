@@ -174,8 +174,9 @@ def arrays(given: _Arrays) -> None:
     """Keep long arrays in the tables of topics.
 
     Tables have a summary of an array with more than 32 elements. Of these topics they get the
-    array, too, and of point clouds a list for each field of the points. Elements in predicates
-    and SQL are then read from columns. New recordings follow, and tables of ended ones are made
+    array, too: predicates on elements of arrays and SQL then read columns. Tables of point
+    clouds get a list for each field of the points, for SQL, DuckDB and other readers of the
+    files; predicates have no points. New recordings follow, and tables of ended ones are made
     anew at once. Segments stay as they are, so this costs room. MongoDB is not needed.
     """
     with (
@@ -189,7 +190,7 @@ def arrays(given: _Arrays) -> None:
         output.print_json([asdict(one) for one in found])
         return
     for one in found:
-        if not given.quiet:
+        if not given.quiet and (one.recordings or not one.left):
             output.say(_told(one, is_known=one.topic in known, off=given.off))
         if one.left:
             output.note(
@@ -203,12 +204,14 @@ def _told(one: ArraysOfTopic, *, is_known: bool, off: bool) -> str:
     without = "without" if off else "with"
     if not is_known:
         return f"{one.topic}: no recording has it yet; its tables will be {without} arrays"
+    if one.has_arrays is False:
+        return f"{one.topic}: no long arrays, except of bytes; its tables stay as they are"
     size = output.size(one.bytes_after)
+    told = f"{one.topic}: tables {without} arrays; those of its type take {size}"
     if not one.recordings:
-        return f"{one.topic}: tables {without} arrays, {size}"
+        return told
     made = output.counted(len(one.recordings), "recording")
-    before = output.size(one.bytes_before)
-    return f"{one.topic}: tables {without} arrays, {size}, before {before}; {made} made anew"
+    return f"{told}, before {output.size(one.bytes_before)}; {made} made anew"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -86,6 +86,7 @@ class TableFolders:
         self._recording = recording
         self._digests = digests or {}
         self._numbers = 0
+        self._keeps_bytes = True
         # Of the folder that is changed:
         self._is_listed = False
         self._shared: set[str] = set()  # shared files that may have rows of the recording
@@ -106,6 +107,7 @@ class TableFolders:
         Raises:
             OSError: a file cannot be written.
         """
+        self._keeps_bytes = not prefixes  # tables that are made anew leave no holes
         with suppress(FileExistsError):
             files.make_folder(self._root / TABLES)
         with locked(self._root):
@@ -294,7 +296,7 @@ class TableFolders:
         table = pa.concat_tables(
             [rows if rows.schema.equals(schema) else rows.cast(schema) for _, rows in pieces]
         ).combine_chunks()
-        reused = None if before is None else before.reusable()
+        reused = before.reusable() if before is not None and self._keeps_bytes else None
         in_front = False
         if reused is not None and before is not None:
             size = len(reused.data) * table.num_rows / max(before.about.rows, 1)

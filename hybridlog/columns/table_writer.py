@@ -342,7 +342,8 @@ class TableWriter:
         """Finish all tables.
 
         Args:
-            entry: The complete recording; topics with another number of messages get no table.
+            entry: The complete recording; topics with another number of messages get no table,
+                and keep an older one.
         """
         if not self._has_ended:
             with self._harmless():
@@ -629,7 +630,8 @@ class TableWriter:
             addition.section, addition.rows = self._joined(entry, found)
         replaced: set[str] = set()
         if not self._is_new:
-            replaced = topics_of(entry) if self._wanted is None else {*self._wanted, *incomplete}
+            # An older table may be the only copy of fields in a damaged chunk.
+            replaced = {*(topics_of(entry) if self._wanted is None else self._wanted)} - incomplete
         if additions or replaced:
             self._check_room()
             types = {type_prefix(c.type) for c in entry.channels if c.topic in replaced}
@@ -663,7 +665,8 @@ class TableWriter:
             elif topic.has_failed:
                 failed.add(topic.name)
         messages = entry.messages_by_topic()
-        return failed | {name for name in rows if rows[name] != messages[name]}
+        names = [*rows] if self._wanted is None else self._wanted
+        return failed | {name for name in names if rows[name] != messages[name]}
 
 
 def _are_long(pieces: Sequence[Piece]) -> bool:

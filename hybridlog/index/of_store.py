@@ -9,7 +9,7 @@ from hybridlog.index import field_indexes
 from hybridlog.index.connection import IndexAddress, again_if_lost
 from hybridlog.query.query import Query
 from hybridlog.query.question import Question
-from hybridlog_storage.errors import TopicError
+from hybridlog_storage.errors import TopicError, UsageError
 
 if TYPE_CHECKING:
     from hybridlog.index.field_indexes import FieldIndex
@@ -114,10 +114,11 @@ class Index:
     def arrays(self, *topics: str, off: bool = False, progress: Progress | None = None) -> _Arrays:
         """Keep long arrays in the tables of topics, beside their summaries.
 
-        Predicates on elements, SQL and other readers of Parquet then read columns in place of
-        messages. Of a PointCloud2 tables get the points, a list for each of their fields.
-        Arrays of bytes stay in the segments alone. The setting is kept in `hybridlog.toml`: new
-        recordings follow it, and tables of ended ones are made anew. No MongoDB is needed.
+        Predicates on elements of arrays, SQL and other readers of Parquet then read columns in
+        place of messages. Of a PointCloud2 tables get the points, a list for each of their
+        fields, for SQL and other readers. Arrays of bytes stay in the segments alone. The setting
+        is kept in `hybridlog.toml`: new recordings follow it, and tables of ended ones are made
+        anew. No MongoDB is needed.
 
         Args:
             topics: Topics, as for `topic`; the full name of one that no recording has yet.
@@ -125,14 +126,17 @@ class Index:
             progress: Called after each chunk.
 
         Returns:
-            What was done for each topic, and the bytes of its tables.
+            What was done for each topic, and the bytes of the tables of its type.
 
         Raises:
+            UsageError: There is no topic, or one is no text.
             TopicError: No recording has a topic, and this is no full name.
             StoreError: The store cannot be written.
         """
         from hybridlog.maintenance.arrays import index_arrays
 
+        if not topics or not all(isinstance(name, str) for name in topics):
+            raise UsageError('Name the topics one by one, as in store.index.arrays("scan", "tf").')
         session = self._session
         session.directory.check_writable()
         session.invalidate()

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import TYPE_CHECKING
 
+from hybridlog.columns.layout import topics_of, type_prefix
 from hybridlog.maintenance import tables
 from hybridlog.maintenance.report import ArraysOfTopic
-from hybridlog.maintenance.sizes import table_bytes
 from hybridlog_storage.messages import EXPIRED_IDS
 from hybridlog_storage.settings import read_settings
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
 
     from hybridlog.columns.tables import Tables
     from hybridlog.maintenance.report import Progress
@@ -44,33 +46,48 @@ def index_arrays(
     others = [one for one in read_settings(directory.path).arrays if one not in topics]
     directory.change_settings(arrays=tuple(sorted(others if off else {*others, *topics})))
     found = {topic: ArraysOfTopic(topic) for topic in topics}
-    having = [(entry, entry.messages_by_topic().keys() & found.keys()) for entry in entries]
-    having = [(entry, own) for entry, own in having if own]
-    chosen = [entry for entry, _ in having]
-    for key, size in table_bytes(directory.path, chosen).items():
-        if key[1] in found:
-            found[key[1]].bytes_before += size
-    for entry, own in having:
-        wanted = {topic for topic in own if _differs(known, entry, topic, off=off)}
+    channels = [channel for entry in entries for channel in entry.channels]
+    types = {one: {type_prefix(c.type) for c in channels if c.topic == one} for one in topics}
+    before = _bytes(directory.path, types)
+    for entry in entries:
+        own = topics_of(entry) & found.keys()
+        wanted = {topic for topic in own if _differs(known, entry, found[topic], off=off)}
         if not wanted:
             continue
-        is_made = tables.make(directory, entry, wanted, progress=progress)
+        tables.make(directory, entry, wanted, progress=progress)
         known.look_again_for(entry, wanted)
         for topic in wanted:
-            (found[topic].recordings if is_made else found[topic].left).append(entry.label)
-    for key, size in table_bytes(directory.path, chosen).items():
-        if key[1] in found:
-            found[key[1]].bytes_after += size
+            is_left = _differs(known, entry, found[topic], off=off)
+            (found[topic].left if is_left else found[topic].recordings).append(entry.label)
+    after = _bytes(directory.path, types)
+    for topic, one in found.items():
+        one.bytes_before, one.bytes_after = before[topic], after[topic]
     return list(found.values())
 
 
-def _differs(known: Tables, entry: RecordingEntry, topic: str, *, off: bool) -> bool:
-    """True if a table is not as the setting of its topic is.
+def _bytes(root: Path, types: Mapping[str, set[str]]) -> dict[str, int]:
+    """Bytes of all tables of the types of each topic."""
+    from hybridlog.columns.folders import files_of
+
+    sizes: Counter[str] = Counter()
+    for file in files_of(root, set[str]().union(*types.values())):
+        sizes[file.path.parent.name.rpartition("~")[0] + "~"] += file.size_bytes
+    return {topic: sum(sizes[one] for one in own) for topic, own in types.items()}
+
+
+def _differs(known: Tables, entry: RecordingEntry, found: ArraysOfTopic, *, off: bool) -> bool:
+    """True if a table is not as the setting of its topic is; notes whether it can have arrays.
 
     Arrays of a recording from which some have expired are in no answer, and so in no table.
     """
+    from hybridlog.columns.fields import has_long_arrays
+
+    topic, differs = found.topic, None
+    for file, _, section in known.sections_of(entry):
+        if topic in section.topics:
+            can_have = has_long_arrays(file.schema)
+            found.has_arrays = found.has_arrays or can_have
+            is_other = can_have and bool(section.topics[topic].arrays) is off
+            differs = differs or is_other
     is_expired = any(one.id >= EXPIRED_IDS for one in entry.channels if one.topic == topic)
-    if is_expired and not off:
-        return False
-    counts = [s.topics[topic] for _, _, s in known.sections_of(entry) if topic in s.topics]
-    return not counts or any(bool(one.arrays) is off for one in counts)
+    return differs is not False and (off or not is_expired)

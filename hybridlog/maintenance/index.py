@@ -339,7 +339,7 @@ class StoreIndex:
         state = self._state
         known = {entry.key: entry for entry in entries}
         places = _places(self.database, known.values())
-        expected = {entry.key: _documents(entry, places) for entry in known.values()}
+        expected = {entry.key: documents_in(entry, places) for entry in known.values()}
         again: set[str] = set()
         orphans: list[object] = []
         collections = state.document_collections()
@@ -463,7 +463,7 @@ def _places(database: Database, entries: Iterable[RecordingEntry]) -> dict[str, 
     return TopicPlaces(database).of({c.topic for entry in entries for c in entry.channels})
 
 
-def _documents(entry: RecordingEntry, places: Mapping[str, TopicPlace]) -> Counter[str]:
+def documents_in(entry: RecordingEntry, places: Mapping[str, TopicPlace]) -> Counter[str]:
     """Number of documents of a recording in each collection."""
     found: Counter[str] = Counter()
     for channel in entry.channels:

@@ -60,10 +60,13 @@ class ArraysOfTopic:
     Attributes:
         topic: Full name.
         recordings: Labels of the recordings whose tables were made anew.
-        bytes_before: Bytes of the topic's tables before.
+        bytes_before: Bytes of all tables of its message type before; topics and recordings
+            share files.
         bytes_after: Bytes of them now.
         left: Labels of recordings whose tables are as before: they are being written, or
             cannot be read.
+        has_arrays: False if its messages can have no long arrays, except of bytes, and tables
+            stay as they are; None without tables.
     """
 
     topic: str
@@ -71,3 +74,4 @@ class ArraysOfTopic:
     bytes_before: int = 0
     bytes_after: int = 0
     left: list[str] = field(default_factory=list)
+    has_arrays: bool | None = None

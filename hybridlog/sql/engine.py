@@ -462,6 +462,9 @@ class SqlAnswer:
                 self._relation = self._connection.cursor.sql(self._text, params=self._params)
         except UsageError as error:
             found = _NO_TABLE.match(str(error))
+            if 'Referenced table "points" not found' in str(error):
+                cure = "`hybridlog index arrays TOPIC` gives the view of a point cloud this column."
+                raise UsageError(f"{error}\n{cure}") from error
             if found is None:
                 raise
             near = get_close_matches(found[1], self._connection.names())

@@ -21,10 +21,11 @@ from rosbags.typesys import Stores, get_typestore
 import hybridlog as hl
 from hybridlog.columns.clouds import PointColumns
 from hybridlog.columns.fields import FieldShape
+from hybridlog.columns.parquet_file import ParquetFileReader
 from hybridlog.query.engines import Need
 from hybridlog.query.planner import Planner
 from hybridlog.schema.codecs import codec_for
-from hybridlog_storage.errors import PayloadError, StoreError, TopicError
+from hybridlog_storage.errors import PayloadError, StoreError, TopicError, UsageError
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.cli.within import answer
 from tests.payloads.logs import (
@@ -37,6 +38,7 @@ from tests.payloads.logs import (
     cloud,
     points_of,
     ranges_of,
+    robot,
     scan,
     standard_channel,
     write_log,
@@ -209,6 +211,59 @@ def test_off_gives_the_columns_back(copy: Path) -> None:
     assert all(before[name].equals(after[name]) for name in before)
 
 
+def test_shared_files_have_no_holes_and_cost_what_it_says(copy: Path, tmp_path: Path) -> None:
+    log = write_log(tmp_path / "other.mcap", [(f"{one[0]}2", *one[1:]) for one in robot(30)])
+    with hl.open(copy, mongo="none") as store:
+        store.record(log, name="other")
+        sizes = []
+        for off in (False, True) * 2:
+            found = store.index.arrays("scan", "scan2", "cloud", off=off)
+            for one, kind in zip(found, ("LaserScan", "LaserScan", "PointCloud2"), strict=True):
+                paths = files_of(store, kind)
+                assert one.bytes_after == sum(path.stat().st_size for path in paths)
+                for about in (ParquetFileReader(path).about for path in paths):
+                    assert [*about.span] == [4, about.body]
+            sizes.append([(one.bytes_before, one.bytes_after) for one in found])
+    assert sizes[1] == sizes[3] == [one[::-1] for one in sizes[2]]
+    for before, with_, after in zip(*sizes[:3], strict=True):
+        assert with_[0] > with_[1] == after[0] <= before[0] < before[1]
+
+
+@pytest.mark.parametrize("off", [False, True])
+def test_a_damaged_chunk_costs_no_table(copy: Path, *, off: bool) -> None:
+    with hl.open(copy, mongo="none") as store:
+        store.index.arrays("scan", off=not off)
+        segment = min(store.directory.recording("log").glob("*.mcap"))
+        data = bytearray(segment.read_bytes())
+        data[2000] ^= 1
+        segment.write_bytes(data)
+        query = store.topic("scan").where("ranges.min < 1.0005")
+        expected, tables = query.count(), columns_of(copy)
+        (found,) = store.index.arrays("scan", off=off)
+        assert (found.recordings, found.left) == ([], ["log"])
+        assert columns_of(copy) == tables
+        store.refresh()
+        assert query.count() == expected > 0
+        assert query.counters.chunks_read == 0
+    said = answer("index", "arrays", "scan", *["--off"] * off, store=copy)
+    assert said.out == ""
+    assert "Tables of /scan in log stay as they are" in said.err
+
+
+def test_topics_without_long_arrays(copy: Path) -> None:
+    before = columns_of(copy)
+    with hl.open(copy, mongo="none") as store:
+        found = store.index.arrays("image", "number")
+        for one in found:
+            assert (one.has_arrays, one.recordings, one.left) == (False, [], [])
+        assert columns_of(copy) == before
+        for wrong in ((), (["scan"],), ("scan", 3)):
+            with pytest.raises(UsageError, match="Name the topics one by one"):
+                store.index.arrays(*wrong)
+    said = answer("index", "arrays", "number", store=copy).out
+    assert said == "/number: no long arrays, except of bytes; its tables stay as they are\n"
+
+
 def answers_of(path: Path) -> list[Any]:
     with hl.open(path, mongo="none") as store:
         scans = store.topic("scan")
@@ -284,7 +339,7 @@ def test_new_recordings_follow_the_setting(tmp_path: Path) -> None:
 
 def test_the_command(copy: Path) -> None:
     said = answer("index", "arrays", "scan", "/later", store=copy).out
-    assert "/scan: tables with arrays, " in said
+    assert "/scan: tables with arrays; those of its type take " in said
     assert "1 recording made anew" in said
     assert "/later: no recording has it yet" in said
     again = answer("index", "arrays", "scan", "--json", store=copy).json
@@ -426,6 +481,8 @@ def test_points_in_sql(copy: Path) -> None:
     """From tables where these have them, and from messages elsewhere."""
     query = "select t, points.x[2] as x, len(points.ring) as n from cloud where seq % 3 = 1"
     with hl.open(copy, mongo="none") as store:
+        with pytest.raises(UsageError, match="`hybridlog index arrays TOPIC` gives"):
+            store.sql("select points.x from cloud")
         store.index.arrays("cloud")
         answer_ = store.sql(query + " order by t")
         right = answer_.rows()

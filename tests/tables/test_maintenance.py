@@ -191,6 +191,26 @@ def test_topics_of_one_file_are_made_alone(few: hl.Store) -> None:
     assert contents(few) == before
 
 
+def test_a_damaged_chunk_costs_no_table(few: hl.Store) -> None:
+    """It may be the only copy of these fields, and documents of its messages are no surplus."""
+    before = contents(few)
+    (entry,) = few.recordings()
+    (path,) = few.directory.recording("few").glob("*.mcap")
+    data = bytearray(path.read_bytes())
+    data[2000] ^= 1
+    path.write_bytes(data)
+    making.make(few.directory, entry, ["/a"])
+    assert contents(few) == before
+    (finding,) = few.verify().findings
+    assert finding.cure == "restore the file from a copy"
+    few.index.rebuild()
+    assert contents(few) == before
+    data[2000] ^= 1
+    path.write_bytes(data)
+    few.index.rebuild()
+    assert compare(few) == 90
+
+
 def test_repair_makes_missing_tables(few: hl.Store) -> None:
     before = contents(few)
     for path in (few.directory.path / TABLES).glob("*/*.parquet"):
