@@ -34,8 +34,8 @@ from hybridlog.query.predicate.types import STATS, FieldTypes, check, check_name
 from hybridlog.schema.kinds import width_of
 from hybridlog_storage.errors import WhereError
 
-MAX_DEPTH = 100
-"""Deepest nesting; MongoDB itself takes up to 180 levels."""
+MAX_DEPTH = 50
+"""Deepest nesting; of MongoDB's 180 levels, its own rewriting takes some for each of ours."""
 MAX_NODES = 20_000
 """Maximum number of keys and values in total."""
 MAX_CHARACTERS = 1_000_000
@@ -66,9 +66,9 @@ _EXPRESSIONS = frozenset(
         *("$multiply", "$pow", "$round", "$sqrt", "$subtract", "$trunc"),
         *("$sin", "$cos", "$tan", "$asin", "$acos", "$atan", "$atan2"),
         *("$degreesToRadians", "$radiansToDegrees"),
-        # arrays; no operator makes one longer than its input
+        # arrays; none makes one longer than its input, as a nested `$map` or `$let` would
         *("$allElementsTrue", "$anyElementTrue", "$arrayElemAt", "$filter", "$first", "$last"),
-        *("$in", "$indexOfArray", "$isArray", "$map", "$size", "$slice"),
+        *("$in", "$indexOfArray", "$isArray", "$size", "$slice"),
         *("$avg", "$max", "$min", "$sum", "$stdDevPop", "$stdDevSamp"),
         # strings
         *("$indexOfBytes", "$indexOfCP", "$strcasecmp", "$strLenBytes", "$strLenCP"),
@@ -77,7 +77,7 @@ _EXPRESSIONS = frozenset(
         *("$convert", "$isNumber", "$toBool", "$toDate", "$toDouble", "$toInt", "$toLong"),
         *("$toString", "$type"),
         # values
-        *("$let", "$literal"),
+        "$literal",
     }
 )
 _OPTIONS = set("ims")
@@ -369,7 +369,9 @@ class _Checker:
         checked: dict[str, object] = {}
         for key, inner in items:
             place = (*path, key)
-            if key.startswith("$") and key not in _EXPRESSIONS:
+            if key.startswith("$") and (
+                key not in _EXPRESSIONS or (key == "$filter" and key in path)
+            ):
                 raise _refused(place, "the operator is not allowed here")
             check = self._literal if key == "$literal" else self._expression
             checked[key] = check(inner, place, depth + 1)
@@ -443,13 +445,15 @@ def _scalar(value: object, path: _Path) -> object:
         if _is_bson(value) and kind.__name__ in _BSON_VALUES:
             return value
         if isinstance(value, str) and not _is_bson(value):  # bson.code.Code is a string
-            value.encode()  # half a surrogate pair raises a ValueError
+            value.encode()
             return str(value)
         if isinstance(value, float):
             return float(value)
         is_date = isinstance(value, datetime) and not math.isnan(value.timestamp())
         if is_date or value is None or isinstance(value, bool | int | bytes):
             return value
+    except UnicodeError:
+        raise _refused(path, "has a text that is not valid Unicode") from None
     except (OverflowError, ValueError, TypeError) as error:
         raise _refused(path, str(error)) from None
     raise _refused(path, f"a value of type {kind.__name__} is not allowed")

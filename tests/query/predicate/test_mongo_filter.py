@@ -9,7 +9,7 @@ import pytest
 from bson import Code, Int64, ObjectId, Regex
 from pymongo.collection import Collection
 
-from hybridlog.query.predicate.mongo_filter import mongo_filter
+from hybridlog.query.predicate.mongo_filter import MAX_DEPTH, mongo_filter
 from hybridlog_storage.errors import WhereError
 
 Document = dict[str, object]
@@ -34,7 +34,8 @@ Document = dict[str, object]
         {"_id": b"12345678901234567890"},
         {"_id": ObjectId("0123456789abcdef01234567"), "n": Int64(5)},
         {"$expr": {"$gt": [{"$size": {"$ifNull": ["$a", []]}}, 3]}},
-        {"$expr": {"$let": {"vars": {"x": "$a"}, "in": {"$eq": ["$$x", {"$literal": "$b"}]}}}},
+        {"$expr": {"$eq": ["$a", {"$literal": "$b"}]}},
+        {"$expr": {"$gt": [{"$size": {"$filter": {"input": [1, 2], "cond": True}}}, 1]}},
         {"a": math.inf},
         {"a": {"$elemMatch": {"b": {"$not": {"$regex": "a"}}}}, "b": {"$lte": math.nan}},
     ],
@@ -59,6 +60,10 @@ def test_allowed(query: Document, collection: Collection[Document]) -> None:
         ({"$expr": {"$eq": [1, {"$accumulator": {}}]}}, r"\$accumulator"),
         ({"$expr": {"$range": [0, 10**9]}}, r"\$range"),
         ({"$expr": {"$reduce": {}}}, r"\$reduce"),
+        # What would take time or memory of any size on the server.
+        ({"$expr": {"$map": {"input": [1], "in": [1, 1]}}}, r"\$map"),
+        ({"$expr": {"$let": {"vars": {"x": [1, 1]}, "in": ["$$x", "$$x"]}}}, r"\$let"),
+        ({"$expr": {"$filter": {"input": [1], "cond": {"$filter": {}}}}}, r"\$filter"),
         ({"$expr": {"$gt": [1, 2], "$lt": [1, 2]}}, "one operator"),
         ({"$text": {"$search": "x"}}, r"\$text"),
         ({"$jsonSchema": {}}, r"\$jsonSchema"),
@@ -97,7 +102,7 @@ def test_allowed(query: Document, collection: Collection[Document]) -> None:
         ({"a": {1, 2}}, "set"),
         ({"a": 1j}, "complex"),
         ({"a": np.zeros(3)}, "ndarray"),
-        ({"a": "\ud800"}, "surrogates"),
+        ({"a": "\ud800"}, "Unicode"),
         ({"\ud800": 1}, "Unicode"),
         ({"a\0": 1}, "NUL"),
         ({5: 1}, "no string"),
@@ -110,12 +115,18 @@ def test_refused(query: Document, place: str) -> None:
         mongo_filter(query, None)
 
 
-def test_deep_filters() -> None:
+def test_deep_filters(collection: Collection[Document]) -> None:
     deep: object = 1
     for _ in range(5_000):
         deep = {"a": deep}
     with pytest.raises(WhereError, match="deeper"):
         mongo_filter({"x": deep}, None)
+    for operator in ("$and", "$or", "$nor"):
+        deepest: Document = {"a": 1}
+        for _ in range(MAX_DEPTH // 2):
+            deepest = {operator: [deepest, {"b": 2}]}
+        (node,) = mongo_filter(deepest, None).filters
+        assert list(collection.find(node.to_filter())) == []
     clause: Document = {"a": 1}
     for _ in range(5_000):
         clause = {"$or": [clause]}
