@@ -194,8 +194,8 @@ def arrays(given: _Arrays) -> None:
             output.say(_told(one, is_known=one.topic in known, off=given.off))
         if one.left:
             output.note(
-                f"Tables of {one.topic} in {listed(one.left)} stay as they are: a recording in "
-                "progress, or one that cannot be read. Run it again later."
+                f"Tables of {one.topic} in {listed(one.left)} stay as they are: the recording is "
+                "in progress or cannot be read, or the disk has no room. Run it again later."
             )
 
 
