@@ -175,7 +175,7 @@ def test_root_takes_no_ones_server(place: Path) -> None:
     ann = User(place, 12345, 12345, (LAB,), 0o002)
     store = place / "lab" / "store"
     ann.run("record", place / "small.bag", "-q", "--store", store)
-    with hl.open(store) as opened:
+    with hl.open(store, require_database=True) as opened:
         assert opened.topic("/imu/data").where({"_meta.seq": {"$gte": 0}}).count() > 0
     assert (store / "mongod-0").stat().st_uid == 0
     theirs = [store / "mongod", *(store / "mongod").rglob("*")]
