@@ -103,7 +103,7 @@ def test_the_page_has_every_part_within_three_screens(tmp_path: Path) -> None:
     text = page.page(journal(tmp_path, samples()))
     assert len(text.splitlines()) < 150
     tables = re.findall(r"(?:^\|.*\n)+", text, re.MULTILINE)
-    assert len(tables) == 11
+    assert len(tables) == 10
     for table in tables:
         assert len({line.count(" | ") for line in table.splitlines()}) == 1, table
     assert "A short run" not in text
