@@ -77,6 +77,8 @@ PLACES = {
     "export_piece_bytes": "hybridlog.view.routes.export.PIECE",
     "catalog_busy_s": "hybridlog_storage.catalog._BUSY_S",
     "direct_flag": "hybridlog_storage.disk.append_file.DIRECT",
+    "manifest_bytes": "hybridlog_storage.manifest.MAX_BYTES",
+    "manifest_wait_s": "hybridlog_storage.manifests.WAIT_S",
     "max_journal": "hybridlog_storage.journal.MAX_JOURNAL",
     "inserted_bytes_together": "hybridlog_storage.mongo.database._MAX_COMMAND_BYTES",
     "mongod_silence_s": "hybridlog_storage.mongo.mongod.SILENCE_LIMIT_S",

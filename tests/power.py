@@ -186,6 +186,12 @@ class PowerCut(System):
             after.pending.append((None, new, number))
             after.left.append((before, old))
 
+    def link(self, old: str, new: str, *, folder: int, new_folder: int) -> None:
+        self._step()
+        number = self._number(os.stat(old, dir_fd=folder, follow_symlinks=False))
+        super().link(old, new, folder=folder, new_folder=new_folder)
+        self._folder(new_folder).pending.append((None, new, number))
+
     def unlink(self, name: str, *, folder: int) -> None:
         self._step()
         super().unlink(name, folder=folder)

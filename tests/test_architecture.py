@@ -32,6 +32,7 @@ HEAVY = ("mcap", "numpy", "pandas", "pyarrow", "pymongo", "rich", "rosbags", "zs
 ALLOWED = {
     "PIL": ("hybridlog.arrays.message_arrays", "hybridlog.drawing.images"),
     "av": ("hybridlog.arrays.video",),
+    "blake3": ("hybridlog_storage.manifest",),
     "bson": (
         "hybridlog.schema.index_bodies",
         "hybridlog.schema.objects",
@@ -59,6 +60,7 @@ ALLOWED = {
         "hybridlog_storage.segments.segment_writer",
     ),
     "mcap_protobuf": ("hybridlog.schema.protobuf_codec",),
+    "msgspec": ("hybridlog_storage.manifest",),
     "obstore": ("hybridlog_storage.remote.bucket",),
     "pandas": ("hybridlog.frames",),
     "polars": ("hybridlog.frames.frame",),

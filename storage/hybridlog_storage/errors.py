@@ -126,6 +126,14 @@ class ObjectChangedError(BucketError):
     """An object is not the version any more that was read. Ask again."""
 
 
+class ManifestError(StoreError):
+    """A manifest that is damaged. `verify --repair` makes it again."""
+
+
+class RecordingGoneError(StoreError):
+    """A recording that is not in the store, or no longer."""
+
+
 class CatalogError(StoreError):
     """The catalog is damaged or incomplete. It is rebuilt from the files."""
 

@@ -8,11 +8,11 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from http.client import HTTPConnection
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from threading import Thread
+from threading import Lock, Thread
 from typing import Any
 
 KEEP = ("content-type", "content-range", "etag", "last-modified", "accept-ranges")
@@ -68,6 +68,7 @@ class Proxy:
         self.delay = 0.0
         self.without_conditions = False
         self.old_lists: dict[str, bytes] | None = None
+        self._writing = Lock()
         outer = self
 
         class Handler(BaseHTTPRequestHandler):
@@ -120,7 +121,9 @@ class Proxy:
             return
         if self.without_conditions:
             headers = {n: v for n, v in headers.items() if n not in {"if-match", "if-none-match"}}
-        with _Closing(HTTPConnection("127.0.0.1", port, timeout=60)) as server:
+        # The server checks conditions before it writes: two of its threads may both be right.
+        alone = self._writing if client.command == "PUT" else nullcontext()
+        with alone, _Closing(HTTPConnection("127.0.0.1", port, timeout=60)) as server:
             server.request(client.command, client.path, body, headers)
             answer = server.getresponse()
             content = answer.read()

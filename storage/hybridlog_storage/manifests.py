@@ -1,0 +1,480 @@
+"""Where manifests lie, and how they change: replaced as a whole, if unchanged.
+
+A change is a function of the newest manifest. On a disk it is made under the lock of the
+recording; in a bucket, on condition that the object is still the one that was read, or else
+again. So no change overwrites another one. A change never creates a manifest, so nothing comes
+back that was removed.
+
+On a disk:
+
+    manifests/<id>.json              the manifest
+    manifests/.lock                  held while a manifest is created, or disappears
+    recordings/<id>/manifest.lock    held while a manifest is replaced
+    recordings/<id>/manifest.old     the manifest before the last change
+
+In a bucket, the first one only. All that is in `recordings/<id>` goes with a removal.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+import random
+import time
+from abc import ABC, abstractmethod
+from contextlib import ExitStack, contextmanager, suppress
+from typing import TYPE_CHECKING, Final
+
+from hybridlog_storage.disk import durability, files
+from hybridlog_storage.errors import (
+    HeldError,
+    ManifestError,
+    ObjectChangedError,
+    ObjectExistsError,
+    RecordingGoneError,
+    StoreError,
+    unreadable,
+)
+from hybridlog_storage.manifest import MAX_BYTES, Manifest, decode, encode, is_id, replace
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator
+    from contextlib import AbstractContextManager
+    from pathlib import Path
+
+    from hybridlog_storage.remote.bucket import Bucket
+
+WAIT_S: Final = 30.0
+"""How long a change waits for others, which take milliseconds."""
+_PAUSE_S: Final = 0.002
+_NO_LOCKS: Final = frozenset({errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS})
+_FOLDER: Final = "manifests"
+_RECORDINGS: Final = "recordings"
+_SUFFIX: Final = ".json"
+_ALL: Final = ".lock"
+_LOCK: Final = "manifest.lock"
+_OLD: Final = "manifest.old"
+
+
+class Manifests(ABC):
+    """The manifests of a store, in a directory or in a bucket."""
+
+    @abstractmethod
+    def ids(self) -> list[str]:
+        """Ids of all recordings that have a manifest, sorted; also of those being removed.
+
+        Raises:
+            HybridlogError: The store does not answer.
+        """
+
+    def read(self, recording: str) -> Manifest:
+        """The newest manifest of a recording.
+
+        Raises:
+            RecordingGoneError: There is no such recording.
+            ManifestError: The manifest is damaged.
+            HybridlogError: The store does not answer.
+        """
+        return _present(self._read(recording)[0])
+
+    def change(self, recording: str, how: Callable[[Manifest], Manifest]) -> Manifest:
+        """Replace a manifest.
+
+        Args:
+            recording: Its id.
+            how: Makes the new manifest of the newest one, perhaps several times; if it returns
+                what it was given, nothing is written. What it raises ends the change.
+
+        Returns:
+            The manifest with the change; it is on the disk.
+
+        Raises:
+            RecordingGoneError: There is no such recording, or it was removed meanwhile.
+            ManifestError: The manifest is damaged.
+            HybridlogError: It cannot be written; the old one is still there.
+        """
+        return self._change(recording, lambda now: how(_present(now)))
+
+    def create(self, manifest: Manifest) -> None:
+        """Create the manifest of a new recording; errors as of `creating`."""
+        with self.creating() as create:
+            create(manifest)
+
+    @abstractmethod
+    def creating(self) -> AbstractContextManager[Callable[[Manifest], None]]:
+        """Create manifests; on a disk nobody else can create one meanwhile.
+
+        Raises:
+            StoreError: The recording exists.
+            HybridlogError: It cannot be written.
+        """
+
+    def restore(self, recording: str, make: Callable[[Manifest | None], Manifest]) -> Manifest:
+        """Make a manifest again that is lost or damaged.
+
+        Args:
+            recording: Its id.
+            make: Makes it of the one before the last change, if there is one.
+
+        Returns:
+            The manifest; the one that is there if it can be read.
+
+        Raises:
+            HybridlogError: It cannot be written.
+        """
+        with self.creating() as create:
+            with suppress(RecordingGoneError, ManifestError):
+                return self._read(recording)[0]
+            made = replace(make(self._old(recording)), status="unproven")
+            self._drop(recording)
+            create(made)
+            return made
+
+    def remove(self, recording: str) -> None:
+        """Remove a recording with all its files; finishes a removal that was interrupted.
+
+        Raises:
+            RecordingGoneError: There is no such recording.
+            HybridlogError: It cannot be changed, or something cannot be deleted.
+        """
+        self._change(recording, lambda now: replace(now, status="removed"))
+        self._delete_files(recording)
+        self._forget(recording)
+
+    def _change(self, recording: str, how: Callable[[Manifest], Manifest]) -> Manifest:
+        end = time.monotonic() + WAIT_S
+        with self._alone(recording):
+            while True:
+                now, version = self._read(recording)
+                made = how(now)
+                if made == now:
+                    return now
+                new = replace(made, id=now.id, created=now.created, changes=now.changes + 1)
+                try:
+                    self._replace(recording, encode(new), version)
+                except ObjectChangedError:
+                    if time.monotonic() > end:
+                        raise
+                    time.sleep(random.uniform(0, 0.2))  # noqa: S311 - so that others come first
+                else:
+                    return new
+
+    def _read(self, recording: str) -> tuple[Manifest, str]:
+        """The manifest, also of a removed recording, and its version in a bucket."""
+        if not is_id(recording):
+            raise RecordingGoneError(f"There is no recording {recording!r}.")
+        try:
+            data, version = self._get(recording)
+        except FileNotFoundError:
+            raise RecordingGoneError(f"There is no recording {recording!r}.") from None
+        try:
+            found = decode(data)
+            if found.id != recording:
+                raise ValueError(f"it is the one of {found.id}")
+        except ValueError as error:
+            raise ManifestError(
+                f"The manifest of {recording} is damaged: {error}. `hybridlog verify --repair` "
+                "makes it again."
+            ) from error
+        return found, version
+
+    @abstractmethod
+    def _get(self, recording: str) -> tuple[bytes, str]:
+        """The bytes of a manifest and their version. Raises FileNotFoundError."""
+
+    @abstractmethod
+    def _alone(self, recording: str) -> AbstractContextManager[None]:
+        """Keep others, where there are locks, from replacing a manifest."""
+
+    @abstractmethod
+    def _replace(self, recording: str, data: bytes, version: str) -> None:
+        """Replace a manifest. Raises ObjectChangedError if it has another version by now."""
+
+    @abstractmethod
+    def _old(self, recording: str) -> Manifest | None:
+        """The manifest before the last change; None if there is none to read."""
+
+    @abstractmethod
+    def _drop(self, recording: str) -> None:
+        """Remove a manifest that cannot be read."""
+
+    @abstractmethod
+    def _delete_files(self, recording: str) -> None:
+        """Delete the files of a removed recording, but not its lock."""
+
+    @abstractmethod
+    def _forget(self, recording: str) -> None:
+        """Delete the manifest of a removed recording."""
+
+
+class DiskManifests(Manifests):
+    """The manifests of a store in a directory.
+
+    Args:
+        path: The store.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._folder = path / _FOLDER
+        self._recordings = path / _RECORDINGS
+
+    def ids(self) -> list[str]:
+        """Ids of all recordings that have a manifest, sorted; also of those being removed."""
+        try:
+            names = files.names(self._folder)
+        except OSError as error:
+            raise unreadable(error, self._folder) from error
+        return _ids(names)
+
+    @contextmanager
+    def creating(self) -> Iterator[Callable[[Manifest], None]]:
+        """Create manifests; nobody else can create one meanwhile."""
+        for folder in (self._folder, self._recordings):
+            with suppress(FileExistsError):
+                files.make_folder(folder)
+        _make_file(self._folder / _ALL)
+        with _locked(self._folder / _ALL):
+            yield self._create
+
+    def _create(self, manifest: Manifest) -> None:
+        data, path = encode(manifest), self._path(manifest.id)
+        if _exists(path):
+            raise StoreError(f"There is a recording {manifest.id} already.")
+        folder = self._recordings / manifest.id
+        try:
+            self._make_lock(folder)
+            with _locked(folder / _LOCK):
+                self._write(path, data)
+        except OSError as error:
+            raise durability.explain(error, path, "writing") from error
+
+    def _make_lock(self, folder: Path) -> None:
+        with suppress(FileExistsError):
+            files.make_folder(folder)
+        files.sync_folder(self._recordings)
+        _make_file(folder / _LOCK)
+
+    def _path(self, recording: str) -> Path:
+        return self._folder / f"{recording}{_SUFFIX}"
+
+    def _get(self, recording: str) -> tuple[bytes, str]:
+        path = self._path(recording)
+        try:
+            return files.read_file(path, MAX_BYTES), ""
+        except FileNotFoundError:
+            raise
+        except OSError as error:
+            raise unreadable(error, path) from error
+
+    @contextmanager
+    def _alone(self, recording: str) -> Iterator[None]:
+        folder = self._recordings / recording
+        with ExitStack() as stack:
+            try:
+                stack.enter_context(_locked(folder / _LOCK))
+            except FileNotFoundError:
+                if not _exists(self._path(recording)):
+                    raise RecordingGoneError(f"There is no recording {recording!r}.") from None
+                self._make_lock(folder)  # copies of a store may leave out what is empty
+                stack.enter_context(_locked(folder / _LOCK))
+            yield
+
+    def _replace(self, recording: str, data: bytes, version: str) -> None:
+        path, old = self._path(recording), self._recordings / recording / _OLD
+        # A second name is enough: the manifest is replaced, not changed.
+        new = old.with_name(f".{_OLD}")
+        with suppress(OSError):
+            files.unlink(new)
+        with suppress(OSError):  # where there are no links, there is no older one
+            files.link(path, new)
+            files.rename(new, old)
+        try:
+            self._write(path, data)
+        except OSError as error:
+            raise durability.explain(error, path, "writing") from error
+
+    def _write(self, path: Path, data: bytes) -> None:
+        """Write a manifest whose lock is held."""
+        new = path.with_name(f".{path.stem}.new")
+        with suppress(FileNotFoundError):
+            files.unlink(new)  # of a writer that died
+        fd = files.open_file(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL)
+        try:
+            try:
+                durability.write_all(fd, [data])
+                durability.sync_file(fd)
+            finally:
+                os.close(fd)
+            durability.publish(new, path)
+        except BaseException:
+            with suppress(OSError):
+                files.unlink(new)
+            raise
+
+    def _old(self, recording: str) -> Manifest | None:
+        path = self._recordings / recording / _OLD
+        try:
+            found = decode(files.read_file(path, MAX_BYTES))
+        except (OSError, ValueError):
+            return None
+        return found if found.id == recording else None
+
+    def _drop(self, recording: str) -> None:
+        with suppress(FileNotFoundError):
+            files.unlink(self._path(recording))
+
+    def _delete_files(self, recording: str) -> None:
+        folder = self._recordings / recording
+        try:
+            for name in files.names(folder):
+                if name != _LOCK:
+                    files.remove_tree(folder / name)
+            files.sync_folder(folder)
+        except FileNotFoundError:
+            return  # somebody else has finished
+        except OSError as error:
+            raise durability.explain(error, folder, "deleting") from error
+
+    def _forget(self, recording: str) -> None:
+        # A copy may have created it anew meanwhile, if somebody else has finished the removal.
+        # A change makes no lock where there is no manifest, so the folder is empty in the end.
+        with _locked(self._folder / _ALL):
+            with suppress(RecordingGoneError):
+                if self._read(recording)[0].status != "removed":
+                    return
+            try:
+                self._drop(recording)
+                files.sync_folder(self._folder)
+                files.remove_tree(self._recordings / recording)
+            except OSError as error:
+                raise durability.explain(error, self._folder, "deleting") from error
+
+
+class BucketManifests(Manifests):
+    """The manifests of a store in a bucket.
+
+    Args:
+        bucket: The objects below the address of the store.
+    """
+
+    def __init__(self, bucket: Bucket) -> None:
+        self._bucket = bucket
+
+    def ids(self) -> list[str]:
+        """Ids of all recordings that have a manifest, sorted; 1,000 a request."""
+        about = self._bucket.objects(f"{_FOLDER}/")
+        return _ids(one.name.removeprefix(f"{_FOLDER}/") for one in about)
+
+    @contextmanager
+    def creating(self) -> Iterator[Callable[[Manifest], None]]:
+        """Create manifests; others may create some meanwhile, but not the same."""
+        yield self._create
+
+    def _create(self, manifest: Manifest) -> None:
+        try:
+            self._bucket.create(_object(manifest.id), encode(manifest))
+        except ObjectExistsError:
+            raise StoreError(f"There is a recording {manifest.id} already.") from None
+
+    def _get(self, recording: str) -> tuple[bytes, str]:
+        about, data = self._bucket.read_whole(_object(recording), MAX_BYTES)
+        return data, about.version
+
+    @contextmanager
+    def _alone(self, recording: str) -> Iterator[None]:
+        yield
+
+    def _replace(self, recording: str, data: bytes, version: str) -> None:
+        self._bucket.replace(_object(recording), data, version)
+
+    def _old(self, recording: str) -> Manifest | None:
+        return None
+
+    def _drop(self, recording: str) -> None:
+        self._bucket.delete([_object(recording)])
+
+    def _delete_files(self, recording: str) -> None:
+        names = [one.name for one in self._bucket.objects(f"{_RECORDINGS}/{recording}/")]
+        self._bucket.delete(names)
+
+    def _forget(self, recording: str) -> None:
+        # Servers have no condition for deletions: between these two it could be created anew.
+        with suppress(RecordingGoneError):
+            if self._read(recording)[0].status == "removed":
+                self._drop(recording)
+
+
+def _object(recording: str) -> str:
+    return f"{_FOLDER}/{recording}{_SUFFIX}"
+
+
+def _ids(names: Iterable[str]) -> list[str]:
+    ids = (name.removesuffix(_SUFFIX) for name in names if name.endswith(_SUFFIX))
+    return sorted(filter(is_id, ids))
+
+
+def _present(manifest: Manifest) -> Manifest:
+    if manifest.status == "removed":
+        raise RecordingGoneError(f"The recording {manifest.name} was removed.")
+    return manifest
+
+
+@contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    """Hold a file's lock. If the file was deleted meanwhile, the one of its name is locked."""
+    end = time.monotonic() + WAIT_S
+    while True:
+        fd = _opened(path, os.O_RDWR)
+        try:
+            _lock(fd, path, end)
+            if _is_at(path, fd):
+                yield
+                return
+        finally:
+            os.close(fd)
+
+
+def _make_file(path: Path) -> None:
+    os.close(_opened(path, os.O_RDWR | os.O_CREAT))
+
+
+def _opened(path: Path, flags: int) -> int:
+    try:
+        return files.open_file(path, flags)
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise durability.explain(error, path, "locking") from error
+
+
+def _lock(fd: int, path: Path, end: float) -> None:
+    while True:
+        try:
+            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            if time.monotonic() > end:
+                message = f"Another process has held {path} for {WAIT_S:.0f} s; end it."
+                raise HeldError(message, is_recording=False) from None
+            time.sleep(random.uniform(0, _PAUSE_S))  # noqa: S311 - no secret
+        except OSError as error:
+            if error.errno not in _NO_LOCKS:
+                raise
+            raise StoreError(
+                f"The file system of {path.parent} has no locks (flock), so the store can only be "
+                "read there. Copy it to another one to change it."
+            ) from error
+        else:
+            return
+
+
+def _is_at(path: Path, fd: int) -> bool:
+    with suppress(FileNotFoundError):
+        return os.path.samestat(files.status(path), os.fstat(fd))
+    return False
+
+
+def _exists(path: Path) -> bool:
+    with suppress(FileNotFoundError):
+        return files.status(path) is not None
+    return False

@@ -1,0 +1,367 @@
+"""Manifests on a disk: processes, kills, power cuts, full disks, links, locks."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hybridlog_storage.disk import files
+from hybridlog_storage.errors import (
+    DiskFullError,
+    HeldError,
+    HybridlogError,
+    RecordingGoneError,
+    StoreError,
+)
+from hybridlog_storage.manifest import Manifest, Note, encode, new_id, replace
+from hybridlog_storage.manifests import DiskManifests
+from tests.calls import Calls
+from tests.limits import Limit
+from tests.power import PowerCut
+
+ONE = Manifest(new_id("run"), "run", 1)
+
+
+def tagged(now: Manifest) -> Manifest:
+    return replace(now, tags={"a": "b"})
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Path:
+    """A store with a recording that was changed once, and has a file."""
+    place = tmp_path / "store"
+    place.mkdir()
+    (place / "hybridlog.toml").touch()
+    manifests = DiskManifests(place)
+    manifests.create(ONE)
+    manifests.change(ONE.id, lambda now: replace(now, name="first"))
+    (place / "recordings" / ONE.id / "000000.mcap").write_bytes(b"x" * 5000)
+    return place
+
+
+def names(store: Path) -> list[str]:
+    return sorted(str(path.relative_to(store)) for path in store.rglob("*") if path.is_file())
+
+
+_ADDS = """
+import sys
+from pathlib import Path
+from hybridlog_storage.errors import RecordingGoneError
+from hybridlog_storage.manifest import Note, replace
+from hybridlog_storage.manifests import DiskManifests
+manifests, recording = DiskManifests(Path(sys.argv[1])), sys.argv[2]
+for at in range(int(sys.argv[3]), int(sys.argv[3]) + 40):
+    try:
+        manifests.change(recording, lambda now: replace(now, notes=(*now.notes, Note(at, ""))))
+    except RecordingGoneError:
+        sys.exit(9)
+    print(at, flush=True)
+"""
+
+
+def adding(store: Path) -> list[subprocess.Popen[str]]:
+    """Ten processes that add 40 notes each, and print the number of each that is there."""
+    return [
+        subprocess.Popen(
+            [sys.executable, "-c", _ADDS, str(store), ONE.id, str(first)],
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        for first in range(0, 1000, 100)
+    ]
+
+
+def test_of_400_edits_by_ten_processes_none_is_lost(store: Path) -> None:
+    manifests = DiskManifests(store)
+    processes = adding(store)
+    last = 0
+    while any(process.poll() is None for process in processes):
+        now = manifests.read(ONE.id)  # never missing, never damaged, never older
+        assert now.changes >= last
+        last = now.changes
+    done = [int(line) for process in processes for line in process.communicate()[0].split()]
+    assert [process.returncode for process in processes] == [0] * 10
+    assert sorted(note.at for note in manifests.read(ONE.id).notes) == sorted(done)
+    assert len(done) == 400
+
+
+def test_nothing_comes_back_after_a_removal(store: Path) -> None:
+    manifests = DiskManifests(store)
+    processes = adding(store)
+    while manifests.read(ONE.id).changes < 30:
+        time.sleep(0.001)
+    manifests.remove(ONE.id)
+    assert manifests.ids() == []
+    for process in processes:
+        process.communicate()
+    assert {process.returncode for process in processes} <= {0, 9}
+    assert names(store) == ["hybridlog.toml", "manifests/.lock"]
+    assert list((store / "recordings").iterdir()) == []
+
+
+class Dying(files.System):
+    """Ends the process at its n-th call, before or after it is done."""
+
+    def __init__(self, at: int, *, after: bool) -> None:
+        self._left, self._after = at, after
+
+    def __getattribute__(self, name: str) -> Any:
+        found = super().__getattribute__(name)
+        if name.startswith("_"):
+            return found
+
+        def step(*arguments: Any, **options: Any) -> Any:
+            if self._left == 0 and not self._after:
+                os._exit(7)
+            result = found(*arguments, **options)
+            if self._left == 0:
+                os._exit(7)
+            self._left -= 1
+            return result
+
+        return step
+
+
+def dies(store: Path, at: int, work: Callable[[DiskManifests], object], *, after: bool) -> bool:
+    """Whether a process that works on the store died at a call."""
+    child = os.fork()
+    if child == 0:
+        try:
+            files.system = Dying(at, after=after)
+            work(DiskManifests(store))
+            os._exit(0)
+        finally:
+            os._exit(1)
+    code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    assert code in {0, 7}
+    return code == 7
+
+
+OTHER = Manifest(new_id("other"), "other", 2)
+WORKS: dict[str, Callable[[DiskManifests], object]] = {
+    "change": lambda m: m.change(ONE.id, tagged),
+    "create": lambda m: m.create(OTHER),
+    "remove": lambda m: m.remove(ONE.id),
+}
+
+
+def check(place: Path, what: str) -> None:
+    """What a store is after work that was interrupted, and that the work can be done again."""
+    manifests = DiskManifests(place)
+    ids = manifests.ids()
+    if what == "change":
+        assert manifests.read(ONE.id).tags in ({}, {"a": "b"})
+        assert manifests.change(ONE.id, tagged).tags == {"a": "b"}
+    elif what == "create":
+        if OTHER.id not in ids:
+            manifests.create(OTHER)
+        assert manifests.read(OTHER.id) == OTHER
+        assert manifests.read(ONE.id).name == "first"
+        manifests.change(OTHER.id, tagged)
+    elif ONE.id in ids:
+        manifests.remove(ONE.id)
+        assert manifests.ids() == []
+    hidden = [name for name in names(place) if Path(name).name.startswith(".")]
+    assert set(hidden) <= {"manifests/.lock", f"recordings/{ONE.id}/.manifest.old"}
+
+
+@pytest.mark.parametrize("after", [False, True])
+@pytest.mark.parametrize("what", WORKS)
+def test_killed_at_each_system_call(store: Path, tmp_path: Path, what: str, after: bool) -> None:
+    at, went_on = 0, True
+    while went_on:
+        place = tmp_path / f"{at}"
+        shutil.copytree(store, place)
+        went_on = dies(place, at, WORKS[what], after=after)
+        check(place, what)
+        at += 1
+    assert at > 6
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("what", WORKS)
+def test_power_cut_at_each_system_call(
+    store: Path, tmp_path: Path, what: str, seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng = random.Random(f"{what} {seed}")
+    at, is_done = 0, False
+    while not is_done:
+        place, found = tmp_path / f"{at}", tmp_path / f"{at} after"
+        shutil.copytree(store, place)
+        power = PowerCut(place, at)
+        with monkeypatch.context() as patch:
+            patch.setattr(files, "system", power)
+            try:
+                WORKS[what](DiskManifests(place))
+                is_done = True
+            except HybridlogError:
+                pass
+            except OSError:
+                assert power.is_off
+        power.after_cut(found, rng)
+        if is_done:
+            ids = DiskManifests(found).ids()
+            assert (ONE.id in ids, OTHER.id in ids) == (what != "remove", what == "create")
+            assert what != "create" or (found / "recordings" / OTHER.id).is_dir()
+            assert what != "change" or DiskManifests(found).read(ONE.id).tags == {"a": "b"}
+        check(found, what)
+        at += 1
+    assert at > 6
+
+
+class Full(files.System):
+    """A full disk: half of what is written has room, then nothing."""
+
+    def writev(self, fd: int, parts: Sequence[memoryview]) -> int:
+        if len(parts[0]) < 30:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return os.write(fd, parts[0][: len(parts[0]) // 2])
+
+
+def test_a_full_disk_refuses_the_change_and_nothing_else(
+    store: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    manifests = DiskManifests(store)
+    before, had = manifests.read(ONE.id), names(store)
+    with monkeypatch.context() as patch:
+        patch.setattr(files, "system", Full())
+        with pytest.raises(DiskFullError, match="Free some space"):
+            manifests.change(ONE.id, tagged)
+        with pytest.raises(DiskFullError):
+            manifests.create(OTHER)
+        assert manifests.read(ONE.id) == before
+        assert manifests.ids() == [ONE.id]
+        assert {*names(store)} - {*had} <= {f"recordings/{OTHER.id}/manifest.lock"}
+    assert manifests.change(ONE.id, tagged).changes == before.changes + 1
+    manifests.create(OTHER)
+
+
+def test_without_locks_it_can_only_be_read(store: Path, calls: Calls) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    calls(fcntl, "flock", refuse)
+    manifests = DiskManifests(store)
+    assert manifests.read(ONE.id).name == "first"
+    for work in WORKS.values():
+        with pytest.raises(StoreError, match=r"no locks .*can only be read"):
+            work(manifests)
+    assert manifests.read(ONE.id).name == "first"
+
+
+def test_without_hard_links_there_is_no_older_one(store: Path, calls: Calls) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise OSError(errno.EPERM, "Operation not permitted")
+
+    manifests = DiskManifests(store)
+    old = store / "recordings" / ONE.id / "manifest.old"
+    assert old.read_bytes() == encode(ONE)
+    calls(os, "link", refuse)
+    manifests.change(ONE.id, tagged)
+    assert manifests.read(ONE.id).tags == {"a": "b"}
+
+
+def test_who_stands_still_is_not_waited_for_without_end(store: Path, limit: Limit) -> None:
+    limit(manifest_wait_s=0.2)
+    holds = (
+        "import fcntl, sys, time\n"
+        "file = open(sys.argv[1], 'r+')\n"
+        "fcntl.flock(file, fcntl.LOCK_EX)\n"
+        "print(flush=True)\n"
+        "time.sleep(60)\n"
+    )
+    lock = store / "recordings" / ONE.id / "manifest.lock"
+    holder = subprocess.Popen([sys.executable, "-c", holds, lock], stdout=subprocess.PIPE)
+    try:
+        assert holder.stdout is not None
+        holder.stdout.readline()
+        holder.send_signal(signal.SIGSTOP)
+        with pytest.raises(HeldError, match="Another process has held"):
+            DiskManifests(store).change(ONE.id, tagged)
+    finally:
+        holder.kill()
+        holder.communicate()
+    assert DiskManifests(store).change(ONE.id, tagged).tags == {"a": "b"}
+
+
+def test_a_lock_that_was_replaced_while_it_was_waited_for_is_taken_anew(
+    store: Path, calls: Calls
+) -> None:
+    lock = store / "recordings" / ONE.id / "manifest.lock"
+    replaced: list[int] = []
+
+    def replace_once(fd: int, _: int) -> None:
+        if not replaced and os.path.samestat(os.fstat(fd), lock.stat()):
+            replaced.append(lock.stat().st_ino)
+            other = lock.with_name("other")  # exists before the first is gone: another inode
+            other.touch()
+            other.rename(lock)
+
+    locked = calls(fcntl, "flock", replace_once)
+    DiskManifests(store).change(ONE.id, tagged)
+    assert replaced
+    assert len(locked) == 2
+
+
+def test_an_empty_folder_that_a_copy_left_out_is_made(store: Path) -> None:
+    shutil.rmtree(store / "recordings")
+    (store / "recordings").mkdir()
+    assert DiskManifests(store).change(ONE.id, tagged).tags == {"a": "b"}
+
+
+@pytest.mark.parametrize("what", ["manifest", "manifests", "folder", "lock"])
+def test_links_are_not_followed(store: Path, tmp_path: Path, what: str) -> None:
+    place = {
+        "manifest": store / "manifests" / f"{ONE.id}.json",
+        "manifests": store / "manifests",
+        "folder": store / "recordings" / ONE.id,
+        "lock": store / "recordings" / ONE.id / "manifest.lock",
+    }[what]
+    outside = tmp_path / "outside"
+    place.rename(outside)
+    place.symlink_to(outside)
+    before = [outside.read_bytes()] if outside.is_file() else sorted(outside.iterdir())
+    with pytest.raises((HybridlogError, OSError)):
+        DiskManifests(store).change(ONE.id, tagged)
+    assert before == ([outside.read_bytes()] if outside.is_file() else sorted(outside.iterdir()))
+
+
+def test_a_store_that_only_others_may_write_is_read(store: Path, calls: Calls) -> None:
+    def refuse(name: str, flags: int, *_: object, **__: object) -> None:
+        if flags & (os.O_WRONLY | os.O_RDWR | os.O_CREAT):
+            raise PermissionError(errno.EACCES, "Permission denied")
+
+    calls(files.system, "open", refuse)
+    manifests = DiskManifests(store)
+    assert manifests.read(ONE.id).name == "first"
+    with pytest.raises(StoreError, match="Not allowed to write"):
+        manifests.change(ONE.id, tagged)
+
+
+def test_removal_leaves_other_recordings_alone(store: Path) -> None:
+    manifests = DiskManifests(store)
+    manifests.create(OTHER)
+    kept = {name for name in names(store) if OTHER.id in name}
+    manifests.remove(ONE.id)
+    assert {*names(store)} == {*kept, "hybridlog.toml", "manifests/.lock"}
+    with pytest.raises(RecordingGoneError):
+        manifests.read(ONE.id)
+
+
+def test_notes_are_kept_in_order(store: Path) -> None:
+    manifests = DiskManifests(store)
+    for at in (3, 1, 2):
+        manifests.change(ONE.id, lambda now, at=at: replace(now, notes=(*now.notes, Note(at, ""))))
+    assert [note.at for note in manifests.read(ONE.id).notes] == [3, 1, 2]
