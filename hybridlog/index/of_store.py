@@ -1,4 +1,4 @@
-"""What a user does with the index of an open store."""
+"""The index of an open store, for its user: rebuild it, add fields to it, find it."""
 
 from __future__ import annotations
 

@@ -55,7 +55,7 @@ class RepairReport:
 
 @dataclass(slots=True)
 class ArraysOfTopic:
-    """What `Index.arrays` did for a topic.
+    """The result of `Index.arrays` for a topic.
 
     Attributes:
         topic: Full name.

@@ -1,4 +1,4 @@
-"""What is known about a question without reading messages, for commands and the page."""
+"""Facts about a question that need no message: its channels, fields, times."""
 
 from __future__ import annotations
 

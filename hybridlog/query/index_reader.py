@@ -48,7 +48,7 @@ Query = tuple[str, Filter]
 
 
 class Found(NamedTuple):
-    """What MongoDB says about parts of a question.
+    """The answer of MongoDB about parts of a question.
 
     Attributes:
         parts: The parts, with the arrival numbers of what the filters find in their place.

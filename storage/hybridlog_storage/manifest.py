@@ -1,4 +1,4 @@
-"""What a recording is: one small file that is only ever replaced as a whole.
+"""The manifest of a recording: one small file that is only ever replaced as a whole.
 
 A manifest is a line of JSON and a line with the digest of the first. It has bounds for all that
 it holds, since it may come from elsewhere: numbers, lengths, names that stay below the store.
@@ -47,7 +47,7 @@ class Record(Struct, frozen=True, omit_defaults=True, forbid_unknown_fields=True
 
 
 class Source(Record, frozen=True):
-    """Where a recording comes from: a file or a robot.
+    """The origin of a recording: a file or a robot.
 
     Attributes:
         kind: Such as `rosbag1`.
@@ -160,7 +160,7 @@ class Mark(Record, frozen=True):
 
 
 class Pin(Record, frozen=True):
-    """What no rule may delete.
+    """Messages that no rule may delete.
 
     Attributes:
         id: Its id.
@@ -198,7 +198,7 @@ class Loss(Record, frozen=True):
 
 
 class Manifest(Record, frozen=True):
-    """What is known of a recording.
+    """A recording: who it is, its channels and files, its losses, and what users said of it.
 
     Attributes:
         id: Never changes; the files lie in `recordings/<id>`.

@@ -1,4 +1,4 @@
-"""Where manifests lie, and how they change: replaced as a whole, if unchanged.
+"""The manifests of a store, in a directory or a bucket: replaced as a whole, if unchanged.
 
 A change is a function of the newest manifest. On a disk it is made under the lock of the
 recording; in a bucket, on condition that the object is still the one that was read, or else
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.remote.bucket import Bucket
 
 WAIT_S: Final = 30.0
-"""How long a change waits for others, which take milliseconds."""
+"""Longest wait of a change for others, which take milliseconds."""
 _PAUSE_S: Final = 0.002
 _NO_LOCKS: Final = frozenset({errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS})
 _FOLDER: Final = "manifests"

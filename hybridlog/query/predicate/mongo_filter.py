@@ -143,7 +143,7 @@ def mongo_filter(
 
 
 def misjudged(node: MongoFilter, types: FieldTypes | Mapping[str, str] | None) -> dict[str, Filter]:
-    """What a filter cannot ask for: filters of documents that it misjudges, by the reason.
+    """Reasons to refuse a filter, each with a filter of the documents that it would misjudge.
 
     Index documents have a long array as a summary only, and no summary of a short one.
     """
