@@ -310,7 +310,9 @@ def check_new_store(choices: RecordChoices, paths: Sequence[Path]) -> None:
         from hybridlog_storage.mongo.index_state import IndexState
 
         with Database.connect(with_password(choices.mongo)) as database:
-            check(IndexState(database).mark(), {"id": ""}, database)
+            mark = IndexState(database).mark()
+            if not os.path.lexists(store_path(choices.store) / NAME):  # nobody has made it yet
+                check(mark, {"id": ""}, database)
 
 
 def _check_not_empty(

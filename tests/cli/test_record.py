@@ -254,7 +254,6 @@ def test_names_that_are_no_utf_8(logs: Path, tmp_path: Path) -> None:
     assert "all is well" in run("verify", store=tmp_path / "s").out
 
 
-@pytest.mark.mongo("embedded")
 def test_one_log_recorded_three_times_at_once(logs: Path, tmp_path: Path) -> None:
     with ExitStack() as running:
         three = [
