@@ -130,6 +130,7 @@ ROBOT = """
         while not node.count_subscribers(name + "/_service_event"):
             assert time.monotonic() < deadline, name
             time.sleep(0.01)
+        time.sleep(0.5)  # the graph knows of a subscription before both ends have met it
         future = client.call_async(ListParameters.Request(prefixes=prefixes))
         rclpy.spin_until_future_complete(node, future, timeout_sec=30)
         assert list(future.result().result.names) == prefixes
