@@ -146,6 +146,7 @@ class Listener:
 def listener() -> Iterator[Listener]:
     found = Listener()
     yield found
+    found.socket.shutdown(socket.SHUT_RDWR)  # wakes the thread that accepts
     found.socket.close()
 
 

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import bson
@@ -125,7 +126,7 @@ def test_a_line_is_checksum_space_json_line_feed() -> None:
 
 
 def test_an_event_says_when_it_happened(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(journal.time, "time_ns", lambda: 77)
+    monkeypatch.setattr(journal, "time", SimpleNamespace(time_ns=lambda: 77))
     assert event("noted", text="x") == {"event": "noted", "at": 77, "text": "x"}
 
 

@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Literal, NoReturn
 
 import numpy as np
@@ -28,6 +29,7 @@ from hybridlog_storage.disk.append_file import BLOCK, AppendFile
 from hybridlog_storage.disk.copying import COPIED_AT_ONCE
 from hybridlog_storage.errors import DiskFullError, SegmentError, StoreError, UsageError
 from hybridlog_storage.messages import Batch, Buffer, Channel, LooseBatch, Schema
+from hybridlog_storage.segments import chunk_builder, segment_writer
 from hybridlog_storage.segments.attachments import Attachment
 from hybridlog_storage.segments.chunk import StoredChunk
 from hybridlog_storage.segments.compression import Compressor, FilePart
@@ -901,7 +903,8 @@ def test_old_chunks_are_flushed_and_young_ones_are_not(
 ) -> None:
     chunks: list[StoredChunk] = []
     now = 100.0
-    monkeypatch.setattr("hybridlog_storage.segments.chunk_builder.time.monotonic", lambda: now)
+    for module in (chunk_builder, segment_writer):
+        monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: now))
     writer = RecordingWriter(tmp_path, RECORDING, lambda c, _: chunks.append(c))
     writer.append(batch_of([(0, b"old", 1, 1, 1)]), CHANNELS)
     now = 101.0

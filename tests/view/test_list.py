@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING
 
 import pytest
@@ -113,7 +114,7 @@ def test_looking_for_new_recordings_is_bounded(
         looks.append(now[0])
         now[0] += 1.5  # it takes that long
 
-    monkeypatch.setattr(context.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(context, "time", SimpleNamespace(monotonic=lambda: now[0]))
     monkeypatch.setattr(demo_store, "refresh", look)
     shown = context.Context(demo_store)
     for _ in range(100):

@@ -9,11 +9,13 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from xml.etree import ElementTree as ET
 
 import pytest
 
+from hybridlog.live.sources.ros2.child import topics
 from hybridlog.live.sources.ros2.child.child import Child
 from hybridlog.live.sources.ros2.child.definitions import (
     Definitions,
@@ -542,7 +544,7 @@ def test_a_type_that_nobody_knows_is_told_and_told_again(
     [lost] = rig.told("lost")
     assert (lost["topic"], lost["cause"], lost["count"]) == ("/t", "unreadable", None)
     later = time.monotonic() + 11
-    monkeypatch.setattr(time, "monotonic", lambda: later)
+    monkeypatch.setattr(topics, "time", SimpleNamespace(monotonic=lambda: later))
     rig.topics.look()
     assert len(rig.told("lost")) == 2
     rig.ros.graph = {}
