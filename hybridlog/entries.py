@@ -28,6 +28,7 @@ from hybridlog_storage.catalog import (
     RecordingEntry,
     channel_entry,
     channel_totals,
+    content_of,
 )
 from hybridlog_storage.disk.directory import PAYLOADS
 from hybridlog_storage.errors import CatalogError, DiskFullError, SegmentError, StoreError
@@ -341,8 +342,7 @@ def put_entry(
         SegmentError: The recording cannot be identified.
     """
     described = describe_now(directory, catalog, label, is_open=is_open)
-    if directory.is_writable or catalog.is_in_memory:
-        catalog.put(described)
+    catalog.put(described)
     return described.entry
 
 
@@ -353,7 +353,8 @@ def read_again(directory: StoreDirectory, catalog: Catalog, entry: RecordingEntr
         StoreError: They cannot be read, or have changed.
     """
     is_open = directory.is_recorded(entry.label)
-    catalog.keep(describe_now(directory, catalog, entry.label, is_open=is_open))
+    now = describe_now(directory, catalog, entry.label, is_open=is_open)
+    catalog.put(now, waits=False)
     for number, _, _ in entry.spans:
         try:
             catalog.table(entry, number)
@@ -392,6 +393,7 @@ def summary_of(entry: RecordingEntry, look: str = "") -> RecordingSummary:
         expired=gone.get(State.EXPIRED, 0),
         not_copied=gone.get(State.NOT_COPIED, 0),
         notes=entry.notes,
+        content=content_of(entry),
         look=look,
     )
 

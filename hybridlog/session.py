@@ -1191,8 +1191,6 @@ class Session:
 
         repairs = self.repairs
         self.snapshot()  # notes what this process has changed
-        self.catalog.write_pending()
-        self.catalog.drop_damaged()
         mended = self._files.mend(until)
         if mended:
             with self._following:
@@ -1277,7 +1275,6 @@ class Session:
             from hybridlog.columns.recordings_file import write_recordings_file
 
             with suppress(OSError, HybridlogError):
-                self.catalog.write_pending()
                 present = self.snapshot().by_label.keys() & {*self.directory.names()}
                 write_recordings_file(self.catalog, present)
                 self.catalog.has_changed = False
@@ -1311,7 +1308,6 @@ class Session:
         if "tables" in vars(self):
             self.tables.invalidate()
         self.disconnect()
-        self.catalog.write_pending()
         is_missing = "tables" in vars(self) and not self.catalog.recordings_file.exists()
         if self.catalog.has_changed or is_missing:
             self.write_recordings_file()

@@ -20,6 +20,7 @@ from rosbags.rosbag1 import Writer as BagWriter
 import hybridlog as hl
 from hybridlog.attachments import StoredAttachment, extras_of, file_names
 from hybridlog.cli.answers import write_answer
+from hybridlog_storage.catalog import CATALOG
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.segments.recovery import recover_segment
 from hybridlog_storage.segments.segment_check import SegmentCheck
@@ -204,7 +205,7 @@ def test_nothing_is_lost_on_the_way(log: Path, tmp_path: Path) -> None:
         assert report.entry.segments > 3
         store.edit("drive", name="other name")
         assert listed(store.attachments("other-name")) == ATTACHMENTS
-    for derived in ("catalog", "mongod", "tables"):
+    for derived in (CATALOG, "mongod", "tables"):
         shutil.rmtree(tmp_path / "s" / derived, ignore_errors=True)
         (tmp_path / "s" / derived).unlink(missing_ok=True)
     with hl.open(tmp_path / "s") as store:

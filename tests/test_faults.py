@@ -6,7 +6,6 @@ import math
 import os
 import random
 import resource
-import shutil
 import signal
 import struct
 import subprocess
@@ -29,7 +28,7 @@ import hybridlog as hl
 from benchmarks.simulator.topics import RobotConfig
 from benchmarks.simulator.write import write_bag
 from hybridlog_storage import journal
-from hybridlog_storage.catalog import RecordingEntry
+from hybridlog_storage.catalog import CATALOG, RecordingEntry
 from hybridlog_storage.errors import DatabaseError, IndexChangedError, SegmentError, StoreError
 from hybridlog_storage.mongo.database import Database
 from hybridlog_storage.mongo.index_state import RECORDINGS, STORE, IndexState, Through
@@ -645,7 +644,7 @@ def test_one_damaged_recording_keeps_no_other_out_of_the_index(
             assert opened.query(sorted(topics_of(said)), [other]).count() == said.total()
         # Of a chunk it is known without the catalog, too.
         before = entry
-    shutil.rmtree(store.directory.path / "catalog")
+    (store.directory.path / CATALOG).unlink()
     with reopened(store) as opened:
         (entry,) = opened.select(["short"])
         assert (entry.status, entry.end) == (before.status, before.end)

@@ -32,8 +32,9 @@ OLD = 1_000_000_000  # a time of reading that any reading changes
 
 FILES = {
     "hybridlog.toml": "hybridlog.toml",
-    "part of the catalog": "catalog/part-000000",
-    "new part of the catalog": "catalog/part-000001",
+    "catalog": "catalog.sqlite",
+    "journal of the catalog": "catalog.sqlite-journal",
+    "log of the catalog": "catalog.sqlite-wal",
     "journal": "recordings/small/journal",
     "lock": "recordings/small/writer.lock",
     "segment": "recordings/small/000000.mcap",
@@ -47,7 +48,6 @@ FOLDERS = {
     "recordings": "recordings",
     "recording": "recordings/small",
     "new recording": "recordings/live",
-    "catalog": "catalog",
     "removed recording": "recordings/.removed-small-0123abcd",
     "recorders": "recorders",
     "tables": "tables",
@@ -72,7 +72,7 @@ MONGOD_FOLDERS = ("", "data", "data/journal", "data/diagnostic.data")
 
 # Other kinds of files, which mongod alone makes.
 OF_MONGOD = re.compile(r"mongod(-\d+)?(/.*)?")
-OF_TABLES = re.compile(r"(tables|catalog)/.*")
+OF_TABLES = re.compile(r"tables/.*")
 
 
 @pytest.fixture(scope="module")

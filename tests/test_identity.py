@@ -27,6 +27,7 @@ from hybridlog.maintenance.lease import become_another
 from hybridlog.query.intervals import Intervals
 from hybridlog.session import Session
 from hybridlog_storage import journal
+from hybridlog_storage.catalog import CATALOG
 from hybridlog_storage.disk import directory as directory_module
 from hybridlog_storage.disk import files
 from hybridlog_storage.disk.directory import StoreDirectory
@@ -329,7 +330,7 @@ def test_names_tags_notes_and_marks_are_kept(place: Path, uri: str) -> None:
             assert (mirror["name"], mirror["tags"]) == ("second floor", {"a": "3"})
         store.index.rebuild()
         check(store)
-    shutil.rmtree(place / "catalog")
+    (place / CATALOG).unlink()
     with hl.open(place, mongo=uri) as store:
         check(store)
 

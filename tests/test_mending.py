@@ -6,14 +6,13 @@ import fcntl
 import os
 import time
 from collections.abc import Iterator
-from contextlib import closing
 from pathlib import Path
 
 import pytest
 
 import hybridlog as hl
 from hybridlog.cli.open_store import _print_left, mended_meanwhile
-from hybridlog_storage.catalog import Catalog
+from hybridlog_storage.catalog import CATALOG
 from tests.running.methods import LABEL, rows, sent
 from tests.running.running import NO_MONGODB, Running, begun
 from tests.running.sequence import Known
@@ -54,12 +53,12 @@ def check(store: hl.Store, known: Known) -> None:
 
 
 def files_in(store: hl.Store) -> dict[str, tuple[int, int, int]]:
-    """Number, size and time of everything in a store but locks."""
+    """Number, size and time of everything in a store but locks and the catalog."""
     found = {}
     for place, folders, names in os.walk(store.directory.path):
         for name in [*folders, *names]:
             about = (Path(place) / name).lstat()
-            if not name.endswith("lock"):
+            if not name.endswith("lock") and name != CATALOG:
                 found[f"{place}/{name}"] = about.st_ino, about.st_size, about.st_mtime_ns
     return found
 
@@ -84,23 +83,6 @@ def test_a_question_about_a_recorder_that_died_writes_nothing(died: hl.Store, kn
     check(died, known)
     died.mend()
     check(died, known)
-
-
-def status_in_catalog(store: hl.Store) -> str:
-    (summary,) = store.summaries()
-    settings = store.directory.settings
-    with closing(Catalog(store.directory.path, settings.store_id, in_memory=False)) as catalog:
-        row = catalog.recording(summary.id)
-    assert row is not None
-    return row[1].status
-
-
-def test_what_was_read_anew_is_written_after_the_answer(died: hl.Store) -> None:
-    died.refresh()
-    assert died.entry(LABEL).status == "unfinished"
-    assert status_in_catalog(died) == "open"
-    died.mend(0)
-    assert status_in_catalog(died) == "unfinished"
 
 
 def test_a_store_that_stays_open_is_repaired_meanwhile(died: hl.Store, known: Known) -> None:

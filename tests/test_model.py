@@ -46,7 +46,7 @@ import hybridlog as hl
 from hybridlog.query.query import Query
 from hybridlog.query.topics import matcher
 from hybridlog.record.recorder import RecordOptions
-from hybridlog_storage.catalog import RecordingEntry
+from hybridlog_storage.catalog import CATALOG, RecordingEntry
 from hybridlog_storage.errors import TimeError, TopicError
 from hybridlog_storage.mongo.index_state import IndexState, Through
 from hybridlog_storage.mongo.mongod import EmbeddedMongod
@@ -507,26 +507,21 @@ class Machine(RuleBasedStateMachine):
     def lose_the_catalog(self, how: str, spot: int) -> None:
         """Whatever of the catalog is gone or changed is made again, and nobody has to ask."""
         self.store.close()
-        folder = self.path / "catalog"
-        for path in [*folder.glob("part-*"), *folder.glob("schema-*")]:
-            if how == "deleted":
-                path.unlink()
-            else:
-                content = bytearray(path.read_bytes())
-                begin = spot % len(content)
-                size = 4096 if how == "page" else 1
-                content[begin : begin + size] = bytes(len(content[begin : begin + size]))
-                path.write_bytes(content)
+        path = self.path / CATALOG
+        if how == "deleted":
+            path.unlink()
+        else:
+            content = bytearray(path.read_bytes())
+            begin = spot % len(content)
+            size = 4096 if how == "page" else 1
+            content[begin : begin + size] = bytes(len(content[begin : begin + size]))
+            path.write_bytes(content)
         self.store = hl.open(self.path, require_database=True)
         topics = tuple(sorted({t for k in self.model.values() for t in k.topics}))
         if topics:
             check(self.store, self.model, Asked(topics, None, "log", None, None, 1, reverse=False))
         assert not self.store.repairs.removed
-        # What no question needs is noticed by who reads everything.
-        places = {f.place for f in self.store.verify().findings} - self.places()
-        assert places <= {"catalog"}
-        if places:
-            self.store.verify(repair=True)
+        assert {f.place for f in self.store.verify().findings} == self.places()
         self.open_again()  # what only decoding tells is found out now, if a question missed it
         self.changed = True
 

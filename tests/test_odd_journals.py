@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 import hybridlog as hl
 from hybridlog_storage import journal
+from hybridlog_storage.catalog import CATALOG
 from tests import odd_values
 from tests.cli.within import answer
 from tests.copying.conftest import expire
@@ -73,8 +74,8 @@ def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
         store.edit("odd", tag={"place": "lab"})
         store.edit("odd", untag=["place"])
         store.mark("odd", BASE + STEP, "here")
-    for name in ("mongod", "catalog"):
-        shutil.rmtree(path / name, ignore_errors=True)
+    shutil.rmtree(path / "mongod", ignore_errors=True)
+    (path / CATALOG).unlink()
     return path
 
 

@@ -165,15 +165,6 @@ def _print_rebuilt(store: Store, doing: str) -> None:
         doing: The consequence; empty if that was said before.
     """
     repairs = store.repairs
-    if store.catalog.was_damaged:
-        note("The catalog was damaged, and was made again.")
-        store.catalog.was_damaged = False
-    if store.catalog.locked is not None:
-        path, store.catalog.locked = store.catalog.locked, None
-        note(
-            "Another process keeps the catalog locked, so the files answer, more slowly. If it "
-            f"does not end by itself, end it: `fuser -v {path}` shows which one it is."
-        )
     if repairs.tables:
         from hybridlog.record.marks import MARKS
 

@@ -58,8 +58,6 @@ class Index:
 
         session = self._session
         database = session.database_for("Rebuilding the index", writes=True)
-        if recordings is None:
-            session.catalog.mend()
         session.invalidate()
         chosen = session.select(recordings)
         index = StoreIndex(session.directory, session.catalog, database, progress)

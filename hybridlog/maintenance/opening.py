@@ -30,7 +30,6 @@ from hybridlog_storage.catalog import Catalog
 from hybridlog_storage.disk import durability, files
 from hybridlog_storage.disk.directory import LOCK, REMOVED, SENDING
 from hybridlog_storage.errors import (
-    CatalogError,
     DiskFullError,
     HeldError,
     StoreError,
@@ -72,7 +71,7 @@ def open_catalog(directory: StoreDirectory, *, in_memory: bool = False) -> Catal
         directory.path,
         directory.settings.store_id,
         in_memory=in_memory or not directory.is_writable,
-        folder=directory.catalog_folder(),
+        cells=directory.catalog_cells(),
     )
 
 
@@ -99,14 +98,6 @@ class StoreFiles:
         Args:
             mends: Repair what a crash has left, as when a store is opened; otherwise it is noted.
         """
-        for _ in range(_TRIES):
-            with suppress(
-                CatalogError
-            ):  # another process has changed topics of a recording meanwhile
-                return self._look_at_all(mends=mends)
-        return self._look_at_all(mends=mends)
-
-    def _look_at_all(self, *, mends: bool) -> Snapshot:
         from hybridlog.maintenance import tables
 
         directory, catalog, report = self.directory, self.catalog, self.report
@@ -120,8 +111,6 @@ class StoreFiles:
             with suppress(OSError):  # the next opening tries again
                 clear_stopped(directory)
         rows = catalog.summaries()
-        if mends:  # before the index is compared with entries, which may be lost then
-            catalog.drop_damaged()
         known = {summary.label: summary for summary in rows}
         for _ in range(_TRIES):
             names = directory.names()
@@ -194,12 +183,10 @@ class StoreFiles:
             mends: Repair what a crash has left; otherwise it is noted.
         """
         found: dict[str, list[RecordingSummary]] = {}
-        unchanged: list[RecordingSummary] = []
         for label, look in looks.items():
             summary = known.get(label)
             if summary is None or summary.look != look or summary.status in UNFINISHED:
                 try:
-                    before = summary
                     summary = self._look_again(label, summary, mends=mends)
                 except DiskFullError:
                     raise
@@ -207,12 +194,8 @@ class StoreFiles:
                     if self.directory.has(label):  # another process may have removed or renamed it
                         self.report.unreadable[label] = str(error)
                     continue
-                if summary is not None and before is not None and summary.look != before.look:
-                    unchanged.append(summary)
             if summary is not None:
                 found.setdefault(summary.id, []).append(summary)
-        if mends or self.catalog.is_in_memory:
-            self.catalog.put_looks(unchanged)
         return found
 
     def _look_again(
@@ -223,7 +206,10 @@ class StoreFiles:
             listing = self.directory.listing(label)
             row = self.catalog.recording(summary.id)
             if row is not None and _is_current(self.directory, row[1], row[0], listing):
-                return summary._replace(look=listing.look)
+                now = summary._replace(look=listing.look)
+                if now.look != summary.look:
+                    self.catalog.put_look(now)
+                return now
         described = (self._mended if mends else self._refresh)(label)
         return described.summary if described is not None else None
 
@@ -261,7 +247,7 @@ class StoreFiles:
 
     def _describe(self, label: str, *, is_open: bool) -> Described:
         described = describe_now(self.directory, self.catalog, label, is_open=is_open)
-        self.catalog.keep(described)
+        self.catalog.put(described, waits=False)
         return described
 
     def _mended(self, label: str) -> Described | None:
@@ -342,7 +328,7 @@ class StoreFiles:
             self.report.copies[other.label] = chosen.label
         # The row may be that of the copy.
         described = describe_now(self.directory, self.catalog, chosen.label)
-        self.catalog.keep(described)
+        self.catalog.put(described, waits=False)
         return described.summary
 
 

@@ -61,11 +61,6 @@ def repair(
     """
     directory.check_writable()
     done = [Repaired(label, "journal", "rebuilt") for label in repairs.journals]
-    entries = None if entries is None else [*entries]
-    if not catalog.is_sound(None if entries is None else [entry.label for entry in entries]):
-        catalog.mend()
-        done.append(Repaired("", "catalog", "rebuilt"))
-        entries = None  # other rows are lost, too
     checker = tables.TableChecker(directory)
     chosen = [(label, "") for label in directory.labels()]
     for label, recording in chosen if entries is None else [(e.label, e.id) for e in entries]:

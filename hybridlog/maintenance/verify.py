@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from hybridlog.columns import field_files
@@ -15,7 +14,7 @@ from hybridlog.index.indexing import ChunkIndexer, Documents
 from hybridlog.maintenance import tables
 from hybridlog.maintenance.index import documents_in
 from hybridlog_storage.disk.directory import LOCK, PAYLOADS
-from hybridlog_storage.errors import CatalogError, SegmentError, StoreError
+from hybridlog_storage.errors import SegmentError, StoreError
 from hybridlog_storage.mongo.index_documents import recording_key, with_prefix
 from hybridlog_storage.mongo.index_state import IndexState
 from hybridlog_storage.mongo.topic_places import TopicPlaces
@@ -39,7 +38,6 @@ _REPAIR = "run `hybridlog verify --repair`"
 RESTORE = "restore the file from a copy"
 _COPY_AGAIN = "`hybridlog copy --check` from a store that has it brings it back"
 _RESTORE_LOST = f"{RESTORE}; `hybridlog info --losses` lists the lost messages"
-_NOTING_S = 2.0  # that a recorder may take to note a segment that it has sealed
 _KNOWN = frozenset({LOCK, "journal.old", PAYLOADS})
 
 
@@ -99,8 +97,6 @@ def verify(
     """
     result = Verification(index=database is not None)
     labels = None if labels is None else [*labels]
-    if not catalog.is_sound(labels):
-        result.findings.append(Finding("", "catalog", "the file is damaged", _REPAIR))
     directory.look_closely()
     index = None if database is None else _Index(database, count_all=labels is None)
     checker = tables.TableChecker(directory)
@@ -248,13 +244,9 @@ class _Check:
             return
         is_open = holder is not None and holder.is_recording
         entry = describe(self._catalog, inventory, is_open=is_open).entry
-        until = time.monotonic() + _NOTING_S
-        while is_open and not self._is_noted(entry, is_open=True) and time.monotonic() < until:
-            time.sleep(_NOTING_S / 100)
-            inventory = take_inventory(self._directory, self._label)
-            entry = describe(self._catalog, inventory, is_open=True).entry
-        if inventory.is_proven or not self._directory.is_remote:  # where no row is noted
-            self._row(entry, is_open=is_open)
+        row = self._catalog.recording(entry.id)
+        if row is not None and row[0] == inventory.listing.print and row[1] != entry:
+            self.found("catalog", "its entry differs from the files", _REPAIR)
         self._result.without_documents += entry.messages - entry.documents
         if entry.status == "open":
             return
@@ -368,30 +360,6 @@ class _Check:
     def _rebuild(self) -> str:
         return f"run `hybridlog index rebuild -r {self._label}`"
 
-    def _is_noted(self, entry: RecordingEntry, *, is_open: bool) -> bool:
-        """True if the catalog has this entry.
-
-        While it is recorded, what was decoded since the entry was made may be missing.
-        """
-        row = self._catalog.recording(entry.id)
-        if row is None:
-            return False
-        return row[1] == entry or (is_open and _not_decoded(row[1]) == _not_decoded(entry))
-
-    def _row(self, entry: RecordingEntry, *, is_open: bool) -> None:
-        """Check the catalog's row and its chunk tables."""
-        if not self._is_noted(entry, is_open=is_open):
-            is_missing = self._catalog.recording(entry.id) is None
-            problem = (
-                "the recording is missing" if is_missing else "its entry differs from the files"
-            )
-            self.found("catalog", problem, _REPAIR)
-        for number, _, _ in entry.spans:
-            try:
-                self._catalog.table(entry, number)
-            except CatalogError as error:
-                self.found("catalog", str(error), _REPAIR)
-
     def _index(self, entry: RecordingEntry) -> None:
         """Find documents that are not in the segments."""
         if self._indexed is None:
@@ -419,16 +387,6 @@ class _Check:
     def _tables(self, entry: RecordingEntry) -> None:
         for topic, problem in self._checker.damage(entry).items():
             self.found(f"table of {topic}", problem, _REPAIR)
-
-
-def _not_decoded(entry: RecordingEntry) -> RecordingEntry:
-    """An entry as it is before its messages are decoded."""
-    channels = []
-    for channel in entry.channels:
-        stats = replace(channel.stats, unreadable=0, surplus=0, stamped=0, unset=0, skew_sum=0.0)
-        stats.first_stamp = stats.last_stamp = stats.skew_min = stats.skew_max = None
-        channels.append(replace(channel, stats=stats))
-    return replace(entry, channels=channels, is_decoded=False)
 
 
 def _by_collection(

@@ -17,6 +17,7 @@ import numpy as np
 
 from hybridlog.query.predicate.numbers import is_nan, is_number
 from hybridlog.query.predicate.tree import And, Compare, Field, Member, Or, is_meta, nodes
+from hybridlog_storage.catalog import content_of
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -63,8 +64,8 @@ def within_bounds(session: Session, question: Question, found: Ranges) -> Ranges
         if not any(known.values()):
             may |= has
         for row in np.flatnonzero(has & ~may).tolist():
-            recording = snapshot.summaries[found.places[row]].id
-            here = {path: ends[recording] for path, ends in known.items() if recording in ends}
+            content = snapshot.summaries[found.places[row]].content
+            here = {path: ends[content] for path, ends in known.items() if content in ends}
             may[row] = may_hold(root, here)
     return found if may.all() else found.take(np.flatnonzero(may))
 
@@ -140,7 +141,9 @@ class BoundsFinder:
         return Found(self, [one for one in self._fields if self._lacks(one, parts)])
 
     def _lacks(self, target: Field, parts: Collection[Part]) -> bool:
-        return any(part.recording.id not in self._known_of(part.topic, target) for part in parts)
+        return any(
+            content_of(part.recording) not in self._known_of(part.topic, target) for part in parts
+        )
 
     def _known_of(self, topic: str, target: Field) -> dict[str, Ends]:
         kind = key_of(topic, target.path)
@@ -150,7 +153,7 @@ class BoundsFinder:
 
     def note(self, part: Part, target: Field, ends: Ends) -> None:
         """Note what is known of a part's recording."""
-        self._known_of(part.topic, target)[part.recording.id] = ends
+        self._known_of(part.topic, target)[content_of(part.recording)] = ends
         self._catalog.note_bounds(key_of(part.topic, target.path), part.recording, ends)
 
 

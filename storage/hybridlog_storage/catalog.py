@@ -2,10 +2,9 @@
 
 It is derived from journals and segments, and may be deleted at any time. It lists recordings
 with summaries, and says more of those that are asked about: their channels, statistics and
-losses, and what was found out by decoding. It comes in parts, see `catalog_parts`, so a change
-writes little. What it says of a recording also has the state of the files that it was read
-from (sizes, times), and is used only while that is unchanged. Chunks are read from the footers
-of segments.
+losses, and what was found out by decoding. What it says of a recording also has the state of
+the files that it was read from (sizes, times), and is used only while that is unchanged. Chunks
+are read from the footers of segments.
 """
 
 from __future__ import annotations
@@ -13,12 +12,10 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import stat
-from base64 import b64decode, b64encode
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Container, Iterable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import asdict, dataclass, field, replace
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 from threading import RLock
@@ -27,34 +24,13 @@ from zlib import compress, decompressobj
 from zlib import error as ZlibError  # noqa: N812
 
 import numpy as np
+from msgspec import convert, to_builtins
+from msgspec.json import Decoder
 
 from hybridlog_storage.cache import Cache
-from hybridlog_storage.catalog_parts import (
-    BOUNDS,
-    DAMAGE,
-    ENTRY,
-    MAX_PART_BYTES,
-    STAMPS,
-    SUMMARY,
-    TOPICS,
-    DiskFolder,
-    MemoryFolder,
-    PartContent,
-    Version,
-    bounds_in,
-    is_of_another,
-    number_of,
-    part_name,
-    texts_in,
-)
+from hybridlog_storage.cells import Cells, Statement, drop, put
 from hybridlog_storage.disk import durability, files
-from hybridlog_storage.errors import (
-    CatalogError,
-    ResourceError,
-    SegmentError,
-    StoreError,
-    exhausted,
-)
+from hybridlog_storage.errors import CatalogError, SegmentError
 from hybridlog_storage.lazy import RowType
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.ordering import run_starts
@@ -62,11 +38,10 @@ from hybridlog_storage.segments.chunk_table import ChunkTable
 from hybridlog_storage.segments.segment_file import sealed_name
 from hybridlog_storage.segments.segment_reader import ChunkPlace, SegmentReader
 from hybridlog_storage.summary import (
-    MAX_INT,
+    Int,
     RecordingSummary,
     TopicType,
     hash_of,
-    topics_from_json,
     topics_to_json,
 )
 
@@ -74,23 +49,32 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog_storage.segments.open_segment import Flushed
+else:
+    Flushed = Any  # in no file
 
-CATALOG: Final = "catalog"
-"""Name of the folder in the store's directory."""
-_SCHEMA: Final = "schema-"
-"""Prefix of the files of schemas, by hash."""
+CATALOG: Final = "catalog.sqlite"
+"""Name of the file in the store's directory."""
+_SUMMARY: Final = "summary"
+_ENTRY: Final = "entry"
+_INDEX: Final = "index"
+_STAMPS: Final = "stamps"
+"""Kinds of the cells of a recording, whose key is its id; of stamps, each segment has one."""
+_TOPICS: Final = "topics"
+_SCHEMA: Final = "schema"
+"""Kinds of the cells of sets of topics and of schemas, by hash; nothing removes them."""
+_BOUNDS: Final = "bounds"
+"""Kind of the cells of bounds, by what they are bounds of."""
 _RECORDINGS: Final = "recordings"
 _RECORDINGS_FILE: Final = Path("tables/recordings.parquet")
-_TOPICS = RecordingSummary._fields.index("topics")
 _BUSY_S: Final = 1.0
+_NOTING_S: Final = 0.1
 _MAX_TABLES: Final = 64 << 20  # bytes of chunk tables in memory
-_MAX_BOUNDED_BYTES: Final = 56 << 10  # of a part from which recordings keep bounds of one kind
-_BOUND_BYTES: Final = 128  # of a line with bounds, about
-_MAX_BOUNDED_PARTS: Final = 256  # parts that are replaced at the end for the sake of bounds
-_MAX_NOTED: Final = 1 << 17  # bounds that wait for the end
+_MAX_NOTED: Final = 1 << 17  # recordings with bounds of one kind, and bounds that wait for the end
+_MAX_KINDS: Final = 256  # of bounds
+_T = TypeVar("_T")
 Ends = tuple[float | None, float | None]
 """The least and the greatest of some numbers; None twice without any."""
-_STAMPS = RowType(
+_STAMP = RowType(
     ("unreadable", "<u4"),
     ("surplus", "<u4"),
     ("stamped", "<u4"),
@@ -119,22 +103,22 @@ class ChannelStats:
     their last field.
     """
 
-    messages: int = 0
-    payload_bytes: int = 0
-    unreadable: int = 0
-    surplus: int = 0
-    first: int | None = None
-    last: int | None = None
-    first_publish: int | None = None
-    last_publish: int | None = None
-    first_stamp: int | None = None
-    last_stamp: int | None = None
-    stamped: int = 0
-    unset: int = 0
+    messages: Int = 0
+    payload_bytes: Int = 0
+    unreadable: Int = 0
+    surplus: Int = 0
+    first: Int | None = None
+    last: Int | None = None
+    first_publish: Int | None = None
+    last_publish: Int | None = None
+    first_stamp: Int | None = None
+    last_stamp: Int | None = None
+    stamped: Int = 0
+    unset: Int = 0
     skew_sum: float = 0.0
-    skew_min: int | None = None
-    skew_max: int | None = None
-    longest: int = 0
+    skew_min: Int | None = None
+    skew_max: Int | None = None
+    longest: Int = 0
     """Longest span of log time of the channel's messages in one chunk."""
 
     @property
@@ -152,16 +136,11 @@ class ChannelStats:
             setattr(self, name, _greatest(getattr(self, name), getattr(other, name)))
 
 
-def _values(item: ChannelEntry | ChannelStats) -> dict[str, Any]:
-    """The fields of an entry by name."""
-    return {name: getattr(item, name) for name in item.__slots__}
-
-
 @dataclass(slots=True, repr=False)
 class ChannelEntry:
     """One channel of a recording."""
 
-    id: int
+    id: Int
     topic: str
     message_encoding: str
     schema: str | None
@@ -223,19 +202,19 @@ class RecordingEntry:
     name: str
     tags: dict[str, str]
     source: dict[str, Any]
-    created: int
+    created: Int
     status: str
     end: dict[str, Any] = field(default_factory=dict)
     channels: list[ChannelEntry] = field(default_factory=list)
-    stored_bytes: int = 0
-    segments: int = 0
-    chunks: int = 0
-    attachments: int = 0
-    metadata_records: int = 0
+    stored_bytes: Int = 0
+    segments: Int = 0
+    chunks: Int = 0
+    attachments: Int = 0
+    metadata_records: Int = 0
     notes: list[dict[str, Any]] = field(default_factory=list)
     marks: list[dict[str, Any]] = field(default_factory=list)
     pins: list[dict[str, Any]] = field(default_factory=list)
-    spans: list[tuple[int, int, int]] = field(default_factory=list)
+    spans: list[tuple[Int, Int, Int]] = field(default_factory=list)
     digests: dict[str, str] = field(default_factory=dict)
     stored: dict[str, str] = field(default_factory=dict)
     is_decoded: bool = False
@@ -276,72 +255,9 @@ class RecordingEntry:
 
     def to_document(self) -> dict[str, Any]:
         """The entry as a mapping of plain values."""
-        # `dataclasses.asdict` takes a millisecond for each channel.
-        channels = [
-            {
-                **_values(channel),
-                "metadata": dict(channel.metadata),
-                "stats": _values(channel.stats),
-            }
-            for channel in self.channels
-        ]
-        values = asdict(replace(self, channels=[], flushed={}))
-        del values["flushed"]
-        return {**values, "channels": channels}
-
-    @classmethod
-    def from_document(cls, document: Mapping[str, Any]) -> RecordingEntry:
-        """The entry from such a mapping.
-
-        Raises:
-            KeyError: A value is missing.
-            TypeError: A value is missing, of another type, or there is one too many.
-            ValueError: A segment has no span of its times.
-        """
-        values = dict(document)
-        values["channels"] = [
-            _checked(ChannelEntry(**{**c, "stats": _checked(ChannelStats(**c["stats"]))}))
-            for c in values["channels"]
-        ]
-        values["spans"] = [(number, first, last) for number, first, last in values["spans"]]
-        if not all(_is_number(one) for span in values["spans"] for one in span):
-            raise TypeError("a span is no pair of times")
-        return _checked(cls(**values))
-
-
-_JSON: Final = {"str": str, "int": int, "float": float, "bool": bool, "dict": dict, "list": list}
-_KINDS: Final = {
-    item: [
-        (name, _JSON[kind], "None" in annotation)
-        for name, annotation in item.__annotations__.items()
-        if (kind := annotation.partition("[")[0].partition(" ")[0]) in _JSON
-    ]
-    for item in (RecordingEntry, ChannelEntry, ChannelStats)
-}
-"""Name and type of the attributes of entries, and whether they may be None."""
-_E = TypeVar("_E", RecordingEntry, ChannelEntry, ChannelStats)
-
-
-def _is_number(value: object) -> bool:
-    """True for a whole number of 64 bits."""
-    if not isinstance(value, int) or isinstance(value, bool):  # BSON has an int of its own
-        return False
-    return -MAX_INT <= value <= MAX_INT
-
-
-def _checked(item: _E) -> _E:
-    """An item whose values have the types of its attributes.
-
-    Raises:
-        TypeError: One has another type.
-    """
-    for name, wanted, may_lack in _KINDS[type(item)]:
-        value = getattr(item, name)
-        if value is None and may_lack:
-            continue
-        if not isinstance(value, wanted) or (wanted is int and not _is_number(value)):
-            raise TypeError(f"{name} is no {wanted.__name__}")
-    return item
+        found: dict[str, Any] = to_builtins(replace(self, flushed={}))
+        del found["flushed"]
+        return {**found, "spans": [[*span] for span in self.spans]}
 
 
 @dataclass(frozen=True, slots=True)
@@ -363,15 +279,15 @@ class ChunkEntry:
     """
 
     recording: str
-    segment: int
-    number: int
-    offset: int
-    length: int
-    trailer: int
-    crc: int
-    trailer_crc: int
-    first: int
-    last: int
+    segment: Int
+    number: Int
+    offset: Int
+    length: Int
+    trailer: Int
+    crc: Int
+    trailer_crc: Int
+    first: Int
+    last: Int
     stats: Mapping[int, ChannelStats]
 
     @property
@@ -461,7 +377,7 @@ def stamps_of(
         table: The segment's chunks.
         chunks: Statistics by channel, for each chunk number that could be decoded.
     """
-    rows = np.zeros(len(table.parts), _STAMPS)
+    rows = np.zeros(len(table.parts), _STAMP)
     bounds = table.part_bounds().tolist()
     for number, by_channel in chunks.items():
         for row in range(bounds[number], bounds[number + 1]):
@@ -478,7 +394,7 @@ def decoded_rows(chunks: Iterable[Mapping[int, ChannelStats]]) -> NDArray[np.voi
         chunks: Statistics by channel, for each chunk of the segment.
     """
     rows = [_decoded(stats) for one in chunks for _, stats in sorted(one.items())]
-    return np.array(rows, _STAMPS)
+    return np.array(rows, _STAMP)
 
 
 def _decoded(stats: ChannelStats) -> tuple[float, ...]:
@@ -515,73 +431,21 @@ class Described:
     channels: Mapping[int, Channel]
 
 
-@dataclass(slots=True)
-class _Part:
-    """The list of a part.
-
-    Attributes:
-        version: As of the folder; empty before it was read again.
-        size: Bytes of the file.
-        summaries: By id; None for recordings without one.
-        shared: Sets of topics as text, by kind and hash.
-        damage: Lists of unreadable chunks as text, by id.
-        lines: Lines with bounds.
-        bounds: Those that were asked about, by kind and id.
-    """
-
-    version: Version = ()
-    size: int = 0
-    lines: bytes = b""
-    summaries: dict[str, RecordingSummary | None] = field(default_factory=dict)
-    shared: dict[tuple[str, str], str] = field(default_factory=dict)
-    damage: dict[str, str] = field(default_factory=dict)
-    bounds: dict[str, dict[str, Ends]] = field(default_factory=dict)
-
-    @classmethod
-    def of(cls, content: PartContent, version: Version, data: bytes) -> _Part:
-        """The list of a part."""
-        sets = {key: text for key, text in content.shared.items() if _are_topics(*key, text)}
-        found = cls(version, len(data), bounds_in(data), shared=sets)
-        for recording, row in content.rows.items():
-            found.summaries[recording] = None
-            if SUMMARY in row:
-                index, _, text = row[SUMMARY].partition(" ")
-                # A list of unreadable chunks may be lost; the index has it, too.
-                index = index.strip("-") if content.is_whole else ""
-                with suppress(TypeError, ValueError):
-                    summary = RecordingSummary.from_values(json.loads(text), index)
-                    if (TOPICS, summary.topics) in sets and summary.id == recording:
-                        found.summaries[recording] = summary
-            if DAMAGE in row:
-                found.damage[recording] = row[DAMAGE]
-        return found
-
-    def bounds_of(self, kind: str) -> dict[str, Ends]:
-        """Bounds of one kind by recording."""
-        if kind not in self.bounds:
-            texts = texts_in(self.lines, kind)
-            self.bounds[kind] = {}
-            with suppress(TypeError, ValueError):
-                for recording, text in texts.items():
-                    low, high = json.loads(text)
-                    if {type(low), type(high)} <= {int, float} or low is high is None:
-                        self.bounds[kind][recording] = low, high
-        return self.bounds[kind]
-
-
 class Catalog:
     """The catalog of a store. Thread safe.
 
     Args:
         store: The store's directory.
         store_id: The store's id; what is of another store is removed.
-        in_memory: Leave no file, for a store that this user cannot write.
-        folder: Its files, if they lie elsewhere.
+        in_memory: Leave the file as it is, for a store that this user cannot write.
+        cells: Its cells, if they lie elsewhere.
 
     Attributes:
-        was_damaged: True if something damaged was found since this was last set to False.
-        locked: The folder, if another process keeps it locked; a catalog in memory replaces it.
+        is_in_memory: True if it exists in the memory of this process only.
         has_changed: True if an ended recording was changed by this process.
+
+    Raises:
+        StoreError: A symlink lies in the place of its file; so do all methods.
     """
 
     def __init__(
@@ -590,31 +454,28 @@ class Catalog:
         store_id: str,
         *,
         in_memory: bool = False,
-        folder: MemoryFolder | None = None,
+        cells: Cells | None = None,
     ) -> None:
-        self.was_damaged = False
+        self.is_in_memory = in_memory or cells is not None
         self.has_changed = False
-        self.locked: Path | None = None
         self._store = store
-        self._store_id = store_id
         self._lock = RLock()
-        self._folder = folder or MemoryFolder()
-        self._parts: dict[int, _Part] = {}
-        self._places: dict[str, int] = {}  # number of its part, by id of a recording
-        self._by_fingerprint: dict[str, list[str]] | None = None
-        self._odd: set[str] = set()  # names of files that are not ours, or left over
-        self._damaged: set[int] = set()  # numbers of parts
-        self._pending: dict[str, Described] = {}  # by recording; written when this is closed
-        # Bounds and the content that they are of, by kind and recording.
-        self._noted: dict[str, dict[str, tuple[str, Ends]]] = defaultdict(dict)
+        self._cells = cells or Cells(
+            store / CATALOG,
+            store_id,
+            writes=not in_memory,
+            before_late=self._remove_recordings_file,
+        )
+        self._listed: tuple[tuple[int, ...], list[RecordingSummary]] = (), []
+        self._topics: dict[str, tuple[TopicType, ...]] = {}
+        # Bounds by kind and content: as they were read, and those to be written.
+        self._bounds: dict[str, tuple[bytes, dict[str, Ends]]] = {}
+        self._noted: dict[str, dict[str, Ends]] = defaultdict(dict)
         self._tables = Cache(_MAX_TABLES)
-        if not in_memory and folder is None:
-            self._folder = DiskFolder(store / CATALOG)
-            self._check_folder()
 
     @property
     def path(self) -> Path:
-        """Its folder."""
+        """Its file."""
         return self._store / CATALOG
 
     @property
@@ -622,312 +483,102 @@ class Catalog:
         """The list of ended recordings for other readers; it is removed before they change."""
         return self._store / _RECORDINGS_FILE
 
-    @property
-    def is_in_memory(self) -> bool:
-        """True if it exists in the memory of this process only."""
-        return not isinstance(self._folder, DiskFolder)
-
     def close(self) -> None:
-        """Write what was kept and noted, drop the rest, and remove what is damaged."""
+        """Write what was noted or could not be written before, and close the file."""
         with self._lock:
-            self.write_pending()
-            self._store_noted()
-            self._invalidate()
-            self.drop_damaged()
-
-    def _check_folder(self) -> None:
-        try:
-            kind = files.status(self.path).st_mode
-            if stat.S_ISLNK(kind):
-                raise StoreError(f"{self.path} is a symlink. Delete it: the catalog is rebuilt.")
-            if not stat.S_ISDIR(kind):
-                self.was_damaged = True
-                files.remove_tree(self.path)
-        except FileNotFoundError:
-            pass  # it is made with the first recording
-        except OSError as error:
-            raise durability.explain(error, self.path, "opening") from error
-
-    # Parts.
-
-    def _follow(self) -> None:
-        """Read the lists of parts that have changed.
-
-        Raises:
-            StoreError: The folder cannot be read.
-        """
-        if not self._folder.has_changed():
-            return
-        try:
-            versions = self._folder.versions()
-        except NotADirectoryError:  # ELOOP for a symlink
-            self._check_folder()
-            versions = {}
-        except OSError as error:
-            raise durability.explain(error, self.path, "reading") from error
-        parts: dict[int, _Part] = {}
-        self._odd = set()
-        for name, version in versions.items():
-            number = number_of(name)
-            if number is None:
-                if not name.startswith(_SCHEMA):
-                    self._odd.add(name)
-                continue
-            known = self._parts.get(number)
-            is_known = known is not None and known.version == version
-            found = known if is_known else self._read_list(name, version)
-            if found is not None:
-                parts[number] = found
-                if not is_known:  # another process may have read recordings again
-                    before = {} if known is None else known.summaries
-                    after = found.summaries.items()
-                    self._drop_noted([one for one, now in after if before.get(one) != now])
-        self._parts = parts
-        self._place()
-
-    def _place(self) -> None:
-        self._by_fingerprint = None
-        self._places = {
-            recording: number
-            for number, part in sorted(self._parts.items())
-            for recording in part.summaries
-        }
-
-    def _read_list(self, name: str, version: Version) -> _Part | None:
-        data = self._data_of(name)
-        if data is None:
-            return None
-        if is_of_another(self._store_id, data):
-            self._odd.add(name)
-            return None
-        found = PartContent.from_bytes(self._store_id, data, is_list=True)
-        self._check(number_of(name) or 0, found)
-        return _Part.of(found, version, data)
-
-    def _read(self, number: int) -> PartContent:
-        """Everything in a part but what is damaged; nothing if it does not exist."""
-        data = self._data_of(part_name(number))
-        if data is None or is_of_another(self._store_id, data):
-            return PartContent()
-        found = PartContent.from_bytes(self._store_id, data)
-        self._check(number, found)
-        return found
-
-    def _check(self, number: int, content: PartContent) -> None:
-        if not content.is_whole:
-            self.was_damaged = True
-            self._damaged.add(number)
-
-    def _data_of(self, name: str) -> bytes | None:
-        """The content of a file; nothing if it cannot be read, None if it does not exist."""
-        try:
-            return self._folder.read(name)
-        except FileNotFoundError:
-            return None
-        except OSError as error:
-            short = exhausted(error.errno, f"reading {self.path / name}")
-            if short is not None:
-                raise short from error
-            return b""
-
-    @contextmanager
-    def _changing(self) -> Iterator[None]:
-        """A change of some parts, without other writers.
-
-        Raises:
-            DiskFullError: There is no room.
-            StoreError: They cannot be written.
-        """
-        with self._lock, ExitStack() as stack:
-            try:
-                try:
-                    stack.enter_context(self._folder.lock(_BUSY_S))
-                except NotADirectoryError:
-                    self._check_folder()
-                    stack.enter_context(self._folder.lock(_BUSY_S))
-            except BlockingIOError:
-                self.locked, copy = self.path, MemoryFolder()
-                for name in self._folder.versions():
-                    copy.write(name, self._data_of(name) or b"")
-                self._folder = copy
-            except OSError as error:
-                raise durability.explain(error, self.path, "writing") from error
-            try:
-                self._follow()
-                self._tidy()
-                yield
-            except OSError as error:
-                raise durability.explain(error, self.path, "writing") from error
+            self._write_bounds()
+            self._tables.drop("table")
+            self._cells.close(_BUSY_S)
 
     @contextmanager
     def unchanged(self) -> Iterator[list[RecordingSummary]]:
-        """All summaries, while nobody changes them.
-
-        Raises:
-            StoreError: They cannot be read.
-        """
-        with self._changing():
-            yield self.summaries()
-
-    def _remove_recordings_file(self) -> None:
-        self.has_changed = True
-        if self.locked is not None or not self.is_in_memory:
-            with suppress(FileNotFoundError):
-                files.unlink(self.recordings_file)
-
-    def _tidy(self) -> None:
-        """Remove files that are not ours, and what is damaged."""
-        for name in self._odd:
-            self._folder.remove(name)
-        self._odd.clear()
-        for number in self._damaged & self._parts.keys():
-            content = self._read(number)
-            for row in content.rows.values():  # what is lost is not known
-                row.pop(ENTRY, None)
-                if SUMMARY in row:
-                    row[SUMMARY] = f"- {row[SUMMARY].partition(' ')[2]}"
-            self._write(number, content)
-        self._damaged.clear()
-
-    def _write(self, number: int, content: PartContent) -> None:
-        """Replace a part."""
-        name = part_name(number)
-        # A recording that got another part is listed there.
-        rows = {r: row for r, row in content.rows.items() if self._places.get(r, number) == number}
-        if not rows:
-            self._folder.remove(name)
-            self._parts.pop(number, None)
-            return
-        texts = [row[SUMMARY] for row in rows.values() if SUMMARY in row]
-        sets = {json.loads(text.partition(" ")[2])[_TOPICS] for text in texts}
-        shared = {key: text for key, text in content.shared.items() if key[1] in sets}
-        whole = PartContent(rows, shared)
-        data = whole.to_bytes(self._store_id)
-        self._folder.write(name, data)
-        self._parts[number] = _Part.of(whole, (), data)
-
-    def _change(self, recording: str, change: Callable[[dict[str, str]], None], *sets: str) -> None:
-        """Change the row of a recording; an empty one is removed.
-
-        Args:
-            recording: Its id.
-            change: Changes its texts by kind.
-            sets: Sets of topics that it may have, as text.
-        """
-        with self._changing():
-            number = self._places.get(recording)
-            if number is None:  # the smallest part takes it
-                sizes = {n: part.size for n, part in self._parts.items()}
-                number = min(sizes, key=sizes.__getitem__, default=0)
-            content = self._read(number)
-            row = content.rows.setdefault(recording, {})
-            change(row)
-            content.shared.update(((TOPICS, hash_of(text)), text) for text in sets)
-            self._by_fingerprint = None
-            self._places.pop(recording, None)
-            if not row:
-                del content.rows[recording]
-            elif len(content.rows) > 1 and content.size > MAX_PART_BYTES:
-                self._places[recording] = free = max(self._parts) + 1
-                self._write(free, PartContent({recording: row}, content.shared))
-            else:
-                self._places[recording] = number
-            self._write(number, content)
+        """All summaries, while nobody changes them; none if that is not possible."""
+        with self._cells.alone(_BUSY_S) as is_alone:
+            yield self.summaries() if is_alone else []
 
     # Changes.
 
-    def keep(self, described: Described) -> None:
-        """Insert or replace a recording; it is written when this is closed."""
-        if self.is_in_memory:
-            self.put(described)
-            return
-        with self._lock:
-            self._invalidate(described.entry.id)
-            self._by_fingerprint = None
-            self._pending[described.entry.id] = described
+    def _write(
+        self,
+        *statements: Statement,
+        wait_s: float = _BUSY_S,
+        make: Callable[[], Iterable[Statement]] = tuple,
+        is_change: bool = False,
+    ) -> None:
+        """Write to the file.
 
-    def write_pending(self) -> None:
-        """Write what was kept, as far as that is possible."""
-        with self._lock:
-            with suppress(StoreError, ResourceError):
-                for described in [*self._pending.values()]:
-                    self.put(described)
-            self._pending.clear()
+        Raises:
+            StoreError: The list of ended recordings, which is wrong now, cannot be removed.
+        """
 
-    def put(self, described: Described) -> None:
-        """Insert or replace a recording."""
-        entry = described.entry
-        # In ASCII: a directory's name may not be UTF-8.
-        text = json.dumps([described.files, entry.to_document()], separators=(",", ":"))
-
-        def change(row: dict[str, str]) -> None:
-            if entry.status != "open":
+        def changed() -> list[Statement]:
+            if is_change:
                 self._remove_recordings_file()
-            kinds = [kind for kind in row if kind.startswith(BOUNDS)]
-            if kinds and _content_of(row) != content_of(entry.digests):
-                for kind in kinds:
-                    del row[kind]
-            row[ENTRY] = text
-            row[SUMMARY] = f"- {described.summary.to_json()}"
+            return [*statements, *make()]
 
-        with self._lock:
-            self._pending.pop(entry.id, None)
-            self._invalidate(entry.id)
-        self._put_schemas({c.schema for c in described.channels.values() if c.schema is not None})
-        self._change(entry.id, change, topics_to_json(described.topics))
+        try:
+            self._cells.write(changed, wait_s)
+        except OSError as error:
+            raise durability.explain(error, self.recordings_file, "removing") from error
 
-    def put_looks(self, summaries: Iterable[RecordingSummary]) -> None:
-        """Note that recordings are unchanged although their directories look different."""
-        texts = {one.id: one.to_json() for one in summaries}
+    def _remove_recordings_file(self) -> None:
+        self.has_changed = True
+        if not self.is_in_memory:
+            with suppress(FileNotFoundError):
+                files.unlink(self.recordings_file)
 
-        def change(recording: str, row: dict[str, str]) -> None:
-            row[SUMMARY] = f"{row[SUMMARY].partition(' ')[0]} {texts[recording]}"
+    def put(self, described: Described, *, waits: bool = True) -> None:
+        """Insert or replace a recording.
 
-        self._note(texts, change)
+        Args:
+            described: The recording.
+            waits: False for a question, which does not wait for other processes.
+        """
+        entry, summary = described.entry, described.summary
+        topics = topics_to_json(described.topics)
+        self._invalidate(entry.id)
+        self._topics[summary.topics] = tuple(described.topics)
+        schemas = {c.schema for c in described.channels.values() if c.schema is not None}
+        known = {schema_hash(schema): schema for schema in schemas}
+        self._write(
+            *(
+                put(_SCHEMA, digest, _schema_body(schema))
+                for digest, schema in known.items()
+                if self._cells.read(_SCHEMA, digest) is None
+            ),
+            put(_TOPICS, summary.topics, topics.encode()),
+            put(_ENTRY, entry.id, _body([described.files, entry.to_document()])),
+            put(_SUMMARY, entry.id, _body(summary[:-1])),
+            make=lambda: self._indexed_by([entry.id], ""),  # until it is compared with the index
+            wait_s=_BUSY_S if waits else _NOTING_S,
+            is_change=entry.status != "open",
+        )
 
-    def put_indexed(self, recordings: Iterable[str], index: str) -> None:
+    def put_look(self, summary: RecordingSummary) -> None:
+        """Note that a recording is unchanged although its directory looks different."""
+        self._write(put(_SUMMARY, summary.id, _body(summary[:-1])), wait_s=_NOTING_S)
+
+    def put_indexed(self, recordings: Collection[str], index: str) -> None:
         """Note which index is complete for recordings.
 
         Args:
             recordings: Their ids.
             index: The id of the index; empty if none is.
         """
+        self._write(make=lambda: self._indexed_by(recordings, index), wait_s=_NOTING_S)
 
-        def change(_: str, row: dict[str, str]) -> None:
-            row[SUMMARY] = f"{index or '-'} {row[SUMMARY].partition(' ')[2]}"
+    def _indexed_by(self, recordings: Iterable[str], index: str) -> Iterator[Statement]:
+        for recording in recordings:
+            before, damage = self._indexed(recording)
+            if before != index:
+                yield put(_INDEX, recording, _body([index, damage]))
 
-        self._note(recordings, change)
-
-    def _note(
-        self, recordings: Iterable[str], change: Callable[[str, dict[str, str]], None]
-    ) -> None:
-        """Change listed recordings; this saves work later, and is left out if it fails."""
-        wanted = [*recordings]
-        if not wanted:
-            return
-        with suppress(StoreError, ResourceError), self._changing():
-            by_part: dict[int, list[str]] = defaultdict(list)
-            for recording in wanted:
-                if recording in self._places:
-                    by_part[self._places[recording]].append(recording)
-            for number, own in by_part.items():
-                content = self._read(number)
-                for recording in own:
-                    if SUMMARY in content.rows.get(recording, {}):
-                        change(recording, content.rows[recording])
-                self._write(number, content)
-
-    def remove(self, recording: str) -> None:
-        """Remove a recording."""
-
-        def clear(row: dict[str, str]) -> None:
-            self._remove_recordings_file()
-            row.clear()
-
-        with self._lock:
-            self._pending.pop(recording, None)
-            self._invalidate(recording)
-        self._change(recording, clear)
+    def put_damage(self, recording: str, damage: Mapping[tuple[int, int], str]) -> None:
+        """Store the unreadable chunks of a recording: reason by segment and number."""
+        rows = [(*place, reason) for place, reason in sorted(damage.items())]
+        self._write(
+            make=lambda: [put(_INDEX, recording, _body([self._indexed(recording)[0], rows]))]
+        )
 
     def put_stamps(
         self, recording: str, stamps: Iterable[tuple[int, str, NDArray[np.void]]]
@@ -939,182 +590,125 @@ class Catalog:
             stamps: Number and digest of a segment, and a row for each of the `parts` of its
                 chunk table.
         """
-        texts = {
-            f"{STAMPS}{number}": f"{digest} {b64encode(compress(rows.tobytes(), 1)).decode()}"
-            for number, digest, rows in stamps
-        }
-        with self._lock:
-            self._invalidate(recording)
-        self._change(recording, lambda row: row.update(texts))
+        self._invalidate(recording)
+        self._write(
+            *(
+                put(
+                    _STAMPS,
+                    recording,
+                    b"%b %b" % (digest.encode(), compress(rows.tobytes(), 1)),
+                    number,
+                )
+                for number, digest, rows in stamps
+            )
+        )
 
-    def put_damage(self, recording: str, damage: Mapping[tuple[int, int], str]) -> None:
-        """Store the unreadable chunks of a recording: reason by segment and number."""
-        text = json.dumps([(*place, reason) for place, reason in sorted(damage.items())])
-        self._change(recording, lambda row: row.update({DAMAGE: text}))
-
-    def rebuild(self) -> None:
-        """Replace the catalog with an empty one.
-
-        Raises:
-            StoreError: It cannot be written.
-        """
-        with self._lock:
-            self.was_damaged |= not self.is_in_memory
-            self._pending.clear()
-            self._invalidate()
-            with self._changing():
-                self._remove_recordings_file()
-                for name in self._folder.versions():
-                    self._folder.remove(name)
-            self._parts, self._places = {}, {}
-
-    def mend(self) -> None:
-        """Look at everything, and remove what is damaged.
-
-        Raises:
-            StoreError: It cannot be read or written.
-        """
-        if not self.is_sound():
-            with self._changing():
-                pass
-
-    def drop_damaged(self) -> None:
-        """Remove what was found to be damaged, if it can be written."""
-        with self._lock:
-            if self._damaged:
-                with suppress(StoreError, ResourceError), self._changing():
-                    pass
+    def remove(self, recording: str) -> None:
+        """Remove a recording."""
+        self._invalidate(recording)
+        kinds = (_SUMMARY, _ENTRY, _INDEX, _STAMPS)
+        self._write(*(drop(kind, recording) for kind in kinds), is_change=True)
 
     # Answers.
 
-    def is_sound(self, labels: Collection[str] | None = None) -> bool:
-        """True if nothing in it is damaged.
-
-        Args:
-            labels: Look at parts with these recordings only; None for all.
-
-        Raises:
-            StoreError: It cannot be read.
-        """
-        with self._lock:
-            self._follow()
-            chosen = {*self._parts}
-            if labels is not None:
-                wanted = {one.id for one in self.summaries() if one.label in labels}
-                chosen = {self._places[recording] for recording in wanted}
-            whole = [self._read(number).is_whole for number in [*chosen]]
-            return all(whole) and not self._odd and not self._damaged
-
     def summaries(self, recordings: Collection[str] | None = None) -> list[RecordingSummary]:
-        """Summaries of recordings by id, None for all; unordered, without damaged ones.
+        """Summaries of recordings by id, None for all; unordered, without damaged ones."""
+        if recordings is None:
+            state, (known, listed) = self._cells.state(), self._listed
+            if known != state:
+                indexed = self._cells.beside(_INDEX, _SUMMARY)
+                listed = self._summaries(self._cells.each(_SUMMARY), indexed)
+                self._listed = state, listed
+            return [*listed]
+        bodies, indexed = (
+            {one: body for one in recordings if (body := self._cells.read(kind, one))}
+            for kind in (_SUMMARY, _INDEX)
+        )
+        return self._summaries(bodies, indexed)
 
-        Raises:
-            StoreError: It cannot be read.
-        """
-        with self._lock:
-            self._follow()
-            wanted = {*self._places} if recordings is None else self._places.keys() & {*recordings}
-            found = [
-                self._parts[self._places[one]].summaries[one]
-                for one in wanted - self._pending.keys()
-            ]
-            pending = [
-                one.summary
-                for recording, one in self._pending.items()
-                if recordings is None or recording in recordings
-            ]
-        return [summary for summary in found if summary is not None] + pending
+    def _summaries(
+        self, bodies: Mapping[str, bytes], indexed: Mapping[str, bytes]
+    ) -> list[RecordingSummary]:
+        found = []
+        for recording, body in bodies.items():
+            summary = _read(_SUMMARY_OF, body)
+            if summary is None or summary.id != recording or self._set(summary.topics) is None:
+                continue
+            index = _read(_INDEX_OF, indexed.get(recording))
+            if index is not None and index[0]:
+                summary = summary._replace(indexed_by=index[0])
+            found.append(summary)
+        return found
 
     def topics(self, digest: str) -> tuple[TopicType, ...]:
-        """A set of topics and their types, by its hash.
+        """A set of topics and their types, by its hash, which a summary has.
 
         Raises:
-            CatalogError: Another process has changed the recordings that had it.
+            CatalogError: It is missing.
         """
-        with self._lock:
-            for one in self._pending.values():
-                if one.summary.topics == digest:
-                    return topics_from_json(topics_to_json(one.topics))
-            key = TOPICS, digest
-            found = next((p.shared[key] for p in self._parts.values() if key in p.shared), "")
-        if hash_of(found) != digest:
-            raise CatalogError(f"Topics in the catalog {self.path} change all the time. Ask again.")
-        return topics_from_json(found)
+        found = self._set(digest)
+        if found is None:
+            raise CatalogError(f"The catalog {self.path} has lost topics. Ask again.")
+        return found
 
-    def _row(self, recording: str) -> dict[str, str]:
-        """All texts of a recording by kind."""
-        with self._lock:
-            if recording not in self._places:
-                self._follow()
-            number = self._places.get(recording)
-            row = self._read(number).rows.get(recording) if number is not None else None
-            if row is None and number is not None:  # another process may have moved it
-                self._follow()
-                row = self._read(self._places.get(recording, number)).rows.get(recording)
-            return row or {}
+    def _set(self, digest: str) -> tuple[TopicType, ...] | None:
+        found = self._topics.get(digest)
+        if found is None:
+            body = self._cells.read(_TOPICS, digest) or b""
+            found = _read(_TOPICS_OF, body)
+            if found is not None and hash_of(body.decode()) == digest:
+                self._topics[digest] = found
+        return self._topics.get(digest)
 
     def recording(self, recording: str) -> tuple[str, RecordingEntry] | None:
         """State of the files and entry of a recording; None if it is missing or damaged."""
-        pending = self._pending.get(recording)
-        if pending is not None:
-            return pending.files, pending.entry
-        row = self._row(recording)
-        with suppress(KeyError, TypeError, ValueError):
-            looks, document = json.loads(row[ENTRY])
-            entry = RecordingEntry.from_document(document)
-            if isinstance(looks, str) and entry.id == recording:
-                return looks, entry
-        return None
+        found = _read(_ENTRY_OF, self._cells.read(_ENTRY, recording))
+        return found if found is not None and found[1].id == recording else None
 
     def with_fingerprint(self, fingerprint: str) -> RecordingEntry | None:
         """A recording of a log with this content, or of one of which it is a part."""
-        with self._lock:
-            summaries = self.summaries()
-            if self._by_fingerprint is None:
-                self._by_fingerprint = defaultdict(list)
-                for one in summaries:
-                    for known in _fingerprints(one.source):
-                        self._by_fingerprint[known].append(one.id)
-            recordings = self._by_fingerprint.get(fingerprint, [])
-        found = (self.recording(recording) for recording in recordings)
-        return next((row[1] for row in found if row is not None), None)
+        for recording, body in self._cells.each(_SUMMARY, _body(fingerprint)).items():
+            summary = _read(_SUMMARY_OF, body)
+            if summary is not None and fingerprint in _fingerprints(summary.source):
+                row = self.recording(recording)
+                if row is not None:
+                    return row[1]
+        return None
+
+    def _indexed(self, recording: str) -> tuple[str, list[tuple[int, int, str]]]:
+        """The index that is complete for a recording, and its unreadable chunks.
+
+        They are one cell: of a list that is lost, no index is known to have all chunks.
+        """
+        return _read(_INDEX_OF, self._cells.read(_INDEX, recording)) or ("", [])
 
     def damage(self, recording: str) -> dict[tuple[int, int], str]:
         """The unreadable chunks of a recording: reason by segment and number."""
-        with self._lock:
-            self._follow()
-            part = self._parts.get(self._places.get(recording, -1))
-            text = part.damage.get(recording, "[]") if part is not None else "[]"
-        with suppress(TypeError, ValueError):
-            rows = json.loads(text)
-            return {(int(segment), int(chunk)): str(reason) for segment, chunk, reason in rows}
-        return {}
+        return {(segment, chunk): reason for segment, chunk, reason in self._indexed(recording)[1]}
 
     def stamps(
         self, entry: RecordingEntry, number: int, table: ChunkTable
     ) -> NDArray[np.void] | None:
         """Decoding results of a segment; None before its messages are decoded."""
-        digest, _, text = self._row(entry.id).get(f"{STAMPS}{number}", "").partition(" ")
+        body = self._cells.read(_STAMPS, entry.id, number) or b""
+        digest, _, packed = body.partition(b" ")
         with suppress(ValueError, ZlibError):
-            most = len(table.parts) * _STAMPS.itemsize
-            rows = np.frombuffer(decompressobj().decompress(b64decode(text), most + 1), _STAMPS)
-            if digest == entry.digests.get(str(number)) and len(rows) == len(table.parts):
+            most = len(table.parts) * _STAMP.itemsize
+            rows = np.frombuffer(decompressobj().decompress(packed, most + 1), _STAMP)
+            is_ours = digest.decode() == entry.digests.get(str(number))
+            if is_ours and len(rows) == len(table.parts):
                 return rows
         return None
 
     # Bounds.
 
     def bounds(self, kind: str) -> dict[str, Ends]:
-        """Known bounds of one kind, by recording; see `note_bounds`."""
+        """Known bounds of one kind, by content; see `note_bounds`."""
         with self._lock:
-            found = {
-                recording: ends
-                for number, part in self._parts.items()
-                for recording, ends in part.bounds_of(f"{BOUNDS}{kind}").items()
-                if self._places.get(recording) == number
-            }
-            noted = self._noted.get(kind, {})
-            return found | {recording: ends for recording, (_, ends) in noted.items()}
+            body = self._cells.read(_BOUNDS, kind) or b""
+            if kind not in self._bounds or self._bounds[kind][0] != body:
+                self._bounds[kind] = body, _ends(body)
+            return self._bounds[kind][1] | self._noted.get(kind, {})
 
     def note_bounds(self, kind: str, entry: RecordingEntry, ends: Ends) -> None:
         """Note the bounds of numbers of a recording; they are written when this is closed.
@@ -1127,63 +721,32 @@ class Catalog:
         with self._lock:
             if sum(map(len, self._noted.values())) >= _MAX_NOTED:
                 self._noted.clear()
-            self._noted[kind][entry.id] = content_of(entry.digests), ends
+            self._noted[kind][content_of(entry)] = ends
 
-    def _drop_noted(self, recordings: Iterable[str]) -> None:
-        for noted in self._noted.values():
-            for recording in recordings:
-                noted.pop(recording, None)
-
-    def _store_noted(self) -> None:
-        """Write bounds that were noted, of as many recordings as takes a second."""
+    def _write_bounds(self) -> None:
         noted, self._noted = self._noted, defaultdict(dict)
-        recordings = {recording for own in noted.values() for recording in own}
-        places = sorted({self._places[one] for one in recordings & self._places.keys()})
-        chosen = {*places[:_MAX_BOUNDED_PARTS]}
 
-        def change(recording: str, row: dict[str, str]) -> None:
-            known = _content_of(row)
-            own = {
-                f"{BOUNDS}{kind}": json.dumps(found[recording][1], separators=(",", ":"))
-                for kind, found in noted.items()
-                if recording in found and found[recording][0] == known
-            }
-            part = self._parts[self._places[recording]]
-            room = (_MAX_BOUNDED_BYTES - part.size) // (_BOUND_BYTES * len(part.summaries))
-            if room <= 0:
-                for kind in [kind for kind in row if kind.startswith(BOUNDS)]:
-                    del row[kind]
-            row.update([*own.items()][-max(room, 1) :])
+        def merged() -> Iterator[Statement]:
+            held = {*self._cells.each(_BOUNDS)} - noted.keys()
+            for kind in [*held][_MAX_KINDS - len(noted) :]:
+                yield drop(_BOUNDS, kind)
+            for kind, own in noted.items():
+                found = _ends(self._cells.read(_BOUNDS, kind) or b"")
+                yield put(_BOUNDS, kind, _body(dict([*{**found, **own}.items()][-_MAX_NOTED:])))
 
-        self._note([one for one in recordings if self._places.get(one) in chosen], change)
+        if noted:
+            self._write(make=merged, wait_s=_NOTING_S)
 
     # Schemas.
-
-    def _put_schemas(self, schemas: Collection[Schema]) -> None:
-        known = {schema_hash(schema): schema for schema in schemas}
-        missing = known.keys() - self.schemas(known).keys()
-        if missing:
-            with self._changing():
-                for digest in missing:
-                    schema = known[digest]
-                    head = json.dumps([schema.name, schema.encoding]).encode()
-                    self._folder.write(f"{_SCHEMA}{digest}", head + b"\n" + bytes(schema.data))
 
     def schemas(self, hashes: Collection[str]) -> dict[str, Schema]:
         """Schemas by hash, without missing or damaged ones."""
         found: dict[str, Schema] = {}
         for digest in hashes:
-            head, _, text = (self._data_of(f"{_SCHEMA}{digest}") or b"").partition(b"\n")
-            with suppress(TypeError, ValueError):
-                name, encoding = json.loads(head)
-                schema = Schema(name, encoding, text)
-                if schema_hash(schema) == digest:
-                    found[digest] = schema
-        if len(found) < len(hashes):
-            for one in [*self._pending.values()]:
-                own = (channel.schema for channel in one.channels.values())
-                known = {schema_hash(schema): schema for schema in own if schema is not None}
-                found |= {digest: known[digest] for digest in known.keys() & {*hashes}}
+            head, _, text = (self._cells.read(_SCHEMA, digest) or b"").partition(b"\n")
+            names = _read(_NAMES_OF, head)
+            if names is not None and schema_hash(schema := Schema(*names, text)) == digest:
+                found[digest] = schema
         return found
 
     # Chunks.
@@ -1247,34 +810,54 @@ class Catalog:
         silent = {c.id for c in entry.channels if not c.has_publish_time}
         return channel_totals(own, None if stamps is None else stamps[begin:end], silent)
 
-    def _invalidate(self, recording: str | None = None) -> None:
-        if recording is None:
-            self._noted.clear()
-            self._tables.drop("table")
-        else:
-            self._drop_noted([recording])
-            self._tables.drop("table", recording)
+    def _invalidate(self, recording: str) -> None:
+        self._tables.drop("table", recording)
 
 
-def _are_topics(kind: str, key: str, text: str) -> bool:
-    """True for the set of topics that a hash belongs to."""
-    if kind != TOPICS or hash_of(text) != key:
-        return False
-    with suppress(TypeError, ValueError):
-        return all(isinstance(word, str) for one in topics_from_json(text) for word in one)
-    return False
+def _body(values: object) -> bytes:
+    # In ASCII: the name of a file may not be UTF-8.
+    return json.dumps(values, separators=(",", ":")).encode("ascii")
 
 
-def content_of(digests: Mapping[str, str]) -> str:
+_SUMMARY_OF: Final = Decoder(RecordingSummary)
+_TOPICS_OF: Final = Decoder(tuple[TopicType, ...])
+_ENTRY_OF: Final = Decoder(tuple[str, RecordingEntry])
+_INDEX_OF: Final = Decoder(tuple[str, list[tuple[Int, Int, str]]])
+_NAMES_OF: Final = Decoder(tuple[str, str])
+
+
+def _read(decoder: Decoder[_T], body: bytes | None) -> _T | None:
+    """The value of a cell; None if it is of another kind."""
+    if not body:
+        return None
+    try:
+        return decoder.decode(body)
+    except (ValueError, RecursionError):  # a name may not be UTF-8
+        with suppress(ValueError, RecursionError):
+            found: _T = convert(json.loads(body), decoder.type)
+            return found
+    return None
+
+
+def _ends(body: bytes) -> dict[str, Ends]:
+    """Bounds by content, without those that are none."""
+    with suppress(TypeError, ValueError, RecursionError, AttributeError):
+        # Numbers of any size stay exact, which `msgspec` makes floats.
+        return {
+            content: (low, high)
+            for content, (low, high) in json.loads(body).items()
+            if {type(low), type(high)} <= {int, float} or low is high is None
+        }
+    return {}
+
+
+def _schema_body(schema: Schema) -> bytes:
+    return _body([schema.name, schema.encoding]) + b"\n" + bytes(schema.data)
+
+
+def content_of(entry: RecordingEntry) -> str:
     """A hash of the content of a recording's segments, by their digests."""
-    return hash_of(json.dumps(sorted(digests.items())))
-
-
-def _content_of(row: Mapping[str, str]) -> str:
-    """The same of a row; empty without an entry."""
-    with suppress(KeyError, TypeError, ValueError, AttributeError):
-        return content_of(json.loads(row[ENTRY])[1]["digests"])
-    return ""
+    return hash_of(json.dumps(sorted(entry.digests.items())))
 
 
 def schema_hash(schema: Schema) -> str:

@@ -135,7 +135,7 @@ class RecordingGoneError(StoreError):
 
 
 class CatalogError(StoreError):
-    """The catalog is damaged or incomplete. It is rebuilt from the files."""
+    """A segment is not the one that the catalog knows. Its files are read again."""
 
 
 class IndexChangedError(StoreError):

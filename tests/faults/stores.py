@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 import re
 import shutil
+import sqlite3
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ from hybridlog.entries import describe_now, take_inventory
 from hybridlog.maintenance.lease import place_of
 from hybridlog.record.losses import losses_of
 from hybridlog_storage.catalog import CATALOG, RecordingEntry
-from hybridlog_storage.catalog_parts import ENTRY, PartContent
+from hybridlog_storage.cells import put
 from hybridlog_storage.disk.directory import StoreDirectory
 from hybridlog_storage.mongo.collection_names import CATALOG_PREFIX
 from hybridlog_storage.mongo.database import Database
@@ -100,13 +101,13 @@ class Prepared:
         if not (path / CATALOG).exists():
             return
         old, new = StoreDirectory(self.path), StoreDirectory(path)
-        for file in (path / CATALOG).glob("part-*"):
-            content = PartContent.from_bytes(new.settings.store_id, file.read_bytes())
-            for row in content.rows.values():
-                looks, entry = json.loads(row[ENTRY])
+        with closing(sqlite3.connect(path / CATALOG)) as catalog, catalog:
+            rows = catalog.execute("SELECT key, body FROM cells WHERE kind = 'entry'").fetchall()
+            for recording, body in rows:
+                looks, entry = json.loads(body)
                 if looks == old.listing(entry["label"]).print:
-                    row[ENTRY] = json.dumps([new.listing(entry["label"]).print, entry])
-            file.write_bytes(content.to_bytes(new.settings.store_id))
+                    now = json.dumps([new.listing(entry["label"]).print, entry])
+                    catalog.execute(*put("entry", recording, now.encode()))
 
     @contextmanager
     def copy(self, server: Server, path: Path) -> Iterator[Case]:
@@ -306,7 +307,7 @@ def _files(path: Path) -> frozenset[str]:
     found = {str(p.relative_to(recordings)) for p in recordings.rglob("*")}
     found |= {f"../{p.name}" for p in path.iterdir()}
     return frozenset(name for name in found if Path(name).name not in _ANY_FILE) - {
-        "../catalog",
+        "../catalog.sqlite",
         "../hybridlog.toml",
         "../recordings",
         "../tables",

@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 import shutil
-import threading
 import time
 from collections.abc import Iterator
-from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
 
 import hybridlog as hl
-from hybridlog.entries import describe, put_entry, take_inventory
-from hybridlog.maintenance.opening import open_catalog
+from hybridlog.entries import put_entry
 from hybridlog.maintenance.report import RepairReport
 from hybridlog.maintenance.verify import verify
 from hybridlog.record.losses import Cause
 from hybridlog.record.running import RunningRecording
-from hybridlog_storage.catalog import RecordingEntry, stamps_of
+from hybridlog_storage.catalog import RecordingEntry
 from hybridlog_storage.disk.directory import StoreDirectory
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings
@@ -128,36 +125,11 @@ def test_a_segment_that_begins_in_the_tick_of_a_look_is_found(
     assert (follower.entry.messages == COUNT) == (age_s == 0)
 
 
-@pytest.mark.parametrize("is_noted", [True, False])
-def test_a_segment_that_is_about_to_be_noted_is_no_problem(
-    running: Running, is_noted: bool
-) -> None:
+def test_a_segment_that_is_about_to_be_noted_is_no_problem(running: Running) -> None:
     """A recorder seals a segment first, and then tells the catalog."""
     with hl.open(running.path.parent / "store", mongo=NO_MONGODB) as reader:
         catalog, directory = reader.session.catalog, reader.directory
         catalog.remove(running.entry.id)
-        noting = threading.Timer(0.3, lambda: put_entry(directory, catalog, "live", is_open=True))
-        if is_noted:
-            noting.start()
-        found = verify(directory, catalog, None, RepairReport(), labels=["live"]).findings
-        assert {one.place for one in found} == (set() if is_noted else {"catalog"})
-        if is_noted:
-            noting.join()
-        else:
-            noting.function()
-
-
-def test_an_entry_from_before_its_messages_were_decoded_is_no_problem(running: Running) -> None:
-    with hl.open(running.path.parent / "store", mongo=NO_MONGODB) as reader:
-        catalog, directory = reader.session.catalog, reader.directory
-        inventory = take_inventory(directory, "live")
-        with closing(open_catalog(directory, in_memory=True)) as empty:
-            found = describe(empty, inventory, is_open=True)
-        catalog.put(found)
-        assert not found.entry.is_decoded
-        tables = [(n, one.digest, one.table) for n, one in inventory.summaries.items()]
-        decoded = [(n, digest, stamps_of(table, {})) for n, digest, table in tables]
-        catalog.put_stamps(running.entry.id, decoded)
         assert not verify(directory, catalog, None, RepairReport(), labels=["live"]).findings
         put_entry(directory, catalog, "live", is_open=True)
 

@@ -451,7 +451,6 @@ def test_recordings_are_listed_beside_their_tables(recorded: hl.Store, tmp_path:
         lambda store: store.edit("log", name="first"),
         lambda store: store.mark("first", BASE, "here"),
         lambda store: store.remove("other"),
-        lambda store: store.catalog.rebuild() or store.refresh(),
     ]
     for change in changes:
         with hl.open(place, mongo=NONE) as store:
@@ -459,11 +458,6 @@ def test_recordings_are_listed_beside_their_tables(recorded: hl.Store, tmp_path:
             change(store)
             assert not path.exists()
         assert listed(place) == listed_by_command(place) != {}
-    with hl.open(place, mongo=NONE) as store:
-        store.catalog.rebuild()
-    assert not path.exists()  # the catalog lacks a recording
-    with hl.open(place, mongo=NONE):
-        pass
     with hl.open(place, mongo=NONE) as store, store.start("live") as live:
         live.write(Channel("/a", "ros1", STATE), payload(0), log_time=BASE)
         assert listed(place).keys() == listed_by_command(place).keys() == {"first"}

@@ -4,7 +4,7 @@
 <store>/
   hybridlog.toml        format version, id of the store, settings
   recordings/<label>/   one recording: journal, segments, columns; writer.lock while it is written
-  catalog/              derived: recordings and channels
+  catalog.sqlite        derived: recordings and channels
   mongod/               derived: data of the embedded MongoDB
 ```
 
@@ -30,7 +30,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Final
 
 from hybridlog_storage import journal
-from hybridlog_storage.catalog_parts import MemoryFolder
+from hybridlog_storage.cells import Cells
 from hybridlog_storage.disk import durability, files
 from hybridlog_storage.errors import HeldError, SegmentError, StoreError, TopicError, unreadable
 from hybridlog_storage.journal import JOURNAL
@@ -300,8 +300,8 @@ class StoreDirectory:
         """The sentence for a store without recordings."""
         return "The store is empty: `hybridlog record FILE` fills it."
 
-    def catalog_folder(self) -> MemoryFolder | None:
-        """The files of the catalog; None for those in its folder here."""
+    def catalog_cells(self) -> Cells | None:
+        """The cells of the catalog; None for those in its file here."""
         return None
 
     def append(self, label: str, *lines: journal.Event) -> None:

@@ -13,7 +13,7 @@ from __future__ import annotations
 import os
 import secrets
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import chain
 from typing import Any, Final, Literal, NamedTuple
 
@@ -209,12 +209,7 @@ class IndexState:
         if found is None:
             return False
         document = {name: found[name] for name in found if name not in {"_id", "index"}}
-        wanted = replace(entry, label=_label(entry), channels=[])
-        try:
-            same = document.pop("channels") == _mirrored(entry)["channels"]
-            return same and RecordingEntry.from_document({**document, "channels": []}) == wanted
-        except (AttributeError, KeyError, TypeError, ValueError):
-            return False
+        return document == _mirrored(entry)
 
     def put_through(self, key: str, through: Through) -> None:
         """Store that the index of a recording has all documents up to a chunk."""

@@ -6,8 +6,8 @@ names of lists count down, so that the newest is listed first.
 
 ```
 zlib of:
-<one line of JSON: format, store, recordings, tables, and names and sizes of the catalog's files>
-<the catalog's files>
+<one line of JSON: format, store, recordings, tables>
+<the catalog, an SQLite database>
 ```
 """
 
@@ -33,7 +33,6 @@ _LAST: Final = (1 << 64) - 1
 _LABEL: Final = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9._-]{0,99}", re.ASCII)
 _ID: Final = re.compile(r"[0-9a-f]{32}", re.ASCII)
 _PART: Final = re.compile(r"[^/\x00]{1,255}")
-_CATALOG_FILE: Final = re.compile(r"(part|schema)-[0-9a-f]{1,64}", re.ASCII)
 _MAX_DEPTH: Final = 3
 
 
@@ -59,14 +58,14 @@ class StoreList:
         number: Counts states, from 1; 0 before the first.
         recordings: By label.
         tables: The object of each file of fields, by path below `tables`.
-        catalog: The files of the catalog, by name.
+        catalog: The catalog, as an SQLite database.
     """
 
     store: str
     number: int = 0
     recordings: Mapping[str, ListedRecording] = field(default_factory=dict)
     tables: Mapping[str, Object] = field(default_factory=dict)
-    catalog: Mapping[str, bytes] = field(default_factory=dict)
+    catalog: bytes = b""
 
     def to_bytes(self) -> bytes:
         """The content of its object."""
@@ -78,10 +77,9 @@ class StoreList:
                 for label, one in self.recordings.items()
             },
             "tables": _rows(self.tables),
-            "catalog": [[name, len(data)] for name, data in self.catalog.items()],
         }
         line = json.dumps(head, separators=(",", ":")).encode() + b"\n"
-        return zlib.compress(line + b"".join(self.catalog.values()), 6)
+        return zlib.compress(line + self.catalog, 6)
 
     @classmethod
     def from_bytes(cls, store: str, number: int, data: bytes, place: str) -> StoreList:
@@ -110,14 +108,8 @@ class StoreList:
             ids = {one.id for one in found.values()}
             if len(ids) < len(found):
                 raise ValueError("a recording is listed twice")
-            catalog, at = {}, 0
-            for name, size in head["catalog"]:
-                if not 0 <= size <= len(rest) - at:
-                    raise ValueError("the catalog is cut")
-                catalog[_checked(_CATALOG_FILE, name)] = rest[at : at + size]
-                at += size
             tables = _objects(head["tables"], f"{TABLES}/")
-            return cls(store, number, found, tables, catalog)
+            return cls(store, number, found, tables, rest)
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError, zlib.error) as e:
             raise StoreError(f"{place} is damaged: {e}.") from e
 

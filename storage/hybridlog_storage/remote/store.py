@@ -11,6 +11,7 @@ import errno
 import hashlib
 import os
 import re
+import sqlite3
 import stat
 import tempfile
 import threading
@@ -24,7 +25,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Final
 
 from hybridlog_storage import journal
-from hybridlog_storage.catalog_parts import MemoryFolder, Version
+from hybridlog_storage.cells import Cells
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk import files
 from hybridlog_storage.disk.directory import LOCK, PAYLOADS, Listing, StoreDirectory
@@ -297,42 +298,36 @@ def mount(address: str) -> BucketFiles:
         return found
 
 
-class ListedCatalog(MemoryFolder):
-    """The files of a catalog in the newest list; changes stay in memory until the next one."""
+class ListedCells(Cells):
+    """The cells of the catalog in the newest list; changes stay in memory until the next one."""
 
-    def __init__(self, source: BucketFiles) -> None:
-        super().__init__()
+    def __init__(self, source: BucketFiles, store: str) -> None:
         self._source = source
         self._base: StoreList | None = None
         self._is_changing = False
-        self._follow()
+        super().__init__(None, store)
 
-    def _follow(self) -> None:
+    def _use(self) -> sqlite3.Connection:
         now = self._source.list
         if now is not self._base and not self._is_changing:
             self._base = now
-            self._contents = {
-                name: (data, (crc32(data), len(data))) for name, data in now.catalog.items()
-            }
-
-    def versions(self) -> dict[str, Version]:
-        """A value for each file by name, which changes with its content."""
-        self._follow()
-        return super().versions()
+            self._close()
+            self._db = self._in_memory(None, now.catalog)
+        return super()._use()
 
     def begin(self) -> None:
         """Begin a change: what is in memory stays there until its end."""
-        self._follow()
-        self._is_changing = True
+        with self._lock:
+            self._use()
+            self._is_changing = True
 
     def end(self) -> None:
-        """End a change: the newest list has the files again."""
+        """End a change: the newest list has the cells again."""
         self._is_changing = False
         self._base = None
 
-    def contents(self) -> dict[str, bytes]:
-        """All files."""
-        return {name: data for name, (data, _) in self._contents.items()}
+    def close(self, wait_s: float) -> None:
+        """Do nothing: others use the cells, too."""
 
 
 class RemoteDirectory(StoreDirectory):
@@ -361,7 +356,7 @@ class RemoteDirectory(StoreDirectory):
         super().__init__(self.source.path, read_only=read_only)
         self.settings = replace(self.settings, mongo=NONE)
         self.source.look(self.settings.store_id, now=True)
-        self._folder = ListedCatalog(self.source)
+        self._cells = ListedCells(self.source, self.settings.store_id)
         self._after: StoreList | None = None
 
     @classmethod
@@ -424,9 +419,9 @@ class RemoteDirectory(StoreDirectory):
         self.check_writable()
         raise AssertionError(name)
 
-    def catalog_folder(self) -> MemoryFolder | None:
-        """The files of the catalog, from the newest list."""
-        return self._folder
+    def catalog_cells(self) -> Cells | None:
+        """The cells of the catalog, from the newest list."""
+        return self._cells
 
     @property
     def _now(self) -> StoreList:
@@ -510,19 +505,19 @@ class RemoteDirectory(StoreDirectory):
         with self.source.lock:
             self.source.look(self.settings.store_id, now=True)
             before = self._now
-            self._folder.begin()
+            self._cells.begin()
             self.source.is_changing = True
             try:
                 yield
                 if self._now is not before:
-                    self.source.commit(before, replace(self._now, catalog=self._folder.contents()))
+                    self.source.commit(before, replace(self._now, catalog=self._cells.to_bytes()))
             except BaseException:
                 if self._now.number == before.number:
                     self.source.list = before
                 raise
             finally:
                 self.source.is_changing = False
-                self._folder.end()
+                self._cells.end()
 
     def check_changes(self) -> None:
         """Raise if the store was opened for reading only."""
