@@ -130,6 +130,10 @@ class ManifestError(StoreError):
     """A manifest that is damaged. `verify --repair` makes it again."""
 
 
+class RecordingExistsError(StoreError):
+    """A recording that is in the store already."""
+
+
 class RecordingGoneError(StoreError):
     """A recording that is not in the store, or no longer."""
 

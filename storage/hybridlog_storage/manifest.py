@@ -11,7 +11,7 @@ import re
 import secrets
 import time
 from collections.abc import Iterable
-from typing import Annotated, Final, Literal
+from typing import Annotated, Final, Literal, TypeVar
 
 from blake3 import blake3
 from msgspec import UNSET, Meta, Struct, UnsetType, json, structs
@@ -44,6 +44,9 @@ Tags = dict[Key, Text]
 
 class Record(Struct, frozen=True, omit_defaults=True, forbid_unknown_fields=True):
     """A part of a manifest."""
+
+
+_Part = TypeVar("_Part", bound=Record)
 
 
 class Source(Record, frozen=True):
@@ -283,13 +286,18 @@ def is_id(name: str) -> bool:
     return _ID.fullmatch(name) is not None
 
 
-def replace(manifest: Manifest, **values: object) -> Manifest:
-    """The manifest with other values.
+def replace(part: _Part, **values: object) -> _Part:
+    """A manifest, or a part of one, with other values.
 
     Raises:
         ValueError: They do not fit.
     """
-    return structs.replace(manifest, **values)
+    return structs.replace(part, **values)
+
+
+def hasher() -> blake3:
+    """A hasher whose hexadecimal digest is that of a file."""
+    return blake3()
 
 
 def encode(manifest: Manifest) -> bytes:

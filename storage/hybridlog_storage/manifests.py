@@ -32,6 +32,7 @@ from hybridlog_storage.errors import (
     ManifestError,
     ObjectChangedError,
     ObjectExistsError,
+    RecordingExistsError,
     RecordingGoneError,
     StoreError,
     unreadable,
@@ -78,6 +79,20 @@ class Manifests(ABC):
         """
         return _present(self._read(recording)[0])
 
+    def find(self, recording: str) -> Manifest | None:
+        """The newest manifest of a recording; None if there is no such recording.
+
+        Raises:
+            RecordingGoneError: It is being removed.
+            ManifestError: The manifest is damaged.
+            HybridlogError: The store does not answer.
+        """
+        try:
+            found, _ = self._read(recording)
+        except RecordingGoneError:
+            return None
+        return _present(found)
+
     def change(self, recording: str, how: Callable[[Manifest], Manifest]) -> Manifest:
         """Replace a manifest.
 
@@ -106,7 +121,7 @@ class Manifests(ABC):
         """Create manifests; on a disk nobody else can create one meanwhile.
 
         Raises:
-            StoreError: The recording exists.
+            RecordingExistsError: The recording exists.
             HybridlogError: It cannot be written.
         """
 
@@ -240,7 +255,7 @@ class DiskManifests(Manifests):
     def _create(self, manifest: Manifest) -> None:
         data, path = encode(manifest), self._path(manifest.id)
         if _exists(path):
-            raise StoreError(f"There is a recording {manifest.id} already.")
+            raise RecordingExistsError(f"There is a recording {manifest.id} already.")
         folder = self._recordings / manifest.id
         try:
             self._make_lock(folder)
@@ -339,6 +354,7 @@ class DiskManifests(Manifests):
     def _forget(self, recording: str) -> None:
         # A copy may have created it anew meanwhile, if somebody else has finished the removal.
         # A change makes no lock where there is no manifest, so the folder is empty in the end.
+        _make_file(self._folder / _ALL)  # copies of a store may leave out what is empty
         with _locked(self._folder / _ALL):
             with suppress(RecordingGoneError):
                 if self._read(recording)[0].status != "removed":
@@ -375,7 +391,7 @@ class BucketManifests(Manifests):
         try:
             self._bucket.create(_object(manifest.id), encode(manifest))
         except ObjectExistsError:
-            raise StoreError(f"There is a recording {manifest.id} already.") from None
+            raise RecordingExistsError(f"There is a recording {manifest.id} already.") from None
 
     def _get(self, recording: str) -> tuple[bytes, str]:
         about, data = self._bucket.read_whole(_object(recording), MAX_BYTES)

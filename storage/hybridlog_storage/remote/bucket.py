@@ -112,7 +112,7 @@ class Bucket:
             raise UsageError(f"{address!r} is not the address of a bucket, as s3://lab/store is.")
         self.address = address.rstrip("/")
         self.lost: set[Object] = set()
-        self._has_conditions = False
+        self._has_conditions = self._replaces = False
         self._has_digests = True
         self._reading = _opened(self.address, _READ_S)
 
@@ -262,8 +262,25 @@ class Bucket:
             ObjectChangedError: It has another one.
             BucketError: The server does not answer, refuses, or ignores conditions.
         """
-        self.check_conditions()
+        self._check_replaces()
         self._put(name, content, {"e_tag": version})
+
+    def _check_replaces(self) -> None:
+        """Try once, in one request, whether the server honours the condition of `replace`."""
+        from obstore.exceptions import NotSupportedError
+
+        if self._has_conditions or self._replaces:
+            return
+        name = f"probe-{secrets.token_hex(8)}"
+        try:
+            self._put(name, b"", {"e_tag": f'"{_ANY_MD5}"'})  # of what does not exist
+            self.delete([name])
+        except (FileNotFoundError, ObjectChangedError):
+            self._replaces = True
+            return
+        except NotSupportedError:
+            pass
+        self.check_conditions()
 
     def create_beside(self, name: str, content: bytes) -> Object:
         """Create an object, under another name if this one is taken by other content.
@@ -302,6 +319,38 @@ class Bucket:
         for piece in pieces:
             upload.write(piece)
         return upload.close()
+
+    def put(self, name: str, size: int, pieces: Iterable[Buffer]) -> Object:
+        """Write an object, which takes the place of one of its name; not if `pieces` raises.
+
+        Args:
+            name: Its name.
+            size: Its bytes; many go in parts.
+            pieces: Its content.
+
+        Raises:
+            BucketError: The server does not answer, refuses, or ignores conditions.
+        """
+        self.check_conditions()
+        if size <= PART_BYTES:
+            content = b"".join(pieces)
+            return Object(name, size, self._put(name, content, "overwrite"), 0)
+        writer = self.in_parts(name)
+        try:
+            with self.explained(name):
+                for piece in pieces:
+                    writer.write(bytes(piece))
+                writer.close()
+        except BaseException as error:
+            with suppress(Exception):  # the first one counts
+                writer.__exit__(type(error), error, error.__traceback__)
+            if isinstance(error, OSError):  # of the writer, which has others than the library
+                raise BucketError(self._problem(name, _reason(error))) from error
+            raise
+        about = self.head(name)
+        if about is None or about.size != size:
+            raise BucketError(f"{self._place(name)} did not arrive.")
+        return about
 
     def in_parts(self, name: str) -> Any:
         """A writer of an object, which takes the place of one of its name."""
