@@ -1,0 +1,489 @@
+"""Places that recordings are copied to and from: the directory of a store, and a bucket.
+
+A place makes a file visible under its name only when all of it has arrived and is proved: its
+bytes were read back, or the server has told their checksum. In a directory it grows beside, as
+`.NAME.part`, where the next copy goes on. A server is a place in `sftp`.
+"""
+
+from __future__ import annotations
+
+import os
+import secrets
+import stat
+import tempfile
+from abc import ABC, abstractmethod
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from hybridlog_storage.disk import durability, files
+from hybridlog_storage.errors import (
+    HeldError,
+    ObjectChangedError,
+    ObjectExistsError,
+    StoreError,
+    unreadable,
+)
+from hybridlog_storage.manifest import hasher
+from hybridlog_storage.manifests import WAIT_S, BucketManifests, DiskManifests
+from hybridlog_storage.remote.bucket import digest_like
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator
+    from contextlib import AbstractContextManager
+
+    from hybridlog_storage.manifest import File
+    from hybridlog_storage.manifests import Manifests
+    from hybridlog_storage.remote.bucket import Bucket, Object
+
+RECORDINGS: Final = "recordings"
+SCHEMAS: Final = "schemas"
+MANIFESTS: Final = "manifests"
+_PIECE: Final = 1 << 20
+_FETCHED: Final = 8 << 20  # bytes that a bucket is asked for
+
+
+class RefusedError(StoreError):
+    """A recording that is not copied; others are."""
+
+
+def digest_of(pieces: Iterable[bytes]) -> str:
+    """The digest of a file, as a manifest has it."""
+    found = hasher()
+    for piece in pieces:
+        found.update(piece)
+    return found.hexdigest()
+
+
+@dataclass(frozen=True, slots=True)
+class Sending:
+    """A file that is sent.
+
+    Attributes:
+        source: The store that has it.
+        recording: Id of its recording.
+        file: As the manifest has it.
+        count: Told of bytes that were sent, or were there already; waits if that is too fast,
+            and is a safe point.
+        limit_rate: Bytes a second, at most; None for no limit.
+    """
+
+    source: Source
+    recording: str
+    file: File
+    count: Callable[[int, bool], None]
+    limit_rate: float | None
+
+    @property
+    def name(self) -> str:
+        """Its path below a store."""
+        return f"{RECORDINGS}/{self.recording}/{self.file.name}"
+
+    def again(self, at: int = 0) -> Iterator[bytes]:
+        """Its bytes from one on.
+
+        Raises:
+            RefusedError: It cannot be read, or has another size.
+        """
+        return self.source.pieces(self.name, at, self.file.bytes)
+
+    def pieces(self, at: int = 0) -> Iterator[bytes]:
+        """The same, as fast as they may go; they are counted."""
+        most = _PIECE if self.limit_rate is None else max(int(self.limit_rate / 4), 1)
+        for piece in self.again(at):
+            for begin in range(0, len(piece), most):
+                part = piece[begin : begin + most]
+                yield part
+                self.count(len(part), True)
+
+    def checked(self) -> Iterator[bytes]:
+        """The same; the last ones only if all have the digest.
+
+        Raises:
+            RefusedError: They have not, or cannot be read.
+        """
+        found, last = hasher(), b""
+        for piece in self.pieces():
+            found.update(piece)
+            if last:
+                yield last
+            last = piece
+        if found.hexdigest() != self.file.digest:
+            raise self.damaged()
+        yield last
+
+    def damaged(self) -> RefusedError:
+        """The error for one whose bytes have another digest than the manifest states."""
+        return RefusedError(
+            f"{self.source.address}/{self.name} is damaged: its bytes do not have the digest that "
+            "the manifest states. `hybridlog verify` shows where."
+        )
+
+
+class Place(ABC):
+    """A store that recordings are copied to.
+
+    Attributes:
+        address: What people call it.
+        manifests: Its manifests.
+    """
+
+    address: str
+    manifests: Manifests
+
+    @abstractmethod
+    def working(self, recording: str) -> AbstractContextManager[None]:
+        """Copy into a recording; where there are locks, nobody else does meanwhile.
+
+        Raises:
+            HeldError: Another process copies it.
+            HybridlogError: The place cannot be written or reached.
+        """
+
+    @abstractmethod
+    def sizes(self, folder: str) -> dict[str, int]:
+        """Bytes of each ordinary file of a folder, by name.
+
+        Raises:
+            HybridlogError: The place does not answer.
+        """
+
+    @abstractmethod
+    def put(self, name: str, content: bytes) -> None:
+        """Write a small file, unless there is one of its name.
+
+        Raises:
+            HybridlogError: It cannot be written.
+        """
+
+    @abstractmethod
+    def send(self, sent: Sending) -> None:
+        """Bring a file, and prove it; it takes the place of one of its name.
+
+        Raises:
+            RefusedError: It is damaged at the source.
+            HybridlogError: It cannot be written, or did not arrive.
+        """
+
+    @abstractmethod
+    def drop(self, name: str) -> None:
+        """Delete what has arrived of a file that is no longer to come."""
+
+    @abstractmethod
+    def is_whole(self, sent: Sending) -> bool:
+        """True if a file that is there has the digest; it is on the disk then."""
+
+
+class Source(Place):
+    """A store that recordings are copied from, too."""
+
+    @abstractmethod
+    def pieces(self, name: str, at: int, size: int | None) -> Iterator[bytes]:
+        """Bytes of a file.
+
+        Args:
+            name: Its path below the store.
+            at: The first one.
+            size: The bytes that it must have, if they are known.
+
+        Raises:
+            RefusedError: It is missing, or has another size.
+            HybridlogError: The place does not answer.
+        """
+
+    @abstractmethod
+    def marked(self, recording: str) -> AbstractContextManager[str]:
+        """Make a hidden file beside those of a recording, for a moment; gives its name."""
+
+    @contextmanager
+    def opened(self, name: str, size: int) -> Iterator[int]:
+        """A handle of a file, or of a copy of it that is gone in the end; errors as `pieces`."""
+        with tempfile.TemporaryFile() as file:
+            os.fchmod(file.fileno(), 0o666)  # which copies of it have, less their umask
+            try:
+                for piece in self.pieces(name, 0, size):
+                    file.write(piece)
+                file.flush()
+            except OSError as error:
+                folder = Path(tempfile.gettempdir())
+                raise durability.explain(error, folder, "copying by way of") from error
+            yield file.fileno()
+
+
+class Directory(Source):
+    """The directory of a store.
+
+    Args:
+        path: The store.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.address = str(path)
+        self.manifests = DiskManifests(path)
+        self._path = path
+
+    @contextmanager
+    def working(self, recording: str) -> Iterator[None]:
+        """As of `Place`; a removal may take the folder that is locked."""
+        folder = self._path / RECORDINGS / recording
+        is_held = False
+        while not is_held:
+            with ExitStack() as held:
+                try:
+                    self._make_folders(folder)
+                    before = files.status(folder)
+                    held.enter_context(files.locked_folder(folder, WAIT_S))
+                    with suppress(FileNotFoundError):
+                        is_held = os.path.samestat(before, files.status(folder))
+                except BlockingIOError:
+                    raise HeldError(
+                        f"Another process copies {recording} into {self.address} at this moment.",
+                        is_recording=False,
+                    ) from None
+                except FileNotFoundError:
+                    if not os.path.lexists(self._path):
+                        raise StoreError(f"There is no store {self.address}.") from None
+                    continue  # it was removed meanwhile
+                except OSError as error:
+                    raise durability.explain(error, folder, "copying into") from error
+                if is_held:
+                    yield
+
+    def _make_folders(self, recording: Path) -> None:
+        for folder in (RECORDINGS, SCHEMAS, MANIFESTS):
+            with suppress(FileExistsError):
+                files.make_folder(self._path / folder)
+        files.sync_folder(self._path)
+        with suppress(FileExistsError):
+            files.make_folder(recording)
+
+    def sizes(self, folder: str) -> dict[str, int]:
+        """As of `Place`."""
+        path = self._path / folder
+        try:
+            found = files.names(path).items()
+        except FileNotFoundError:
+            return {}
+        except OSError as error:
+            raise unreadable(error, path) from error
+        return {name: about.st_size for name, about in found if stat.S_ISREG(about.st_mode)}
+
+    def put(self, name: str, content: bytes) -> None:
+        """As of `Place`."""
+        path = self._path / name
+        try:
+            if path.name not in files.names(path.parent):
+                files.write_file(path, content)
+        except OSError as error:
+            raise durability.explain(error, path, "copying into") from error
+
+    def send(self, sent: Sending) -> None:
+        """As of `Place`; goes on behind the last byte that is there."""
+        final = self._path / sent.name
+        part = final.with_name(f".{final.name}.part")
+        try:
+            fd = files.open_file(part, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK)
+            try:
+                if not _fill(fd, sent):
+                    files.system.truncate(fd, 0)
+                    raise sent.damaged()
+                durability.sync_file(fd)
+                if digest_of(read(fd, 0, sent.file.bytes)) != sent.file.digest:
+                    raise StoreError(f"{final} did not arrive as it was sent. Copy again.")
+            finally:
+                os.close(fd)
+            durability.publish(part, final)
+        except OSError as error:
+            raise durability.explain(error, final, "copying into") from error
+
+    def drop(self, name: str) -> None:
+        """As of `Place`."""
+        with suppress(OSError):
+            files.unlink(self._path / name)
+
+    def is_whole(self, sent: Sending) -> bool:
+        """As of `Place`."""
+        path = self._path / sent.name
+        try:
+            with _file(path) as fd:
+                if digest_of(read(fd, 0, sent.file.bytes)) != sent.file.digest:
+                    return False
+                durability.sync_file(fd)
+            files.sync_folder(path.parent)
+        except FileNotFoundError:
+            return False
+        except OSError as error:
+            raise unreadable(error, path) from error
+        return True
+
+    def pieces(self, name: str, at: int, size: int | None) -> Iterator[bytes]:
+        """As of `Source`."""
+        with self._opened(name, size) as fd:
+            pieces = read(fd, at, os.fstat(fd).st_size)
+            while piece := readable(pieces, f"{self.address}/{name}"):
+                yield piece
+
+    @contextmanager
+    def opened(self, name: str, size: int) -> Iterator[int]:
+        """As of `Source`."""
+        with self._opened(name, size) as fd:
+            yield fd
+
+    @contextmanager
+    def _opened(self, name: str, size: int | None) -> Iterator[int]:
+        path = self._path / name
+        with ExitStack() as stack:
+            try:
+                with files.folder(path.parent.parent):
+                    fd = stack.enter_context(_file(path))
+                found = os.fstat(fd).st_size
+            except OSError as error:
+                raise RefusedError(f"{path} cannot be copied: {error.strerror}.") from error
+            if size is not None and found != size:
+                raise RefusedError(f"{path} is damaged: it has {found} bytes instead of {size}.")
+            yield fd
+
+    @contextmanager
+    def marked(self, recording: str) -> Iterator[str]:
+        """As of `Source`."""
+        path = self._path / RECORDINGS / recording / f".copying-{secrets.token_hex(8)}"
+        try:
+            os.close(files.open_file(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL))
+        except OSError as error:
+            raise durability.explain(error, path, "copying from") from error
+        try:
+            yield path.name
+        finally:
+            with suppress(OSError):
+                files.unlink(path)
+
+
+class BucketStore(Source):
+    """A store in a bucket.
+
+    Args:
+        bucket: The objects below its address.
+    """
+
+    def __init__(self, bucket: Bucket) -> None:
+        self.address = bucket.address
+        self.manifests = BucketManifests(bucket)
+        self._bucket = bucket
+        self._found: dict[str, Object] = {}
+
+    @contextmanager
+    def working(self, recording: str) -> Iterator[None]:
+        """As of `Place`; here several may, since all of them write the same."""
+        yield
+
+    def sizes(self, folder: str) -> dict[str, int]:
+        """As of `Place`; 1,000 a request."""
+        found = {one.name: one for one in self._bucket.objects(f"{folder}/")}
+        self._found |= found
+        return {name.removeprefix(f"{folder}/"): one.size for name, one in found.items()}
+
+    def put(self, name: str, content: bytes) -> None:
+        """As of `Place`."""
+        with suppress(ObjectExistsError):
+            self._bucket.create(name, content)
+
+    def send(self, sent: Sending) -> None:
+        """As of `Place`; from its first byte on."""
+        self._found[sent.name] = self._bucket.put(sent.name, sent.file.bytes, sent.checked())
+        if not self.is_whole(sent):
+            raise StoreError(f"{self.address}/{sent.name} did not arrive as it was sent.")
+
+    def drop(self, name: str) -> None:
+        """As of `Place`."""
+        self._bucket.delete([name])
+
+    def is_whole(self, sent: Sending) -> bool:
+        """As of `Place`: by the checksum of the server, or it is read."""
+        about = self._found[sent.name]
+        self._bucket.check_conditions()  # tells whether the server has checksums
+        try:
+            with suppress(RefusedError):  # what is damaged here may be whole there
+                found = self._bucket.digest(about)
+                if found == digest_like(found, sent.again()):
+                    return True
+            return digest_of(self._bucket.pieces(about)) == sent.file.digest
+        except (FileNotFoundError, ObjectChangedError):
+            return False
+
+    def pieces(self, name: str, at: int, size: int | None) -> Iterator[bytes]:
+        """As of `Source`."""
+        about = self._found.get(name) or self._bucket.head(name)
+        where = f"{self.address}/{name}"
+        if about is None:
+            raise RefusedError(f"{where} cannot be copied: there is no such object.")
+        if size is not None and about.size != size:
+            raise RefusedError(f"{where} is damaged: it has {about.size} bytes instead of {size}.")
+        for begin in range(at, about.size, _FETCHED):
+            part = begin, min(begin + _FETCHED, about.size)
+            try:
+                yield self._bucket.read(name, [part], about.version)[0]
+            except (FileNotFoundError, ObjectChangedError) as error:
+                raise RefusedError(f"{where} has changed meanwhile. Copy again.") from error
+
+    @contextmanager
+    def marked(self, recording: str) -> Iterator[str]:
+        """As of `Source`."""
+        name = f".copying-{secrets.token_hex(8)}"
+        whole = f"{RECORDINGS}/{recording}/{name}"
+        try:
+            self._bucket.put(whole, 0, ())
+            yield name
+        finally:
+            self._bucket.delete([whole])
+
+
+def _fill(fd: int, sent: Sending) -> bool:
+    """Write a file behind what is there of it, or else anew; True if it has the digest."""
+    about, size = os.fstat(fd), sent.file.bytes
+    if not stat.S_ISREG(about.st_mode):
+        raise OSError(0, "it is not an ordinary file")
+    begins = [about.st_size, 0] if 0 < about.st_size <= size else [0]  # the end may be torn
+    return any(digest_of(_written(fd, sent, at)) == sent.file.digest for at in begins)
+
+
+def _written(fd: int, sent: Sending, at: int) -> Iterator[bytes]:
+    """The bytes of a file, as they are written; of the first ones, what is there."""
+    files.system.truncate(fd, at)
+    sent.count(at, False)
+    yield from read(fd, 0, at)
+    os.lseek(fd, at, os.SEEK_SET)
+    for piece in sent.pieces(at):
+        durability.write_all(fd, [piece])
+        yield piece
+
+
+@contextmanager
+def _file(path: Path) -> Iterator[int]:
+    """A handle of an ordinary file."""
+    fd = files.open_file(path, os.O_RDONLY | os.O_NONBLOCK)
+    try:
+        if not stat.S_ISREG(os.fstat(fd).st_mode):
+            raise OSError(0, "it is not an ordinary file")
+        yield fd
+    finally:
+        os.close(fd)
+
+
+def readable(pieces: Iterator[bytes], name: str) -> bytes:
+    """The next bytes of a file that is copied; none at its end.
+
+    Raises:
+        RefusedError: It cannot be read.
+    """
+    try:
+        return next(pieces, b"")
+    except OSError as error:
+        raise RefusedError(f"{name} cannot be copied: {error.strerror}.") from error
+
+
+def read(fd: int, at: int, end: int) -> Iterator[bytes]:
+    """Bytes of an open file, a megabyte at a time."""
+    while at < end and (piece := os.pread(fd, min(_PIECE, end - at), at)):
+        yield piece
+        at += len(piece)

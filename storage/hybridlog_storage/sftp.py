@@ -1,0 +1,548 @@
+"""A store on a server, as a place to copy to: OpenSSH's own programs, nothing to install there.
+
+`sftp` brings files, and goes on at the last byte that is there. If a shell with `flock` and
+`sha256sum` answers, it is as in a directory: the folder of the recording is locked meanwhile,
+what has arrived is proved there, and a manifest is replaced under its lock if it is unchanged.
+
+Where only sftp is allowed, what has arrived is read back. Copies wait for each other while they
+replace a manifest, by making the folder `manifests/.copying-<id>`; but an edit by a program on
+the server between the last look at the manifest and its replacement is lost.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import random
+import re
+import secrets
+import shlex
+import subprocess
+import tempfile
+import time
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Final, Self
+from urllib.parse import unquote, urlsplit
+
+from hybridlog_storage.copy_places import MANIFESTS, RECORDINGS, SCHEMAS, Place, read, readable
+from hybridlog_storage.errors import (
+    HeldError,
+    HybridlogError,
+    ObjectChangedError,
+    RecordingExistsError,
+    StoreError,
+    UsageError,
+)
+from hybridlog_storage.manifest import MAX_BYTES, Manifest, encode, hasher, is_id
+from hybridlog_storage.manifests import WAIT_S, Manifests
+from hybridlog_storage.stopping import pause, safe_point
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+    from contextlib import AbstractContextManager
+
+    from hybridlog_storage.copy_places import Sending
+
+DEFAULT_SSH: Final = "ssh -o ServerAliveInterval=15"
+"""Notices within a minute that a connection is dead."""
+_POLL_S: Final = 0.05
+_NOT_REACHED: Final = 255  # exit code of ssh
+_CHANGED: Final = 9  # exit code of our scripts
+_SHARED_S: Final = 15  # a connection without users stays for so long
+_SIZE: Final = re.compile("[0-9]{1,18}")
+_MAX_SAID: Final = 64 << 20  # bytes that a program may print
+_LOOK: Final = "flock -w 9 . true && sha256sum < /dev/null > /dev/null && echo hybridlog"
+
+
+class Server(Place):
+    """A store on a server. A context manager.
+
+    Args:
+        url: `ssh://user@host:port/path`; `/~/path` is below the home directory.
+        ssh: The ssh program, with options; None for `ssh`.
+
+    Attributes:
+        has_shell: Whether it runs the programs that give a directory's promises.
+
+    Raises:
+        UsageError: It is no such URL.
+    """
+
+    def __init__(self, url: str, ssh: str | None = None) -> None:
+        self.address = url
+        self.manifests = _ServerManifests(self)
+        self._ssh = shlex.split(ssh or DEFAULT_SSH)
+        self._host, self._options, self._root = _parts(url)
+        self._held = ExitStack()
+        self._scratch = Path()
+        self._found: dict[str, int] = {}  # by path, of the folder that was listed last
+        self.has_shell = False
+
+    def __enter__(self) -> Self:
+        self._scratch = Path(self._held.enter_context(tempfile.TemporaryDirectory(prefix="hl-")))
+        # One login for all that follows.
+        self._options += [
+            *("-o", "ControlMaster=auto"),
+            *("-o", f'ControlPath="{self._scratch}/login"'),
+            *("-o", f"ControlPersist={_SHARED_S}"),
+        ]
+        program = self._scratch / "ssh"
+        program.write_text(f'#!/bin/sh\nexec {shlex.join(self._ssh)} "$@"\n')
+        program.chmod(0o700)
+        self._held.callback(self._end)
+        try:
+            self.sftp()
+            with suppress(StoreError):  # ssh says the same if there is none
+                self.has_shell = self.shell(_LOOK)[1].endswith("hybridlog\n")
+        except BaseException:
+            self._held.close()
+            raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._held.close()
+
+    def _end(self) -> None:
+        with suppress(OSError, subprocess.TimeoutExpired):
+            words = [*self._ssh, *self._options, "-O", "exit", self._host]
+            subprocess.run(words, capture_output=True, check=False, timeout=10)  # noqa: S603
+
+    @contextmanager
+    def working(self, recording: str) -> Iterator[None]:
+        """As of `Place`; with a shell, as of a directory there."""
+        folders = (RECORDINGS, SCHEMAS, MANIFESTS, f"{RECORDINGS}/{recording}")
+        self.sftp(*(f"-mkdir {folder}" for folder in folders))
+        with ExitStack() as held:
+            if self.has_shell:
+                held.enter_context(self._locked(recording))
+            yield
+
+    @contextmanager
+    def _locked(self, recording: str) -> Iterator[None]:
+        """Hold the lock of a recording; it goes with the connection, too."""
+        script = f"exec flock -w {WAIT_S:.0f} {RECORDINGS}/{recording} sh -c 'echo locked; cat'"
+        with self._ssh_process(script) as (process, said, errors):
+            while not os.fstat(said.fileno()).st_size:
+                if process.poll() is not None:
+                    self._check_reached(process, errors)
+                    raise HeldError(
+                        f"Another process copies {recording} to {self.address} at this moment.",
+                        is_recording=False,
+                    )
+                pause(_POLL_S)
+            yield
+
+    def sizes(self, folder: str) -> dict[str, int]:
+        """As of `Place`."""
+        rows = (row.split() for row in self.sftp(f"-ls -lna {folder}"))
+        found = {
+            row[-1].rpartition("/")[2]: int(row[4])
+            for row in rows
+            if len(row) > 5 and row[0].startswith("-") and _SIZE.fullmatch(row[4])
+        }
+        self._found = {f"{folder}/{name}": size for name, size in found.items()}
+        return found
+
+    def put(self, name: str, content: bytes) -> None:
+        """As of `Place`."""
+        folder, _, last = f"./{name}".rpartition("/")
+        if last not in self.sizes(folder):
+            self.move(self.put_beside(content, folder), name)
+
+    def put_beside(self, content: bytes, folder: str) -> str:
+        """Write a small file under a hidden name of its own."""
+        name = f"{folder}/.copying-{secrets.token_hex(8)}"
+        with tempfile.TemporaryFile() as file:
+            os.fchmod(file.fileno(), 0o666)  # which it has there, less the umask
+            file.write(content)
+            file.flush()
+            self.sftp(f"put -f {_handle(file.fileno())} {name}", passed=file.fileno())
+        return name
+
+    def move(self, old: str, new: str) -> None:
+        """Rename a file; it takes the place of another one."""
+        self.sftp(f"rename {old} {new}")
+
+    def fetched(self, name: str, most: int) -> bytes | None:
+        """A file, and at most one byte more than it may have; None if there is none."""
+        if not any(row.startswith("-") for row in self.sftp(f"-ls -lna {name}")):
+            return None
+        with self._got(name, most) as path:
+            return path.read_bytes()[: most + 1]
+
+    @contextmanager
+    def _got(self, name: str, most: int) -> Iterator[Path]:
+        """A file that was fetched; one that has more bytes is not fetched to its end."""
+        path = self._scratch / secrets.token_hex(8)
+        try:
+            with suppress(_EnoughError):
+                self.sftp(f'get {name} "{path}"', watch=lambda _: _check_size(path, most))
+            yield path
+        finally:
+            path.unlink(missing_ok=True)
+
+    def send(self, sent: Sending) -> None:
+        """As of `Place`; goes on at the last byte that is there."""
+        file, part = sent.file, f"{RECORDINGS}/{sent.recording}/.{sent.file.name}.part"
+        with sent.source.opened(sent.name, file.bytes) as fd:
+            sha256, digest = _digests(fd, sent.name)
+            if digest != file.digest:
+                raise sent.damaged()
+            there = self._found.pop(part, 0)
+            for at in [there, 0] if 0 < there <= file.bytes else [0]:  # the end may be torn
+                sent.count(at, False)
+                if at < file.bytes or not at:
+                    self._send(fd, part, at, sent)
+                if self._is(part, sha256, sent):
+                    self.move(part, sent.name)
+                    return
+        self.drop(part)
+        raise StoreError(f"{self.address}/{sent.name} did not arrive as it was sent. Copy again.")
+
+    def _send(self, fd: int, part: str, at: int, sent: Sending) -> None:
+        done = at
+
+        def watch(process: int) -> None:
+            nonlocal done
+            now = max(done, min(_position(process, fd), sent.file.bytes))
+            sent.count(now - done, True)
+            done = now
+
+        how = "reput" if at else "put"
+        limit = [] if sent.limit_rate is None else ["-l", str(max(int(sent.limit_rate / 128), 1))]
+        self.sftp(f"{how} -f {_handle(fd)} {part}", passed=fd, watch=watch, options=limit)
+        sent.count(sent.file.bytes - done, True)
+
+    def drop(self, name: str) -> None:
+        """As of `Place`."""
+        self.sftp(f"-rm {name}")
+
+    def is_whole(self, sent: Sending) -> bool:
+        """As of `Place`."""
+        if not self.has_shell:
+            return self._is(sent.name, "", sent)
+        with sent.source.opened(sent.name, sent.file.bytes) as fd:
+            sha256, digest = _digests(fd, sent.name)
+        return digest == sent.file.digest and self._is(sent.name, sha256, sent)
+
+    def _is(self, name: str, sha256: str, sent: Sending) -> bool:
+        """True if a file there has the bytes of one here."""
+        if self.has_shell:
+            code, said = self.shell(f"sha256sum < {name} && sync {name}")
+            return code == 0 and said.split()[:1] == [sha256]
+        with self._got(name, sent.file.bytes) as path, path.open("rb") as found:
+            return _digests(found.fileno(), name)[1] == sent.file.digest
+
+    def sftp(
+        self,
+        *lines: str,
+        passed: int | None = None,
+        watch: Callable[[int], None] = lambda _: None,
+        options: Sequence[str] = (),
+    ) -> list[str]:
+        """Run commands in the folder of the store; what they print.
+
+        Args:
+            lines: The commands; those that begin with `-` may fail.
+            passed: A handle that a command reads.
+            watch: Called now and then with the id of the process; what it raises ends it.
+            options: Of the program.
+
+        Raises:
+            StoreError: The server is not reached, or a command fails.
+        """
+        root = self._root.replace("\\", "\\\\").replace('"', '\\"')
+        script = "\n".join([f'-@mkdir "{root}"', f'@cd "{root}"', *map(_silent, lines), ""])
+        host = self._host
+        if ":" in host:
+            user, at, host = host.rpartition("@")
+            host = f"{user}{at}[{host}]"
+        words = [
+            *("sftp", "-q", "-S", str(self._scratch / "ssh"), *self._options),
+            *("-o", "BatchMode=no", "-b", "-", *options, host),
+        ]
+        with _running(words, passed) as (process, said, errors):
+            assert process.stdin is not None
+            with suppress(BrokenPipeError), process.stdin as stream:
+                stream.write(script.encode())
+            _wait(process, said, watch)
+            self._check_reached(process, errors)
+            if process.returncode:
+                why = _reason(errors)
+                hint = " Is there room?" if "Failure" in why else ""  # all that sftp says of it
+                raise StoreError(f"{self.address}: {why}.{hint}")
+            return _text(said).splitlines()
+
+    def shell(self, script: str) -> tuple[int, str]:
+        """Exit code and output of a script that runs in the folder of the store.
+
+        Raises:
+            StoreError: The server is not reached.
+        """
+        with self._ssh_process(script) as (process, said, errors):
+            assert process.stdin is not None
+            process.stdin.close()
+            _wait(process, said)
+            self._check_reached(process, errors)
+            return process.returncode, _text(said)
+
+    def _ssh_process(self, script: str) -> AbstractContextManager[_Running]:
+        script = f"cd -- {shlex.quote(self._root)} && {script}"
+        command = f"sh -c {shlex.quote(script)}"
+        return _running([*self._ssh, *self._options, self._host, command], None)
+
+    def _check_reached(self, process: subprocess.Popen[bytes], errors: IO[bytes]) -> None:
+        if process.returncode == _NOT_REACHED:
+            raise StoreError(
+                f"{self.address} is not reached: {_reason(errors)}. What arrived stays there: run "
+                "the command again."
+            )
+
+
+class _ServerManifests(Manifests):
+    """The manifests of a store on a server."""
+
+    def __init__(self, server: Server) -> None:
+        self._server = server
+
+    def ids(self) -> list[str]:
+        """Ids of all recordings that have a manifest, sorted."""
+        names = self._server.sizes(MANIFESTS)
+        ids = (name.removesuffix(".json") for name in names if name.endswith(".json"))
+        return sorted(filter(is_id, ids))
+
+    @contextmanager
+    def creating(self) -> Iterator[Callable[[Manifest], None]]:
+        """Create manifests; others may create some meanwhile, but not the same."""
+        yield self._create
+
+    def _create(self, manifest: Manifest) -> None:
+        server, final = self._server, _path(manifest.id)
+        exists = RecordingExistsError(f"There is a recording {manifest.id} already.")
+        with self._beside(encode(manifest)) as new:
+            if server.has_shell:
+                folder = f"{RECORDINGS}/{manifest.id}"
+                self._replaced(
+                    f"{MANIFESTS}/.lock",
+                    f"test -e {final} && exit {_CHANGED}; : >> {folder}/manifest.lock && "
+                    f"{{ sync {folder} {RECORDINGS} || sync; }} && mv {new} {final}",
+                    exists,
+                )
+                return
+            try:
+                server.sftp(f"rename -l {new} {final}")  # not if there is one
+            except StoreError:
+                if server.sizes(MANIFESTS).get(f"{manifest.id}.json") is None:
+                    raise
+                raise exists from None
+
+    def _get(self, recording: str) -> tuple[bytes, str]:
+        data = self._server.fetched(_path(recording), MAX_BYTES)
+        if data is None:
+            raise FileNotFoundError
+        return data, hashlib.sha256(data).hexdigest()
+
+    def _alone(self, recording: str) -> AbstractContextManager[None]:
+        return nullcontext()
+
+    def _replace(self, recording: str, data: bytes, version: str) -> None:
+        server, final = self._server, _path(recording)
+        changed = ObjectChangedError(f"{server.address}/{final} was changed meanwhile.")
+        with self._beside(data) as new:
+            if server.has_shell:
+                folder = f"{RECORDINGS}/{recording}"
+                self._replaced(
+                    f"{folder}/manifest.lock",
+                    f'test "$(sha256sum < {final})" = "{version}  -" || exit {_CHANGED}; '
+                    f"ln -f {final} {folder}/manifest.old; mv {new} {final}",
+                    changed,
+                )
+                return
+            with self._locked(recording):
+                if self._get(recording)[1] != version:
+                    raise changed
+                server.move(new, final)
+
+    def _replaced(self, lock: str, script: str, changed: HybridlogError) -> None:
+        """Run a script there under a lock; names of files are on the disk before and after."""
+        sync = f"{{ sync {lock.rpartition('/')[0]} {SCHEMAS} {MANIFESTS} || sync; }}"
+        script = f"{sync} && {{ {script}; }} && {sync}"
+        code, said = self._server.shell(
+            f"exec flock -w {WAIT_S:.0f} {lock} sh -c {shlex.quote(script)} 2>&1"
+        )
+        if code == _CHANGED:
+            raise changed
+        if code:
+            raise StoreError(
+                f"{self._server.address}: a manifest cannot be written ({said.strip()[:500]}), or "
+                f"another process has held {lock} for {WAIT_S:.0f} s."
+            )
+
+    @contextmanager
+    def _beside(self, data: bytes) -> Iterator[str]:
+        """A file with a new manifest, beside the others until it is renamed."""
+        new = self._server.put_beside(data, MANIFESTS)
+        try:
+            yield new
+        except BaseException:
+            with suppress(StoreError):
+                self._server.drop(new)
+            raise
+
+    @contextmanager
+    def _locked(self, recording: str) -> Iterator[None]:
+        """Keep other copies away, where there is no shell; for less than a second."""
+        server, lock = self._server, f"{MANIFESTS}/.copying-{recording}"
+        end = time.monotonic() + WAIT_S
+        while True:
+            try:
+                server.sftp(f"mkdir {lock}")
+                break
+            except StoreError as error:
+                if time.monotonic() > end:
+                    raise HeldError(
+                        f"{server.address}/{lock} says that another process copies. If none does, "
+                        "remove this folder.",
+                        is_recording=False,
+                    ) from error
+            pause(random.uniform(0, 1))  # noqa: S311 - so that others come first
+        try:
+            yield
+        finally:
+            server.sftp(f"-rmdir {lock}")
+
+    def _old(self, recording: str) -> Manifest | None:
+        return None
+
+    def _drop(self, recording: str) -> None:
+        raise _only_there(self._server)
+
+    def _delete_files(self, recording: str) -> None:
+        raise _only_there(self._server)
+
+    def _forget(self, recording: str) -> None:
+        raise _only_there(self._server)
+
+
+_Running = tuple["subprocess.Popen[bytes]", "IO[bytes]", "IO[bytes]"]
+"""A process, and files with its output and its errors: pipes would stay open with the login."""
+
+
+@contextmanager
+def _running(words: Sequence[str], passed: int | None) -> Iterator[_Running]:
+    """A process; it has ended at the end of the block."""
+    with tempfile.TemporaryFile() as said, tempfile.TemporaryFile() as errors:
+        try:
+            process = subprocess.Popen(  # noqa: S603 - the user named it
+                words,
+                stdin=subprocess.PIPE,
+                stdout=said,
+                stderr=errors,
+                pass_fds=[] if passed is None else [passed],
+                env={**os.environ, "LC_ALL": "C"},
+            )
+        except OSError as error:
+            raise StoreError(f"{words[0]} cannot be started: {error.strerror}.") from error
+        with process:
+            try:
+                yield process, said, errors
+            except BaseException:
+                process.kill()
+                raise
+
+
+def _wait(
+    process: subprocess.Popen[bytes],
+    said: IO[bytes],
+    watch: Callable[[int], None] = lambda _: None,
+) -> None:
+    """Wait for the end of a process; a safe point now and then."""
+    while True:
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(_POLL_S)
+            return
+        safe_point()
+        watch(process.pid)
+        if os.fstat(said.fileno()).st_size > _MAX_SAID:
+            raise StoreError("The server says more than any store has to say.")
+
+
+class _EnoughError(Exception):
+    """A file is larger than it may be."""
+
+
+def _check_size(path: Path, most: int) -> None:
+    with suppress(FileNotFoundError):
+        if path.stat().st_size > most:
+            raise _EnoughError
+
+
+def _text(file: IO[bytes]) -> str:
+    """What a program has printed."""
+    file.seek(0)
+    return file.read(_MAX_SAID).decode(errors="replace")
+
+
+def _reason(errors: IO[bytes]) -> str:
+    """The last lines of what a program has to complain about."""
+    lines = [line.strip() for line in _text(errors).splitlines()]
+    shown = [line for line in lines if line and not line.startswith("remote mkdir")][-2:]
+    return "".join(one for one in "; ".join(shown).rstrip(".") if one.isprintable())[:500]
+
+
+def _silent(line: str) -> str:
+    """A command that is not printed."""
+    return f"-@{line[1:]}" if line.startswith("-") else f"@{line}"
+
+
+def _path(recording: str) -> str:
+    return f"{MANIFESTS}/{recording}.json"
+
+
+def _handle(fd: int) -> str:
+    """A name for an open file, which no other one can take."""
+    os.lseek(fd, 0, os.SEEK_SET)  # some systems give the same place in it
+    return f"/dev/fd/{fd}"
+
+
+def _position(process: int, fd: int) -> int:
+    """How far a process has read an open file, if the system says."""
+    folder, found = Path(f"/proc/{process}"), 0
+    with suppress(OSError, ValueError):
+        for one in (folder / "fd").iterdir():
+            is_it = one.name != str(fd) and os.path.samestat(one.stat(), os.fstat(fd))
+            if is_it:
+                text = (folder / "fdinfo" / one.name).read_text()
+                found = int(text.split()[1])
+    return found
+
+
+def _digests(fd: int, name: str) -> tuple[str, str]:
+    """SHA-256, which servers can work out, and the digest of an open file."""
+    sha256, digest, pieces = hashlib.sha256(), hasher(), read(fd, 0, os.fstat(fd).st_size)
+    while piece := readable(pieces, name):
+        safe_point()
+        sha256.update(piece)
+        digest.update(piece)
+    return sha256.hexdigest(), digest.hexdigest()
+
+
+def _only_there(server: Server) -> StoreError:
+    return StoreError(f"Recordings of {server.address} can only be removed there.")
+
+
+def _parts(url: str) -> tuple[str, list[str], str]:
+    """Host, options of the programs, and path of a URL."""
+    try:
+        parts = urlsplit(url)
+        port, host = parts.port, parts.hostname or ""
+    except ValueError as error:
+        raise UsageError(f"{url!r} is no URL: {error}.") from error
+    user, path = unquote(parts.username or ""), unquote(parts.path).removeprefix("/~/")
+    if not host or host.startswith("-") or user.startswith("-") or not path.strip("/"):
+        raise UsageError(f"Write ssh://user@host/path, not {url!r}.")
+    if parts.password or parts.query or parts.fragment or not (url + path).isprintable():
+        raise UsageError("ssh://user@host/path has no password; ssh asks, or takes a key.")
+    options = [] if port is None else ["-o", f"Port={port}"]
+    return f"{user}@{host}" if user else host, options, path

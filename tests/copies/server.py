@@ -1,0 +1,140 @@
+"""A server that `ssh` and `sftp` reach, in a process of its own, behind a relay that cuts."""
+
+from __future__ import annotations
+
+import select
+import socket
+import subprocess
+import sys
+import threading
+from contextlib import suppress
+from pathlib import Path
+
+_SERVES = """
+import asyncio
+import contextlib
+import sys
+
+import asyncssh
+
+
+async def pass_on(reader, writer):
+    with contextlib.suppress(OSError, asyncssh.Error):
+        while data := await reader.read(1 << 16):
+            writer.write(data)
+            await writer.drain()
+
+
+async def run(process):
+    shell = await asyncio.create_subprocess_shell(
+        process.command,
+        stdin=asyncio.subprocess.PIPE,
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.PIPE,
+    )
+
+    async def feed():
+        await pass_on(process.stdin, shell.stdin)
+        shell.stdin.close()
+
+    feeding = asyncio.create_task(feed())
+    await asyncio.gather(
+        pass_on(shell.stdout, process.stdout), pass_on(shell.stderr, process.stderr)
+    )
+    process.exit(await shell.wait())
+    feeding.cancel()
+
+
+async def main():
+    options = {"process_factory": run, "encoding": None} if sys.argv[2] == "shell" else {}
+    server = await asyncssh.listen(
+        "127.0.0.1",
+        0,
+        server_host_keys=[asyncssh.generate_private_key("ssh-ed25519")],
+        authorized_client_keys=sys.argv[1],
+        sftp_factory=True,
+        **options,
+    )
+    print(server.sockets[0].getsockname()[1], flush=True)
+    await asyncio.Event().wait()
+
+
+asyncio.run(main())
+"""
+
+
+class Sshd:
+    """A server on this machine.
+
+    Args:
+        folder: Where its key is to lie.
+        kind: "shell", or "sftp" for one that runs no commands.
+
+    Attributes:
+        port: That of the relay.
+        ssh: The program that reaches it, with options.
+        left: Bytes from the client until the connections are cut; None for no cut.
+        passed: Bytes from the client so far.
+    """
+
+    def __init__(self, folder: Path, kind: str) -> None:
+        key = folder / "key"
+        make = ["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", str(key)]
+        subprocess.run(make, check=True)
+        self._process = subprocess.Popen(
+            [sys.executable, "-c", _SERVES, f"{key}.pub", kind],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+        )
+        assert self._process.stdout is not None
+        self._server = int(self._process.stdout.readline())
+        self.ssh = (
+            f"ssh -F /dev/null -i {key} -o StrictHostKeyChecking=no -o LogLevel=ERROR "
+            "-o UserKnownHostsFile=/dev/null"
+        )
+        self.left: int | None = None
+        self.passed = 0
+        self._listening = socket.create_server(("127.0.0.1", 0))
+        self.port = self._listening.getsockname()[1]
+        threading.Thread(target=self._serve, daemon=True).start()
+
+    def url(self, path: Path) -> str:
+        return f"ssh://127.0.0.1:{self.port}{path}"
+
+    def reset(self) -> None:
+        self.left, self.passed = None, 0
+
+    def close(self) -> None:
+        self._listening.close()
+        self._process.kill()
+        self._process.wait()
+
+    def _serve(self) -> None:
+        with suppress(OSError):
+            while True:
+                client, _ = self._listening.accept()
+                threading.Thread(target=self._relay, args=(client,), daemon=True).start()
+
+    def _relay(self, client: socket.socket) -> None:
+        with client, socket.create_connection(("127.0.0.1", self._server)) as server:
+            for one in (client, server):
+                one.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            with suppress(OSError):
+                while self._pass_on(client, server):
+                    pass
+
+    def _pass_on(self, client: socket.socket, server: socket.socket) -> bool:
+        for one in select.select([client, server], [], [])[0]:
+            data = one.recv(1 << 16)
+            if not data:
+                return False
+            if one is server:
+                client.sendall(data)
+                continue
+            self.passed += len(data)
+            if self.left is not None:
+                data, self.left = data[: self.left], self.left - len(data[: self.left])
+            server.sendall(data)
+            if self.left == 0:
+                return False
+        return True

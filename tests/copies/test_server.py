@@ -1,0 +1,115 @@
+"""Servers: who is reached how, and what is refused."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+
+import pytest
+
+from hybridlog_storage.copy import copy
+from hybridlog_storage.copy_places import Directory
+from hybridlog_storage.errors import HeldError, StoreError, UsageError
+from hybridlog_storage.manifest import Manifest, Note, replace
+from hybridlog_storage.sftp import Server
+from tests.copies.conftest import RECORDING, Makes, recording
+from tests.copies.server import Sshd
+from tests.copies.test_copy import as_of
+from tests.limits import Limit
+
+
+def test_urls(sshd: dict[str, Sshd], tmp_path: Path) -> None:
+    for wrong in (
+        "ssh://server",
+        "ssh://server/",
+        "ssh:///store",
+        "ssh://-oProxyCommand=x/store",
+        "ssh://-x@server/store",
+        "ssh://me:secret@server/store",
+        "ssh://server:x/store",
+        "ssh://server/store?x",
+        "ssh://server/a%0Ab",
+    ):
+        with pytest.raises(UsageError):
+            Server(wrong)
+    server = sshd["sftp"]
+    with pytest.raises(StoreError, match="not reached"), Server("ssh://127.0.0.1:1/x", server.ssh):
+        pass
+    with (
+        pytest.raises(StoreError, match="no-such"),
+        Server(server.url(tmp_path), "no-such"),
+    ):
+        pass
+    missing = server.url(tmp_path / "missing" / "store")
+    with pytest.raises(StoreError, match="missing/store"), Server(missing, server.ssh):
+        pass
+
+
+@pytest.mark.parametrize("kind", ["shell", "sftp"])
+def test_recordings_are_removed_there_alone(make: Makes, kind: str) -> None:
+    source, target = make("directory"), make(kind)
+    source.begin(recording())
+    assert target.place.manifests.ids() == []
+    copy(source.source, target.place, RECORDING)
+    assert target.place.manifests.ids() == [RECORDING]
+    target.place.manifests.change(RECORDING, lambda now: now)
+    with pytest.raises(StoreError, match="only be removed there"):
+        target.place.manifests._drop(RECORDING)
+
+
+def test_a_lock_that_a_kill_has_left_is_named(make: Makes, limit: Limit) -> None:
+    limit(server_wait_s=0.2)
+    source, target = make("directory"), make("sftp")
+    source.begin(recording())
+    source.place.manifests.change(RECORDING, lambda now: replace(now, **as_of(recording(3))))
+    copy(source.source, target.place, RECORDING)
+    assert target.folder is not None
+    (target.folder / "manifests" / f".copying-{RECORDING}").mkdir()
+    source.place.manifests.change(RECORDING, lambda now: replace(now, **as_of(recording())))
+    with pytest.raises(HeldError, match="remove this folder"):
+        copy(source.source, target.place, RECORDING)
+
+
+def test_a_copy_waits_for_another_one(make: Makes, limit: Limit) -> None:
+    limit(server_wait_s=1, directory_copy_wait_s=0.2)
+    for kind in ("directory", "shell"):
+        source, target = make("directory"), make(kind)
+        source.begin(recording())
+        assert target.folder is not None
+        with Directory(target.folder).working(RECORDING):
+            with pytest.raises(HeldError, match="Another process copies"):
+                copy(source.source, target.place, RECORDING)
+        copy(source.source, target.place, RECORDING)
+        target.check(recording())
+
+
+@pytest.mark.parametrize("kind", ["directory", "bucket", "shell"])
+def test_no_edit_is_lost_while_it_is_copied_again_and_again(make: Makes, kind: str) -> None:
+    source, target = make("directory"), make(kind)
+    source.begin(recording())
+    source.place.manifests.change(
+        RECORDING, lambda now: replace(now, **as_of(recording(1, "open")))
+    )
+    copy(source.source, target.place, RECORDING)
+
+    def note() -> None:
+        manifests = target.manifests()
+        for at in range(30):
+            manifests.change(RECORDING, lambda now, at=at: noted(now, at))
+
+    thread = threading.Thread(target=note)
+    thread.start()
+    for count in range(2, 7):
+        later = recording(count, "open")
+        source.place.manifests.change(
+            RECORDING, lambda now, later=later: replace(now, **as_of(later))
+        )
+        copy(source.source, target.place, RECORDING)
+    thread.join()
+    found = target.check()
+    assert [note.at for note in found.notes] == [*range(30)]
+    assert found.files == recording().files
+
+
+def noted(now: Manifest, at: int) -> Manifest:
+    return replace(now, notes=(*now.notes, Note(at, "")))
