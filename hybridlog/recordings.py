@@ -12,7 +12,7 @@ from hybridlog.wording import listed
 from hybridlog_storage.errors import TopicError
 
 if TYPE_CHECKING:
-    from hybridlog.session import Session
+    from hybridlog.session import Asked, Session
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.summary import RecordingSummary
 
@@ -21,7 +21,7 @@ class Recordings(Sequence["RecordingEntry"]):
     """Some recordings of an open store, oldest first; each entry is read when it is accessed.
 
     Args:
-        session: The open store.
+        source: The open store, or one moment of it.
         summaries: The recordings in short.
         problem: The reason why there is none.
 
@@ -30,11 +30,11 @@ class Recordings(Sequence["RecordingEntry"]):
     """
 
     def __init__(
-        self, session: Session, summaries: Iterable[RecordingSummary], problem: str = ""
+        self, source: Asked, summaries: Iterable[RecordingSummary], problem: str = ""
     ) -> None:
         self.summaries = tuple(summaries)
-        self._session = session
-        self._problem = problem or session.directory.when_empty
+        self._source = source
+        self._problem = problem or source.directory.when_empty
 
     def __len__(self) -> int:
         return len(self.summaries)
@@ -52,12 +52,12 @@ class Recordings(Sequence["RecordingEntry"]):
                 raise TopicError(f"{index!r} is not one of {listed(self.labels)}.")
             index = self.labels.index(index)
         if isinstance(index, slice):
-            return Recordings(self._session, self.summaries[index], self._problem)
-        return self._session.here().entry_of(self.summaries[index])
+            return Recordings(self._source, self.summaries[index], self._problem)
+        return self._source.now().entry_of(self.summaries[index])
 
     def __iter__(self) -> Iterator[RecordingEntry]:
         """The entries, without those of recordings that were removed meanwhile."""
-        return self._session.here().entries(self.summaries)
+        return self._source.now().entries(self.summaries)
 
     def __eq__(self, other: object) -> bool:
         """True for the same recordings, also as a list of entries."""
@@ -102,7 +102,7 @@ class Recordings(Sequence["RecordingEntry"]):
 
     def topics(self) -> list[str]:
         """Names of their topics, sorted; includes those whose messages are all lost."""
-        return self._session.topics_of(self.ids)
+        return self._source.now().topics_of(self.ids)
 
     def topic(self, *names: str) -> Query:
         """Make a query about topics of these recordings.
@@ -117,8 +117,9 @@ class Recordings(Sequence["RecordingEntry"]):
         self.check()
         if not names:
             raise TopicError(f"Name a topic. There are: {listed(self.topics())}.")
-        found = self._session.resolve_in(names, self.ids)
-        return self._query(found, namesakes(names, self.topics()))
+        session = self._source.now()
+        found = session.resolve_in(names, self.ids)
+        return self._query(session, found, namesakes(names, session.topics_of(self.ids)))
 
     def all_topics(self) -> Query:
         """Make a query about all topics of these recordings.
@@ -126,8 +127,11 @@ class Recordings(Sequence["RecordingEntry"]):
         Raises:
             TopicError: There is no recording.
         """
-        return self._query(self.check().topics())
+        session = self._source.now()
+        return self._query(session, session.topics_of(self.check().ids))
 
-    def _query(self, topics: Sequence[str], others: tuple[str, ...] = ()) -> Query:
-        found = self._session.having(topics, self.ids)
-        return Query(self._session, Question(*found, namesakes=others))
+    def _query(
+        self, session: Session, topics: Sequence[str], others: tuple[str, ...] = ()
+    ) -> Query:
+        found = session.having(topics, self.ids)
+        return Query(self._source, Question(*found, namesakes=others))

@@ -6,7 +6,8 @@ import os
 import re
 import secrets
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import contextmanager, suppress
+from copy import copy
 from functools import partial, wraps
 from pathlib import Path
 from typing import (
@@ -27,14 +28,16 @@ from hybridlog.index import consent
 from hybridlog.index.connection import again_if_lost
 from hybridlog.index.of_store import Index
 from hybridlog.maintenance.report import Progress, RepairReport
+from hybridlog.opened import OpenStore
 from hybridlog.query.asked import narrowed
 from hybridlog.query.choice import Choice
 from hybridlog.query.query import Query
 from hybridlog.query.question import Question
+from hybridlog.query.steps import of_now
 from hybridlog.query.times import parse_range, parse_time
 from hybridlog.query.topics import namesakes
 from hybridlog.record.losses import extent_of
-from hybridlog.session import Session, of_one_moment
+from hybridlog.session import Asked, Session
 from hybridlog.wording import listed
 from hybridlog_storage import journal
 from hybridlog_storage.catalog import Catalog, RecordingEntry
@@ -190,10 +193,10 @@ def receiving(store: Store) -> Iterator[DirectoryPlace]:
     def known() -> dict[str, str]:
         return {one.id: one.label for one in store.session.snapshot().summaries}
 
-    store.session.catch_up()
+    store.shared.catch_up()
     place = DirectoryPlace(store.directory, known)
     yield place
-    store.session.catch_up()
+    store.shared.catch_up()
     for entry in store.select(place.published):  # so that other readers find them
         tables.make(store.directory, entry, is_new=True)
 
@@ -211,7 +214,7 @@ def _place(to: str | Path, options: CopyOptions, store: Store) -> Iterator[Place
         if source.place == address:
             raise UsageError(f"{address} is this very store: there is nothing to copy.")
         target = RemoteDirectory.create_in(address)
-        yield BucketPlace(target, source, store.catalog, store.session.tables)
+        yield BucketPlace(target, source, store.catalog, store.shared.tables)
         return
     if is_ssh(str(to)):
         with ssh_place(str(to), options.ssh, options.program) as server:
@@ -289,12 +292,13 @@ class Store:
         recover: bool = True,
     ) -> None:
         self.directory = directory
-        self._session = Session(directory, mongo, progress, cache_mb, recover=recover)
+        self.shared = OpenStore(directory, mongo, progress, cache_mb, recover=recover)
+        self._source: Asked = self.shared
         self._sql: SqlEngine | None = None
         try:
-            self._session.snapshot()
+            self.shared.now()
         except BaseException:
-            self._session.catalog.close()
+            self.shared.catalog.close()
             raise
 
     def __enter__(self) -> Self:
@@ -307,12 +311,23 @@ class Store:
 
     @property
     def session(self) -> Session:
-        """Its state while it is open.
+        """The store at the moment that a question is about: now, or that of a snapshot.
 
         Raises:
             UsageError: It was opened before this process was forked.
         """
-        return self._session.here()
+        return self._source.now()
+
+    def _to_change(self) -> OpenStore:
+        """What is open of the store, which is about to be changed.
+
+        Raises:
+            UsageError: This is a snapshot, or the store was opened before this process was forked.
+        """
+        self.shared.check_process()
+        if self._source is not self.shared:
+            raise UsageError("A snapshot of a store only answers: change the store itself.")
+        return self.shared
 
     def __repr__(self) -> str:
         return f"<Store {self.directory.place}>"
@@ -336,24 +351,25 @@ class Store:
     @property
     def catalog(self) -> Catalog:
         """Recordings, channels, chunks and schemas, in a local file."""
-        return self.session.catalog
+        self.shared.check_process()
+        return self.shared.catalog
 
     @property
     def repairs(self) -> RepairReport:
         """Repairs made when the store was opened."""
-        return self.session.repairs
+        return self.shared.repairs
 
     # The index.
 
     @property
     def database(self) -> Database | None:
         """The index, connected on first access; None if MongoDB is unavailable."""
-        return self.session.database
+        return self.shared.index.database
 
     @property
     def index(self) -> Index:
         """Makes and describes the index."""
-        return Index(self.session)
+        return Index(self.shared)
 
     def connect(self) -> Database:
         """Connect to the index and bring it up to date.
@@ -362,19 +378,22 @@ class Store:
             DatabaseError: MongoDB does not answer.
             StoreError: It holds the index of another store, or this store is a copy.
         """
-        return self.session.connect()
+        return self._to_change().index.connect()
 
     def refresh(self) -> None:
         """Drop the snapshot of the catalog, to see new recordings of other processes."""
-        self.session.invalidate()
+        self._to_change().invalidate()
 
-    def at_one_moment(self) -> AbstractContextManager[None]:
-        """A block whose questions all see the recordings of one moment.
+    def snapshot(self) -> Store:
+        """The store at one moment: all questions to what this returns see the same recordings.
 
-        Without it each call sees what running recordings have flushed by then. A running
-        recording is as it was when the first question of the block asked about it.
+        Without it each question sees what running recordings have flushed by then. A running
+        recording is as it was when the first question asked about it. A snapshot cannot be
+        changed, and needs not be closed.
         """
-        return self.session.at_one_moment()
+        found = copy(self)
+        vars(found).update(_source=self.session, _sql=None)
+        return found
 
     def mend(self, seconds: float = _MENDING_S) -> None:
         """Repair what questions met: recordings after a crash, missing and damaged tables.
@@ -385,20 +404,22 @@ class Store:
             seconds: What takes longer is left; `repairs` names it. `verify(repair=True)` does all.
         """
         with suppress(StoreError, ResourceError):
-            self.session.mend(seconds)
+            self.shared.mend(seconds)
 
     def close(self) -> None:
         """Repair what questions met, and close files and connections. May be called again."""
         self._close(mends=True)
 
     def _close(self, *, mends: bool) -> None:
-        if self._session.is_inherited:  # its files and connections are the parent's
+        if self.shared.is_inherited:  # its files and connections are the parent's
             return
-        if mends:
+        is_open = self._source is self.shared  # and no snapshot
+        if mends and is_open:
             self.mend()
         if self._sql is not None:
             self._sql.close()
-        self.session.close()
+        if is_open:
+            self.shared.close()
 
     # Recordings and topics.
 
@@ -445,21 +466,18 @@ class Store:
         )
         return self.choose(choice)
 
-    @of_one_moment
     def choose(self, choice: Choice) -> Recordings:
         """The recordings that satisfy a choice; see `recordings`."""
         from hybridlog.query.choosing import choose
         from hybridlog.recordings import Recordings
 
         chosen = choose(self.session, choice)
-        return Recordings(self.session, chosen.summaries, chosen.problem)
+        return Recordings(self._source, chosen.summaries, chosen.problem)
 
-    @of_one_moment
     def summaries(self) -> list[RecordingSummary]:
         """All recordings in short, oldest first; much faster than `recordings`."""
         return list(self.session.look().summaries)
 
-    @of_one_moment
     def entry(self, recording: str) -> RecordingEntry:
         """The entry of a recording, by its id or its label.
 
@@ -468,7 +486,6 @@ class Store:
         """
         return self.session.entry(recording)
 
-    @of_one_moment
     def select(self, names: Names | None) -> list[RecordingEntry]:
         """Recordings by label, name, id, or the beginning of one of these; None for all.
 
@@ -479,12 +496,10 @@ class Store:
         """
         return self.session.select(names)
 
-    @of_one_moment
     def topics(self) -> list[str]:
         """Names of all topics, sorted; includes those whose messages are all lost."""
         return self.session.topics()
 
-    @of_one_moment
     def attachments(self, recording: str | RecordingEntry) -> list[StoredAttachment]:
         """The attachments of a recording's log, in their order.
 
@@ -497,9 +512,9 @@ class Store:
         """
         from hybridlog.attachments import attachments_of
 
-        return [each for e in self.select([recording]) for each in attachments_of(self.session, e)]
+        session = self.session
+        return [each for e in session.select([recording]) for each in attachments_of(session, e)]
 
-    @of_one_moment
     def metadata(self, recording: str | RecordingEntry) -> list[StoredMetadata]:
         """The metadata records of a recording's log, in their order.
 
@@ -512,11 +527,11 @@ class Store:
         """
         from hybridlog.attachments import metadata_of
 
-        return [each for e in self.select([recording]) for each in metadata_of(self.session, e)]
+        session = self.session
+        return [each for e in session.select([recording]) for each in metadata_of(session, e)]
 
     # Questions.
 
-    @of_one_moment
     def topic(self, *names: str) -> Query:
         """Make a query about one or several topics.
 
@@ -529,15 +544,16 @@ class Store:
         """
         if not all(isinstance(name, str) for name in names):
             raise UsageError("Topics are names: topic('scan', 'odom').")
-        found = self.session.resolve(names)
-        others = namesakes(names, self.topics())
-        return Query(self.session, Question(*found, namesakes=others))
+        session = self.session
+        found = session.resolve(names)
+        others = namesakes(names, session.topics())
+        return Query(self._source, Question(*found, namesakes=others))
 
     def all_topics(self) -> Query:
         """Make a query about all topics."""
-        return self.query(self.topics())
+        session = self.session
+        return Query(self._source, Question(*session.having(session.topics())))
 
-    @of_one_moment
     def query(self, topics: Sequence[str], recordings: Names | None = None) -> Query:
         """A question about topics by their full names, in some recordings or all.
 
@@ -547,9 +563,8 @@ class Store:
         """
         if isinstance(topics, str):
             raise UsageError(f"query takes a list of names; topic({topics!r}) takes a name.")
-        return Query(self.session, Question(*self.session.having(topics, recordings)))
+        return Query(self._source, Question(*self.session.having(topics, recordings)))
 
-    @of_one_moment
     def tf(self, recording: Texts = None, *, topics: Sequence[str] = ()) -> FrameTree:
         """The coordinate frames of a recording, and the transforms between them.
 
@@ -562,15 +577,15 @@ class Store:
         """
         from hybridlog.tf.reader import frame_tree
 
-        chosen = self.recordings(recording).check()
+        now = self.snapshot()
+        chosen = now.recordings(recording).check()
         if len(chosen) > 1:
             raise TopicError(
                 f"Frames belong to one recording: name one of {listed(chosen.labels)}."
             )
         names = chosen.topic(*topics).topics if topics else chosen.topics()
-        return frame_tree(self.session, chosen.summaries[0], names)
+        return frame_tree(now.session, chosen.summaries[0], names)
 
-    @of_one_moment
     def check(self, recording: Texts = None) -> list[TopicCheck]:
         """Check how regularly the topics of recordings came, the worst first; see `Query.check`.
 
@@ -580,9 +595,8 @@ class Store:
         Raises:
             TopicError: No such recording.
         """
-        return self.recordings(recording).check().all_topics().check()
+        return self.snapshot().recordings(recording).check().all_topics().check()
 
-    @of_one_moment
     def judge(self, contract: Contract | str | Path, recording: Texts = None) -> list[Result]:
         """The results of the rules of a contract on recordings.
 
@@ -598,10 +612,10 @@ class Store:
         from hybridlog.contract.judge import judge
 
         rules = contract if isinstance(contract, Contract) else Contract.read(contract)
-        chosen = self.recordings(recording).check().summaries
-        return [result for one in chosen for result in judge(self.session, rules, one)]
+        now = self.snapshot()
+        chosen = now.recordings(recording).check().summaries
+        return [result for one in chosen for result in judge(now.session, rules, one)]
 
-    @of_one_moment
     def diff(
         self,
         a: Texts,
@@ -630,9 +644,10 @@ class Store:
         """
         from hybridlog.contract.diff import diff
 
-        sides = (self.recordings(one).check() for one in (a, b))
+        now = self.snapshot()
+        sides = (now.recordings(one).check() for one in (a, b))
         return diff(
-            self.session,
+            now.session,
             *sides,
             topics=topics,
             between=between,
@@ -640,7 +655,6 @@ class Store:
             contract=contract,
         )
 
-    @of_one_moment
     def align(
         self,
         base: str | Query,
@@ -684,12 +698,13 @@ class Store:
         if not isinstance(fields or {}, Mapping):
             raise UsageError("Fields are given by topic: fields={'scan': ['ranges.min']}.")
         chosen = dict(fields or {})
-        queries = [self._query_of(one, chosen) for one in (base, *beside)]
+        now = self.snapshot()
+        queries = [_query_of(now, one, chosen) for one in (base, *beside)]
         if chosen:
             raise TopicError(f"{', '.join(chosen)} of fields is no topic of this alignment.")
         questions = [query.question for query in queries]
         return side_by_side(
-            self.session,
+            now.session,
             questions[0],
             questions[1:],
             how=how,
@@ -698,7 +713,6 @@ class Store:
             across_recordings=across_recordings,
         )
 
-    @of_one_moment
     def to_lerobot(
         self,
         query: Query,
@@ -743,9 +757,9 @@ class Store:
         from hybridlog.training.lerobot_episodes import LerobotOptions
 
         options = LerobotOptions(fps, episodes_by, task, task_topic, codec, on_gap)
-        return write_lerobot(query, FeatureMap.given(features), path, options, progress=progress)
+        given = FeatureMap.given(features)
+        return write_lerobot(of_now(query), given, path, options, progress=progress)
 
-    @of_one_moment
     def sync(
         self,
         topics: Sequence[str | Query],
@@ -772,35 +786,24 @@ class Store:
 
         if isinstance(topics, str):
             raise UsageError("Topics are a list: sync(['scan', 'odom']).")
-        queries = [self._query_of(one, {}) for one in topics]
+        now = self.snapshot()
+        queries = [_query_of(now, one, {}) for one in topics]
         questions = [narrowed(query, topic).question for query in queries for topic in query.topics]
         if clock not in {"log", "publish", "header"}:
             raise UsageError(f"Unknown clock {clock!r}; choose log, publish or header.")
-        again = partial(_session_of, self.directory.address, self.session.connection.wanted)
-        return Synced(self.session, again, questions, tolerance, cast("Clock", clock))
-
-    def _query_of(self, name: str | Query, fields: dict[str, Sequence[str]]) -> Query:
-        """A query about a topic, with its share of the fields, which is taken out of them."""
-        query = self.topic(name) if isinstance(name, str) else name
-        if query.session is not self.session:
-            place = query.session.directory.place
-            raise UsageError(f"A query of {place} cannot be joined with another store's.")
-        for key in [*fields]:
-            if key == name or self.topic(key).topics == query.topics:
-                query = query.fields(*fields.pop(key))
-        return query
+        again = partial(_session_of, self.directory.address, self.shared.index.connection.wanted)
+        return Synced(now.session, again, questions, tolerance, cast("Clock", clock))
 
     @property
     def sql_engine(self) -> SqlEngine:
         """Runs SQL; for programs that need several statements in one connection."""
-        session = self.session
+        self.shared.check_process()
         if self._sql is None:
             from hybridlog.sql.engine import SqlEngine
 
-            self._sql = SqlEngine(session)
+            self._sql = SqlEngine(self._source)
         return self._sql
 
-    @of_one_moment
     def sql(
         self,
         query: str,
@@ -869,7 +872,7 @@ class Store:
                 source,
                 self.directory,
                 self.catalog,
-                self.session.index_to_record("Recording a log"),
+                self._to_change().index.index_to_record("Recording a log"),
                 fingerprint=fingerprint(source.files),
                 options=options or RecordOptions(**choices),
                 progress=progress,
@@ -892,7 +895,7 @@ class Store:
         return LiveRecording(
             self.directory,
             self.catalog,
-            self.session.index_to_record("Starting a recording"),
+            self._to_change().index.index_to_record("Starting a recording"),
             name,
             options or LiveOptions(**choices),
             on_close=self._after,
@@ -900,15 +903,15 @@ class Store:
 
     def _after(self, report: RecordReport) -> None:
         """Update the store after the end of a recording."""
-        self.session.catch_up(report.entry.id)
-        connected = self.session.connected
+        self._to_change().catch_up(report.entry.id)
+        connected = self.shared.index.connected
         if report.failure is None and (connected is None or connected.ping()):
             if connected is not None:
                 # The next connection need not look at it.
-                self.catalog.put_indexed([report.entry.id], self.session.connection.index)
+                self.catalog.put_indexed([report.entry.id], self.shared.index.connection.index)
             return
         # MongoDB has ended meanwhile. If it is available again, the rest is indexed.
-        self.session.disconnect()
+        self.shared.index.disconnect()
         try:
             self.connect()
         except HybridlogError as error:
@@ -920,7 +923,6 @@ class Store:
             report.indexed, report.missed, report.failure = report.entry.documents, 0, None
 
     @again_if_lost
-    @of_one_moment
     def sizes(self, recordings: Names | None = None) -> Sizes:
         """Bytes of recordings and topics in segments, tables and MongoDB.
 
@@ -938,7 +940,7 @@ class Store:
 
         entries = self.select(recordings)
         database = self.database
-        places = None if database is None else self.session.places("Sizes")
+        places = None if database is None else self.shared.index.places("Sizes")
         return sizes_of(self.directory, self.catalog, entries, database, places)
 
     @overload
@@ -996,13 +998,13 @@ class Store:
         self._check_on_disk()
         from hybridlog.maintenance.repair import repair, repair_index
 
-        self.session.mend()
+        self._to_change().mend()
         self.refresh()
         chosen = [] if recordings is None else self.select(recordings)
         entries = None if recordings is None else chosen
         done = repair(self.directory, self.catalog, self.repairs, entries)
         self.refresh()
-        database = self.session.writable_database
+        database = self.shared.index.writable_database
         if database is not None:
             done += repair_index(
                 self.directory,
@@ -1048,6 +1050,7 @@ class Store:
         keeper = Keeper(self.directory, self.remove, changed=put if is_remote else lambda _: None)
         if dry_run:
             return KeepReport(keeper.plan(wanted))
+        self._to_change()
         self.directory.check_changes()
         try:
             return keeper.keep(wanted, progress)
@@ -1080,6 +1083,7 @@ class Store:
         """
         from hybridlog.maintenance.keep import append_pins, may_hold, pin_of
 
+        shared = self._to_change()
         (entry,) = self.select([recording])
         start, stop = extent_of(entry)
         if begin is not None or end is not None:
@@ -1090,7 +1094,7 @@ class Store:
         name = secrets.token_hex(4)
         line = pin_of(name, (times[0], times[1]), topics, text(reason))
         append_pins(self.directory, self.catalog, entry, line)
-        self.session.catch_up(entry.id)
+        shared.catch_up(entry.id)
         return name
 
     @_again_if_overtaken
@@ -1102,6 +1106,7 @@ class Store:
         """
         from hybridlog.maintenance.keep import append_pins
 
+        shared = self._to_change()
         known = {pin["id"]: entry for entry in self.select(None) for pin in entry.pins}
         for name in names:
             if name not in known:
@@ -1109,7 +1114,7 @@ class Store:
         for name in names:
             entry, line = known[name], journal.event(journal.UNPINNED, id=name)
             append_pins(self.directory, self.catalog, entry, line)
-            self.session.catch_up(entry.id)
+            shared.catch_up(entry.id)
 
     @_again_if_overtaken
     def remove(self, recording: str) -> None:
@@ -1123,21 +1128,23 @@ class Store:
         """
         from hybridlog.maintenance import edit
 
+        shared = self._to_change()
         if recording not in self.repairs.copies:
-            self.session.catch_up()
-            self.session.snapshot()
+            shared.catch_up()
         try:
             if recording in self.repairs.copies:
                 original = self.entry(self.repairs.copies[recording])
                 edit.remove_copy(self.directory, recording, original.id)
             else:
                 (entry,) = self.select([recording])
-                edit.remove(self.directory, self.catalog, self.session.writable_database, entry)
+                edit.remove(
+                    self.directory, self.catalog, self.shared.index.writable_database, entry
+                )
         except ConnectionLostError:
             self.refresh()
             self.connect()  # a new connection removes the rest
         finally:
-            self.session.catch_up()
+            shared.catch_up()
 
     @_again_if_overtaken
     def edit(
@@ -1175,7 +1182,7 @@ class Store:
             raise UsageError(
                 'Tags are texts by keys, not empty and without NUL: tag={"place": "lab"}.'
             )
-        self.session.catch_up()
+        self._to_change().catch_up()
         (entry,) = self.select([recording])
         lines = []
         for key in [untag] if isinstance(untag, str) else untag:
@@ -1190,11 +1197,11 @@ class Store:
         if name is not None:
             lines.append(journal.event(journal.RENAMED, name=text(name)))
         edit.append(self.directory, self.catalog, entry, lines)
-        connected = self.session.connected
-        if connected is not None and self.session.connection.may_write:
+        connected = self.shared.index.connected
+        if connected is not None and self.shared.index.connection.may_write:
             with suppress(ConnectionLostError):  # the next connection mirrors it
                 index.mirror(self.catalog, connected, entry.id)
-        self.session.catch_up(entry.id)
+        self._to_change().catch_up(entry.id)
         return self.entry(entry.id)
 
     @_again_if_overtaken
@@ -1223,7 +1230,7 @@ class Store:
         """
         from hybridlog.maintenance import edit
 
-        self.session.catch_up()
+        self._to_change().catch_up()
         (entry,) = self.select([recording])
         time = edit.time_of_mark(entry, moment)
         last = None if until is None else edit.time_of_mark(entry, until)
@@ -1241,7 +1248,7 @@ class Store:
             if error.is_recording:
                 raise StoreError(f"{error} To mark it now, mark it without --at.") from error
             raise
-        self.session.catch_up(entry.id)
+        self._to_change().catch_up(entry.id)
         return self.entry(entry.id)
 
     @_again_if_overtaken
@@ -1259,12 +1266,12 @@ class Store:
         """
         from hybridlog.maintenance import edit
 
-        self.session.catch_up()
+        self._to_change().catch_up()
         (entry,) = self.select([recording])
         start, end = extent_of(entry)
         time = None if moment is None else parse_time(moment, start=start, end=end)
         edit.unmark(self.directory, self.catalog, entry, time, text=text(note))
-        self.session.catch_up(entry.id)
+        self._to_change().catch_up(entry.id)
         return self.entry(entry.id)
 
     def copy(
@@ -1302,7 +1309,7 @@ class Store:
             raise UsageError("Payloads that are not copied cannot expire: drop one of the two.")
         if wanted.then_expire:
             self.directory.check_writable()
-        self.session.catch_up()
+        self._to_change().catch_up()
         chosen = self._chosen(recordings)
         with _place(to, wanted, self) as place:
 
@@ -1342,7 +1349,7 @@ class Store:
             report.held.append(recording)
             return
         finally:
-            self.session.catch_up(recording)
+            self._to_change().catch_up(recording)
         report.freed_bytes += expired.freed_bytes
         report.problems += expired.problems
 
@@ -1360,3 +1367,15 @@ class Store:
     def _check_on_disk(self) -> None:
         if self.directory.is_remote:
             self.directory.check_writable()
+
+
+def _query_of(store: Store, name: str | Query, fields: dict[str, Sequence[str]]) -> Query:
+    """A query about a topic, with its share of the fields, which is taken out of them."""
+    query = store.topic(name) if isinstance(name, str) else name
+    if query.session.shared is not store.shared:
+        place = query.session.directory.place
+        raise UsageError(f"A query of {place} cannot be joined with another store's.")
+    for key in [*fields]:
+        if key == name or store.topic(key).topics == query.topics:
+            query = query.fields(*fields.pop(key))
+    return query

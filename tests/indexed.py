@@ -13,7 +13,7 @@ EVERYTHING = {"_meta.seq": {"$gte": 0}}
 
 def documents_of(store: hl.Store, *topics: str) -> list[dict[str, Any]]:
     """The documents of some topics, by time, recording and arrival."""
-    database = store.session.database_for("A test")
+    database = store.shared.index.database_for("A test")
     found: list[dict[str, Any]] = []
     for topic in topics:
         place = store.index.place(topic)

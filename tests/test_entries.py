@@ -652,7 +652,7 @@ def test_an_answer_needs_nothing_that_the_catalog_has_lost(
         assert [m.decode().data for m in store.topic("/b")] == [f"{n:04d}" for n in range(1, 80, 3)]
         (entry,) = store.recordings()
         check(entry)
-        assert store.session.connected is None
+        assert store.shared.index.connected is None
 
 
 def test_chunks_of_another_segment_are_refused(made: Made) -> None:
@@ -679,7 +679,7 @@ def test_the_catalog_may_go_while_the_store_is_open(made: Made) -> None:
                 opened_store.refresh()
                 check(*opened_store.recordings())
                 assert [m.raw for m in opened_store.all_topics()] == wanted
-        assert store.session.connected is None
+        assert store.shared.index.connected is None
 
 
 def test_another_process_may_keep_the_catalog_locked(made: Made, limit: Limit) -> None:

@@ -24,7 +24,7 @@ from pymongo import MongoClient
 
 import hybridlog as hl
 from benchmarks.simulator.write import write_bag
-from hybridlog import session as session_module
+from hybridlog.index import access
 from hybridlog.query.counters import Counters
 from hybridlog.query.engines import MatchColumns
 from hybridlog.query.engines.payload_scan import PayloadScan
@@ -205,13 +205,13 @@ def test_a_killed_mongod_is_started_again(store: Path) -> None:
         want = documents(opened)
         imu = opened.topic(IMU)
         counts = imu.count(), imu.where(WHERE).count()
-        places = opened.session.places("A test")
+        places = opened.shared.index.places("A test")
         kill_mongod(store)
         assert (imu.count(), imu.where(WHERE).count()) == counts
         assert documents(opened) == want
         assert not opened.repairs.damage
         assert not opened.repairs.indexed
-        assert opened.session.places("A test") is not places
+        assert opened.shared.index.places("A test") is not places
 
 
 def test_an_unreachable_server_is_not_waited_for_by_each_question(
@@ -230,7 +230,7 @@ def test_an_unreachable_server_is_not_waited_for_by_each_question(
         assert len(tried) == 1
         # When that is some time ago, the next question tries again.
         later = SimpleNamespace(monotonic=lambda: time.monotonic() + 1e9, sleep=time.sleep)
-        monkeypatch.setattr(session_module, "time", later)
+        monkeypatch.setattr(access, "time", later)
         with other_mongod(tmp_path, port=port):
             assert sum(documents(opened)) == 0  # nothing is indexed there
             assert len(tried) == 2
@@ -310,7 +310,7 @@ def test_a_connection_to_the_index_as_it_is_is_made_again(store: Path) -> None:
         assert sum(documents(opened)) > 0
         kill_mongod(store)
         assert opened.verify().index
-        assert opened.session.unavailable is None
+        assert opened.shared.index.unavailable is None
 
 
 @pytest.mark.parametrize("waits", [False, True])

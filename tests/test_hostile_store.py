@@ -321,7 +321,7 @@ def test_the_cure_cures(tmp_path: Path, template: Path) -> None:
     victims.watch()
     with hl.open(store) as away:
         assert away.database is None
-        assert "Remove" in str(away.session.unavailable)
+        assert "Remove" in str(away.shared.index.unavailable)
         assert away.topic("/imu/data").count() > 0
     (store / "mongod").unlink()
     with hl.open(store) as back:

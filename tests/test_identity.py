@@ -21,11 +21,11 @@ from mcap.writer import Writer
 
 import hybridlog as hl
 from hybridlog.columns.folders import files_of
+from hybridlog.index.access import IndexAccess
 from hybridlog.maintenance import copying
 from hybridlog.maintenance.copying import CopyReport
 from hybridlog.maintenance.lease import become_another
 from hybridlog.query.intervals import Intervals
-from hybridlog.session import Session
 from hybridlog_storage import journal
 from hybridlog_storage.catalog import CATALOG
 from hybridlog_storage.disk import directory as directory_module
@@ -217,10 +217,10 @@ def test_a_copied_store_with_a_uri_is_noticed_and_removes_nothing(
     for _ in range(2):
         with hl.open(copy, mongo=uri) as store:
             assert store.database is None
-            assert "copy" in str(store.session.unavailable)
-            assert "--new-id" in str(store.session.unavailable)
+            assert "copy" in str(store.shared.index.unavailable)
+            assert "--new-id" in str(store.shared.index.unavailable)
             with pytest.raises(DatabaseError, match="--moved"):
-                store.topic("/n") if store.topics() else store.session.database_for("This")
+                store.topic("/n") if store.topics() else store.shared.index.database_for("This")
         with pytest.raises(StoreError, match="copy"):
             hl.open(copy, mongo=uri, require_database=True)
     assert documents(uri) == before
@@ -274,9 +274,9 @@ def test_a_store_from_another_host_asks_first(place: Path, uri: str) -> None:
         state.claim({"id": mark["id"], "host": "another", "path": "/data/store"})
     with hl.open(place, mongo=uri) as store:
         with pytest.raises(DatabaseError, match="/data/store on another"):
-            store.session.database_for("This")
+            store.shared.index.database_for("This")
         assert store.topic("/n").count() == COUNT  # by topic and time it goes on
-        store.session.take_over()
+        store.shared.index.take_over()
         assert answers(store) == right()
 
 
@@ -371,7 +371,7 @@ def test_a_removal_that_was_announced_is_finished(place: Path, uri: str) -> None
         assert store.repairs.removed == ["one"]
         assert not store.recordings()
         assert list((place / "recordings").iterdir()) == []
-        database = store.session.database_for("This")
+        database = store.shared.index.database_for("This")
         assert database.count("n", {}) == 0
         assert IndexState(database).of() == {}
 
@@ -503,7 +503,7 @@ def test_a_command_changes_the_recording_that_was_chosen(
     base, one, other = two
     others = content_of(base, other)
     limit(sync=lambda *_: None)
-    monkeypatch.setattr(Session, "database", None)
+    monkeypatch.setattr(IndexAccess, "database", None)
     changes = [(swap, False), (swap, True), (replace, False), (remove, True)]
     for first, (change, after) in enumerate(changes):
         for step in count(7 * first % stride, stride):

@@ -37,7 +37,7 @@ def test_a_server_stays_while_a_client_is_connected(path: Path, limit: Limit) ->
     limit(clients_wait_s=5.0)
     with hl.open(path) as store:
         address = store.index.address()
-        assert contents(store.session) == [(f"/{n}", n, 20) for n in ("number", "stamped", "text")]
+        assert contents(store.shared) == [(f"/{n}", n, 20) for n in ("number", "stamped", "text")]
     server = mongod(path)
     with MongoClient[dict[str, object]](address.uri) as client:
         time.sleep(7)
@@ -74,7 +74,7 @@ def test_as_a_command(path: Path) -> None:
 def test_an_address_has_no_password(tmp_path: Path) -> None:
     uri = "mongodb://me:secret@127.0.0.1:1/robots?serverSelectionTimeoutMS=1&authSource=admin"
     with hl.open(tmp_path / "store", create=True, mongo=uri) as store:
-        connection = store.session.connection
+        connection = store.shared.index.connection
         connection._uri = uri
         connection.open = lambda: None  # type: ignore[method-assign, assignment, return-value]
         assert connection.address(1) == uri.replace(":secret", "")

@@ -58,7 +58,7 @@ def least(value: int) -> dict[str, object]:
 
 
 def database_of(store: hl.Store) -> Database:
-    return store.session.database_for("this test")
+    return store.shared.index.database_for("this test")
 
 
 def documents(store: hl.Store) -> Counter[str]:
@@ -238,7 +238,7 @@ def test_no_question_about_all_topics_walks_through_them_once_a_topic(tmp_path: 
     with hl.open(tmp_path / "store", create=True, require_database=True) as store:
         store.record(log)
         store.all_topics().where(least(3)).count()  # everything is open now
-        store.session._channels.clear()
+        store.shared.channels.clear()
         store.session.tables.invalidate()
         (entry,) = store.recordings()
         channels = entry.channels = Walked(entry.channels)

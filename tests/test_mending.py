@@ -78,7 +78,7 @@ def test_a_question_about_a_recorder_that_died_writes_nothing(died: hl.Store, kn
     assert not died.repairs.noted
     assert died.repairs.recovered.keys() == {LABEL}
     assert died.entry(LABEL).status == "recovered"
-    assert not died.session._running
+    assert not died.shared._running
     assert not any(name.endswith(".mcap.open") for name in files_in(died))
     check(died, known)
     died.mend()
@@ -96,11 +96,11 @@ def test_a_store_that_stays_open_is_repaired_meanwhile(died: hl.Store, known: Kn
 
 
 def test_one_moment_outlasts_the_repair(died: hl.Store, known: Known) -> None:
-    with died.at_one_moment():
-        check(died, known)
-        with hl.open(died.directory.path, mongo=NO_MONGODB) as other:
-            assert other.entry(LABEL).status == "recovered"
-        check(died, known)
+    then = died.snapshot()
+    check(then, known)
+    with hl.open(died.directory.path, mongo=NO_MONGODB) as other:
+        assert other.entry(LABEL).status == "recovered"
+    check(then, known)
     check(died, known)
 
 

@@ -42,7 +42,7 @@ def store(tmp_path: Path, log: Path) -> Iterator[hl.Store]:
 
 
 def documents(store: hl.Store) -> dict[str, int]:
-    database = store.session.database_for("this test")
+    database = store.shared.index.database_for("this test")
     found = {name: database.count(collection_of(name), {"_meta.seq": {"$gte": 0}}) for name in FOUR}
     return {name: count for name, count in found.items() if count}
 
@@ -76,7 +76,7 @@ def test_every_rebuild_keeps_it(store: hl.Store) -> None:
     assert documents(store) == INDEXED
     store.index.rebuild(["log"])
     assert documents(store) == INDEXED
-    store.session.database_for("this test").drop_all()
+    store.shared.index.database_for("this test").drop_all()
     path = store.directory.path
     store.close()
     (path / CATALOG).unlink()
@@ -103,7 +103,7 @@ def test_what_has_no_documents_is_not_missing_among_those_of_others(
 
 
 def test_documents_that_should_not_be_there_are_found(store: hl.Store) -> None:
-    database = store.session.database_for("this test")
+    database = store.shared.index.database_for("this test")
     (entry,) = store.recordings()
     stray = {"_id": b"x" * 24, "_meta": {"rec": entry.key}}
     database.ensure_collection(collection_of(LEFT_OUT[0]))
@@ -140,7 +140,7 @@ def test_a_live_recording(tmp_path: Path) -> None:
             for number in range(5):
                 for channel in (said, silent):
                     recording.write(channel, b'{"n": %d}' % number)
-        database = store.session.database_for("this test")
+        database = store.shared.index.database_for("this test")
         assert database.count("said") == 5
         assert not {"silent", "hybridlog.shared"} & set(database.list_collections())
         assert store.topic("silent").where("n >= 3").count() == 2

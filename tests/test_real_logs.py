@@ -76,7 +76,7 @@ DAMAGED = {
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
     with hl.open(tmp_path_factory.mktemp("real") / "store", create=True) as opened:
-        assert opened.database is not None, opened.session.unavailable
+        assert opened.database is not None, opened.shared.index.unavailable
         yield opened
 
 

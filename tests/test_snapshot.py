@@ -274,7 +274,7 @@ def test_topics_that_another_process_changes_meanwhile(
             return ask(recording)
 
         monkeypatch.setattr(store.catalog, "recording", asked)
-        store.session.invalidate()
+        store.shared.invalidate()
         assert [one.topic_count for one in store.summaries()] == [1, 1]
         assert store.topic("/a").count() == store.topic("/b").count() == 1
         store.refresh()

@@ -71,9 +71,9 @@ def test_what_only_mongodb_can_is_refused(stores: dict[str, hl.Store]) -> None:
     ):
         with pytest.raises(DatabaseError, match=r"without MongoDB.*--mongo embedded"):
             ask()
-    assert isinstance(store.session.unavailable, WithoutMongoError)
+    assert isinstance(store.shared.index.unavailable, WithoutMongoError)
     assert (store.verify().index, store.verify().findings) == (False, [])
-    assert store.session.connection.place == "none"
+    assert store.shared.index.connection.place == "none"
 
 
 def test_header_statistics_and_marks(
@@ -159,7 +159,7 @@ def test_a_live_recording_while_the_server_comes(tmp_path: Path, calls: Calls) -
             if away:
                 raise ConnectionLostError("MongoDB does not answer")
 
-        calls(store.session.connection, "another", another)
+        calls(store.shared.index.connection, "another", another)
         with store.start("live", LiveOptions(flush_interval_s=0.1)) as recording:
             for one in messages(0, 50, 0):
                 recording.write(CHANNELS[one.topic], one.raw, log_time=one.log_time)
@@ -215,4 +215,4 @@ def test_as_many_were_removed_as_recorded_without_mongodb(bag: Path, tmp_path: P
         database = store.connect()
         second = store.entry("second")
         assert IndexState(database).of().keys() == {second.key} != {first.key}
-        assert sum(count for *_, count in contents(store.session)) == second.messages
+        assert sum(count for *_, count in contents(store.shared)) == second.messages

@@ -107,7 +107,7 @@ class Hybridlog(Backend):
         try:
             store = self.store
             store.refresh()
-            database = store.session.database_for("Counting")
+            database = store.shared.index.database_for("Counting")
             for topic in set(found) & set(store.topics()):
                 found[topic] = sum(len(batch) for batch, _ in store.query([topic]).batches())
                 # Without a filter it would be an estimate once the server was killed.

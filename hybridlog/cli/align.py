@@ -97,7 +97,7 @@ def align_command(given: _Given) -> None:
         raise UsageError("Name the rows: --to TOPIC for its messages, or --step for times.")
     topics, to = given.topics, given.to
     started = time.monotonic()
-    with given.opened() as store:
+    with given.opened(snapshot=True) as store:
         show = _resample if given.base is None else _align
         counters, remarks = show(store, given, topics, to)
         sys.stdout.flush()

@@ -282,7 +282,7 @@ class Answering:
 def answering(given: Topics) -> Iterator[Answering]:
     """The open store and the query; its cost and remarks are printed at the end."""
     started = time.monotonic()
-    with given.opened() as store:
+    with given.opened(snapshot=True) as store:
         asked = Answering(store, given.query(store))
         yield asked
         sys.stdout.flush()
@@ -412,7 +412,6 @@ def write_answer(
         from hybridlog.frames.lines import lines
         from hybridlog.query.planner import Planner
 
-        query.session.renew()
         query.counters.reset()
         yield from lines(Planner(query.session, query.question, query.counters))
 
@@ -543,8 +542,7 @@ def _schema_of(query: Query) -> pa.Schema | None:
     from hybridlog.query.counters import Counters
     from hybridlog.query.planner import Planner
 
-    with query.session.at_one_moment():
-        return schema_of(Planner(query.session, query.question, Counters()))
+    return schema_of(Planner(query.session, query.question, Counters()))
 
 
 def _write_pictures(

@@ -66,7 +66,7 @@ def check_command(given: _Check) -> None:
         check_room(path, force=given.force)
     if contract is not None:
         rules = Contract.read(contract)
-        with given.opened() as store:
+        with given.opened(snapshot=True) as store:
             chosen = given.recordings_in(store)
             results = [one for label in chosen.labels for one in store.judge(rules, label)]
         _show_verdict(results, len(chosen), given)
@@ -177,7 +177,7 @@ def diff_command(given: _Diff) -> None:
 
     rules = None if given.contract is None else Contract.read(given.contract)
     share = parse_share(given.tolerance)
-    with given.opened() as store:
+    with given.opened(snapshot=True) as store:
         found = store.diff(
             given.a,
             given.b,

@@ -176,8 +176,8 @@ def _opened(context: click.Context) -> Iterator[Session]:
     directory = _store(context)
     from hybridlog.store import Store
 
-    with closing(Store(directory, mongo="none", recover=False).session) as session:
-        yield session
+    with closing(Store(directory, mongo="none", recover=False).shared) as shared:
+        yield shared.now()
 
 
 def _chosen(context: click.Context, session: Session) -> list[RecordingSummary]:

@@ -76,7 +76,7 @@ def export_command(given: _Given) -> None:
     settings = given.settings(form)
     if form in _LOGS and split is None:
         check_room(target, force=force, is_directory=is_directory(form, target))
-    with given.opened() as store:
+    with given.opened(snapshot=True) as store:
         query = given.query(store)
         if not query.topics:
             raise UsageError(store.directory.when_empty)

@@ -89,7 +89,7 @@ def address(given: _Shared) -> None:
         found = store.index.address()
         from hybridlog.index.of_store import contents
 
-        places = [] if given.quiet and not given.as_json else contents(store.session)
+        places = [] if given.quiet and not given.as_json else contents(store.shared)
         recordings = len(store.session.snapshot())
     if given.as_json:
         topics = [
@@ -240,7 +240,7 @@ def watch_command(given: _Watch) -> None:
 
 def _look(store: Store, given: _Shared) -> Iterator[StoreError]:
     """Index what has come since the last look, and print it; yields what cannot be read."""
-    if store.session.snapshot().is_open.any() or store.session.has_changed():
+    if store.session.snapshot().is_open.any() or store.shared.has_changed():
         store.refresh()
     repairs = store.repairs
     try:

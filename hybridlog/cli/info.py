@@ -94,7 +94,7 @@ def info_command(given: _Given) -> None:
         show_segment(Path(given.names[0]), as_json=given.as_json)
         return
     try:
-        with given.opened() as store:
+        with given.opened(snapshot=True) as store:
             if not _show_part(store, given):
                 _show(store, given)
     except (StoreError, UsageError):
@@ -170,7 +170,7 @@ def _show(store: Store, given: _Given) -> None:
             output.say()
         _print_recording(
             entry,
-            store.session.connection.place,
+            store.shared.index.connection.place,
             *extras[entry.id],
             videos=videos.get(entry.id, {}),
             drawn=drawn.get(entry.id),

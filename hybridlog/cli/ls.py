@@ -24,7 +24,7 @@ class _Given(Choosing, InStore, AsJson):
 @command(_Given)
 def ls_command(given: _Given) -> None:
     """List the recordings."""
-    with given.opened() as store:
+    with given.opened(snapshot=True) as store:
         if store.directory.look_closely():
             store.refresh()
         recordings = given.recordings_in(store).summaries

@@ -47,7 +47,7 @@ def verify_command(given: _Verify) -> None:
         total = sum(entry.stored_bytes for entry in chosen.summaries)
         with progress_bar("verify", total, quiet=given.quiet) as bar:
             result = store.verify(None if given.choice.is_everything else chosen, Stages(bar))
-        why = store.session.unavailable
+        why = store.shared.index.unavailable
     elapsed = time.monotonic() - started
     if given.as_json:
         output.print_json({**asdict(result), "seconds": round(elapsed, 3)})
@@ -95,7 +95,7 @@ def _repair(given: _Verify) -> None:
         output.note("The store has a new id now.")
     with given.opened(quiet=given.quiet) as store:
         if given.moved:
-            store.session.take_over()
+            store.shared.index.take_over()
             output.note("The index belongs to the store at this place now.")
         chosen = None if given.choice.is_everything else given.recordings_in(store)
         with progress_bar("repair", 0, quiet=given.quiet) as bar:

@@ -103,7 +103,7 @@ def open_command(given: _Given) -> None:
             )
         return
     program = _find(given.viewer)
-    with given.opened() as store:
+    with given.opened(snapshot=True) as store:
         query = given.query(store)
         path = _written(store, query, given)
         if not given.quiet:

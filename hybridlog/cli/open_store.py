@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Collection, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext
 from itertools import chain, islice
 from pathlib import Path
 from shlex import quote
@@ -37,10 +37,11 @@ def opened_store(
     cache_mb: int | None = None,
     quiet: bool = False,
     is_lasting: bool = False,
+    snapshot: bool = False,
     records: bool = False,
     recover: bool = True,
 ) -> Iterator[Store]:
-    """The open store; what a command asks is of one moment.
+    """The open store.
 
     Args:
         path: Its directory; without, `HYBRIDLOG_STORE` or `./hybridlog-store`.
@@ -49,8 +50,9 @@ def opened_store(
         needs_database: Fail when MongoDB is unavailable.
         cache_mb: Size of the embedded MongoDB's cache in MiB.
         quiet: No progress while the index is brought up to date.
-        is_lasting: The command goes on while recordings change: each question is of its own
-            moment.
+        is_lasting: The command goes on while recordings change; what it meets is repaired
+            meanwhile.
+        snapshot: All that the command asks is of one moment.
         records: The command records, also while MongoDB is unavailable.
         recover: False to leave what a crash has cut to another opening, which reports it.
     """
@@ -81,13 +83,11 @@ def opened_store(
         raise
     finally:
         bar.close()
-    during: AbstractContextManager[None] = store.at_one_moment()
-    if is_lasting:
-        during = mended_meanwhile(store) if recover else nullcontext()
+    during = mended_meanwhile(store) if is_lasting and recover else nullcontext()
     with store, during:
         doing = "so the files answer"
         if records:
-            target = store.session.index_to_record("Recording")
+            target = store.shared.index.index_to_record("Recording")
             doing = "so the index is made later" if target.is_wanted else "so there is no index"
         if recover:
             _print_repairs(store, doing)
@@ -95,7 +95,7 @@ def opened_store(
             _print_rebuilt(store, doing)
         told = {*store.repairs.unreadable}
         try:
-            yield store
+            yield store.snapshot() if snapshot else store
             store.mend()
             _print_left(store)
         finally:
@@ -183,7 +183,7 @@ def _print_rebuilt(store: Store, doing: str) -> None:
             note(f"Recording {recording}: {counted(chunks, 'chunk')} added to the index.")
     for recording in repairs.removed:
         note(f"Recording {recording} has no files any more; it is out of the index.")
-    reason = store.session.unavailable
+    reason = store.shared.index.unavailable
     is_wanted = reason is not None and not isinstance(reason, WithoutMongoError)
     if doing and is_wanted and store.directory.is_writable:
         note(f"MongoDB is unavailable, {doing}: {reason}")

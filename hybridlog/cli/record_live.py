@@ -94,7 +94,7 @@ def _begin_recovery(choices: RecordChoices, store: Store) -> threading.Thread:
     def recover() -> None:
         try:
             with opened_store(store.directory.path, choices.mongo, quiet=True) as opened:
-                opened.session.database  # noqa: B018 - brings the index up to date
+                opened.shared.index.database  # noqa: B018 - brings the index up to date
         except (HybridlogError, OSError) as error:
             output.note(f"hybridlog: earlier recordings are not recovered yet: {error}")
 

@@ -64,7 +64,7 @@ def tf_command(given: _Given) -> None:
     from hybridlog.tf.reader import frames_and_stamps
 
     to = given.to
-    with given.opened() as store:
+    with given.opened(snapshot=True) as store:
         chosen = given.recordings_in(store)
         tree = store.tf(chosen.ids or None)
         if given.strict and tree.remarks:

@@ -27,7 +27,7 @@ class RecordedChunks:
     """
 
     def __init__(self, session: Session, recording: RecordingEntry) -> None:
-        self._session = session
+        self.session = session
         self._recording = recording
         self._known: dict[int, int] = {}  # chunks of each segment whose parts are known
         self._sealed: set[int] = set()  # segments with no other chunks
@@ -71,7 +71,7 @@ class RecordedChunks:
         if number not in recording.flushed and str(number) not in recording.digests:
             return False
         count = len(before.chunks)
-        now = self._session.chunk_table(recording, number).chunks[:count]
+        now = self.session.chunk_table(recording, number).chunks[:count]
         return len(now) == count and all(
             np.array_equal(now[name][-1:], before.chunks[name][-1:])
             for name in ("offset", "length", "trailer_crc")
@@ -86,7 +86,7 @@ class RecordedChunks:
         for number, first, last in self._recording.spans:
             if number in self._sealed or first >= span[1] or last < span[0]:
                 continue
-            table = self._session.chunk_table(self._recording, number)
+            table = self.session.chunk_table(self._recording, number)
             new = part_rows(number, table, self._known.get(number, 0))
             if len(new):
                 self._rows.append(new)
@@ -120,4 +120,4 @@ class RecordedChunks:
         Raises:
             SegmentError: They are missing or damaged.
         """
-        return self._session.times(self._recording, segment, chunk)
+        return self.session.times(self._recording, segment, chunk)

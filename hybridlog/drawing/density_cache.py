@@ -24,7 +24,7 @@ from hybridlog_storage.stopping import held
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog.session import Session
+    from hybridlog.session import Asked, Session
     from hybridlog_storage.catalog import RecordingEntry
 
 _BLOCK: Final = 10  # a block has 2^10 bins
@@ -60,10 +60,14 @@ class _Block(NamedTuple):
 
 
 class DensityCache:
-    """Counts messages by pixel for many clients. Thread safe."""
+    """Counts messages by pixel for many clients. Thread safe.
 
-    def __init__(self, session: Session) -> None:
-        self._session = session
+    Args:
+        source: The open store, or one moment of it.
+    """
+
+    def __init__(self, source: Asked) -> None:
+        self._source = source
 
     def density(
         self,
@@ -87,10 +91,12 @@ class DensityCache:
         Raises:
             TopicError: The recording has no such topic.
         """
-        recorded = self._of(recording)
+        session = self._source.now()
+        recorded = _recorded(session, recording)
         with held(recorded.lock):
+            recorded.session = session
             found = recorded.density(recording, span, pixels, topics)
-        self._keep(recording, recorded)
+        _keep(session, recording, recorded)
         return found
 
     def periods(
@@ -103,33 +109,43 @@ class DensityCache:
             span: Log time of messages that tell it, if it is not known yet.
             topics: Full names.
         """
-        recorded = self._of(recording)
+        session = self._source.now()
+        recorded = _recorded(session, recording)
         with held(recorded.lock):
+            recorded.session = session
             found = [recorded.period(recording, span, topic) for topic in topics]
-        self._keep(recording, recorded)
+        _keep(session, recording, recorded)
         return found
 
-    def _of(self, recording: RecordingEntry) -> _Recorded:
-        found: _Recorded | None = self._session.cache.get("recording", recording.id)
-        return found or _Recorded(self._session)
 
-    def _keep(self, recording: RecordingEntry, recorded: _Recorded) -> None:
-        self._session.cache.put("recording", recording.id, value=recorded, size=recorded.size)
+def _recorded(session: Session, recording: RecordingEntry) -> _Recorded:
+    found: _Recorded | None = session.cache.get("recording", recording.id)
+    return found or _Recorded(session)
+
+
+def _keep(session: Session, recording: RecordingEntry, recorded: _Recorded) -> None:
+    session.cache.put("recording", recording.id, value=recorded, size=recorded.size)
 
 
 class _Recorded:
-    """The chunks and blocks of one recording."""
+    """The chunks and blocks of one recording.
+
+    Attributes:
+        session: The store at the moment that is drawn.
+    """
 
     def __init__(self, session: Session) -> None:
         self.lock = threading.Lock()
-        self._session = session
+        self.session = session
         self._chunks: RecordedChunks | None = None
         self._periods: dict[str, tuple[float, int]] = {}  # and the messages that told it
 
     def follow(self, recording: RecordingEntry) -> RecordedChunks:
         """The chunks as they are now."""
+        if self._chunks is not None:
+            self._chunks.session = self.session
         if self._chunks is None or not self._chunks.follow(recording):
-            self._chunks = RecordedChunks(self._session, recording)
+            self._chunks = RecordedChunks(self.session, recording)
         return self._chunks
 
     @property
@@ -203,7 +219,7 @@ class _Recorded:
         blocks: dict[tuple[int, str], _Block] = {}
         missing: dict[tuple[int, int], list[str]] = defaultdict(list)
         for number, topic in product(numbers, topics):
-            block = self._session.cache.get("density", chunks, level, number, topic)
+            block = self.session.cache.get("density", chunks, level, number, topic)
             if block is not None:
                 blocks[number, topic] = block
             if block is None or block.parts < now:
@@ -223,7 +239,7 @@ class _Recorded:
                     if (number, topic) in blocks:
                         block = blocks[number, topic].with_more(block)
                     blocks[number, topic] = block
-                    self._session.cache.put(
+                    self.session.cache.put(
                         "density",
                         *(chunks, level, number, topic),
                         value=block,

@@ -337,8 +337,9 @@ class IndexWriter:
         while segment in self._places or segment < self._next[0]:
             digest = self._sealed.get(segment)  # first: what it has is known then
             reader = self._open(segment)
+            known = self._places.get(segment)
+            places = None if known is None else [*known]  # before the size of the file is read
             reader.grow()
-            places = self._places.get(segment)
             if places is None:
                 places = reader.summary().chunks
             with self._noting_failure():
@@ -378,6 +379,7 @@ class IndexWriter:
                     ) from error
                 self.damage[reader.number, place.number] = str(error)
                 continue
+            self.damage.pop((reader.number, place.number), None)
             size += len(chunk.batch.buffer)
             if group and size > _GROUP_BYTES:
                 yield group

@@ -14,7 +14,7 @@ from hybridlog_storage.errors import TopicError, UsageError
 if TYPE_CHECKING:
     from hybridlog.index.field_indexes import FieldIndex
     from hybridlog.maintenance.report import ArraysOfTopic, Progress
-    from hybridlog.session import Session
+    from hybridlog.opened import OpenStore
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.mongo.topic_places import TopicPlace
 
@@ -30,11 +30,11 @@ class Index:
     """The index of an open store.
 
     Args:
-        session: The open store.
+        shared: The open store.
     """
 
-    def __init__(self, session: Session) -> None:
-        self._session = session
+    def __init__(self, shared: OpenStore) -> None:
+        self._shared = shared
 
     @again_if_lost
     def rebuild(
@@ -56,18 +56,18 @@ class Index:
         """
         from hybridlog.maintenance.index import StoreIndex
 
-        session = self._session
-        database = session.database_for("Rebuilding the index", writes=True)
-        session.invalidate()
-        chosen = session.select(recordings)
-        index = StoreIndex(session.directory, session.catalog, database, progress)
+        shared = self._shared
+        database = shared.index.database_for("Rebuilding the index", writes=True)
+        shared.invalidate()
+        chosen = shared.now().select(recordings)
+        index = StoreIndex(shared.directory, shared.catalog, database, progress)
         left = index.rebuild(chosen)
         if recordings is None:
-            index.remove_rest(session.recordings())
+            index.remove_rest(shared.now().recordings())
         elif left:
             raise next(iter(left.values()))
-        session.invalidate()
-        return session.as_now([entry for entry in chosen if entry.id not in left])
+        shared.invalidate()
+        return shared.now().as_now([entry for entry in chosen if entry.id not in left])
 
     @again_if_lost
     def add(self, topic: str, *fields: str) -> _FieldIndexes:
@@ -86,7 +86,7 @@ class Index:
             DatabaseError: MongoDB refuses, for example because two fields are arrays.
         """
         query = self._about(topic)
-        database = self._session.database_for("An index", writes=True)
+        database = self._shared.index.database_for("An index", writes=True)
         query.fields(*(name for name in fields if name not in field_indexes.OWN_FIELDS))
         field_indexes.add(database, query.topics, fields)
         return field_indexes.of_topics(database, query.topics)
@@ -99,14 +99,14 @@ class Index:
             TopicError: A topic does not exist.
         """
         query = self._about(topic)
-        database = self._session.database_for("An index", writes=True)
+        database = self._shared.index.database_for("An index", writes=True)
         return field_indexes.remove(database, query.topics, fields)
 
     @again_if_lost
     def list(self, *topics: str) -> _FieldIndexes:
         """The indexes on fields, of these topics or of all."""
-        database = self._session.database_for("Indexes")
-        names = self._about(*topics).topics if topics else self._session.topics()
+        database = self._shared.index.database_for("Indexes")
+        names = self._about(*topics).topics if topics else self._shared.now().topics()
         return field_indexes.of_topics(database, names)
 
     def arrays(self, *topics: str, off: bool = False, progress: Progress | None = None) -> _Arrays:
@@ -135,9 +135,9 @@ class Index:
 
         if not topics or not all(isinstance(name, str) for name in topics):
             raise UsageError('Name the topics one by one, as in store.index.arrays("scan", "tf").')
-        session = self._session
-        session.directory.check_writable()
-        session.invalidate()
+        shared = self._shared
+        shared.directory.check_writable()
+        shared.invalidate()
         names: dict[str, None] = {}
         for name in topics:
             try:
@@ -146,10 +146,11 @@ class Index:
                 if not name.startswith("/") or {*name} & {*"*?[]"}:
                     raise
                 names[name] = None
+        session = shared.now()
         snapshot = session.snapshot()
         places = snapshot.having([*names]).tolist()
         entries = [session.entry_of(snapshot.summaries[place]) for place in places]
-        directory, tables = session.directory, session.tables
+        directory, tables = shared.directory, shared.tables
         return index_arrays(directory, entries, [*names], tables, off=off, progress=progress)
 
     @again_if_lost
@@ -162,8 +163,8 @@ class Index:
         Raises:
             DatabaseError: MongoDB is unavailable.
         """
-        database = self._session.connect()
-        return IndexAddress(self._session.connection.address(_CLIENTS_WAIT_S), database.name)
+        database = self._shared.index.connect()
+        return IndexAddress(self._shared.index.connection.address(_CLIENTS_WAIT_S), database.name)
 
     @again_if_lost
     def place(self, topic: str) -> TopicPlace:
@@ -180,18 +181,17 @@ class Index:
             TopicError: The topic does not exist.
         """
         (name, *_) = self._about(topic).topics
-        return self._session.places("The place of a topic").of([name])[name]
+        return self._shared.index.places("The place of a topic").of([name])[name]
 
     def _about(self, *topics: str) -> Query:
-        with self._session.at_one_moment():
-            return Query(self._session, Question(*self._session.resolve(topics)))
+        return Query(self._shared, Question(*self._shared.now().resolve(topics)))
 
 
 @again_if_lost
-def contents(session: Session) -> list[tuple[str, str, int]]:
+def contents(shared: OpenStore) -> list[tuple[str, str, int]]:
     """Each topic with the MongoDB collection of its documents, and their number there."""
-    database = session.database_for("The contents of the index")
-    places = session.places("The contents of the index").of(session.topics())
+    database = shared.index.database_for("The contents of the index")
+    places = shared.index.places("The contents of the index").of(shared.now().topics())
     known = [place for place in places.values() if place.is_listed]
     filters = [(place.collection, place.documents()) for place in known]
     counts = iter(database.count_each([one for one in filters if one[1]]))

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, TypeVar
 
 from hybridlog.query.counters import Counters
 from hybridlog.query.planner import Planner
-from hybridlog.session import of_one_moment
 
 if TYPE_CHECKING:
     from hybridlog.query.question import RecordedChannel, Span
@@ -16,7 +15,6 @@ if TYPE_CHECKING:
 _Query = TypeVar("_Query", bound="Steps")
 
 
-@of_one_moment
 def narrowed(query: _Query, *topics: str) -> _Query:
     """The same question about one or some of its topics, by their full names.
 
@@ -26,22 +24,19 @@ def narrowed(query: _Query, *topics: str) -> _Query:
     several = question.names_recording or len(session.chosen(question)) > 1
     names, chosen = session.having(topics, question.recordings)
     question = replace(question, topics=names, recordings=chosen, names_recording=several)
-    return type(query)(session, question, query.conditions)
+    return type(query)(query.source, question, query.conditions)
 
 
-@of_one_moment
 def channels_of(query: Steps) -> list[RecordedChannel]:
     """Every channel of a question."""
     return Planner(query.session, query.question, query.counters).channels()
 
 
-@of_one_moment
 def field_types(query: Steps) -> dict[str, str] | None:
     """Paths that can be queried and their types; None when a topic has no fixed fields."""
     return query.session.field_types(query.topics, query.question.recordings)
 
 
-@of_one_moment
 def spans_of(query: Steps) -> dict[str, Span]:
     """Log time `[begin, end)` of the messages of each recording, ns; by id, oldest first.
 

@@ -31,10 +31,11 @@ if TYPE_CHECKING:
     from hybridlog.query.chunk_columns import Chunk
     from hybridlog.query.message_filter import MessageFilter
     from hybridlog.query.question import Clock, RecordedChannel, Span
+    from hybridlog.session import Session
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.messages import Batch
     from hybridlog_storage.segments.chunk import StoredChunk
-    from hybridlog_storage.segments.segment_reader import ChunkPlace, SegmentReader
+    from hybridlog_storage.segments.segment_reader import ChunkPlace
 
 _LOOK_AHEAD = 4
 _MIN_THREADED_BYTES = 4 << 20  # starting threads takes as long as reading a megabyte
@@ -165,19 +166,19 @@ class ChunkScan:
 
     Args:
         plan: What to read.
-        reader_of: Returns the reader of a segment, by recording id and number.
+        session: The store at the moment of the plan.
         ahead: True to read ahead; unnecessary for a caller that takes few messages.
     """
 
     def __init__(
         self,
         plan: ScanPlan,
-        reader_of: Callable[[str, int], SegmentReader],
+        session: Session,
         *,
         ahead: bool = True,
     ) -> None:
         self._plan = plan
-        self._reader_of = reader_of
+        self._session = session
         self._reads_ahead = ahead
 
     def runs(self) -> Iterator[MessageRun]:
@@ -252,7 +253,7 @@ class ChunkScan:
         start: Callable[[ChunkTask, RowSelection | None], _Loading],
     ) -> Iterator[tuple[ChunkTask, MessageRun, ChunkTask | None]]:
         counters = self._plan.counters
-        if tasks and self._reader(tasks[0]).is_fetched:
+        if tasks and self._session.segment(*tasks[0].key[:2]).is_fetched:
             upcoming = self._announced(self._selected(tasks))
         else:
             upcoming = self._selected(tasks)
@@ -284,15 +285,11 @@ class ChunkScan:
             for task, _ in group:
                 by_segment.setdefault(task.key[:2], []).append(task.chunk.place)
             for segment, places in by_segment.items():
-                self._reader_of(*segment).fetch(places)
+                self._session.segment(*segment).fetch(places)
             yield from group
 
-    def _reader(self, task: ChunkTask) -> SegmentReader:
-        return self._reader_of(task.scan.recording.id, task.chunk.segment)
-
     def _load(self, task: ChunkTask, selection: RowSelection | None) -> _Loaded:
-        reader = self._reader(task)
-        chunk = reader.read_chunk(task.chunk.place)
+        chunk = self._session.read_chunk(*task.key[:2], task.chunk.place)
         run = self._wanted(task, chunk, selection)
         run, unreadable, expired = self._filtered(run)
         return run, chunk.length + chunk.trailer, unreadable, expired

@@ -139,7 +139,7 @@ class IndexReader:
                 )
         failure: Exception | None = None
         for _ in range(_TRIES):
-            database = self._session.index_as_it_is()
+            database = self._session.shared.index.index_as_it_is()
             state = IndexState(database)
             try:
                 # What is read after this is as new as this, whichever member is the primary.

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from hybridlog.query.steps import Steps
-from hybridlog.session import of_one_moment
 from hybridlog_storage.errors import (
     UsageError,
 )
@@ -18,7 +17,6 @@ if TYPE_CHECKING:
 class IntervalAnswers(Steps):
     """Answers with times, and times as conditions."""
 
-    @of_one_moment
     def intervals(
         self,
         at_least: DurationLike | None = None,
@@ -58,7 +56,6 @@ class IntervalAnswers(Steps):
             found = found.at_least(at_least)
         return found if length is None else found.cut(length)
 
-    @of_one_moment
     def changes(
         self, *fields: str, pause: DurationLike = "1s", tolerance: float = 0.0
     ) -> Intervals:
@@ -90,7 +87,6 @@ class IntervalAnswers(Steps):
         with self.counters.timed():
             return self._intervals().changes(fields, pause, tolerance)
 
-    @of_one_moment
     def gaps(
         self, longer_than: DurationLike | None = None, periods: float | None = None
     ) -> Intervals:

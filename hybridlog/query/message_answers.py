@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from hybridlog.query.planner import Planner
-from hybridlog.query.steps import Steps
+from hybridlog.query.steps import Steps, of_now
 from hybridlog.query.times import parse_time
-from hybridlog.session import of_one_moment
 from hybridlog_storage.errors import (
     DefinitionError,
     PayloadError,
@@ -42,8 +41,9 @@ class MessageAnswers(Steps):
         from hybridlog.message import messages_in
         from hybridlog.query.answers.video import picture_of
 
-        picture = picture_of(self.session)
-        for run in self._planner().runs():
+        planner = self._planner()
+        picture = picture_of(planner.session)
+        for run in planner.runs():
             yield from messages_in(run, picture)
 
     def follow(self, *names: str) -> Following:
@@ -62,9 +62,8 @@ class MessageAnswers(Steps):
         from hybridlog.query.answers.follow import Following
 
         self.counters.reset()
-        return Following(self.session, self.question, self.counters, names)
+        return Following(self.source, self.question, self.counters, names)
 
-    @of_one_moment
     def at(self, moment: TimeLike) -> Message:
         """The message of `at_time`. Its arrays are read-only: copy to change them.
 
@@ -74,21 +73,7 @@ class MessageAnswers(Steps):
                 time.
         """
         self._as_they_came("Loops and `at`")
-        return self._at(moment)
-
-    def _at(self, moment: TimeLike) -> Message:
-        if not self.question.is_unbounded or self.question.clock != "log":
-            raise UsageError(
-                "A message at a time is the last one by log time; `between`, `during` and "
-                "`clock` cannot be combined with it."
-            )
-        from hybridlog.query.answers.last_message import message_at
-
-        with self.counters.timed():
-            found = message_at(self.session, self.question, self.counters, moment)
-        if found is None:
-            raise TopicError(f"No message of {', '.join(self.topics)} is at or before {moment}.")
-        return found
+        return _message_at(self, moment)
 
     def at_time(self, moment: TimeLike) -> Self:
         """Only the message that was current at a time: the last one not after it.
@@ -99,16 +84,17 @@ class MessageAnswers(Steps):
         """
         from hybridlog.query.answers.last_message import just_before
 
-        found = self._at(moment)
+        now = of_now(self)
+        found = _message_at(now, moment)
         time = found.log_time_ns
         question = just_before(self.question, found.recording, time, time)
         # What is lost between the message and the moment may have been the current one.
-        snapshot = self.session.snapshot()
+        snapshot = now.session.snapshot()
         place = snapshot.by_id[found.recording]
         start, end = int(snapshot.begin[place]), int(snapshot.end[place])
         latest = max(parse_time(moment, start=start, end=end), time)
-        since = type(self)(self.session, replace(question, bounds=(time, latest + 1)))
-        return type(self)(self.session, question, (*self.conditions, since))
+        since = type(self)(self.source, replace(question, bounds=(time, latest + 1)))
+        return type(self)(self.source, question, (*self.conditions, since))
 
     def batches(self) -> Iterator[tuple[Batch, Sequence[RecordedChannel]]]:
         """The messages in order, many at once; `batch.channel` indexes the channels.
@@ -124,7 +110,6 @@ class MessageAnswers(Steps):
             if len(batch):
                 yield batch, run.channels
 
-    @of_one_moment
     def latched(
         self, *, original_times: bool = False
     ) -> Iterator[tuple[Batch, Sequence[RecordedChannel]]]:
@@ -139,7 +124,6 @@ class MessageAnswers(Steps):
         self.counters.reset()
         return in_force(self.session, self.question, self.counters, original_times=original_times)
 
-    @of_one_moment
     def count(self) -> int:
         """Number of messages."""
         with self.counters.timed():
@@ -147,7 +131,6 @@ class MessageAnswers(Steps):
             self.counters.messages = found
         return found
 
-    @of_one_moment
     def to_numpy(self, frame: str | None = None) -> NDArray[Any] | list[NDArray[Any]]:
         """Every message as an array (`Message.to_numpy`): stacked if all are alike.
 
@@ -168,13 +151,14 @@ class MessageAnswers(Steps):
             self.counters.reset()
             framed = replace(self.question, frame=frame)
             return _stacked([one.points for one in points_of(self.session, framed, self.counters)])
-        scans = self._scans()
+        now = of_now(self)
+        scans = _scans_of(now)
         if scans is not None:
             return scans
         arrays: list[NDArray[Any]] = []
         refused: PayloadError | DefinitionError | None = None
         unreadable = 0
-        for message in self:
+        for message in now:
             try:
                 arrays.append(message.to_numpy())
             except (PayloadError, DefinitionError) as error:
@@ -185,18 +169,34 @@ class MessageAnswers(Steps):
         self.counters.unreadable += unreadable
         return _stacked(arrays)
 
-    def _scans(self) -> NDArray[Any] | None:
-        """Laser scans of one length as an array, from columns; None for everything else."""
-        from hybridlog.frames.answer import FIELDS, are_scans, scans_in
-
-        if not are_scans(self._planner().channels()):
-            return None
-        self.counters.reset()
-        question = replace(self.question, fields=FIELDS, tags=())
-        found = scans_in(Planner(self.session, question, self.counters))
-        return None if self.counters.unreadable or self.counters.reduced else found
-
 
 def _stacked(arrays: list[NDArray[Any]]) -> NDArray[Any] | list[NDArray[Any]]:
     alike = {(a.shape, a.dtype) for a in arrays}
     return np.stack(arrays) if len(alike) == 1 else arrays
+
+
+def _message_at(query: Steps, moment: TimeLike) -> Message:
+    if not query.question.is_unbounded or query.question.clock != "log":
+        raise UsageError(
+            "A message at a time is the last one by log time; `between`, `during` and "
+            "`clock` cannot be combined with it."
+        )
+    from hybridlog.query.answers.last_message import message_at
+
+    with query.counters.timed():
+        found = message_at(query.session, query.question, query.counters, moment)
+    if found is None:
+        raise TopicError(f"No message of {', '.join(query.topics)} is at or before {moment}.")
+    return found
+
+
+def _scans_of(query: Steps) -> NDArray[Any] | None:
+    """Laser scans of one length as an array, from columns; None for everything else."""
+    from hybridlog.frames.answer import FIELDS, are_scans, scans_in
+
+    if not are_scans(Planner(query.session, query.question, query.counters).channels()):
+        return None
+    query.counters.reset()
+    question = replace(query.question, fields=FIELDS, tags=())
+    found = scans_in(Planner(query.session, question, query.counters))
+    return None if query.counters.unreadable or query.counters.reduced else found

@@ -26,6 +26,7 @@ from hybridlog.schema.column import STAMP
 from hybridlog.schema.states import GONE
 from hybridlog.snapshot import UNFINISHED
 from hybridlog_storage.errors import (
+    ChangedError,
     ResourceError,
     SegmentError,
     StoreError,
@@ -52,6 +53,7 @@ if TYPE_CHECKING:
 _GROUP_GROWTH = 64  # so many times more recordings are planned after each group
 _MAX_GROUP = 4096  # recordings planned at once, if they do not overlap
 _READ_AHEAD_FROM = 50  # messages; nothing is read ahead for fewer
+_T = TypeVar("_T")
 _Rows = TypeVar("_Rows", "MatchColumns", "Values")
 _Key = tuple[int, int]
 _COUNTING: Final[tuple[type[Counting], ...]] = (
@@ -215,9 +217,11 @@ class Planner:
         for part in self.parts():
             by_topic[part.topic].append(part)
         if every == 1:
-            total = self._count([part for parts in by_topic.values() for part in parts])
+            parts = [part for parts in by_topic.values() for part in parts]
+            total = self._again(self._count, parts)
         else:
-            total = sum(-(-self._count(parts) // every) for parts in by_topic.values())
+            counts = (self._again(self._count, parts) for parts in by_topic.values())
+            total = sum(-(-count // every) for count in counts)
         limit = self.question.limit
         return total if limit is None else min(total, limit)
 
@@ -252,7 +256,7 @@ class Planner:
         """For each message of a part, whether it matches, in order."""
         (part,) = self._decided([part])
         engines = self._choose(part, Need.OUTCOMES)
-        return self._first(engines, lambda engine: engine.outcomes(part))
+        return self._first(engines, lambda engine, own: engine.outcomes(own), part)
 
     def values(self, part: Part, fields: Collection[str] | None) -> Iterator[Values]:
         """Fields of the matching messages of a part, in order."""
@@ -262,7 +266,7 @@ class Planner:
     def _values(
         self, part: Part, fields: Collection[str] | None, engines: Sequence[Engine]
     ) -> Iterator[Values]:
-        return self._first(engines, lambda engine: engine.values(part, fields))
+        return self._first(engines, lambda engine, own: engine.values(own, fields), part)
 
     def values_of_tables(
         self, parts: Sequence[Part], fields: Collection[str] | None
@@ -299,19 +303,15 @@ class Planner:
         """All messages that match, in order; recordings are read when their turn comes."""
         limit = self.question.limit
         ahead = limit is None or limit > _READ_AHEAD_FROM
-        with self.session.noticing_changes():
-            for group in self.groups():
-                plan = self.plan(group)
-                yield from ChunkScan(plan, self.session.segment, ahead=ahead).runs()
+        for group in self.groups():
+            yield from ChunkScan(self.plan(group), self.session, ahead=ahead).runs()
 
     def unordered(self) -> Iterator[MessageRun]:
         """The messages of an answer without `limit` and `every`, unordered."""
-        with self.session.noticing_changes():
-            for group in self.groups():
-                plan = self.plan(group)
-                for run in ChunkScan(plan, self.session.segment).unordered():
-                    self.counters.add_messages(run.batch)
-                    yield run
+        for group in self.groups():
+            for run in ChunkScan(self.plan(group), self.session).unordered():
+                self.counters.add_messages(run.batch)
+                yield run
 
     def groups(self) -> Iterator[list[Part]]:
         """The parts in groups, those that overlap in time together, in the answer's order.
@@ -334,8 +334,31 @@ class Planner:
             yield [part for row in rows for part in self.parts_in(*found[row])]
             begin, most = end, min(most * _GROUP_GROWTH, _MAX_GROUP)
 
+    def _again(self, ask: Callable[[Sequence[Part]], _T], parts: Sequence[Part]) -> _T:
+        """Ask about parts; once more about those of recordings whose files were replaced."""
+        try:
+            return ask(parts)
+        except ChangedError:
+            return ask(self._renewed(parts))
+
+    def _renewed(self, parts: Sequence[Part]) -> list[Part]:
+        """The same parts, of recordings whose files were replaced as they are now."""
+        snapshot = self.session.snapshot()
+        found: list[Part] = []
+        for part in parts:
+            summary = snapshot.summaries[snapshot.by_id[part.recording.id]]
+            if self.session.entry_of(summary) is part.recording:
+                found.append(part)
+                continue
+            again = self.parts_in(summary, part.bounds, part.windows)
+            found += [one for one in again if one.topic == part.topic]
+        return found
+
     def plan(self, parts: Sequence[Part]) -> ScanPlan:
         """The plan for reading the matching messages of some parts."""
+        return self._again(self._plan, parts)
+
+    def _plan(self, parts: Sequence[Part]) -> ScanPlan:
         parts = self._decided(parts)
         plan = self._scan.plan(parts, filtered=False)
         plan.reverse = self.question.reverse
@@ -485,19 +508,30 @@ class Planner:
         raise failure
 
     def _first(
-        self, engines: Sequence[Engine], ask: Callable[[Engine], Iterator[_Rows]]
+        self,
+        engines: Sequence[Engine],
+        ask: Callable[[Engine, Part], Iterator[_Rows]],
+        part: Part,
     ) -> Iterator[_Rows]:
         """Items of the cheapest engine; the next one goes on where it fails."""
         failure: Exception | None = None
         last: _Key | None = None
-        for engine in engines:
+        left, is_renewed = [*engines], False
+        while left:
+            engine = left.pop(0)
             try:
-                for item in ask(engine):
+                for item in ask(engine, part):
                     rest = item if last is None else _after(item, last)
                     if rest is not None:
                         yield rest
                         last = _last_key(rest) or last
                 return
+            except ChangedError as error:
+                failure = error
+                if not is_renewed:
+                    is_renewed = True
+                    (part,) = self._decided(self._renewed([part]))
+                    left.insert(0, engine)
             except _FALLBACK_ERRORS as error:
                 if failure is None or isinstance(failure, UndecidedError):
                     failure = error

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING
 
 from hybridlog.query.interval_answers import IntervalAnswers
 from hybridlog.query.message_answers import MessageAnswers
+from hybridlog.query.steps import of_now
 from hybridlog.query.table_answers import TableAnswers
-from hybridlog.session import of_one_moment
 from hybridlog.wording import listed
 from hybridlog_storage.errors import (
     HybridlogError,
@@ -31,7 +31,7 @@ class Query(MessageAnswers, TableAnswers, IntervalAnswers):
     """A question about some topics of an open store. Immutable: each step returns a new one.
 
     Args:
-        session: The open store.
+        source: The open store, or one moment of it.
         question: The question.
 
     Attributes:
@@ -51,14 +51,14 @@ class Query(MessageAnswers, TableAnswers, IntervalAnswers):
 
     def _described(self) -> dict[str, str]:
         """The parts of the question in words."""
-        question = self.question
+        question, session = self.question, self.session
         found = {"topics": listed(self.topics, 3)}
         try:
-            places = self.session.chosen(question).tolist()
+            places = session.chosen(question).tolist()
         except HybridlogError as error:
             found["recordings"] = str(error)
         else:
-            summaries = self.session.snapshot().summaries
+            summaries = session.snapshot().summaries
             labels = listed((summaries[place].label for place in places[:4]), 3)
             several = f"{len(places)} recordings"
             found["recordings"] = several if len(places) != 1 else f"recording {labels}"
@@ -85,7 +85,6 @@ class Query(MessageAnswers, TableAnswers, IntervalAnswers):
             found["order"] = "latest first"
         return found
 
-    @of_one_moment
     def completeness(self) -> Completeness:
         """Completeness of the last answer, or, without one, of an answer given now.
 
@@ -96,7 +95,6 @@ class Query(MessageAnswers, TableAnswers, IntervalAnswers):
         others = ((one.question, one.counters) for one in self.conditions)
         return completeness_of(self.session, self.question, self.counters, *others)
 
-    @of_one_moment
     def remarks(self, *, is_empty: bool | None = None) -> list[str]:
         """Sentences about the last answer.
 
@@ -112,9 +110,10 @@ class Query(MessageAnswers, TableAnswers, IntervalAnswers):
 
         if is_empty is None:
             is_empty = not self.counters.messages
-        found = [*self.completeness().sentences]
+        now = of_now(self)
+        found = [*now.completeness().sentences]
         for one in self.conditions:
             nothing = self.question.during is not None and not self.question.during
-            found += remarks(self.session, one.question, is_empty=nothing)
-        found += remarks(self.session, self.question, is_empty=is_empty)
+            found += remarks(now.session, one.question, is_empty=nothing)
+        found += remarks(now.session, self.question, is_empty=is_empty)
         return [*dict.fromkeys(found)]

@@ -248,8 +248,7 @@ class RangeResolver:
             if not known:
                 from hybridlog.schema.codec import stamps_of
 
-                reader = self._session.segment(recording.id, chunk.segment)
-                batch = reader.read_chunk(chunk.place).batch
+                batch = self._session.read_chunk(recording.id, chunk.segment, chunk.place).batch
                 batch = batch.take(np.flatnonzero(batch.channel == number))
                 times = batch.publish_time if is_publish else stamps_of(channel.codec, batch)[1]
                 known = [int(times.min()), int(times.max())] if len(times) else []

@@ -5,16 +5,14 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Mapping, Sequence
-from copy import copy
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Self, cast
+from typing import TYPE_CHECKING, Any, Self, TypeVar, cast
 
 from hybridlog.query.choice import Choice
 from hybridlog.query.counters import Counters
 from hybridlog.query.planner import Planner
 from hybridlog.query.question import Clock, Question
 from hybridlog.query.times import parse_duration, parse_time
-from hybridlog.session import of_one_moment
 from hybridlog.wording import listed
 from hybridlog_storage.errors import (
     TopicError,
@@ -26,9 +24,10 @@ if TYPE_CHECKING:
     from hybridlog.query.choice import During, Tags, Texts
     from hybridlog.query.intervals import Intervals
     from hybridlog.query.times import DurationLike, TimeLike
-    from hybridlog.session import Session
+    from hybridlog.session import Asked, Session
     from hybridlog_storage.summary import RecordingSummary
 
+_Query = TypeVar("_Query", bound="Steps")
 _MAX_STEP = 2**62  # longer than any topic, and an int64
 
 
@@ -36,7 +35,7 @@ class Steps:
     """Chooses what a question asks: each step returns a new one.
 
     Args:
-        session: The open store.
+        source: The open store, or one moment of it.
         question: The question.
 
     Attributes:
@@ -46,31 +45,31 @@ class Steps:
     """
 
     def __init__(
-        self, session: Session, question: Question, conditions: tuple[Steps, ...] = ()
+        self, source: Asked, question: Question, conditions: tuple[Steps, ...] = ()
     ) -> None:
         self.question = question
         self.counters = Counters()
         self.conditions = conditions
-        self._session = session
+        self.source = source
 
     @property
     def session(self) -> Session:
-        """The open store.
+        """The store at the moment that an answer is about: now, or that of a snapshot.
 
         Raises:
             UsageError: It was opened before this process was forked.
         """
-        return self._session.here()
+        return self.source.now()
 
     def __eq__(self, other: object) -> bool:
         """True if both are the same question to the same open store."""
         if not isinstance(other, Steps):
             return NotImplemented
-        return self._session is other._session and self.question == other.question
+        return self.source is other.source and self.question == other.question
 
     def __hash__(self) -> int:
         """Hash of the question."""
-        return hash((id(self._session), self.question))
+        return hash((id(self.source), self.question))
 
     @property
     def topics(self) -> tuple[str, ...]:
@@ -84,7 +83,7 @@ class Steps:
 
     def __copy__(self) -> Self:
         """The same question with separate counters."""
-        return type(self)(self.session, self.question, self.conditions)
+        return type(self)(self.source, self.question, self.conditions)
 
     def between(self, begin: TimeLike | None, end: TimeLike | None = None) -> Self:
         """Only messages with `begin <= time < end`.
@@ -111,7 +110,6 @@ class Steps:
             raise UsageError(f"Unknown clock {clock!r}; choose log, publish or header.")
         return self._with(clock=cast(Clock, clock))
 
-    @of_one_moment
     def where(
         self,
         predicate: str | Mapping[str, object],
@@ -173,23 +171,23 @@ class Steps:
             # The message that is exactly so far away belongs to it.
             before, after = within, f"{parse_duration(within) + 1}ns"
         own, others = split_own(parse_across(text))
-        query = copy(self)
+        query = now = of_now(self)
         for predicate in own:
             query = query.where(predicate)
         conditions: list[Self] = []
 
         def windows(condition: Near) -> Intervals:
-            question = question_about(self.session, query.question, condition.topic, before, after)
-            events = type(self)(self.session, question)
+            question = question_about(now.session, query.question, condition.topic, before, after)
+            events = type(self)(now.source, question)
             if condition.predicate:
                 events = events.where(condition.predicate)
             conditions.append(events)
             return events.windows(before, after)
 
-        whole = everything(self.session, self.question)
+        whole = everything(now.session, self.question)
         for condition in others:
             query = query.during(intervals_of(condition, windows, whole))
-        return type(self)(self.session, query.question, (*self.conditions, *conditions))
+        return type(self)(self.source, query.question, (*self.conditions, *conditions))
 
     def limit(self, count: int) -> Self:
         """At most this many messages.
@@ -215,7 +213,6 @@ class Steps:
         """Latest message first."""
         return self._with(reverse=not self.question.reverse)
 
-    @of_one_moment
     def fields(self, *paths: str) -> Self:
         """Only these fields in tables (`header.stamp`, `pose.position`, `ranges.min`).
 
@@ -246,7 +243,6 @@ class Steps:
         """
         return self._with(frame=frame)
 
-    @of_one_moment
     def tags(self, *keys: str) -> Self:
         """Tags of the recordings as columns of tables, behind `topic` and `recording`.
 
@@ -256,8 +252,9 @@ class Steps:
         Raises:
             TopicError: no recording of the query has such a tag.
         """
-        places = self.session.chosen(self.question).tolist()
-        snapshot = self.session.snapshot()
+        session = self.session
+        places = session.chosen(self.question).tolist()
+        snapshot = session.snapshot()
         known = {key for place in places for key in snapshot.summaries[place].tags}
         for key in keys:
             if key not in known:
@@ -267,7 +264,6 @@ class Steps:
                 )
         return self._with(tags=tuple(dict.fromkeys(keys)))
 
-    @of_one_moment
     def in_recording(
         self,
         *names: str,
@@ -299,7 +295,6 @@ class Steps:
             raise TopicError(chosen.problem)
         return self._on(self.topics, [summary.id for summary in chosen.summaries])
 
-    @of_one_moment
     def during(self, intervals: Intervals) -> Self:
         """Only messages whose log time is in one of some intervals of their recording.
 
@@ -319,7 +314,6 @@ class Steps:
             intervals = self.question.during.common(intervals)
         return self._with(during=intervals.merged())
 
-    @of_one_moment
     def windows(self, before: DurationLike = 0, after: DurationLike = 0) -> Intervals:
         """Time around each message: `t - before <= time < t + after`, within its recording.
 
@@ -338,11 +332,11 @@ class Steps:
         with self.counters.timed():
             return self._intervals().windows(before, after)
 
-    @of_one_moment
     def summaries(self) -> list[RecordingSummary]:
         """The recordings in short, oldest first; some may have no message in the answer."""
-        places = self.session.chosen(self.question).tolist()
-        return [self.session.snapshot().summaries[place] for place in places]
+        session = self.session
+        places = session.chosen(self.question).tolist()
+        return [session.snapshot().summaries[place] for place in places]
 
     def _intervals(self) -> IntervalQueries:
         from hybridlog.query.answers.interval_queries import IntervalQueries
@@ -350,14 +344,15 @@ class Steps:
         return IntervalQueries(self.session, self.question, self.counters)
 
     def _with(self, **changes: Any) -> Self:
-        return type(self)(self.session, replace(self.question, **changes), self.conditions)
+        return type(self)(self.source, replace(self.question, **changes), self.conditions)
 
     def _on(self, topics: Sequence[str], recordings: Sequence[str] | None) -> Self:
         """The same conditions on other topics and recordings."""
-        topics, chosen = self.session.having(topics, recordings)
+        session = self.session
+        topics, chosen = session.having(topics, recordings)
         others = self.question.namesakes
         if others and recordings is not None:
-            there = {*self.session.topics_of(recordings)}
+            there = {*session.topics_of(recordings)}
             others = tuple(topic for topic in others if topic in there)
         return self._with(topics=topics, recordings=chosen, namesakes=others)
 
@@ -368,9 +363,15 @@ class Steps:
 
     def _planner(self) -> Planner:
         """A planner for an answer, of a moment that begins now."""
-        self.session.renew()
         self.counters.reset()
         return Planner(self.session, self.question, self.counters)
+
+
+def of_now(query: _Query) -> _Query:
+    """The same question with the same counters, at the moment that begins now."""
+    found = type(query)(query.session, query.question, query.conditions)
+    found.counters = query.counters
+    return found
 
 
 def _is_field(path: str, known: Mapping[str, str]) -> bool:

@@ -6,8 +6,7 @@ from collections.abc import Iterator
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
-from hybridlog.query.steps import Steps
-from hybridlog.session import of_one_moment
+from hybridlog.query.steps import Steps, of_now
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -22,7 +21,6 @@ if TYPE_CHECKING:
 class TableAnswers(Steps):
     """Answers with the fields of messages as rows and columns."""
 
-    @of_one_moment
     def to_arrow(self) -> pa.Table:
         """A table: scalars and strings as columns, arrays as lists, first column log time."""
         import pyarrow as pa
@@ -43,7 +41,6 @@ class TableAnswers(Steps):
 
         return to_polars(self.to_arrow())
 
-    @of_one_moment
     def to_pandas(self) -> pd.DataFrame:
         """A frame of the same columns, indexed by log time (UTC, ns)."""
         from hybridlog.frames.answer import to_pandas
@@ -72,7 +69,6 @@ class TableAnswers(Steps):
         for batch in lines(self._planner()):
             yield [line if isinstance(line, str) else "".join(line) for line in batch]
 
-    @of_one_moment
     def resample(
         self,
         step: DurationLike,
@@ -101,7 +97,6 @@ class TableAnswers(Steps):
 
         return resampled(self.session, self.question, step, how, tolerance)
 
-    @of_one_moment
     def rate(self, window: DurationLike | None = None) -> pa.Table:
         """Number and rate of the messages of each topic.
 
@@ -124,7 +119,6 @@ class TableAnswers(Steps):
         with self.counters.timed():
             return Rates(self.session, self.question, self.counters).rate(window)
 
-    @of_one_moment
     def check(self) -> list[TopicCheck]:
         """Check how regularly the topics came: rate, jitter, gap, late start, early stop, losses.
 
@@ -141,7 +135,6 @@ class TableAnswers(Steps):
         with self.counters.timed():
             return check(self.session, self.question, self.counters)
 
-    @of_one_moment
     def stats(self, *fields: str) -> list[FieldStatistics]:
         """Statistics of the numeric fields: count, NaN, infinite, least, greatest, mean, deviation.
 
@@ -157,6 +150,7 @@ class TableAnswers(Steps):
         from hybridlog.query.answers.field_statistics import statistics
 
         self._as_they_came("Statistics")
-        query = self.fields(*fields) if fields else self
+        now = of_now(self)
+        query = now.fields(*fields) if fields else now
         with self.counters.timed():
-            return statistics(self.session, query.question, self.counters)
+            return statistics(now.session, query.question, self.counters)

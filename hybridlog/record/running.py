@@ -85,14 +85,9 @@ class RunningRecording:
         self.topics = set() if self.entry is None else topic_types(self.entry)
         return True
 
-    def is_cut(self) -> bool:
-        """True if chunks that were read have been taken back, on a full disk."""
-        return any(segment.is_cut() for segment in self._segments.values())
-
-    def reader(self, number: int) -> SegmentReader | None:
-        """The reader of a segment that is not sealed; None for others."""
-        segment = self._segments.get(number)
-        return None if segment is None else segment.reader
+    def readers(self) -> dict[int, SegmentReader]:
+        """The readers of segments that are not sealed, by number."""
+        return {number: segment.reader for number, segment in self._segments.items()}
 
     @contextmanager
     def _noting(self, number: int) -> Iterator[None]:

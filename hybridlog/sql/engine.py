@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from hybridlog.query.answers.completeness import Completeness
-    from hybridlog.session import Session
+    from hybridlog.session import Asked
     from hybridlog.sql.pieces import ScanCounts
     from hybridlog.sql.topic_view import Remarks
 
@@ -62,8 +62,8 @@ _T = TypeVar("_T")
 class SqlEngine:
     """Runs SQL on an open store. Thread safe."""
 
-    def __init__(self, session: Session) -> None:
-        self.session = session
+    def __init__(self, source: Asked) -> None:
+        self._source = source
         self._bases: dict[int, Any] = {}
         self._content: StoreContent | None = None
         self._trees: dict[str, str] = {}
@@ -97,10 +97,9 @@ class SqlEngine:
     def content(self, scope: Question = EVERYWHERE) -> StoreContent:
         """Recordings and views of a scope as they are now."""
         with self._lock:
-            known = self._content
-            if known is None or known.scope != scope or known.snapshot is not self.session.look():
-                with self.session.at_one_moment():
-                    known = self._content = StoreContent(self.session, scope)
+            known, session = self._content, self._source.now()
+            if known is None or known.scope != scope or known.snapshot is not session.look():
+                known = self._content = StoreContent(session, scope)
             return known
 
     def tree(self, cursor: Any, text: str) -> str:
@@ -118,7 +117,7 @@ class SqlEngine:
     def reject(self, damaged: DamagedTableError) -> None:
         """Drop a damaged table; the next query makes it again."""
         with self._lock:
-            self.session.reject_table(damaged.source.entry, damaged.source.topic)
+            self._source.now().reject_table(damaged.source.entry, damaged.source.topic)
             self._content = None
 
     def close(self) -> None:
@@ -180,18 +179,19 @@ class SqlConnection:
         Raises:
             IncompleteError: Messages are lost, or not written yet.
         """
-        with self.engine.session.at_one_moment():
-            content = self.content
-            named = (content.names.topic(name) for name in content.names.named(text))
-            topics = {topic for topic in named if topic is not None}
-            self.completeness(topics, content.having(topics)).check()
+        content = self.content
+        named = (content.names.topic(name) for name in content.names.named(text))
+        topics = {topic for topic in named if topic is not None}
+        self.completeness(content, topics, content.having(topics)).check()
 
-    def completeness(self, topics: Collection[str], recordings: Collection[str]) -> Completeness:
+    def completeness(
+        self, content: StoreContent, topics: Collection[str], recordings: Collection[str]
+    ) -> Completeness:
         """Completeness of the answer of a query."""
         from hybridlog.query.answers.lost import completeness_of
 
         asked = replace(self.scope, topics=tuple(topics), recordings=tuple(recordings))
-        return completeness_of(self.engine.session, asked)
+        return completeness_of(content.session, asked)
 
     def schema(self, view: str) -> pa.Schema:
         """Columns of a view or table of the store; none without such a view."""
@@ -228,13 +228,13 @@ class SqlConnection:
             )
         if self._only_reads and any(_kind(statement) != "SELECT" for statement in statements):
             raise UsageError("Only queries are possible here, such as select and show.")
-        with self.engine.session.at_one_moment():
-            self._names.update(self.content.names.named(text))
-            self.register()
-            answers = [
-                self._prepared(statement, params if statement is statements[-1] else None, timeout)
-                for statement in statements
-            ]
+        content = self.content
+        self._names.update(content.names.named(text))
+        self.register(content)
+        answers = [
+            self._prepared(statement, params if statement is statements[-1] else None, timeout)
+            for statement in statements
+        ]
         return answers[-1]
 
     def _prepared(self, statement: Any, params: Params, timeout: float | None) -> SqlAnswer:
@@ -247,9 +247,8 @@ class SqlConnection:
             answer.run()
         return answer
 
-    def register(self) -> None:
-        """Register the views that were named so far, if they are not the current ones."""
-        content = self.content
+    def register(self, content: StoreContent) -> None:
+        """Register the views that were named so far, if they are not those of this content."""
         known = set() if content is not self._content else self._registered
         for name in self._names - known:
             topic = content.names.topic(name)
@@ -331,13 +330,14 @@ class SqlAnswer:
             lines.append(f"{topic} has no columns of fields: {reason}.")
         for (topic, state), count in found.absent.items():
             lines.append(f"{topic}: {without_fields(count, state)}.")
-        views = self._connection.content.names.views
+        content = self._connection.content
+        views = content.names.views
         for topic in sorted(found.topics):
             others = namesakes([topic.strip("/")], views)
             unread = [views[other] for other in others if other not in found.topics]
             if unread:
                 lines.append(f"{topic} was asked, not the view {listed(unread, 5)}.")
-        lacks = self._connection.completeness(found.topics, found.recordings)
+        lacks = self._connection.completeness(content, found.topics, found.recordings)
         return [*lines, *lacks.sentences]
 
     def run(self) -> None:
@@ -456,7 +456,6 @@ class SqlAnswer:
         return table
 
     def _prepare(self) -> None:
-        self._connection.register()
         try:
             with self._explained():
                 self._relation = self._connection.cursor.sql(self._text, params=self._params)
@@ -487,6 +486,7 @@ class SqlAnswer:
                     return call()
             except DamagedTableError as damaged:
                 self._connection.engine.reject(damaged)
+                self._connection.register(self._connection.content)
                 self._prepare()
         with self._explained():
             return call()

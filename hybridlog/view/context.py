@@ -11,6 +11,7 @@ import time
 import traceback
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from copy import copy
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
@@ -26,7 +27,6 @@ from hybridlog.record.losses import extent_of
 from hybridlog.view.params import RequestParams
 from hybridlog.view.sql_process import SqlProcess
 from hybridlog_storage.errors import HybridlogError, ResourceError, TimeError, TopicError
-from hybridlog_storage.lazy import lazy
 from hybridlog_storage.stopping import GivenUpError, held, until_given_up
 from hybridlog_storage.times import END, span_of
 
@@ -57,46 +57,37 @@ class Context:
     """The store that is shown.
 
     Attributes:
-        store: That store.
+        store: That store; at one moment while an answer is worked out.
         turns: Held by each answer that is worked out.
+        matches: Matches of the last questions.
+        sql: Answers SQL.
+        slices: MCAP files of selections.
     """
 
     def __init__(self, store: Store) -> None:
         self.store = store
-        self._refreshing = threading.Lock()
-        self._looked = time.monotonic()
-        self._took = 0.0
+        self._looks = _Looks(store)
         self.turns = threading.BoundedSemaphore(MAX_WORKING)
+        self.matches = MatchCache(store.shared.cache)
+        self.sql = SqlProcess(store)
+        self.slices = SliceCache()
 
-    @lazy
+    def of_now(self) -> Context:
+        """The same context for an answer, whose store is of the moment that begins now."""
+        found = copy(self)
+        found.store = self.store.snapshot()
+        return found
+
+    @property
     def densities(self) -> DensityCache:
         """Counts of messages by pixel."""
         return DensityCache(self.store.session)
 
-    @lazy
-    def matches(self) -> MatchCache:
-        """Matches of the last questions."""
-        return MatchCache(self.store.session.cache)
-
-    @lazy
-    def sql(self) -> SqlProcess:
-        """Answers SQL."""
-        return SqlProcess(self.store)
-
-    @lazy
-    def slices(self) -> SliceCache:
-        """MCAP files of selections."""
-        return SliceCache()
-
     def refresh(self, least_s: float = REFRESH_S) -> None:
         """See what other processes have recorded since, unless the last look was just now."""
-        with self._refreshing:
-            begun = time.monotonic()
-            if begun >= self._looked + max(least_s, self._took / REFRESH_SHARE):
-                self.store.refresh()
-                self.store.session.snapshot()
-                self._looked = time.monotonic()
-                self._took = self._looked - begun
+        self._looks.refresh(least_s)
+        if self.store is not self._looks.store:
+            self.store = self._looks.store.snapshot()
 
     def recording(self, params: RequestParams) -> RecordingEntry:
         """The recording that the parameter `recording` names by its label or id.
@@ -130,6 +121,25 @@ class Context:
         return recording, self.query(recording, params.text("topic"))
 
 
+class _Looks:
+    """Looks for new recordings of a store, not too often."""
+
+    def __init__(self, store: Store) -> None:
+        self.store = store
+        self._looking = threading.Lock()
+        self._looked = time.monotonic()
+        self._took = 0.0
+
+    def refresh(self, least_s: float) -> None:
+        with self._looking:
+            begun = time.monotonic()
+            if begun >= self._looked + max(least_s, self._took / REFRESH_SHARE):
+                self.store.refresh()
+                self.store.shared.now()
+                self._looked = time.monotonic()
+                self._took = self._looked - begun
+
+
 def start_of(recording: RecordingEntry) -> int:
     """The time that offsets count from, ns: of the first message, else of the recording."""
     span = recording.span
@@ -159,12 +169,8 @@ def route(path: str, answer: Answer, turns: threading.Semaphore | None = None) -
         context: Context = request.app.state.context
         params = RequestParams(request.query_params, request.headers.get("if-none-match"))
         try:
-            with (
-                until_given_up(given_up),
-                held(turns or context.turns),
-                context.store.at_one_moment(),
-            ):
-                found = answer(context, params)
+            with until_given_up(given_up), held(turns or context.turns):
+                found = answer(context.of_now(), params)
             return found if isinstance(found, Response) else json_response(found)
         except HybridlogError as error:
             return error_response(error)

@@ -112,6 +112,10 @@ class SegmentError(StoreError):
     """A segment of the store that cannot be read."""
 
 
+class ChangedError(StoreError):
+    """Files of a recording were replaced while a question was about them. Ask again."""
+
+
 class BucketError(HybridlogError):
     """A bucket that does not answer, refuses access, or ignores conditions of writers."""
 

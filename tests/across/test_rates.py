@@ -189,7 +189,7 @@ def test_bursts_are_no_gaps(tmp_path: Path) -> None:
         for pixels in (20_000, 1000, 200):
             (line,) = series(query, ["v"], pixels=pixels)
             assert int(np.isnan(line.least).sum()) == 1, pixels
-        (period,) = DensityCache(store.session).periods(store.entry("a"), span, ["/burst"])
+        (period,) = DensityCache(store.shared).periods(store.entry("a"), span, ["/burst"])
         assert period == 97 * MS
         edges = np.linspace(span[0], span[1], 5000).astype(np.int64)
         counts = np.histogram(times, edges)[0]

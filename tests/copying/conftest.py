@@ -51,7 +51,7 @@ def expire(store: hl.Store, label: str, segments: Sequence[int] = ()) -> None:
     with directory.writing(label):
         numbers = segments or [*directory.listing(label).sealed]
         expiry.expire(directory, label, numbers, min_bytes=0)
-    store.session.catch_up()
+    store.shared.catch_up()
 
 
 @contextmanager

@@ -111,7 +111,7 @@ def test_pixels_have_what_queries_count(
 def test_zooming_and_panning_change_nothing(
     store: hl.Store, views: list[tuple[tuple[int, int], int]]
 ) -> None:
-    cache = DensityCache(store.session)
+    cache = DensityCache(store.shared)
     for span, pixels in views:
         found = cache.density(store.entry("a"), span, pixels, ["/late", "/steady"])
         widths = np.diff(found.edges)
@@ -127,7 +127,7 @@ def test_zooming_and_panning_change_nothing(
 
 
 def test_the_ends_of_time(store: hl.Store) -> None:
-    cache = DensityCache(store.session)
+    cache = DensityCache(store.shared)
     for span in ((0, 2**63 - 1), (2**63 - 3, 2**63 - 1), (0, 1)):
         for pixels in (1, 1000):
             found = cache.density(store.entry("a"), span, pixels, ["/steady"])
@@ -138,17 +138,17 @@ def test_the_ends_of_time(store: hl.Store) -> None:
 
 
 def test_a_small_cache_forgets_and_stays_right(store: hl.Store) -> None:
-    session = store.session
-    before, session.cache = session.cache, Cache(20_000)
+    shared = store.shared
+    before, shared.cache = shared.cache, Cache(20_000)
     try:
-        cache = DensityCache(session)
+        cache = DensityCache(shared)
         for begin in range(0, LENGTH, LENGTH // 16):
             span = BASE + begin, BASE + begin + LENGTH // 16
             found = cache.density(store.entry("a"), span, 500, sorted(TIMES))
             for topic, counts in zip(found.topics, found.counts, strict=True):
                 assert (counts == _truth(topic, found.edges)).all()
     finally:
-        session.cache = before
+        shared.cache = before
 
 
 def test_what_is_added_to_an_estimate_is_one() -> None:
@@ -173,7 +173,7 @@ class Reads:
 
 def test_the_cost_is_that_of_the_span(store: hl.Store, calls: Calls) -> None:
     reads = Reads(calls)
-    cache = DensityCache(store.session)
+    cache = DensityCache(store.shared)
     store.session.cache.drop("recording")  # of other tests
     store.session.cache.drop("density")
     whole = (BASE, BASE + LENGTH)
@@ -198,7 +198,7 @@ def test_usual_periods(store: hl.Store) -> None:
     """Of messages in chunks of many, and in chunks of their own."""
     topics = ["/steady", "/large", "/one"]
     span = BASE, BASE + LENGTH
-    steady, large, one = DensityCache(store.session).periods(store.entry("a"), span, topics)
+    steady, large, one = DensityCache(store.shared).periods(store.entry("a"), span, topics)
     steps = np.diff(np.sort(TIMES["/steady"]))
     assert steady == pytest.approx(np.quantile(steps, 0.9), rel=0.02)
     assert (large, one) == (100 * MS, 0)
@@ -274,7 +274,7 @@ def test_a_recording_that_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         writing.start("live", settings=settings, flush_interval_s=0.05) as recording,
         hl.open(tmp_path / "store") as store,
     ):
-        cache = DensityCache(store.session)
+        cache = DensityCache(store.shared)
         with pytest.raises(TopicError, match="'/a'"):
             cache.density(store.entry("live"), span, 10, ["/a"])
 

@@ -207,8 +207,8 @@ def test_what_has_no_end_yet_is_refused(path: Path) -> None:
         ):
             with pytest.raises(UsageError):
                 asked.follow()
-        with store.at_one_moment(), pytest.raises(UsageError, match="at_one_moment"):
-            next(topic.follow())
+        with pytest.raises(UsageError, match="snapshot"):
+            store.snapshot().topic("/a").follow()
         one.end()
         with pytest.raises(UsageError, match="none of those asked about"):
             topic.follow()

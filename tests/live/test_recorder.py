@@ -626,7 +626,7 @@ def test_the_reserve_holds_for_what_waits_in_memory(
 
 def test_what_is_expected_is_ready_before_its_first_message(store: hl.Store, limit: Limit) -> None:
     limit(expected_topics=2)
-    database = store.session.database_for("This")
+    database = store.shared.index.database_for("This")
     robot = Running(store)
     channels = [text_channel(topic) for topic in ("/said", "/silent", "/one_too_many")]
     for channel in channels:
@@ -645,7 +645,7 @@ def test_what_a_ring_expects_is_in_no_index(store: hl.Store) -> None:
     robot = Running(store, RecorderOptions(reserve_bytes=0, snapshots=SnapshotOptions(ring_s=5)))
     robot.recorder.expect(text_channel("/said"))
     assert robot.recorder.stop() == []
-    assert collection_of("/said") not in store.session.database_for("This").list_collections()
+    assert collection_of("/said") not in store.shared.index.database_for("This").list_collections()
 
 
 def test_a_standard_type_without_its_definition(store: hl.Store) -> None:

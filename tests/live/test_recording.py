@@ -607,7 +607,7 @@ def test_what_a_mongod_had_lost_when_it_died_is_indexed_again_and_counted_once(
     with store.start("talk", flush_interval_s=0.2) as recording:
         recording.write(speech, text(b"lost"), log_time=1)
         wait_for(lambda: recording.lag == 0 and recording.stored[0] == 1)
-        database, key = store.session.database_for("This"), recording.id[:16]
+        database, key = store.shared.index.database_for("This"), recording.id[:16]
         IndexState(database).put_through(key, NOTHING)
         assert database.delete(collection_of("/speech"), {"_meta.rec": key}) == 1
         kill_mongod(store.directory.path)

@@ -502,7 +502,7 @@ def test_messages_near_events_are_what_a_loop_finds(
 def test_the_order_does_not_depend_on_indexes_of_the_user(store: hl.Store) -> None:
     logs = [(second, "/state", {"s": 9 - second}) for second in range(10)]
     model = recorded(store, {"a": logs})
-    database = store.session.database_for("the test")
+    database = store.shared.index.database_for("the test")
     database.create_index("state", [("s", 1)])
     query = store.topic("/state").where("s > 2")
     for asked in (query, store.topic("/state").where({"s": {"$gt": 2}})):

@@ -89,10 +89,17 @@ def test_in_a_process_of_its_own(running: Running, one: Asked, tmp_path: Path) -
 def seen(calls: Calls) -> list[dict[str, int]]:
     """What the recording has for each command, when it ends."""
     found: list[dict[str, int]] = []
+    taken: list[hl.Store] = []
+
+    def keep(then: hl.Store, *_: object) -> hl.Store:
+        taken.append(then)
+        return then
 
     def look(store: hl.Store, _: str) -> None:
-        found.append(dict(store.entry(LABEL).messages_by_topic()))
+        asked = [one for one in taken if one.shared is store.shared] or [store]
+        found.append(dict(asked[0].entry(LABEL).messages_by_topic()))
 
+    calls.change(hl.Store, "snapshot", keep)
     calls(open_store, "_print_rebuilt", look)
     return found
 

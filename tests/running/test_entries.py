@@ -69,7 +69,7 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
             assert time.monotonic() < until
             time.sleep(0.02)
         (summary,) = reader.session.snapshot().summaries
-        sealed = reader.session._read_entry(summary)
+        sealed = reader.shared.entry(summary)
         assert sealed is not None
         assert 0 < sealed.messages < COUNT
         shutil.copytree(base / "store", base / "copy", ignore=shutil.ignore_patterns("mongod*"))
@@ -128,7 +128,7 @@ def test_a_segment_that_begins_in_the_tick_of_a_look_is_found(
 def test_a_segment_that_is_about_to_be_noted_is_no_problem(running: Running) -> None:
     """A recorder seals a segment first, and then tells the catalog."""
     with hl.open(running.path.parent / "store", mongo=NO_MONGODB) as reader:
-        catalog, directory = reader.session.catalog, reader.directory
+        catalog, directory = reader.catalog, reader.directory
         catalog.remove(running.entry.id)
         assert not verify(directory, catalog, None, RepairReport(), labels=["live"]).findings
         put_entry(directory, catalog, "live", is_open=True)

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 import hybridlog as hl
-from hybridlog_storage.errors import HybridlogError
+from hybridlog_storage.errors import HybridlogError, SegmentError
 from hybridlog_storage.mcap.mcap_content import RECORD_HEAD
 from hybridlog_storage.segments.open_segment import OpenSegment
 from hybridlog_storage.segments.segment_format import (
@@ -173,13 +173,15 @@ def test_what_was_taken_back_is_read_again(running: Running, copied: Path) -> No
         fewer = store.all_topics().count()
         assert 0 < fewer < whole == len(running.sent)
         assert len(rows(store.all_topics())) == fewer
-        with store.at_one_moment():
-            assert store.all_topics().count() == fewer
-            path.write_bytes(data[: chunks[-3]])
-            with ThreadPoolExecutor(1) as pool:  # which sees it first
-                assert pool.submit(store.all_topics().count).result() < fewer
-            assert store.topic("arm").to_arrow().num_rows == store.topic("arm").count()
-            assert store.all_topics().count() < fewer  # looked for again
+        then = store.snapshot()
+        assert then.all_topics().count() == fewer
+        path.write_bytes(data[: chunks[-3]])
+        with ThreadPoolExecutor(1) as pool:  # which sees it first
+            assert pool.submit(store.all_topics().count).result() < fewer
+        assert store.topic("arm").to_arrow().num_rows == store.topic("arm").count()
+        assert store.all_topics().count() < fewer
+        with pytest.raises(SegmentError):  # and no gap in silence
+            rows(then.all_topics())
         # Other bytes of another chunk are in the place of the last one that was read.
         path.write_bytes(data[: chunks[-1]])
         before = store.all_topics().count()

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import json
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 import hybridlog as hl
 from hybridlog.live import LiveOptions
+from hybridlog.maintenance.expiry import expire
 from hybridlog.maintenance.opening import StoreFiles
-from hybridlog_storage.errors import SegmentError
-from hybridlog_storage.messages import Channel
+from hybridlog_storage.errors import SegmentError, UsageError
+from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.segments.segment_reader import SegmentReader
+from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.calls import Calls
 from tests.running.running import NO_MONGODB
 
@@ -91,13 +95,10 @@ def test_a_segment_that_cannot_be_read_any_more_is_told(
 def test_entries_belong_to_their_moment(tmp_path: Path) -> None:
     with hl.open(tmp_path / "store", create=True) as store:
         record(store, "one", START)
-        with store.at_one_moment():
-            before = store.entry("one")
-            refresh = threading.Thread(target=store.refresh)
-            refresh.start()
-            refresh.join()
-            assert store.entry("one") is before
+        then = store.snapshot()
+        before = then.entry("one")
         store.refresh()
+        assert then.entry("one") is before
         assert store.entry("one") is not before
 
 
@@ -127,3 +128,95 @@ def test_a_gap_at_the_end_is_longer_than_what_may_not_be_flushed(tmp_path: Path)
             assert time.monotonic() < deadline
             time.sleep(0.02)
         assert gaps() == [(second // 2, 37 * second // 4), (37 * second // 4, 19 * second + 1)]
+
+
+def test_chunks_that_are_flushed_while_the_index_is_made_are_not_damaged(
+    tmp_path: Path, calls: Calls
+) -> None:
+    """The index looked at the size of a file, and then took chunks that came behind it."""
+    first, second = (
+        Channel("/said", "json", Schema("a/Said", "jsonschema", b'{"title": "%d"}' % n))
+        for n in (1, 2)
+    )
+    settings = SegmentSettings(chunk_size=4096, segment_size=40_000, compression="none")
+
+    def slow(_: object, reader: SegmentReader) -> None:
+        if threading.current_thread().name.startswith("hybridlog-index"):
+            time.sleep(0.05)
+
+    calls.change(SegmentReader, "grow", slow)
+    written, seen = 0, 0
+    with (
+        hl.open(tmp_path / "store", create=True, mongo="none") as writer,
+        hl.open(tmp_path / "store", mongo="none") as store,
+    ):
+        options = LiveOptions(settings=settings, flush_interval_s=0.01)
+        with writer.start("live", options) as recording:
+            until = time.monotonic() + 3
+            while time.monotonic() < until:
+                payload = b'{"n": %d, "pad": "%s"}' % (written, b"." * 300)
+                channel = (first, second)[written % 2]
+                recording.write(channel, payload, log_time=START + written)
+                written += 1
+                if not written % 10:
+                    time.sleep(0.005)
+                if not written % 100 and store.topics():
+                    found = [json.loads(one.raw)["n"] for one in store.topic("said")]
+                    assert found == [*range(len(found))]
+                    assert seen <= len(found) <= store.topic("said").count()
+                    seen = len(found)
+        assert [json.loads(one.raw)["n"] for one in store.topic("said")] == [*range(written)]
+        assert store.topic("said").count() == written
+        assert not store.topic("said").completeness().has_losses
+
+
+ASKS: dict[str, Callable[[hl.Store], int]] = {
+    "rows": lambda s: len([*s.topic("said")]),
+    "count": lambda s: s.topic("said").count(),
+    "count in time": lambda s: s.topic("said").between("start", "end").count(),
+    "count where": lambda s: s.topic("said").where("n >= 0").count(),
+    "frame": lambda s: len(s.topic("said").to_arrow()),
+    "stats": lambda s: s.topic("said").stats("n")[0].count,
+}
+
+
+@pytest.mark.parametrize("name", ASKS)
+@pytest.mark.parametrize("is_snapshot", [False, True], ids=["store", "snapshot"])
+def test_files_that_were_replaced_are_looked_for_once_more(
+    tmp_path: Path, name: str, is_snapshot: bool
+) -> None:
+    """Within the answer, also where the payloads of segments have expired."""
+    settings = SegmentSettings(chunk_size=4096, segment_size=10_000, compression="none")
+    with (
+        hl.open(tmp_path / "store", create=True, mongo="none") as writer,
+        hl.open(tmp_path / "store", mongo="none") as opened,
+    ):
+        with writer.start("one", LiveOptions(settings=settings)) as recording:
+            for n in range(200):
+                payload = b'{"n": %d, "pad": "%s"}' % (n, b"." * 200)
+                recording.write(SAID, payload, log_time=START + n)
+        store = opened.snapshot() if is_snapshot else opened
+        assert store.entry("one").segments > 2
+        with writer.directory.writing("one"):
+            expire(writer.directory, "one", [0, 2], min_bytes=0)
+        assert ASKS[name](store) == 200
+
+
+def test_a_snapshot_only_answers(tmp_path: Path) -> None:
+    with hl.open(tmp_path / "store", create=True, mongo="none") as store:
+        record(store, "one", START)
+        with store.snapshot() as then:
+            record(store, "two", START + 1)
+            assert then.recordings().labels == ("one",)
+            assert then.snapshot().topic("said").count() == then.topic("said").count() == 1
+            for change in (
+                lambda: then.edit("one", note="here"),
+                lambda: then.remove("one"),
+                lambda: then.start("three"),
+                then.refresh,
+                lambda: then.pin("one"),
+                lambda: then.keep({"max-age": "0s"}),
+            ):
+                with pytest.raises(UsageError, match="snapshot"):
+                    change()
+        assert store.topic("said").count() == 2

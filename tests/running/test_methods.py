@@ -80,17 +80,17 @@ def sent_of(store: hl.Store, running: Running) -> Known:
 
 
 def check_all(store: hl.Store, running: Running) -> None:
-    """Ask everything in one block: all answers are of one moment."""
-    with store.at_one_moment():
-        known = sent_of(store, running)
-        for name, rule in [*METHODS.items(), *STORE.items()]:
-            found, wanted = rule.ask(store), rule.right(known)
-            assert same(found, wanted), (name, found, wanted)
-        assert sent_of(store, running).counts == known.counts
+    """Ask everything of a snapshot: all answers are of one moment."""
+    then = store.snapshot()
+    known = sent_of(then, running)
+    for name, rule in [*METHODS.items(), *STORE.items()]:
+        found, wanted = rule.ask(then), rule.right(known)
+        assert same(found, wanted), (name, found, wanted)
+    assert sent_of(then, running).counts == known.counts
 
 
 def test_one_moment_while_segments_are_sealed(running: Running) -> None:
-    """The block sees one state of the recording, whatever is sealed meanwhile."""
+    """A snapshot sees one state of the recording, whatever is sealed meanwhile."""
     segments = running.before.entry(LABEL).segments
     with running.writing(60, 0.01) as writing, hl.open(running.path, mongo=NO_MONGODB) as store:
         while writing.is_alive():

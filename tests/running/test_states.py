@@ -155,7 +155,8 @@ def test_a_killed_recorder(kind: str, tmp_path: Path, monkeypatch: pytest.Monkey
             process.wait()
             with monkeypatch.context() as patch:
                 patch.setattr(StoreDirectory, "is_writable", False)
-                with hl.open(path, mongo=NO_MONGODB) as store, store.at_one_moment():
+                with hl.open(path, mongo=NO_MONGODB) as opened:
+                    store = opened.snapshot()
                     entry = store.entry(LABEL)
                     assert entry.status == "unfinished"
                     counts = dict(entry.messages_by_topic())
@@ -224,13 +225,14 @@ def ended(tmp_path: Path) -> Iterator[tuple[hl.Store, Known]]:
 def test_sealed_between_a_look_and_reading(tmp_path: Path) -> None:
     with begun(tmp_path / "store", "many", 130) as found:
         known = found.flushed()
-        with hl.open(found.path, mongo=NO_MONGODB) as store, store.at_one_moment():
-            assert store.entry(LABEL).flushed
+        with hl.open(found.path, mongo=NO_MONGODB) as store:
+            then = store.snapshot()
+            assert then.entry(LABEL).flushed
             found.write(60)
             found.recording.close()
-            check(store, known)
-            steps = iter(store.all_topics())
-        assert len([*steps]) == len(found.sent)
+            check(then, known)
+            assert len([*then.all_topics()]) == len(known.sent)
+            assert len([*store.all_topics()]) == len(found.sent)
 
 
 def test_renamed_meanwhile(ended: tuple[hl.Store, Known]) -> None:
@@ -246,10 +248,10 @@ def test_renamed_meanwhile(ended: tuple[hl.Store, Known]) -> None:
 
 def test_removed_meanwhile(ended: tuple[hl.Store, Known]) -> None:
     store, known = ended
-    with store.at_one_moment():
-        assert store.topic("arm").count() == len(known.of("/arm"))
-        with hl.open(store.directory.path, mongo=NO_MONGODB) as other:
-            other.remove(LABEL)
+    then = store.snapshot()
+    assert then.topic("arm").count() == len(known.of("/arm"))
+    with hl.open(store.directory.path, mongo=NO_MONGODB) as other:
+        other.remove(LABEL)
     assert store.topics() == []
     assert store.summaries() == []
 

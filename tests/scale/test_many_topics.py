@@ -93,7 +93,7 @@ def test_missing_tables_are_made_together(stores: dict[int, Path], tmp_path: Pat
             query = store.all_topics().where("data > 3")
             assert query.count() == count * (MESSAGES - 4)
             assert not store.repairs.tables
-            costs[count] = cost_of(store, store.session.mend)
+            costs[count] = cost_of(store, store.shared.mend)
             assert query.count() == count * (MESSAGES - 4)
             assert len(store.repairs.tables) == count
         with hl.open(copy) as store:

@@ -142,7 +142,7 @@ def test_what_columns_answer_asks_mongodb_nothing(tmp_path: Path) -> None:
     for name, ask in BY_COLUMNS.items():
         with hl.open(path) as alone:
             want = ask(alone)
-            assert alone.session.connected is None, name
+            assert alone.shared.index.connected is None, name
         with hl.open(path, require_database=True) as store, commands() as sent:
             assert ask(store) == want
             assert not sent, name

@@ -14,6 +14,7 @@ import pytest
 from pymongo import MongoClient
 
 import hybridlog as hl
+from hybridlog.session import Session
 from hybridlog_storage.mongo.index_state import IndexState
 from tests.cli.running import COMMAND, environment
 from tests.faults import logs
@@ -50,24 +51,26 @@ def test_what_comes_into_a_store_is_indexed_once_by_several_that_watch(
             store.connect()
             with hl.open(lab, mongo=uri) as other:
                 arrive(robot, lab, "drive-4")
-                read = store.session.entry_of
+                read = Session.entry_of
 
-                def overtaken(summary: Any) -> Any:
-                    entry = read(summary)
-                    if summary.label == "drive-4" and not other.session.repairs.indexed:
+                def overtaken(session: Session, summary: Any) -> Any:
+                    entry = read(session, summary)
+                    is_ours = session.shared is store.shared
+                    if is_ours and summary.label == "drive-4" and not other.shared.repairs.indexed:
                         other.refresh()
                         other.connect()
                     return entry
 
-                monkeypatch.setattr(store.session, "entry_of", overtaken)
+                monkeypatch.setattr(Session, "entry_of", overtaken)
                 store.refresh()
                 store.connect()
-                assert "drive-4" in other.session.repairs.indexed
-                assert "drive-4" not in store.session.repairs.indexed
+                assert "drive-4" in other.shared.repairs.indexed
+                assert "drive-4" not in store.shared.repairs.indexed
 
         def is_indexed(label: str) -> Any:
             with hl.open(robot, mongo="none") as source, hl.open(lab, mongo=uri) as store:
-                indexed = IndexState(store.session.connection.open()).one(source.entry(label).key)
+                state = IndexState(store.shared.index.connection.open())
+                indexed = state.one(source.entry(label).key)
                 return indexed is not None and indexed.state == "complete"
 
         with ExitStack() as stack:

@@ -155,7 +155,7 @@ def test_what_a_crash_has_left_gets_all_its_tables(
     few: hl.Store, server: str, tmp_path: Path
 ) -> None:
     before = contents(few)
-    path, database = few.directory.path, few.session.database_for("This")
+    path, database = few.directory.path, few.shared.index.database_for("This")
     # As if the recorder had been killed while it wrote.
     (entry,) = few.recordings()
     IndexState(database).put(entry, "open", turn=1)
@@ -163,7 +163,7 @@ def test_what_a_crash_has_left_gets_all_its_tables(
     shutil.rmtree(path / TABLES)
     (path / PARTS / f"r{entry.id}").mkdir(parents=True)
     (path / PARTS / f"r{entry.id}" / "1.parquet").write_bytes(b"PAR1 half")
-    few.session.disconnect()
+    few.shared.index.disconnect()
     few.refresh()
     few.connect()
     assert contents(few) == before

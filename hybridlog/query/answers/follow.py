@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from hybridlog.query.counters import Counters
     from hybridlog.query.engines import Engine
     from hybridlog.query.question import Part, Question, Span
-    from hybridlog.session import Session
+    from hybridlog.session import Asked, Session
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.summary import RecordingSummary
 
@@ -41,7 +41,7 @@ class Following(Planner, Iterator["Message"]):
     """The messages of running recordings as they come; waits for the next one.
 
     Args:
-        session: The open store.
+        source: The open store.
         question: The question; without a time range, about what is flushed from now on.
         counters: Count what is read.
         names: The topics as they were written; globs take topics that appear later.
@@ -51,38 +51,42 @@ class Following(Planner, Iterator["Message"]):
 
     Raises:
         UsageError: No recording of the question is running, or it asks for what is not known
-            before the end.
+            before the end; or a snapshot is asked, in which nothing comes.
     """
 
     def __init__(
-        self, session: Session, question: Question, counters: Counters, names: Sequence[str]
+        self, source: Asked, question: Question, counters: Counters, names: Sequence[str]
     ) -> None:
         question, wanted = _checked(question), question.recordings
-        with session.at_one_moment():
-            running = [
-                session.entry_of(one)
-                for one in session.look(wanted).summaries
-                if one.status == "open" and (wanted is None or one.id in wanted)
-            ]
-            if not running:
-                raise UsageError(
-                    "Only a running recording can be followed, and none of those asked about is."
-                )
-            ids = tuple(entry.id for entry in running)
-            named = question.names_recording or len(running) > 1
-            question = replace(question, recordings=ids, names_recording=named)
-            super().__init__(session, question, counters)
-            self._ranges = RangeResolver(session, replace(question, bounds=None))
-            self._scan = self._arrived = _Arrived(session, counters)
-            self._takes = later(names)
-            self._bounds: dict[str, Span] = {}
-            self._read = dict.fromkeys(ids, (0, 0))  # the last segment, and how many of its chunks
-            for entry in running if question.bounds is None else ():
-                self._read[entry.id] = max([0, *map(int, entry.digests), *entry.flushed]), 0
-                _ = [*self._arrivals(entry, None)]
-            _ = self.examples, self.ranks  # of this moment
-        picture = picture_of(session)
-        self._messages = (message for run in self.runs() for message in messages_in(run, picture))
+        session = source.now()
+        if session is source:
+            raise UsageError("In a snapshot nothing new is seen: follow in the store itself.")
+        running = [
+            session.entry_of(one)
+            for one in session.look(wanted).summaries
+            if one.status == "open" and (wanted is None or one.id in wanted)
+        ]
+        if not running:
+            raise UsageError(
+                "Only a running recording can be followed, and none of those asked about is."
+            )
+        ids = tuple(entry.id for entry in running)
+        named = question.names_recording or len(running) > 1
+        question = replace(question, recordings=ids, names_recording=named)
+        super().__init__(session, question, counters)
+        self._source = source
+        self._ranges = RangeResolver(session, replace(question, bounds=None))
+        self._scan = self._arrived = _Arrived(session, counters)
+        self._takes = later(names)
+        self._bounds: dict[str, Span] = {}
+        self._read = dict.fromkeys(ids, (0, 0))  # the last segment, and how many of its chunks
+        for entry in running if question.bounds is None else ():
+            self._read[entry.id] = max([0, *map(int, entry.digests), *entry.flushed]), 0
+            _ = [*self._arrivals(entry, None)]
+        _ = self.examples, self.ranks  # of this moment
+        self._messages = (
+            message for run in self.runs() for message in messages_in(run, picture_of(self.session))
+        )
 
     def __next__(self) -> Message:
         """The next message; ends with the recordings."""
@@ -92,11 +96,9 @@ class Following(Planner, Iterator["Message"]):
         goes_on = True
         while goes_on:
             started = time.monotonic()
-            if self.session.is_at_one_moment:
-                raise UsageError("Within at_one_moment, nothing new is seen: follow outside of it.")
-            with self.session.at_one_moment():
-                plan, goes_on = self._look()
-            for run in ChunkScan(plan, self.session.segment).runs():
+            self.session = self._arrived.session = self._source.now()
+            plan, goes_on = self._look()
+            for run in ChunkScan(plan, self.session).runs():
                 yield run
                 safe_point()
             if goes_on:

@@ -134,7 +134,7 @@ class _LatchedScan:
         times, numbers = np.array(cuts, np.int64).T
         plan = ScanPlan(own, [_merged_scan(scans)], counters=self._counters)
         whole = np.array([not channel.is_reduced for channel in own], np.bool_)
-        for run in ChunkScan(plan, self._session.segment).runs():
+        for run in ChunkScan(plan, self._session).runs():
             of, time = run.batch.channel, run.batch.log_time
             at = times[of]
             keep = (time > at) | ((time == at) & (run.seq >= numbers[of]))
@@ -153,7 +153,7 @@ class _LatchedScan:
             return _FIRST
         plan = ScanPlan([*group], [self._scan(group, 0, 0)], reverse=True, counters=self._counters)
         cut = _FIRST
-        for run in ChunkScan(plan, self._session.segment, ahead=False).runs():
+        for run in ChunkScan(plan, self._session, ahead=False).runs():
             row = min(left, len(run.batch)) - 1
             cut = int(run.batch.log_time[row]), int(run.seq[row])
             left -= row + 1
@@ -164,7 +164,7 @@ class _LatchedScan:
     def _last_key_frame(self, group: Sequence[RecordedChannel]) -> _Key | None:
         """The last key frame of some channels of video; None if there is none."""
         plan = ScanPlan([*group], [self._scan(group, 0, 0)], reverse=True, counters=self._counters)
-        for run in ChunkScan(plan, self._session.segment, ahead=False).runs():
+        for run in ChunkScan(plan, self._session, ahead=False).runs():
             for row, index in enumerate(run.batch.channel.tolist()):
                 if is_key_frame(run.channels[index].channel, run.batch.payload(row)):
                     return int(run.batch.log_time[row]), int(run.seq[row])

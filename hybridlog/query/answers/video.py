@@ -6,7 +6,6 @@ import threading
 from collections import OrderedDict
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from hybridlog.arrays import is_video_type
@@ -155,12 +154,11 @@ class _Playing:
 class VideoPictures:
     """Decodes frames of video topics. Those in a row are decoded once each."""
 
-    def __init__(self, session: Session) -> None:
-        self._session = session
+    def __init__(self) -> None:
         self._lock = threading.Lock()
         self._playing: OrderedDict[tuple[str, str], _Playing] = OrderedDict()
 
-    def picture(self, message: Message) -> NDArray[Any]:
+    def picture(self, session: Session, message: Message) -> NDArray[Any]:
         """The picture of a frame, red first; read-only.
 
         Raises:
@@ -173,31 +171,31 @@ class VideoPictures:
             key, place = (message.recording, message.topic), _place(message)
             playing = self._playing.pop(key, None)
             if playing is None or playing.place != place:
-                playing = self._decoded(message, playing)
+                playing = self._decoded(session, message, playing)
                 playing.picture.flags.writeable = False
             self._playing[key] = playing
             if len(self._playing) > _MAX_OPEN:
                 self._playing.popitem(last=False)
             return playing.picture
 
-    def _decoded(self, message: Message, playing: _Playing | None) -> _Playing:
+    def _decoded(self, session: Session, message: Message, playing: _Playing | None) -> _Playing:
         if playing is not None and playing.decoder.is_over:
             playing = None
         stop = None if playing is None else playing.place
-        frames = [*back_to_key(self._session, message, stop)][::-1]
+        frames = [*back_to_key(session, message, stop)][::-1]
         first, form, data = frames[0]
         if playing is None or is_key_frame(form, data):
             begin, decoder = first.log_time_ns, None
         else:
             begin, decoder = playing.place[0], playing.decoder
-        self._check_whole(message, frames[-1][1], begin)
+        self._check_whole(session, message, frames[-1][1], begin)
         decoder = decoder or VideoDecoder(form)
         for each, form, data in frames:
             picture = decoder.decode(form, data, is_wanted=each is frames[-1][0])
         assert picture is not None
         return _Playing(decoder, _place(message), picture)
 
-    def _check_whole(self, message: Message, form: str, begin: int) -> None:
+    def _check_whole(self, session: Session, message: Message, form: str, begin: int) -> None:
         """Refuse a frame that may refer to a lost one.
 
         Raises:
@@ -207,7 +205,7 @@ class VideoPictures:
         if begin + 1 < message.log_time_ns:
             bounds = (begin + 1, message.log_time_ns)
             question = Question((message.topic,), (message.recording,), bounds)
-            lost = lost_times(self._session, question)
+            lost = lost_times(session, question)
             # H.264 and H.265 tell themselves what is missing: an unknown time is enough for AV1.
             if any(form == "av1" or one.begin_ns > BEGIN for one in lost):
                 raise PayloadError(
@@ -218,8 +216,13 @@ class VideoPictures:
 
 def picture_of(session: Session) -> PictureOf:
     """Decodes frames of video of an open store."""
-    made = partial(VideoPictures, session)
-    return lambda m: session.cache.made("videos", make=made, size_of=lambda _: _SIZE).picture(m)
+
+    def picture(message: Message) -> NDArray[Any]:
+        pictures = session.cache.made("videos", make=VideoPictures, size_of=lambda _: _SIZE)
+        found: NDArray[Any] = pictures.picture(session, message)
+        return found
+
+    return picture
 
 
 def _place(message: Message) -> tuple[int, int]:

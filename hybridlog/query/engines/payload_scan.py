@@ -32,7 +32,7 @@ class PayloadScan:
     """Reads the chunks of the parts; needs only the segments."""
 
     def __init__(self, session: Session, counters: Counters) -> None:
-        self._session = session
+        self.session = session
         self._counters = counters
 
     def cost(self, part: Part, need: Need, fields: Collection[str] | None = ()) -> float:
@@ -45,7 +45,7 @@ class PayloadScan:
 
     def count(self, parts: Sequence[Part]) -> int:
         """Read the messages and count those that match."""
-        scan = ChunkScan(self.plan(parts), self._session.segment)
+        scan = ChunkScan(self.plan(parts), self.session)
         return sum(len(run.batch) for run in scan.unordered())
 
     def outcomes(self, part: Part) -> Iterator[MatchColumns]:
@@ -54,7 +54,7 @@ class PayloadScan:
 
         plan = self.plan([part], filtered=False)
         decide = _filter_of(part)
-        for run in ChunkScan(plan, self._session.segment).runs():
+        for run in ChunkScan(plan, self.session).runs():
             holds = np.ones(len(run.batch), np.bool_)
             if decide is not None:
                 for index, rows in rows_by_channel(run.batch.channel):
@@ -100,7 +100,7 @@ class PayloadScan:
 
     def _by_channel(self, plan: ScanPlan) -> Iterator[tuple[RecordedChannel, MessageRun]]:
         """The messages of a plan with fields in order, those of one channel at a time."""
-        for run in ChunkScan(plan, self._session.segment).runs():
+        for run in ChunkScan(plan, self.session).runs():
             changes = np.flatnonzero(np.diff(run.batch.channel)) + 1
             for own in map(run.take, np.split(np.arange(len(run.batch)), changes)):
                 channel = plan.channels[int(own.batch.channel[0])]
@@ -140,7 +140,7 @@ class PayloadScan:
                 bounds = int(windows[0, 0]), int(windows[-1, 1])
         is_empty = bounds is not None and bounds[0] >= bounds[1]
         chunks = (
-            [] if is_empty else self._session.chunks(part.recording, list(indexes), bounds, clock)
+            [] if is_empty else self.session.chunks(part.recording, list(indexes), bounds, clock)
         )
         return RecordingScan(part.recording, indexes, part.bounds, chunks, part.windows)
 

@@ -96,8 +96,7 @@ class RunningTables:
                 is_own = task.scan.recording.id == part.recording.id
                 if not is_own or task.chunk.segment in own.segments:
                     continue
-                reader = self._session.segment(part.recording.id, task.chunk.segment)
-                chunk = reader.read_chunk(task.chunk.place)
+                chunk = self._session.read_chunk(*task.key[:2], task.chunk.place)
                 for channel in part.channels:
                     rows = np.flatnonzero(chunk.batch.channel == channel.channel_id)
                     if len(rows):

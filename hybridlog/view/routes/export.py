@@ -59,7 +59,7 @@ def mcap_response(query: Query, name: str) -> Response:
         query: The query.
         name: Name of the file, of plain characters.
     """
-    pieces = query.session.all_at_one_moment(pieces_of(query))
+    pieces = pieces_of(query)
     # Most errors come before the first piece, and can still be told.
     return _file_response(_with(next(pieces), pieces), name)
 

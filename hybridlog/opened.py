@@ -1,0 +1,221 @@
+"""An open store: its newest state, of which each question takes a moment; repairs; closing."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from contextlib import suppress
+from typing import TYPE_CHECKING
+
+from hybridlog.index.access import IndexAccess
+from hybridlog.index.connection import Connection
+from hybridlog.maintenance.opening import open_catalog
+from hybridlog.session import Session
+from hybridlog.shared import Shared
+from hybridlog_storage.errors import DiskFullError, HybridlogError
+
+if TYPE_CHECKING:
+    from hybridlog.maintenance.report import Progress
+    from hybridlog.snapshot import Snapshot
+    from hybridlog_storage.disk.directory import StoreDirectory
+
+_LONG_LOOK_S = 0.05  # a look for new recordings that takes longer is not made all the time,
+_LOOK_SHARE = 0.1  # but for this share of it,
+_MAX_BETWEEN_LOOKS_S = 1.0  # and at least so often
+
+
+class OpenStore(Shared):
+    """An open store. Thread safe for reading.
+
+    Args:
+        directory: The store's directory.
+        mongo: URI of the MongoDB that holds the index, `embedded`, or `none`; None for the one
+            in the store's settings.
+        progress: Called while an index is brought up to date.
+        cache_mb: Size of the embedded MongoDB's cache in MiB; None for the one in the store's
+            settings.
+        recover: False to leave what a crash has cut, and what the index lacks of it, to another
+            opening.
+    """
+
+    index: IndexAccess
+
+    def __init__(
+        self,
+        directory: StoreDirectory,
+        mongo: str | None,
+        progress: Progress | None,
+        cache_mb: int | None = None,
+        *,
+        recover: bool = True,
+    ) -> None:
+        super().__init__(directory)
+        connection = Connection(directory, mongo, cache_mb)
+        self.index = IndexAccess(self, connection, progress, recovers=recover)
+        self._recovers = recover
+        self._is_opened = False  # what a crash left was repaired, unless it is left to another
+        self._latest: Session | None = None
+        self._changed = 0, False  # as of the latest state, see `StoreDirectory.changed`
+        self._names: list[str] = []  # in `recordings`
+        self._looks_at = 0.0  # when the next look for new recordings is due, by `monotonic`
+        self._mending = threading.Lock()
+
+    def now(self) -> Session:
+        """The store at this moment, for one question; no file is read if nothing has changed.
+
+        Raises:
+            UsageError: This is a forked process.
+        """
+        self.check_process()
+        latest = self._latest
+        if latest is None:
+            return self._read()
+        if self._has_names_changed() and time.monotonic() >= self._looks_at:
+            self.catch_up()
+            return self._latest or self._read()
+        # What running recordings have flushed since is for this question to see.
+        return latest.again() if latest.snapshot().unfinished else latest
+
+    def _read(self) -> Session:
+        with self.following:  # or a thread might keep an older state than `_changed` says
+            if self._latest is not None:
+                return self._latest
+            begun = time.monotonic()
+            mends, self._is_opened = self._recovers and not self._is_opened, True
+            self._changed = self.directory.changed()
+            self._names = self.directory.names()
+            try:
+                found = self._files.look_at_all(mends=mends)
+            except DiskFullError as error:
+                # The store remains readable, and recordings can be removed.
+                self.repairs.disk_full = error
+                self.catalog.close()
+                self.catalog = open_catalog(self.directory, in_memory=True)
+                found = self._files.look_at_all(mends=mends)
+            self._latest = latest = Session(self, found)
+            ended = time.monotonic()
+            self._looks_at = ended
+            if ended - begun > _LONG_LOOK_S:  # in a store of thousands
+                self._looks_at += min((ended - begun) / _LOOK_SHARE, _MAX_BETWEEN_LOOKS_S)
+            return latest
+
+    def _has_names_changed(self) -> bool:
+        """True if recordings may have come, gone, or got other names since the latest state."""
+        now, before = self.directory.changed(), self._changed
+        if now[0] == before[0] and not before[1] and self.directory.names() == self._names:
+            self._changed = now
+        return self._changed != now
+
+    def has_changed(self) -> bool:
+        """True if files of recordings that were read look different by now."""
+        latest = self._latest
+        if latest is None or self._has_names_changed():
+            return True
+        read = [one for one in latest.snapshot().summaries if one.id in self._entries]
+        looks = self.directory.looks([one.label for one in read])
+        return any(looks.get(one.label) != one.look for one in read)
+
+    def replace_latest(self, before: Snapshot, now: Session) -> None:
+        """Let later questions begin with what one has seen, unless there is a newer state."""
+        if self._latest is not None and self._latest.snapshot() is before:
+            self._latest = now.again()
+
+    def catch_up(self, *recordings: str) -> None:
+        """See which recordings came, went, or got another name, and how some others are now.
+
+        All else that was read stays, so this costs little in a store of thousands.
+        """
+        with self.following:
+            if self._latest is None:
+                return
+            before = self._latest.snapshot()
+            changed, names = self.directory.changed(), self.directory.names()
+            labels = {*names}.symmetric_difference(before.by_label)  # copies are among them
+            known = [before.by_id[one] for one in recordings if one in before.by_id]
+            labels.update(before.summaries[place].label for place in known)
+            now = self._files.catch_up(before, labels)
+            if now is None or self.directory.names() != names:
+                self.invalidate()
+                return
+            self._changed, self._names = changed, names
+            self._latest = Session(self, now)
+            self.index.note_changes()
+            places = {before.by_label[label] for label in labels & before.by_label.keys()}
+            self._invalidate_recordings({before.summaries[place].id for place in places})
+
+    def invalidate(self) -> None:
+        """Drop everything that was read, so that the next question reads the store again."""
+        with self.following:
+            self._latest = None
+            self.index.note_changes()
+            self._entries = {}
+        self.channels.clear()
+        self.columns.clear()
+        self._drop_files()
+
+    def note_changes(self, *recordings: str) -> None:
+        """See `IndexAccess.note_changes`."""
+        self.index.note_changes(*recordings)
+
+    # Repairs.
+
+    def mend(self, seconds: float = math.inf) -> None:
+        """Repair what questions met: recordings after a crash, missing and damaged tables.
+
+        Args:
+            seconds: What takes longer stays in `repairs.noted` and `repairs.noted_tables`.
+
+        Raises:
+            DiskFullError: There is no room.
+        """
+        self.check_process()
+        if self.directory.is_writable:
+            with self._mending:
+                self._mend(time.monotonic() + seconds)
+
+    def _mend(self, until: float) -> None:
+        from hybridlog.maintenance.tables import make_noted
+
+        repairs = self.repairs
+        self.now()  # notes what this process has changed
+        mended = self._files.mend(until)
+        if mended:
+            with self.following:
+                for recording in mended:
+                    self._running.pop(recording, None)
+                self.catch_up(*mended)
+        by_recording: dict[str, set[str]] = {}
+        for recording, topic in [*repairs.noted_tables]:
+            by_recording.setdefault(recording, set()).add(topic)
+        session = self.now()
+        for recording, topics in by_recording.items():
+            entry = session.entry_if_there(recording)
+            if entry is None or make_noted(
+                self.directory, entry, topics, self.tables, repairs, until=until
+            ):
+                repairs.noted_tables -= {(recording, topic) for topic in topics}
+
+    # Closing.
+
+    def write_recordings_file(self) -> None:
+        """List the ended recordings for other readers of their tables, if that is possible."""
+        if self.directory.is_writable:
+            from hybridlog.columns.recordings_file import write_recordings_file
+
+            with suppress(OSError, HybridlogError):
+                present = self.now().snapshot().by_label.keys() & {*self.directory.names()}
+                write_recordings_file(self.catalog, present)
+                self.catalog.has_changed = False
+
+    def close(self) -> None:
+        """Close files and connections. May be called more than once."""
+        with self._opening:
+            for reader in self._segments.values():
+                reader.close()
+        self._drop_files()
+        self.index.disconnect()
+        is_missing = "tables" in vars(self) and not self.catalog.recordings_file.exists()
+        if self.catalog.has_changed or is_missing:
+            self.write_recordings_file()
+        self.catalog.close()

@@ -1,0 +1,268 @@
+"""What all moments of an open store share: the catalog, open files, caches."""
+
+from __future__ import annotations
+
+import os
+import threading
+from abc import ABC, abstractmethod
+from collections.abc import Collection
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+from hybridlog.columns.payload_files import RecordingPayloads, open_segment
+from hybridlog.maintenance.opening import StoreFiles, open_catalog
+from hybridlog.maintenance.report import RepairReport
+from hybridlog.snapshot import UNFINISHED
+from hybridlog_storage.cache import Cache
+from hybridlog_storage.disk import files
+from hybridlog_storage.errors import StoreError, UsageError
+from hybridlog_storage.lazy import lazy
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from hybridlog.columns.tables import Tables
+    from hybridlog.query.chunk_columns import ChunkColumns
+    from hybridlog.query.question import RecordedChannel
+    from hybridlog.record.running import RunningRecording
+    from hybridlog.snapshot import Snapshot
+    from hybridlog_storage.catalog import Catalog, RecordingEntry
+    from hybridlog_storage.disk.directory import StoreDirectory
+    from hybridlog_storage.messages import Schema
+    from hybridlog_storage.segments.chunk_table import ChunkTable
+    from hybridlog_storage.segments.segment_reader import SegmentReader
+    from hybridlog_storage.summary import RecordingSummary
+
+_MAX_OPEN_SEGMENTS = 256
+_TRIES = 5  # to find a recording, while it is renamed
+
+
+class Shared(ABC):
+    """What all questions to one open store share. Thread safe for reading.
+
+    Args:
+        directory: The store's directory.
+
+    Attributes:
+        directory: The store's directory.
+        index: The index in MongoDB, an `IndexAccess`.
+        repairs: Repairs made when the store was opened.
+        cache: What was read or worked out; chunks of single messages are a kind of it.
+        schemas: Schemas by hash.
+        following: Held while running recordings are looked at, and while the newest state changes.
+        channels: Channels of recordings by id and topic, and the entry that they are of.
+        columns: Columns of the chunks of a segment, and the table that they are of.
+    """
+
+    index: Any
+
+    def __init__(self, directory: StoreDirectory) -> None:
+        self._process = os.getpid()
+        self.directory = directory
+        self.repairs = RepairReport()
+        self.cache = Cache()
+        self.following = threading.RLock()
+        self._running: dict[str, RunningRecording] = {}
+        self._entries: dict[str, RecordingEntry] = {}  # compared with their files, by id
+        self.schemas: dict[str, Schema] = {}
+        self.channels: dict[str, tuple[RecordingEntry, dict[str, list[RecordedChannel]]]] = {}
+        self.columns: dict[tuple[str, int, frozenset[int]], tuple[ChunkTable, ChunkColumns]] = {}
+        self._segments: dict[tuple[str, int, str], SegmentReader] = {}
+        self._contents: dict[tuple[Path, frozenset[tuple[str, str]]], RecordingPayloads] = {}
+        self._tables_tried: set[tuple[str, str]] = set()  # looked for, and noted if missing
+        self._opening = threading.Lock()
+
+    @property
+    def is_inherited(self) -> bool:
+        """True in a child of the process that opened the store."""
+        return os.getpid() != self._process
+
+    def check_process(self) -> None:
+        """Refuse to go on in a child of the process that opened the store.
+
+        Raises:
+            UsageError: This is one.
+        """
+        if self.is_inherited:
+            raise UsageError(
+                f"The store {self.directory.place} was opened before this process was forked: open "
+                "it here, in the child."
+            )
+
+    @lazy
+    def catalog(self) -> Catalog:
+        """Recordings, channels, chunks and schemas."""
+        return open_catalog(self.directory)
+
+    @lazy
+    def tables(self) -> Tables:
+        """Parquet tables of topics; pyarrow is loaded for them."""
+        from hybridlog.columns.tables import Tables
+
+        return Tables(self.directory.path, self.cache)
+
+    @property
+    def _files(self) -> StoreFiles:
+        return StoreFiles(self.directory, self.catalog, self.repairs)
+
+    # Moments, of which a `Session` is one.
+
+    @abstractmethod
+    def now(self) -> Any:
+        """The store at this moment."""
+
+    @abstractmethod
+    def catch_up(self, *recordings: str) -> None:
+        """See which recordings came, went, or got another name, and how some others are now."""
+
+    @abstractmethod
+    def replace_latest(self, before: Snapshot, now: Any) -> None:
+        """Let later questions begin with what one has seen, unless there is a newer state."""
+
+    @abstractmethod
+    def invalidate(self) -> None:
+        """Drop everything that was read, so that the next question reads the store again."""
+
+    @abstractmethod
+    def note_changes(self, *recordings: str) -> None:
+        """Note that the index may lack something, of some recordings for certain."""
+
+    def _invalidate_recordings(self, recordings: Collection[str]) -> None:
+        """Drop what was read of some recordings, by their ids."""
+        for recording in recordings:
+            self.channels.pop(recording, None)
+            entry = self._entries.pop(recording, None)
+            topics = {channel.topic for channel in entry.channels} if entry is not None else set()
+            self._tables_tried -= {(recording, topic) for topic in topics}
+        with self._opening:
+            self._contents.clear()
+            for key in [key for key in self._segments if key[0] in recordings]:
+                del self._segments[key]
+        self.columns.clear()
+        self.cache.drop("chunk")
+        if "tables" in vars(self):
+            self.tables.look_again()
+
+    def _drop_files(self) -> None:
+        with self._opening:
+            self._contents.clear()
+            self._segments.clear()  # each is closed by the last thread that reads from it
+        self.cache.drop("chunk")
+        self._tables_tried.clear()
+        if "tables" in vars(self):
+            self.tables.invalidate()
+
+    # Recordings.
+
+    def followed(self, summary: RecordingSummary) -> RunningRecording:
+        """A running recording with what is flushed by now; `following` is held."""
+        from hybridlog.record.running import RunningRecording
+
+        running = self._running.get(summary.id)
+        if running is None:
+            running = self._running[summary.id] = RunningRecording(
+                self.directory, summary.label, partial(self.entry, summary)
+            )
+        running.follow()
+        entry = running.entry
+        if entry is None or entry.status not in UNFINISHED or entry.label != summary.label:
+            del self._running[summary.id]
+        self.schemas |= running.schemas
+        if entry is not None and entry.status not in UNFINISHED:
+            self._invalidate_tables(entry)
+        return running
+
+    def entry(self, summary: RecordingSummary) -> RecordingEntry | None:
+        """The entry of what is sealed of a recording, compared with its files once."""
+        found = None if summary.status in UNFINISHED else self._entries.get(summary.id)
+        if found is None:
+            entry = self._current(summary)
+            for _ in range(_TRIES):
+                if entry is not None and entry.id == summary.id:
+                    break
+                # Another process may have renamed it.
+                now = self._files.look_at_all()
+                if summary.id not in now.by_id:
+                    return None
+                entry = self._current(now.summaries[now.by_id[summary.id]])
+            if entry is None or entry.id != summary.id:
+                return None
+            if entry.status in UNFINISHED:
+                return entry
+            found = self._entries.setdefault(summary.id, entry)
+        return found
+
+    def _current(self, summary: RecordingSummary) -> RecordingEntry | None:
+        try:
+            entry, is_new = self._files.current_entry(summary)
+        except StoreError:
+            if self.directory.has(summary.label):
+                raise
+            return None  # another process has just renamed or removed it
+        if entry is not None and is_new:
+            # The index may have what the files had before.
+            self.note_changes(entry.id)
+        return entry
+
+    def known_entry(self, recording: str) -> RecordingEntry | None:
+        """The entry of an ended recording, if it was read."""
+        return self._entries.get(recording)
+
+    # Files.
+
+    def segment(self, entry: RecordingEntry, number: int) -> SegmentReader:
+        """The reader of a sealed segment.
+
+        Raises:
+            SegmentError: It cannot be opened, as where the recording has another name by now.
+        """
+        with self._opening:
+            # A segment with expired chunks is another file than before.
+            key = entry.id, number, entry.stored.get(str(number), "")
+            reader = self._segments.get(key)
+            if reader is None:
+                _make_room(self._segments)
+                path = self.directory.recording(entry.label)
+                reader = self._segments[key] = open_segment(
+                    path / f"{number:06d}.mcap", number, self._contents_of(entry)
+                )
+            return reader
+
+    def contents(self, entry: RecordingEntry) -> RecordingPayloads:
+        """What is left of expired chunks, shared by the segments of a recording as it is now."""
+        with self._opening:
+            return self._contents_of(entry)
+
+    def _contents_of(self, entry: RecordingEntry) -> RecordingPayloads:
+        key = self.directory.recording(entry.label), frozenset(entry.stored.items())
+        found = self._contents.get(key)
+        if found is None:
+            _make_room(self._contents)
+            found = self._contents[key] = RecordingPayloads(key[0], cache=self.cache)
+        return found
+
+    def note_missing_table(self, recording: RecordingEntry, topic: str) -> None:
+        """Note once that a topic has no table, for `mend` if that can make it."""
+        from hybridlog.maintenance.tables import can_be_made
+
+        key = recording.id, topic
+        if key not in self._tables_tried:
+            self._tables_tried.add(key)
+            if can_be_made(recording, topic, self.tables):
+                self.repairs.noted_tables.add(key)
+
+    def _invalidate_tables(self, recording: RecordingEntry) -> None:
+        """Look for the tables of a recording again, now that it has ended."""
+        topics = {channel.topic for channel in recording.channels}
+        self._tables_tried -= {(recording.id, topic) for topic in topics}
+        if "tables" in vars(self):
+            self.tables.look_again_for(recording, topics)
+
+
+def _make_room(opened: dict[Any, Any]) -> None:
+    """Drop the file that was opened first, if many are open.
+
+    It is closed when the last thread that reads from it also drops it.
+    """
+    if len(opened) >= files.most_open(_MAX_OPEN_SEGMENTS):
+        del opened[next(iter(opened))]
