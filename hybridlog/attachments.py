@@ -33,7 +33,7 @@ class StoredAttachment:
     """An attachment of a recording: a file that lay in the log beside its messages.
 
     Attributes:
-        recording: Label of the recording.
+        recording: Name of the recording.
         name: Its name in the log; need be no valid file name, and need not be unique.
         media_type: Its media type, such as `text/plain`.
         size: Bytes of its content.
@@ -130,7 +130,7 @@ def attachments_of(session: Session, entry: RecordingEntry) -> list[StoredAttach
             source = partial(_open, session, entry.id, number, summary.table, index)
             found.append(
                 StoredAttachment(
-                    recording=entry.label,
+                    recording=entry.name,
                     name=index.name,
                     media_type=index.media_type,
                     size=index.data_size,

@@ -1,27 +1,27 @@
-"""Makes catalog entries of recordings from their journals and segments, and puts them there.
+"""Makes catalog entries of recordings from their manifests and segments, and puts them there.
 
-Recording, recovery, rebuilding and opening use the same functions, so their entries are
-equal. Files that differ from the journal are not used. Content that the journal lists and
-that is missing or changed becomes rows of the loss ledger.
+Recording, recovery and opening use the same functions, so their entries are equal. Files that
+differ from the manifest are not used. Content that the manifest lists and that is missing or
+changed becomes rows of the loss ledger.
 """
 
 from __future__ import annotations
 
 import os
-import secrets
+import time
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
+from msgspec import ValidationError, convert, to_builtins
 
 from hybridlog.columns.layout import PAYLOAD_PARTS
 from hybridlog.record.losses import Cause, extent_of, joined, topics_of
 from hybridlog.schema.states import State, expired_messages
-from hybridlog_storage import journal
+from hybridlog_storage import manifest as truth
 from hybridlog_storage.catalog import (
     ChannelStats,
     Described,
@@ -31,25 +31,30 @@ from hybridlog_storage.catalog import (
     content_of,
 )
 from hybridlog_storage.disk.directory import PAYLOADS
-from hybridlog_storage.errors import CatalogError, DiskFullError, SegmentError, StoreError
-from hybridlog_storage.journal import Journal, PayloadFile
+from hybridlog_storage.errors import (
+    CatalogError,
+    DiskFullError,
+    ManifestError,
+    RecordingGoneError,
+    SegmentError,
+    StoreError,
+)
+from hybridlog_storage.manifest import Fields, File, Manifest, Source, free_name, loss_of
+from hybridlog_storage.manifests import change_in, read_in
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_file import Sealed, sealed_channels
 from hybridlog_storage.segments.segment_reader import SegmentReader, SegmentSummary
 from hybridlog_storage.summary import RecordingSummary, TopicType, hash_of, topics_to_json
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
     from hybridlog_storage.catalog import Catalog
     from hybridlog_storage.disk.directory import Listing, StoreDirectory
-    from hybridlog_storage.journal import JournalState, SealedSegment
 
 
-_TRIES = 10  # to read a recording while its directory is renamed
-
-
-def new_id() -> str:
-    """A random id of a recording: 32 hexadecimal digits."""
-    return secrets.token_hex(16)
+_TRIES = 10  # to read a recording while its files are replaced
 
 
 def recording_metadata(entry: RecordingEntry) -> dict[str, object]:
@@ -65,14 +70,14 @@ def recording_metadata(entry: RecordingEntry) -> dict[str, object]:
 
 @dataclass(frozen=True, slots=True)
 class Misfit:
-    """A file of a recording that differs from the journal.
+    """A file of a recording that differs from the manifest.
 
     Attributes:
         segment: Number in the file's name.
         file: Its name; empty for one that is missing.
         reason: Description of the problem.
-        is_unlisted: Whether it is a whole segment of this recording that the journal lacks.
-        belongs: Number under which the journal lists this content; None if it does not.
+        is_unlisted: Whether it is a whole segment of this recording that the manifest lacks.
+        belongs: Number under which the manifest lists this content; None if it does not.
     """
 
     segment: int
@@ -84,50 +89,54 @@ class Misfit:
 
 @dataclass(slots=True)
 class Inventory:
-    """Content of a recording's directory, compared with its journal.
+    """Content of a recording's directory, compared with its manifest.
 
     Attributes:
-        label: Name of the directory.
+        folder: Name of the directory.
         listing: Names of its files.
-        state: State of the journal; None without one.
+        manifest: Its manifest; None without one.
         summaries: Summaries of valid segments, by number.
         stored: Digest and size of the files of segments with expired chunks, by number. Their
             summaries have the digest of the segment as it was before.
-        misfits: Files that differ from the journal.
+        misfits: Files that differ from the manifest.
         lost: Listed segments that are missing or changed.
-        joined: Joined files of fields that a lost journal has listed.
-        replaced: Files that these were joined of.
     """
 
-    label: str
+    folder: str
     listing: Listing
-    state: JournalState | None
+    manifest: Manifest | None
     summaries: dict[int, SegmentSummary] = field(default_factory=dict)
     stored: dict[int, tuple[str, int]] = field(default_factory=dict)
     misfits: list[Misfit] = field(default_factory=list)
-    lost: list[SealedSegment] = field(default_factory=list)
-    joined: dict[str, PayloadFile] = field(default_factory=dict)
-    replaced: dict[str, PayloadFile] = field(default_factory=dict)
+    lost: list[File] = field(default_factory=list)
 
     @property
     def id(self) -> str:
         """The recording's id; empty if unknown."""
-        if self.state is not None and self.state.id:
-            return self.state.id
+        if self.manifest is not None:
+            return self.manifest.id
         ids = Counter(str(s.recording.get("id", "")) for s in self.summaries.values())
         return ids.most_common(1)[0][0] if ids else ""
 
     @property
-    def payloads(self) -> dict[str, PayloadFile]:
-        """Files of fields of expired messages, as the journal and the segments list them."""
-        found: dict[str, PayloadFile] = {}
+    def name(self) -> str:
+        """The recording's name, or its folder's while that is unknown."""
+        if self.manifest is not None:
+            return self.manifest.name
+        names = (str(summary.recording.get("name", "")) for summary in self.summaries.values())
+        return next(filter(None, names), self.folder)
+
+    @property
+    def fields(self) -> dict[str, Fields]:
+        """Files of fields of expired messages, as manifest and segments list them."""
+        found: dict[str, Fields] = {}
         for summary in self.summaries.values():
             files = (summary.compacted or {}).get("files", ())
-            found.update({file.file: file for file in files})
-        if self.state is not None:
-            found = {path: file for path, file in found.items() if path not in self.state.deleted}
-            found |= self.state.payloads
-        return {path: f for path, f in found.items() if path not in self.replaced} | self.joined
+            found.update({file["file"]: Fields(**file) for file in files})
+        if self.manifest is not None:
+            found = {path: f for path, f in found.items() if path not in self.manifest.deleted}
+            found |= {file.file: file for file in self.manifest.fields}
+        return found
 
     def stored_file(self, number: int) -> tuple[str, int]:
         """Digest and size of the file of a valid segment."""
@@ -136,36 +145,31 @@ class Inventory:
 
     @property
     def end(self) -> Mapping[str, Any] | None:
-        """The end of the recording: by its journal, else by the last segment that states it."""
-        if self.state is not None and self.state.end is not None:
-            return self.state.end
+        """The end of the recording: by its manifest, else by the last segment that states it."""
+        if self.manifest is not None and self.manifest.is_ended:
+            return end_values(self.manifest)
         ends = [summary.end for _, summary in sorted(self.summaries.items()) if summary.end]
         return ends[-1] if ends else None
 
     @property
     def is_proven(self) -> bool:
-        """True if the journal is complete, and all segments that it lists are valid."""
-        return (
-            self.state is not None
-            and self.state.is_proof
-            and not self.lost
-            and not any(misfit.is_unlisted for misfit in self.misfits)
-        )
+        """True if the manifest was never lost, and all segments that it lists are valid."""
+        return self.manifest is not None and self.manifest.status != "unproven" and not self.lost
 
 
-def take_inventory(directory: StoreDirectory, label: str) -> Inventory:
-    """Compare the sealed segments of a recording with its journal.
+def take_inventory(directory: StoreDirectory, folder: str) -> Inventory:
+    """Compare the sealed segments of a recording with its manifest.
 
     Raises:
-        StoreError: Directory or journal cannot be read.
+        StoreError: Directory or manifest cannot be read, or it is the copy of another one.
     """
-    path = directory.recording(label)
-    listing = directory.listing(label)
-    state = journal.read(path) if listing.journal else None
-    found = Inventory(label, listing, state)
-    listed = state.sealed if state is not None else {}
-    numbers = {sealed.digest: number for number, sealed in listed.items()}
-    unmarked = state.unmarked if state is not None else set()
+    path = directory.recording(folder)
+    listing = directory.listing(folder)
+    manifest = read_in(path)
+    found = Inventory(folder, listing, manifest)
+    listed = manifest.logs if manifest is not None else {}
+    numbers = {file.digest: number for number, file in listed.items()}
+    unmarked = manifest.unmarked if manifest is not None else ()
     for number, name in listing.sealed.items():
         if number in unmarked:
             continue  # it is about to be removed
@@ -174,7 +178,7 @@ def take_inventory(directory: StoreDirectory, label: str) -> Inventory:
         except SegmentError as error:
             found.misfits.append(Misfit(number, name, str(error)))
     recording = found.id
-    _find_joined(found, path / PAYLOADS)
+    check_folder(directory, folder, recording)
     for number, summary in list(found.summaries.items()):
         name = listing.sealed[number]
         problem = _difference(found, summary, number, recording)
@@ -182,68 +186,83 @@ def take_inventory(directory: StoreDirectory, label: str) -> Inventory:
             del found.summaries[number]
             belongs = numbers.get(summary.whole_digest)
             found.misfits.append(Misfit(number, name, problem, belongs=belongs))
-        elif state is not None and not _is_listed(found, state, number):
-            reason = "the journal does not list it"
+        elif manifest is not None and not _is_listed(found, manifest, number):
+            reason = "the manifest does not list it"
             found.misfits.append(Misfit(number, name, reason, is_unlisted=True))
-    for number, sealed in listed.items():
+    for number, file in listed.items():
         # A listed segment with its old name is about to be renamed.
         if number not in found.summaries and number not in listing.open:
-            found.lost.append(sealed)
+            found.lost.append(file)
             if number not in listing.sealed:
-                found.misfits.append(Misfit(number, "", f"{sealed.file} is missing"))
+                found.misfits.append(Misfit(number, "", f"{file.name} is missing"))
     found.misfits.sort(key=lambda misfit: misfit.segment)
     return found
 
 
-def _find_joined(inventory: Inventory, folder: Path) -> None:
-    """Find what took the place of files of fields that are missing; the journal may be lost."""
-    listed, there = inventory.payloads, inventory.listing.payloads
-    if listed.keys() <= there.keys():
-        return
-    from hybridlog.columns.column_file import ColumnFile
+def steady_inventory(directory: StoreDirectory, recording: str) -> Inventory:
+    """The inventory of a recording that may be changed meanwhile.
 
-    for path in there.keys() - listed.keys():
-        with suppress(StoreError, FileNotFoundError, LookupError, ValueError, TypeError):
-            file = ColumnFile(folder / path)
-            (section,) = file.about.recordings
-            ((topic, counts),) = section.topics.items()
-            replaced = {*file.about.payloads["replaces"]} & listed.keys()
-            if section.id == inventory.id and replaced:
-                about = PayloadFile(path, file.size_bytes, file.digest, topic, counts.rows)
-                inventory.joined[path] = about
-                inventory.replaced |= {one: listed[one] for one in replaced}
+    Files come and go before or after the manifest says so. What seems to be missing is looked
+    for again if anything has changed; edits alone, however many, are waited for by nobody.
+
+    Raises:
+        StoreError: Its files cannot be read, or change all the time.
+    """
+    for _ in range(_TRIES):
+        found = take_inventory(directory, recording)
+        if not (found.misfits or found.lost or _losses_of_fields(found)):
+            return found
+        if directory.listing(recording).print == found.listing.print:
+            return found
+    raise StoreError(f"The files of recording {recording!r} change while they are read. Ask again.")
+
+
+def check_folder(directory: StoreDirectory, folder: str, recording: str) -> None:
+    """Raise if a folder has another name than the id of its recording; hidden ones may have.
+
+    Raises:
+        StoreError: It has.
+    """
+    if recording and folder != recording and not folder.startswith("."):
+        path = directory.recording(folder)
+        if directory.has(recording):
+            raise StoreError(f"{path} is a copy of {recording}: remove it.")
+        raise StoreError(f"{path} is recording {recording}: give the folder this name again.")
 
 
 def _difference(
     inventory: Inventory, summary: SegmentSummary, number: int, recording: str
 ) -> str | None:
-    """The difference of a whole segment from the journal; None if it matches.
+    """The difference of a whole segment from the manifest; None if it matches.
 
     A segment with expired chunks gets the digest that it had before, which it names itself: the
-    journal may lack the line about it.
+    manifest may not say so yet.
     """
     its_id, its_number = summary.recording.get("id"), summary.recording.get("segment")
     if its_id != recording:
         return f"it is a segment of another recording, {its_id}"
     if its_number != number:
         return f"it is segment {its_number} of this recording"
-    state = inventory.state
-    sealed = state.sealed.get(number) if state is not None else None
+    manifest = inventory.manifest
+    sealed = manifest.logs.get(number) if manifest is not None else None
     whole = summary.whole_digest
     if whole != summary.digest and (sealed is None or sealed.digest == whole):
         inventory.stored[number] = summary.digest, summary.size
         inventory.summaries[number] = replace(summary, digest=whole)
     elif sealed is not None and (summary.digest, summary.size) != (sealed.digest, sealed.bytes):
-        return "it is not the segment that the journal lists: an older or a changed one"
+        return "it is not the segment that the manifest lists: an older or a changed one"
     return None
 
 
-def _is_listed(inventory: Inventory, state: JournalState, number: int) -> bool:
-    """True if the journal lists a valid segment as its file is now, and what that needs."""
-    files = (inventory.summaries[number].compacted or {}).get("files", ())
-    is_listed_size = inventory.stored.get(number) in (None, *state.thinned.get(number, ()))
-    known = state.payloads.keys() | state.deleted
-    return number in state.sealed and is_listed_size and {f.file for f in files} <= known
+def _is_listed(inventory: Inventory, manifest: Manifest, number: int) -> bool:
+    """True if the manifest lists a valid segment as its file is now, and what that needs."""
+    file = manifest.logs.get(number)
+    if file is None:
+        return False
+    named = (inventory.summaries[number].compacted or {}).get("files", ())
+    stored = file.stored and (file.stored.digest, file.stored.bytes)
+    known = {*manifest.deleted, *(one.file for one in manifest.fields)}
+    return inventory.stored.get(number) in (None, stored) and {f["file"] for f in named} <= known
 
 
 def read_summary(path: Path, number: int) -> SegmentSummary:
@@ -265,14 +284,14 @@ def describe(catalog: Catalog, inventory: Inventory, *, is_open: bool = False) -
         is_open: Whether a process is writing it.
 
     Raises:
-        SegmentError: Neither journal nor segments say what recording it is.
+        ManifestError: It has no manifest.
     """
     from hybridlog.schema.codecs import codec_for
 
-    if not inventory.id:
-        raise SegmentError(
-            f"Recording {inventory.label!r} has neither a journal nor a segment that can be "
-            "read. Restore the files, or remove the directory."
+    if inventory.manifest is None:
+        raise ManifestError(
+            f"{inventory.folder} has no manifest: `hybridlog verify --repair` makes it again "
+            "from `manifest.old` and the segments."
         )
     entry = _base(inventory)
     channels: dict[int, Channel] = {}
@@ -289,10 +308,10 @@ def describe(catalog: Catalog, inventory: Inventory, *, is_open: bool = False) -
     entry.stored_bytes += sum(file["bytes"] for file in entry.payloads)
     entry.end = dict(end) if end is not None else {}
     ours = [row for sealed in inventory.lost for row in _losses_of_segment(inventory, sealed)]
-    ours += _losses_of_crash(inventory)
     ours += _losses_of_fields(inventory)
     ours += _losses_of_chunks(inventory, catalog.damage(inventory.id))
-    entry.status = _status(inventory, end, is_open=is_open, has_losses=bool(ours))
+    has_losses = bool(ours) or any(row["cause"] == Cause.SEGMENT for row in _rows_of(end))
+    entry.status = _status(inventory, end, is_open=is_open, has_losses=has_losses)
     if lost or ours:
         entry.end["losses"] = joined([*entry.end.get("losses", ()), *lost]) + ours
     entry.stored = {str(number): digest for number, (digest, _) in inventory.stored.items()}
@@ -316,8 +335,12 @@ def describe(catalog: Catalog, inventory: Inventory, *, is_open: bool = False) -
     )
 
 
+def _rows_of(end: Mapping[str, Any] | None) -> Iterable[Mapping[str, Any]]:
+    return () if end is None else end.get("losses", ())
+
+
 def describe_now(
-    directory: StoreDirectory, catalog: Catalog, label: str, *, is_open: bool = False
+    directory: StoreDirectory, catalog: Catalog, recording: str, *, is_open: bool = False
 ) -> Described:
     """Read a recording from its files.
 
@@ -325,23 +348,18 @@ def describe_now(
         SegmentError: The recording cannot be identified.
         StoreError: Its files change all the time.
     """
-    for _ in range(_TRIES):
-        inventory = take_inventory(directory, label)
-        # Of a directory that is renamed meanwhile, files would be missing.
-        if directory.listing(label).print == inventory.listing.print:
-            return describe(catalog, inventory, is_open=is_open)
-    raise StoreError(f"The files of recording {label!r} change while they are read. Ask again.")
+    return describe(catalog, steady_inventory(directory, recording), is_open=is_open)
 
 
 def put_entry(
-    directory: StoreDirectory, catalog: Catalog, label: str, *, is_open: bool = False
+    directory: StoreDirectory, catalog: Catalog, recording: str, *, is_open: bool = False
 ) -> RecordingEntry:
     """Read a recording's files and update its catalog row.
 
     Raises:
         SegmentError: The recording cannot be identified.
     """
-    described = describe_now(directory, catalog, label, is_open=is_open)
+    described = describe_now(directory, catalog, recording, is_open=is_open)
     catalog.put(described)
     return described.entry
 
@@ -352,15 +370,15 @@ def read_again(directory: StoreDirectory, catalog: Catalog, entry: RecordingEntr
     Raises:
         StoreError: They cannot be read, or have changed.
     """
-    is_open = directory.is_recorded(entry.label)
-    now = describe_now(directory, catalog, entry.label, is_open=is_open)
+    is_open = directory.is_recorded(entry.id)
+    now = describe_now(directory, catalog, entry.id, is_open=is_open)
     catalog.put(now, waits=False)
     for number, _, _ in entry.spans:
         try:
             catalog.table(entry, number)
         except CatalogError as error:
             raise StoreError(
-                f"The files of recording {entry.label!r} have changed since the store was "
+                f"The files of recording {entry.name!r} have changed since the store was "
                 "opened. Open it again."
             ) from error
 
@@ -375,7 +393,6 @@ def summary_of(entry: RecordingEntry, look: str = "") -> RecordingSummary:
     losses, gone = entry.end.get("losses", ()), expired_messages(entry)
     return RecordingSummary(
         id=entry.id,
-        label=entry.label,
         name=entry.name,
         tags=entry.tags,
         source=entry.source,
@@ -406,32 +423,105 @@ def topic_types(entry: RecordingEntry) -> set[TopicType]:
 
 
 def _base(inventory: Inventory) -> RecordingEntry:
-    state = inventory.state
-    said: dict[str, Any]
-    if state is not None and state.begun:
-        said = {**state.begun, "name": state.name, "tags": state.tags}
-    elif inventory.summaries:
-        said = dict(inventory.summaries[min(inventory.summaries)].recording)
-    else:
-        raise SegmentError(
-            f"Recording {inventory.label!r} has neither a journal nor a segment that can be read."
+    manifest = inventory.manifest
+    assert manifest is not None
+    return RecordingEntry(
+        id=manifest.id,
+        name=manifest.name,
+        tags=dict(manifest.tags),
+        source=_source_of(manifest.source),
+        created=manifest.created,
+        status="open",
+        notes=[{"at": note.at, "text": note.text} for note in manifest.notes],
+        marks=[mark_values(mark) for mark in manifest.marks],
+        pins=[pin_values(pin) for pin in manifest.pins],
+        payloads=[to_builtins(file) for file in inventory.fields.values()],
+    )
+
+
+_SOURCE = {"path": "", "kind": "", "profile": "", "bytes": 0}
+
+
+def _source_of(source: Source) -> dict[str, Any]:
+    """A source as the catalog keeps it, in JSON."""
+    said = {**_SOURCE, **to_builtins(source)}
+    return {**said, "parts": [*source.parts]} if source.parts else said
+
+
+def lost_in_crash(manifest: Manifest, after: Sealed) -> list[truth.Loss]:
+    """Rows of the loss ledger for content of a listed segment that a crash has taken."""
+    before = manifest.logs[after.segment]
+    left = {one.id: one.messages for one in after.channels}
+    reason = "a crash took what was written last"
+    return [
+        truth.Loss(
+            Cause.SEGMENT.value,
+            manifest.channels[number].topic,
+            part.messages - left.get(number, 0),
+            part.first,
+            part.last,
+            reason,
+            before.name,
         )
-    try:
-        said = journal.description_of(said)
-    except (KeyError, TypeError, ValueError) as error:
-        raise SegmentError(
-            f"The description of recording {inventory.label!r} is damaged: {error!r}"
-        ) from error
-    entry = RecordingEntry(label=inventory.label, status="open", **said)
-    entry.source = {"path": "", "kind": "", "bytes": 0, **entry.source}
-    if state is not None:
-        entry.name = state.name or entry.name  # also where only the first line is lost
-        entry.tags |= state.tags
-        entry.notes = list(state.notes)
-        entry.marks = list(state.marks)
-        entry.pins = list(state.pins.values())
-    entry.payloads = [asdict(file) for file in inventory.payloads.values()]
-    return entry
+        for number, part in before.parts.items()
+        if part.messages > left.get(number, 0)
+    ]
+
+
+def described(inventory: Inventory) -> Manifest:
+    """What the segments of a recording say of it, without its files.
+
+    Raises:
+        SegmentError: None says anything that can be read.
+    """
+    for _, summary in sorted(inventory.summaries.items()):
+        said = summary.recording
+        known = {name: said.get(name) for name in ("id", "name", "tags", "source", "created")}
+        with suppress(ValidationError):
+            return convert(known, Manifest)
+    raise SegmentError(
+        f"Recording {inventory.folder!r} has neither a manifest nor a segment that can be read."
+    )
+
+
+def end_values(manifest: Manifest) -> dict[str, Any]:
+    """The end of a recording as entries have it."""
+    values: dict[str, Any] = {
+        "status": manifest.status,
+        "losses": [loss_values(one) for one in manifest.losses],
+    }
+    if manifest.status == "recovered":
+        values |= {"cut_bytes": manifest.cut_bytes, "damage": [*manifest.damage]}
+    return values
+
+
+def loss_values(loss: truth.Loss) -> dict[str, Any]:
+    """A row of the loss ledger as entries and segments have it."""
+    return {
+        "cause": loss.cause,
+        "count": loss.count,
+        "file": loss.file,
+        "from": loss.first,
+        "length": loss.length,
+        "offset": loss.offset,
+        "reason": loss.reason,
+        "to": loss.last,
+        "topic": loss.topic or None,
+    }
+
+
+def mark_values(mark: truth.Mark) -> dict[str, Any]:
+    """A mark as entries have it."""
+    until = {} if mark.end is None else {"end": mark.end}
+    tags = dict(mark.tags)
+    return {"time": mark.time, "text": mark.text, "tags": tags, "segment": mark.segment, **until}
+
+
+def pin_values(pin: truth.Pin) -> dict[str, Any]:
+    """A pin as entries have it."""
+    topics = None if pin.topics is None else [*pin.topics]
+    span = {"from": pin.first, "to": None if pin.last is None else pin.last + 1}
+    return {"id": pin.id, **span, "topics": topics, "reason": pin.reason}
 
 
 def _status(
@@ -449,32 +539,29 @@ def _status(
     return str(end.get("status", "complete")) if end is not None else "recovered"
 
 
-def _losses_of_segment(inventory: Inventory, sealed: SealedSegment) -> list[dict[str, Any]]:
+def _losses_of_segment(inventory: Inventory, file: File) -> list[dict[str, Any]]:
     """Rows of the loss ledger for a listed segment that is not readable."""
-    reasons = [m.reason for m in inventory.misfits if m.segment == sealed.segment]
+    reasons = [m.reason for m in inventory.misfits if m.segment == file.number]
     reason = "; ".join(reasons) or "it cannot be read"
-    lost = [channel for channel in sealed.channels if channel["messages"]]
+    channels = inventory.manifest.channels if inventory.manifest is not None else {}
+    lost: list[dict[str, Any]] = [
+        {
+            "topic": channels[number].topic,
+            "messages": part.messages,
+            "first": part.first,
+            "last": part.last,
+        }
+        for number, part in file.parts.items()
+        if part.messages
+    ]
     nothing = {"messages": 0, "topic": None, "first": None, "last": None}
-    return [_loss(sealed.file, reason, c, length=sealed.bytes) for c in lost or [nothing]]
-
-
-def _losses_of_crash(inventory: Inventory) -> list[dict[str, Any]]:
-    """Rows for listed content that was lost in a crash."""
-    rows = []
-    for before, after in inventory.state.replaced if inventory.state is not None else ():
-        left = {channel["id"]: channel["messages"] for channel in after.channels}
-        for channel in before.channels:
-            count = channel["messages"] - left.get(channel["id"], 0)
-            if count > 0:
-                reason = "a crash took what was written last"
-                rows.append(_loss(before.file, reason, {**channel, "messages": count}))
-    return rows
+    return [_loss(file.name, reason, c, length=file.bytes) for c in lost or [nothing]]
 
 
 def _losses_of_fields(inventory: Inventory) -> list[dict[str, Any]]:
     """Rows for missing or changed files of fields of expired messages."""
     rows = []
-    for file in inventory.payloads.values():
+    for file in inventory.fields.values():
         size = inventory.listing.payloads.get(file.file)
         if size == file.bytes or (size is None and PAYLOAD_PARTS in inventory.listing.others):
             continue  # or it is about to get its name
@@ -492,7 +579,7 @@ def _losses_of_fields(inventory: Inventory) -> list[dict[str, Any]]:
     return rows
 
 
-def _span_of(summary: SegmentSummary, file: PayloadFile) -> tuple[int, int] | None:
+def _span_of(summary: SegmentSummary, file: Fields) -> tuple[int, int] | None:
     """First and last log time of messages that need a file: expired ones of its topic."""
     table = summary.table
     needs_file = np.repeat(table.is_expired, table.chunks["parts"])
@@ -566,110 +653,141 @@ def channels_of(summaries: Iterable[SegmentSummary]) -> dict[int, Channel]:
     return channels
 
 
-def journal_from_segments(inventory: Inventory, store_id: str, reason: str) -> list[journal.Event]:
-    """The lines of a journal rebuilt from the files.
+def listed(sealed: Sealed) -> Callable[[Manifest], Manifest]:
+    """The change that lists a segment, in the place of the one of its number."""
+    times = [time for one in sealed.channels for time in (one.first, one.last)]
+    file = File(
+        sealed.segment,
+        sealed.segment,
+        sealed.file,
+        "log",
+        sealed.bytes,
+        sealed.digest,
+        time.time_ns(),
+        min(times, default=None),
+        max(times, default=None),
+        {
+            one.id: truth.Part(one.messages, one.payload_bytes, one.first, one.last)
+            for one in sealed.channels
+        },
+    )
+    channels = {one.id: truth.Channel(one.topic, one.encoding, one.type) for one in sealed.channels}
 
-    It has the whole lines of the old one, and lists missing segments.
+    def how(now: Manifest) -> Manifest:
+        others = tuple(one for one in now.files if one.name != file.name)
+        known = {**channels, **now.channels}
+        numbers = tuple(one for one in now.unmarked if one != file.number)
+        made = truth.replace(now, files=(*others, file), channels=known, unmarked=numbers)
+        return truth.with_totals(made)
+
+    return how
+
+
+def ended(end: Mapping[str, Any]) -> Callable[[Manifest], Manifest]:
+    """The change that ends a recording.
+
+    Args:
+        end: Its `status`, `losses`, `cut_bytes` and `damage`, as segments have them.
+    """
+    status = cast("Literal['complete', 'damaged', 'recovered']", end.get("status", "complete"))
+    losses = tuple(loss_of(row) for row in end.get("losses", ()))
+
+    def how(now: Manifest) -> Manifest:
+        return truth.replace(
+            now,
+            status="unproven" if now.status == "unproven" else status,
+            losses=(*now.losses, *losses),
+            cut_bytes=end.get("cut_bytes", 0),
+            damage=tuple(end.get("damage", ())),
+        )
+
+    return how
+
+
+def unlisted(inventory: Inventory) -> Callable[[Manifest], Manifest] | None:
+    """The change that lists valid segments which the manifest lacks, and what they need."""
+    files = [misfit.segment for misfit in inventory.misfits if misfit.is_unlisted]
+    return _listing_of(inventory, files) if files else None
+
+
+def made_again(inventory: Inventory, old: Manifest | None) -> Manifest:
+    """The manifest of a recording that has lost it.
+
+    Args:
+        inventory: What is there.
+        old: The one before the last change, if it can be read.
 
     Raises:
-        SegmentError: Neither journal nor segments say what recording it is.
+        SegmentError: Nothing says what recording it is.
     """
-    entry = _base(inventory)
-    state = inventory.state
-    lines: list[journal.Event] = [
-        journal.event(journal.BEGUN, store=store_id, **_begun(entry, state)),
-        journal.event(journal.REBUILT, reason=reason),
-    ]
-    listed = dict(state.sealed) if state is not None else {}
-    for number in sorted(listed.keys() | inventory.summaries.keys()):
-        sealed = listed.get(number)
-        if sealed is not None:
-            before = [old for old, _ in state.replaced if old.segment == number] if state else []
-            lines += map(sealed_event, [*before, sealed])
-        else:
-            lines.append(sealed_line(inventory, number))
-    if state is not None:
-        lines += [
-            journal.event(journal.NOTED, text=n["text"]) | {"at": n["at"]} for n in state.notes
-        ]
-        lines += [journal.event(journal.MARKED, **mark) for mark in state.marks]
-        lines += [journal.event(journal.PINNED, **pin) for pin in state.pins.values()]
-    lines += _expired_lines(inventory)
-    if inventory.end is not None:
-        lines.append(journal.event(journal.ENDED, end=dict(inventory.end)))
-    return lines
+    made = old or described(inventory)
+    numbers = [n for n in inventory.summaries if n not in made.logs]
+    made = _listing_of(inventory, numbers)(made)
+    end = inventory.end
+    if end is not None and not made.is_ended:
+        made = ended(end)(made)
+    return truth.replace(made, status="unproven", changes=made.changes + 1)
 
 
-def unlisted_lines(inventory: Inventory) -> list[journal.Event]:
-    """The lines about valid segments, and the fields that they need, that a journal lacks."""
-    unlisted = {misfit.segment: misfit.file for misfit in inventory.misfits if misfit.is_unlisted}
-    state = inventory.state
-    if state is None or not unlisted:
-        return []
-    # It may have listed other segments that are gone; this cannot be excluded.
-    reason = f"it did not list {', '.join(unlisted.values())}"
-    new = [sealed_line(inventory, number) for number in unlisted if number not in state.sealed]
-    return [journal.event(journal.REBUILT, reason=reason), *new, *_expired_lines(inventory)]
+def _listing_of(inventory: Inventory, numbers: Iterable[int]) -> Callable[[Manifest], Manifest]:
+    changes = [listed(sealed_of(inventory, number)) for number in numbers]
+
+    def how(now: Manifest) -> Manifest:
+        for change, number in zip(changes, numbers, strict=True):
+            if number not in now.logs:
+                now = change(now)
+        stored = {n: one for n, one in inventory.stored.items() if n in now.logs}
+        for number, (digest, size) in stored.items():
+            file = now.logs[number]
+            topics = tuple(sorted({*file.expired, *_expired_topics(inventory, number)}))
+            what = truth.Stored(size, digest)
+            now = truth.with_file(now, number, stored=what, expired=topics)
+        fields = {**{one.file: one for one in now.fields}, **inventory.fields}
+        there = tuple(file for path, file in fields.items() if path not in now.deleted)
+        return truth.replace(now, fields=there)
+
+    return how
 
 
-def _expired_lines(inventory: Inventory) -> list[journal.Event]:
-    def topics(number: int) -> list[str]:
-        summary = inventory.summaries[number]
-        return summary.topics_in(one for one in summary.chunks if one.is_expired)
-
-    replaced = inventory.replaced
-    files = [asdict(file) for file in (*replaced.values(), *inventory.payloads.values())]
-    segments = [
-        {"segment": number, "digest": digest, "bytes": size, "topics": topics(number)}
-        for number, (digest, size) in inventory.stored.items()
-    ]
-    lines: list[journal.Event] = []
-    if files:
-        lines.append(journal.event(journal.EXPIRED, files=files, segments=segments))
-    if replaced:
-        lines.append(journal.event(journal.EXPIRED, deleted=[*replaced]))
-    return lines
+def _expired_topics(inventory: Inventory, number: int) -> list[str]:
+    summary = inventory.summaries[number]
+    return summary.topics_in(one for one in summary.chunks if one.is_expired)
 
 
-def _begun(entry: RecordingEntry, state: JournalState | None) -> dict[str, Any]:
-    origin = state.begun.get("origin", {}) if state is not None else {}
-    return {**recording_metadata(entry), "origin": origin}
-
-
-def sealed_line(inventory: Inventory, number: int) -> journal.Event:
-    """The journal line for an existing segment."""
+def sealed_of(inventory: Inventory, number: int) -> Sealed:
+    """An existing segment, as it was sealed."""
     summary = inventory.summaries[number]
     channels = sealed_channels(summary.table.as_stored(), summary.channels)
-    file = inventory.listing.sealed[number]
     size = summary.size
     if number in inventory.stored and summary.compacted is not None:
         size = summary.compacted.get("bytes", size)
-    return sealed_event(Sealed(number, file, size, summary.digest, channels))
+    return Sealed(number, inventory.listing.sealed[number], size, summary.digest, channels)
 
 
-def sealed_event(sealed: Sealed | SealedSegment) -> journal.Event:
-    """The journal line for a segment; one that was listed has the time of that."""
-    line = journal.event(
-        journal.SEALED,
-        segment=sealed.segment,
-        file=sealed.file,
-        bytes=sealed.bytes,
-        digest=sealed.digest,
-        channels=[dict(c) if isinstance(c, Mapping) else asdict(c) for c in sealed.channels],
-    )
-    written = sealed.at if isinstance(sealed, journal.SealedSegment) else 0
-    return {**line, "at": written} if written else line
+def announce_removal(
+    directory: StoreDirectory, recording: str, check: Callable[[Manifest], None] = lambda _: None
+) -> None:
+    """Announce the removal of a recording in its manifest.
 
+    On a full disk that may not fit; then the directory's hidden name announces it.
 
-def announce_removal(directory: StoreDirectory, label: str) -> None:
-    """Announce the removal of a recording in its journal.
-
-    On a full disk the line may not fit; then the directory's hidden name announces it.
+    Args:
+        directory: The store.
+        recording: Its id.
+        check: Called with the newest manifest; raises to keep the recording.
     """
-    path = directory.recording(label)
-    if directory.listing(label).journal:
-        with suppress(DiskFullError):
-            Journal(path).append(journal.event(journal.REMOVING, by=os.getpid()))
+
+    def removed(now: Manifest) -> Manifest:
+        check(now)
+        return truth.replace(now, status="removed")
+
+    with suppress(DiskFullError, RecordingGoneError):
+        change_in(directory.recording(recording), removed)
+
+
+def free_name_in(catalog: Catalog, name: str, but: str = "") -> str:
+    """A name that no recording of a store has, but for one, by its id; within `alone`."""
+    return free_name(text(name), {one.name for one in catalog.summaries() if one.id != but})
 
 
 def text(name: str) -> str:

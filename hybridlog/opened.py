@@ -113,8 +113,8 @@ class OpenStore(Shared):
         if latest is None or self._has_names_changed():
             return True
         read = [one for one in latest.snapshot().summaries if one.id in self._entries]
-        looks = self.directory.looks([one.label for one in read])
-        return any(looks.get(one.label) != one.look for one in read)
+        looks = self.directory.looks([one.id for one in read])
+        return any(looks.get(one.id) != one.look for one in read)
 
     def replace_latest(self, before: Snapshot, now: Session) -> None:
         """Let later questions begin with what one has seen, unless there is a newer state."""
@@ -122,7 +122,7 @@ class OpenStore(Shared):
             self._latest = now.again()
 
     def catch_up(self, *recordings: str) -> None:
-        """See which recordings came, went, or got another name, and how some others are now.
+        """See which recordings came or went, and how some others are now.
 
         All else that was read stays, so this costs little in a store of thousands.
         """
@@ -131,18 +131,16 @@ class OpenStore(Shared):
                 return
             before = self._latest.snapshot()
             changed, names = self.directory.changed(), self.directory.names()
-            labels = {*names}.symmetric_difference(before.by_label)  # copies are among them
-            known = [before.by_id[one] for one in recordings if one in before.by_id]
-            labels.update(before.summaries[place].label for place in known)
-            now = self._files.catch_up(before, labels)
+            ids = {*names}.symmetric_difference(before.by_id)
+            ids.update(one for one in recordings if one in before.by_id)
+            now = self._files.catch_up(before, ids)
             if now is None or self.directory.names() != names:
                 self.invalidate()
                 return
             self._changed, self._names = changed, names
             self._latest = Session(self, now)
             self.index.note_changes()
-            places = {before.by_label[label] for label in labels & before.by_label.keys()}
-            self._invalidate_recordings({before.summaries[place].id for place in places})
+            self._invalidate_recordings(ids & before.by_id.keys())
 
     def invalidate(self) -> None:
         """Drop everything that was read, so that the next question reads the store again."""
@@ -204,7 +202,7 @@ class OpenStore(Shared):
             from hybridlog.columns.recordings_file import write_recordings_file
 
             with suppress(OSError, HybridlogError):
-                present = self.now().snapshot().by_label.keys() & {*self.directory.names()}
+                present = self.now().snapshot().by_id.keys() & {*self.directory.names()}
                 write_recordings_file(self.catalog, present)
                 self.catalog.has_changed = False
 

@@ -46,11 +46,11 @@ class Recordings(Sequence["RecordingEntry"]):
     def __getitem__(self, index: slice) -> Recordings: ...
 
     def __getitem__(self, index: int | str | slice) -> RecordingEntry | Recordings:
-        """The entry of a recording by position or label, or some of the recordings."""
+        """The entry of a recording by position or name, or some of the recordings."""
         if isinstance(index, str):
-            if index not in self.labels:
-                raise TopicError(f"{index!r} is not one of {listed(self.labels)}.")
-            index = self.labels.index(index)
+            if index not in self.names:
+                raise TopicError(f"{index!r} is not one of {listed(self.names)}.")
+            index = self.names.index(index)
         if isinstance(index, slice):
             return Recordings(self._source, self.summaries[index], self._problem)
         return self._source.now().entry_of(self.summaries[index])
@@ -68,7 +68,7 @@ class Recordings(Sequence["RecordingEntry"]):
     __hash__ = None  # type: ignore[assignment]
 
     def __repr__(self) -> str:
-        return f"<Recordings {listed((one.label for one in self.summaries), 5)}>"
+        return f"<Recordings {listed((one.name for one in self.summaries), 5)}>"
 
     def _repr_html_(self) -> str:
         """The recordings in a notebook."""
@@ -77,8 +77,8 @@ class Recordings(Sequence["RecordingEntry"]):
         return recordings_html(f"{len(self)} recordings", self.summaries)
 
     def _ipython_key_completions_(self) -> list[str]:
-        """Labels, for `recordings["…"]`."""
-        return list(self.labels)
+        """Names, for `recordings["…"]`."""
+        return list(self.names)
 
     @property
     def ids(self) -> tuple[str, ...]:
@@ -86,9 +86,9 @@ class Recordings(Sequence["RecordingEntry"]):
         return tuple(summary.id for summary in self.summaries)
 
     @property
-    def labels(self) -> tuple[str, ...]:
-        """Their labels."""
-        return tuple(summary.label for summary in self.summaries)
+    def names(self) -> tuple[str, ...]:
+        """Their names."""
+        return tuple(summary.name for summary in self.summaries)
 
     def check(self) -> Recordings:
         """These recordings.

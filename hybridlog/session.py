@@ -11,7 +11,6 @@ from collections.abc import (
     Sequence,
 )
 from contextlib import suppress
-from dataclasses import replace
 from itertools import accumulate
 from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Protocol, TypeVar
 
@@ -25,6 +24,7 @@ from hybridlog.query.topics import resolve
 from hybridlog.snapshot import UNFINISHED
 from hybridlog.wording import listed
 from hybridlog_storage.catalog import ChannelStats, schema_hash
+from hybridlog_storage.disk.directory import gone
 from hybridlog_storage.errors import (
     CatalogError,
     ChangedError,
@@ -196,7 +196,7 @@ class Session:
         """
         found = self._entry_of(summary)
         if found is None:
-            raise _gone(summary.label)
+            raise gone(summary.name)
         return found
 
     def _entry_of(self, summary: RecordingSummary) -> RecordingEntry | None:
@@ -216,16 +216,16 @@ class Session:
         return None if place is None else self._entry_of(self._recordings.summaries[place])
 
     def entry(self, recording: str) -> RecordingEntry:
-        """The entry of a recording, by its id or its label.
+        """The entry of a recording, by its id or its name.
 
         Raises:
             TopicError: it does not exist.
         """
         snapshot = self._recordings
-        place = snapshot.by_id.get(recording, snapshot.by_label.get(recording))
-        if place is None:
-            raise _gone(recording)
-        return self.entry_of(snapshot.summaries[place])
+        found = snapshot.called(recording)
+        if len(found) != 1:
+            raise self._unclear(recording, found)
+        return self.entry_of(snapshot.summaries[found[0]])
 
     def chosen(self, question: Question) -> NDArray[np.intp]:
         """Positions in the snapshot of the recordings of a question, oldest first.
@@ -254,7 +254,7 @@ class Session:
             summary = summaries[place]
             entry = self._entries.get(summary.id) or self.shared.known_entry(summary.id)
             is_complete = not summary.has_losses and summary.status == "complete"
-            if entry is None and is_complete and not self.directory.lost_of(summary.label):
+            if entry is None and is_complete and not self.directory.lost_of(summary.id):
                 continue
             entry = entry or self.entry_of(summary)
             if entry.status != "complete" or entry.end.get("losses"):
@@ -262,7 +262,7 @@ class Session:
         return found
 
     def select(self, names: Iterable[str | RecordingEntry] | None) -> list[RecordingEntry]:
-        """Recordings by label, name, id, or the beginning of one of these; None for all.
+        """Recordings by name, id, or the beginning of one of these; None for all.
 
         Raises:
             TopicError: no recording matches, or several do.
@@ -287,16 +287,22 @@ class Session:
         snapshot = self._recordings
         chosen: dict[int, None] = {}
         for given in names:
-            wanted = given if isinstance(given, str) else given.id
-            name = self.shared.repairs.copies.get(wanted, wanted)
+            name = given if isinstance(given, str) else given.id
             found = snapshot.named(name)
             if len(found) != 1:
-                shown = found or range(len(snapshot))
-                candidates = listed(snapshot.summaries[n].label for n in shown)
-                problem = "is ambiguous" if found else "is not in the store"
-                raise TopicError(f"Recording {name!r} {problem}. There are: {candidates}.")
+                raise self._unclear(name, found)
             chosen[found[0]] = None
         return list(chosen)
+
+    def _unclear(self, name: str, found: Sequence[int]) -> TopicError:
+        """The error for a name that means no recording, or several."""
+        summaries = self.snapshot().summaries
+        several = [summaries[place] for place in found]
+        names = [one.name for one in several or summaries]
+        if len({*names}) < len(several):  # copied by hand
+            names = [one.id for one in several]
+        problem = "is ambiguous" if found else "is not in the store"
+        return TopicError(f"Recording {name!r} {problem}. There are: {listed(names)}.")
 
     def topics(self) -> list[str]:
         """Names of all topics, sorted; includes those whose messages are all lost."""
@@ -362,7 +368,7 @@ class Session:
 
         Args:
             topics: Full names.
-            recordings: Ids, labels, names or entries; None for all.
+            recordings: Ids, names or entries; None for all.
 
         Returns:
             The topics, and the ids; None for every recording that has a topic.
@@ -445,10 +451,10 @@ class Session:
             others = snapshot.having({*found}.difference(known)).tolist()
             if not others:
                 raise
-            labels = listed((snapshot.summaries[place].label for place in others), _MAX_NAMES)
+            known_by = listed((snapshot.summaries[place].name for place in others), _MAX_NAMES)
             have = "has" if len(others) == 1 else "have"
             join = " In" if str(error).endswith("?") else "; in"
-            raise TopicError(f"{error}{join} the store, {labels} {have} such a topic") from error
+            raise TopicError(f"{error}{join} the store, {known_by} {have} such a topic") from error
 
     def predicate(
         self, text: str, topics: tuple[str, ...], recordings: tuple[str, ...] | None
@@ -491,13 +497,13 @@ class Session:
             self.shared.schemas |= self.catalog.schemas(wanted - self.shared.schemas.keys())
         if not wanted <= self.shared.schemas.keys():
             # The catalog has lost a schema.
-            inventory = take_inventory(self.directory, recording.label)
+            inventory = take_inventory(self.directory, recording.id)
             channels = channels_of(inventory.summaries.values()).values()
             there = (channel.schema for channel in channels if channel.schema is not None)
             self.shared.schemas |= {schema_hash(schema): schema for schema in there}
         if not wanted <= self.shared.schemas.keys():
             raise StoreError(
-                f"Definitions of recording {recording.label!r} cannot be read at the moment. Ask "
+                f"Definitions of recording {recording.name!r} cannot be read at the moment. Ask "
                 "again."
             )
         return {
@@ -586,7 +592,6 @@ class Session:
                 if (now.digests, now.stored) != (recording.digests, recording.stored):
                     self._entries[recording.id] = now
                     raise _changed(recording) from None
-                recording = replace(recording, label=now.label)
             read_again(self.directory, self.catalog, recording)
             return ask(recording, *args, **kwargs)
 
@@ -624,7 +629,7 @@ class Session:
         place = place_of(self.chunk_table(recording, segment), chunk)
         found = self._read(recording.id, segment, lambda reader: reader.read_times(place))
         if not found.keys() >= {*place.channels}:
-            raise StoreError(f"Payloads of {recording.label!r} were deleted meanwhile. Ask again.")
+            raise StoreError(f"Payloads of {recording.name!r} were deleted meanwhile. Ask again.")
         return found
 
     def chunk(
@@ -704,13 +709,13 @@ class Session:
         """
         place = self._recordings.by_id.get(entry.id)
         look = None if place is None else self._recordings.summaries[place].look
-        if self.directory.looks([entry.label]).get(entry.label) == look:
+        if self.directory.looks([entry.id]).get(entry.id) == look:
             return None
         self.shared.catch_up(entry.id)
         newer: Session = self.shared.now()
         now = newer.entry_if_there(entry.id)
         if now is None:
-            raise _gone(entry.label)
+            raise gone(entry.name)
         if _files_of(now) == _files_of(entry):
             return None
         self._newer[entry.id] = newer
@@ -740,7 +745,7 @@ class Session:
 
 def _files_of(entry: RecordingEntry) -> tuple[object, ...]:
     """What tells the files of a recording from later ones."""
-    return entry.label, entry.digests, entry.stored, entry.flushed.keys()
+    return entry.digests, entry.stored, entry.flushed.keys()
 
 
 def _in_order(by_topic: Iterable[Sequence[RecordedChannel]]) -> list[RecordedChannel]:
@@ -750,12 +755,8 @@ def _in_order(by_topic: Iterable[Sequence[RecordedChannel]]) -> list[RecordedCha
 
 def _changed(recording: RecordingEntry) -> ChangedError:
     return ChangedError(
-        f"Files of recording {recording.label!r} were replaced while it was read. Ask again."
+        f"Files of recording {recording.name!r} were replaced while it was read. Ask again."
     )
-
-
-def _gone(recording: str) -> TopicError:
-    return TopicError(f"Recording {recording!r} is no longer in the store.")
 
 
 def _size_of(chunk: StoredChunk) -> int:

@@ -161,11 +161,11 @@ class Shared(ABC):
         running = self._running.get(summary.id)
         if running is None:
             running = self._running[summary.id] = RunningRecording(
-                self.directory, summary.label, partial(self.entry, summary)
+                self.directory, summary.id, partial(self.entry, summary)
             )
         running.follow()
         entry = running.entry
-        if entry is None or entry.status not in UNFINISHED or entry.label != summary.label:
+        if entry is None or entry.status not in UNFINISHED:
             del self._running[summary.id]
         self.schemas |= running.schemas
         if entry is not None and entry.status not in UNFINISHED:
@@ -177,15 +177,7 @@ class Shared(ABC):
         found = None if summary.status in UNFINISHED else self._entries.get(summary.id)
         if found is None:
             entry = self._current(summary)
-            for _ in range(_TRIES):
-                if entry is not None and entry.id == summary.id:
-                    break
-                # Another process may have renamed it.
-                now = self._files.look_at_all()
-                if summary.id not in now.by_id:
-                    return None
-                entry = self._current(now.summaries[now.by_id[summary.id]])
-            if entry is None or entry.id != summary.id:
+            if entry is None:
                 return None
             if entry.status in UNFINISHED:
                 return entry
@@ -196,9 +188,9 @@ class Shared(ABC):
         try:
             entry, is_new = self._files.current_entry(summary)
         except StoreError:
-            if self.directory.has(summary.label):
+            if self.directory.has(summary.id):
                 raise
-            return None  # another process has just renamed or removed it
+            return None  # another process has just removed it
         if entry is not None and is_new:
             # The index may have what the files had before.
             self.note_changes(entry.id)
@@ -222,7 +214,7 @@ class Shared(ABC):
             reader = self._segments.get(key)
             if reader is None:
                 _make_room(self._segments)
-                path = self.directory.recording(entry.label)
+                path = self.directory.recording(entry.id)
                 reader = self._segments[key] = open_segment(
                     path / f"{number:06d}.mcap", number, self._contents_of(entry)
                 )
@@ -234,7 +226,7 @@ class Shared(ABC):
             return self._contents_of(entry)
 
     def _contents_of(self, entry: RecordingEntry) -> RecordingPayloads:
-        key = self.directory.recording(entry.label), frozenset(entry.stored.items())
+        key = self.directory.recording(entry.id), frozenset(entry.stored.items())
         found = self._contents.get(key)
         if found is None:
             _make_room(self._contents)

@@ -26,11 +26,12 @@ if TYPE_CHECKING:
 UNFINISHED = frozenset({"open", "unfinished"})
 """Statuses of recordings that may have ended, or grown, since the snapshot."""
 _MAX_CACHED = 128  # sets of topics
+_LEAST = 4  # characters of an id that stand for it
 _LATEST = (1 << 63) - 1
 
 
-def _order(one: RecordingSummary) -> tuple[bool, tuple[int, int], str]:
-    return one.span is None, one.span or (0, 0), one.label
+def _order(one: RecordingSummary) -> tuple[bool, tuple[int, int], str, str]:
+    return one.span is None, one.span or (0, 0), one.name, one.id
 
 
 def _columns_of(
@@ -134,11 +135,11 @@ class Snapshot:
             known = dict(held[number] for number in used.tolist())
             columns["set"] = np.searchsorted(used, columns["set"])
         vars(found).update(_columns=columns, _topics=known, _having={})
-        stale = {"tags", "by_id", "by_label", "unfinished"}
-        if before == places[::-1] and [one.label for one in changed] == [
-            self.summaries[place].label for place in before
+        stale = {"tags", "by_id", "by_name", "unfinished"}
+        if before == places[::-1] and [one.id for one in changed] == [
+            self.summaries[place].id for place in before
         ]:
-            stale = {"tags", "unfinished"}  # each is where it was
+            stale = {"tags", "by_name", "unfinished"}  # each is where it was
         if known.keys() != self._topics.keys():
             stale |= {"topics", "schemas"}
         for name in stale:
@@ -151,9 +152,18 @@ class Snapshot:
         return {summary.id: place for place, summary in enumerate(self.summaries)}
 
     @lazy
-    def by_label(self) -> dict[str, int]:
-        """The position of each recording, by label."""
-        return {summary.label: place for place, summary in enumerate(self.summaries)}
+    def by_name(self) -> dict[str, list[int]]:
+        """The positions of the recordings with each name: one, but for those copied by hand."""
+        found: dict[str, list[int]] = defaultdict(list)
+        for place, summary in enumerate(self.summaries):
+            found[summary.name].append(place)
+        return dict(found)
+
+    def ids_called(self) -> dict[str, str]:
+        """The id of each recording, by its id and, where no other one has it, by its name."""
+        places = self.by_name.items()
+        names = {name: self.summaries[of[0]].id for name, of in places if len(of) == 1}
+        return names | {one.id: one.id for one in self.summaries}
 
     @lazy
     def topics(self) -> list[str]:
@@ -248,29 +258,25 @@ class Snapshot:
         return [self.summaries[place] for place in places[np.sort(firsts)].tolist()]
 
     def called(self, name: str) -> list[int]:
-        """Positions of the recordings with exactly this id or label, else with this name."""
-        place = self.by_id.get(name, self.by_label.get(name))
-        if place is not None:
-            return [place]
-        return [place for place, one in enumerate(self.summaries) if one.name == name]
+        """Positions of the recordings with exactly this id, else with this name."""
+        return [self.by_id[name]] if name in self.by_id else self.by_name.get(name, [])
 
     def named(self, name: str) -> list[int]:
         """Positions of the recordings that a name may mean.
 
-        It is an id or a label, else a name, else the beginning of a label, else of an id.
+        It is an id, else a name, else the beginning of a name, else that of an id or of its
+        random digits.
         """
         found = self.called(name)
         if found:
             return found
         everything = list(enumerate(self.summaries))
-        return [place for place, one in everything if one.label.startswith(name)] or [
-            place for place, one in everything if len(name) >= 4 and one.id.startswith(name)
+        return [place for place, one in everything if one.name.startswith(name)] or [
+            place
+            for place, one in everything
+            if len(name) >= _LEAST and (one.id.startswith(name) or one.key.startswith(name))
         ]
 
     def matching(self, pattern: str) -> list[int]:
-        """Positions of the recordings whose label or name fits a glob, with case."""
-        return [
-            place
-            for place, one in enumerate(self.summaries)
-            if fnmatchcase(one.label, pattern) or fnmatchcase(one.name, pattern)
-        ]
+        """Positions of the recordings whose name fits a glob, with case."""
+        return [place for place, one in enumerate(self.summaries) if fnmatchcase(one.name, pattern)]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import secrets
+import time as clock
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from copy import copy
@@ -39,7 +40,6 @@ from hybridlog.query.topics import namesakes
 from hybridlog.record.losses import extent_of
 from hybridlog.session import Asked, Session
 from hybridlog.wording import listed
-from hybridlog_storage import journal
 from hybridlog_storage.catalog import Catalog, RecordingEntry
 from hybridlog_storage.disk.directory import StoreDirectory
 from hybridlog_storage.errors import (
@@ -54,6 +54,7 @@ from hybridlog_storage.errors import (
     TopicError,
     UsageError,
 )
+from hybridlog_storage.manifest import Manifest, Note, replace
 from hybridlog_storage.remote import TRIES, address_of, directory_of
 from hybridlog_storage.settings import (
     EMBEDDED,
@@ -95,7 +96,7 @@ DEFAULT_STORE = "hybridlog-store"
 _MENDING_S: Final = 2.0
 """Longest time that a command repairs what it met, after its answer."""
 Names: TypeAlias = "Iterable[str | RecordingEntry]"
-"""Recordings by label, name or id, or their entries."""
+"""Recordings by name or id, or their entries."""
 _ELSEWHERE: Final = re.compile(r"(?P<host>[^/:]+):(?P<path>.*)")
 """A URL, or a place on a server as scp has it."""
 _P = ParamSpec("_P")
@@ -190,11 +191,9 @@ def receiving(store: Store) -> Iterator[DirectoryPlace]:
     from hybridlog.maintenance import tables
     from hybridlog.maintenance.places import DirectoryPlace
 
-    def known() -> dict[str, str]:
-        return {one.id: one.label for one in store.session.snapshot().summaries}
-
     store.shared.catch_up()
-    place = DirectoryPlace(store.directory, known)
+    _ = store.session  # the catalog then has all names
+    place = DirectoryPlace(store.directory, store.catalog)
     yield place
     store.shared.catch_up()
     for entry in store.select(place.published):  # so that other readers find them
@@ -437,8 +436,8 @@ class Store:
         """The recordings that satisfy all conditions, oldest first; all without conditions.
 
         Args:
-            name: Label, name, id, the beginning of a label or an id, or a glob (`monday*`)
-                for labels and names; one of several must match.
+            name: Name, id, the beginning of one, or a glob for names (`monday*`); one of several
+                must match.
             tag: `"robot=7"`, or `"robot"` for any value, or a dictionary.
             has: Topics that they have: full or short names, globs, `re:`.
             type: Types of messages: `sensor_msgs/Imu`, `Imu`, a glob.
@@ -479,7 +478,7 @@ class Store:
         return list(self.session.look().summaries)
 
     def entry(self, recording: str) -> RecordingEntry:
-        """The entry of a recording, by its id or its label.
+        """The entry of a recording, by its id or its name.
 
         Raises:
             TopicError: It does not exist.
@@ -487,7 +486,7 @@ class Store:
         return self.session.entry(recording)
 
     def select(self, names: Names | None) -> list[RecordingEntry]:
-        """Recordings by label, name, id, or the beginning of one of these; None for all.
+        """Recordings by name, id, or the beginning of one of these; None for all.
 
         Entries stand for themselves, so `recordings` gives what this takes.
 
@@ -504,7 +503,7 @@ class Store:
         """The attachments of a recording's log, in their order.
 
         Args:
-            recording: Its label, name or id, the beginning of one, or its entry.
+            recording: Its name or id, the beginning of one, or its entry.
 
         Raises:
             TopicError: It does not exist.
@@ -519,7 +518,7 @@ class Store:
         """The metadata records of a recording's log, in their order.
 
         Args:
-            recording: Its label, name or id, the beginning of one, or its entry.
+            recording: Its name or id, the beginning of one, or its entry.
 
         Raises:
             TopicError: It does not exist.
@@ -569,7 +568,7 @@ class Store:
         """The coordinate frames of a recording, and the transforms between them.
 
         Args:
-            recording: Its label, name or id; None if the store has one alone.
+            recording: Its name or id; None if the store has one alone.
             topics: Topics with transforms; empty for all of types of tf, tf2 and Foxglove.
 
         Raises:
@@ -580,9 +579,7 @@ class Store:
         now = self.snapshot()
         chosen = now.recordings(recording).check()
         if len(chosen) > 1:
-            raise TopicError(
-                f"Frames belong to one recording: name one of {listed(chosen.labels)}."
-            )
+            raise TopicError(f"Frames belong to one recording: name one of {listed(chosen.names)}.")
         names = chosen.topic(*topics).topics if topics else chosen.topics()
         return frame_tree(now.session, chosen.summaries[0], names)
 
@@ -590,7 +587,7 @@ class Store:
         """Check how regularly the topics of recordings came, the worst first; see `Query.check`.
 
         Args:
-            recording: Label, name, id or glob; None for all recordings.
+            recording: Name, id or glob; None for all recordings.
 
         Raises:
             TopicError: No such recording.
@@ -602,7 +599,7 @@ class Store:
 
         Args:
             contract: A file in YAML, or what `Contract.parse` makes of one.
-            recording: Label, name, id or glob; None for all recordings.
+            recording: Name, id or glob; None for all recordings.
 
         Raises:
             UsageError: The contract cannot be read, or breaks its schema.
@@ -632,7 +629,7 @@ class Store:
         and the others are those of the time that both have.
 
         Args:
-            a: Label, name, id or glob; several recordings are compared together.
+            a: Name, id or glob; several recordings are compared together.
             b: The same.
             topics: Only these; empty for all.
             between: Only messages of this range of each; None for the time that both have.
@@ -684,7 +681,7 @@ class Store:
             clock: The time that is compared: `log`, `publish` or `header`.
             across_recordings: Messages of `others` may be of any recording of their queries,
                 such as one of a second robot at that time; by default, of the row's. The
-                column `scan.recording` has the label of each.
+                column `scan.recording` has the name of each.
 
         Raises:
             TopicError: no such topic or field, or a topic does not have the clock.
@@ -984,13 +981,12 @@ class Store:
         if repair:
             return self._repair(recordings, progress)
         self.refresh()
-        labels = None if recordings is None else [r.label for r in self.select(recordings)]
+        chosen = None if recordings is None else [one.id for one in self.select(recordings)]
         return verify(
             self.directory,
             self.catalog,
             self.database,
-            self.repairs,
-            labels=labels,
+            recordings=chosen,
             progress=progress,
         )
 
@@ -1040,6 +1036,7 @@ class Store:
             StoreError: Another process deletes here, too; or the store is read-only.
         """
         from hybridlog.entries import put_entry
+        from hybridlog.maintenance.edit import remove_if
         from hybridlog.maintenance.keep import Keeper, KeepReport
         from hybridlog.maintenance.retention import Rules
 
@@ -1047,7 +1044,8 @@ class Store:
         is_remote = self.directory.is_remote
         wanted.check_place(is_remote=is_remote)
         put = partial(put_entry, self.directory, self.catalog)
-        keeper = Keeper(self.directory, self.remove, changed=put if is_remote else lambda _: None)
+        remove = partial(remove_if, self.shared)
+        keeper = Keeper(self.directory, remove, changed=put if is_remote else lambda _: None)
         if dry_run:
             return KeepReport(keeper.plan(wanted))
         self._to_change()
@@ -1069,7 +1067,7 @@ class Store:
         """Pin a time of a recording: its payloads are never deleted to make room.
 
         Args:
-            recording: Its label, name or id, or its entry; it may be running.
+            recording: Its name or id, or its entry; it may be running.
             begin: First log time; None for the beginning.
             end: Log time after the last one; None for the end.
             topics: Full names of topics; None for all.
@@ -1081,7 +1079,8 @@ class Store:
         Raises:
             TimeError: A time is invalid, or the range is empty or outside of the recording.
         """
-        from hybridlog.maintenance.keep import append_pins, may_hold, pin_of
+        from hybridlog.maintenance.edit import change
+        from hybridlog.maintenance.keep import may_hold, pin_of
 
         shared = self._to_change()
         (entry,) = self.select([recording])
@@ -1090,10 +1089,14 @@ class Store:
             parse_range(begin, end, start=start, end=stop)
         times = [None if t is None else parse_time(t, start=start, end=stop) for t in (begin, end)]
         if not may_hold(entry, *times):
-            raise TimeError(f"Nothing to pin: recording {entry.label!r} has no message then.")
+            raise TimeError(f"Nothing to pin: recording {entry.name!r} has no message then.")
         name = secrets.token_hex(4)
-        line = pin_of(name, (times[0], times[1]), topics, text(reason))
-        append_pins(self.directory, self.catalog, entry, line)
+        pin = pin_of(name, (times[0], times[1]), topics, text(reason))
+
+        def how(now: Manifest) -> Manifest:
+            return replace(now, pins=(*(one for one in now.pins if one.id != name), pin))
+
+        change(self.directory, self.catalog, entry, how)
         shared.catch_up(entry.id)
         return name
 
@@ -1104,16 +1107,18 @@ class Store:
         Raises:
             UsageError: There is no pin of a name.
         """
-        from hybridlog.maintenance.keep import append_pins
+        from hybridlog.maintenance.edit import change
+
+        def how(now: Manifest) -> Manifest:
+            return replace(now, pins=tuple(pin for pin in now.pins if pin.id not in names))
 
         shared = self._to_change()
         known = {pin["id"]: entry for entry in self.select(None) for pin in entry.pins}
         for name in names:
             if name not in known:
                 raise UsageError(f"There is no pin {name!r}; `hybridlog keep --pins` lists them.")
-        for name in names:
-            entry, line = known[name], journal.event(journal.UNPINNED, id=name)
-            append_pins(self.directory, self.catalog, entry, line)
+        for entry in {known[name].id: known[name] for name in names}.values():
+            change(self.directory, self.catalog, entry, how)
             shared.catch_up(entry.id)
 
     @_again_if_overtaken
@@ -1121,30 +1126,16 @@ class Store:
         """Delete a recording.
 
         Args:
-            recording: Label, name, or id. The label of a copy removes only that copy.
+            recording: Name or id.
 
         Raises:
             StoreError: it is being written.
         """
-        from hybridlog.maintenance import edit
+        from hybridlog.maintenance.edit import remove_if
 
         shared = self._to_change()
-        if recording not in self.repairs.copies:
-            shared.catch_up()
-        try:
-            if recording in self.repairs.copies:
-                original = self.entry(self.repairs.copies[recording])
-                edit.remove_copy(self.directory, recording, original.id)
-            else:
-                (entry,) = self.select([recording])
-                edit.remove(
-                    self.directory, self.catalog, self.shared.index.writable_database, entry
-                )
-        except ConnectionLostError:
-            self.refresh()
-            self.connect()  # a new connection removes the rest
-        finally:
-            shared.catch_up()
+        (entry,) = self.select([recording])
+        remove_if(shared, entry.id)
 
     @_again_if_overtaken
     def edit(
@@ -1159,8 +1150,8 @@ class Store:
         """Change what is said about a recording.
 
         Args:
-            recording: Its label, name or id, or its entry.
-            name: Another name; its directory gets a label made from it.
+            recording: Its name or id, or its entry.
+            name: Another name; if another recording has it, it gets a number behind it.
             note: A note, which `info` shows.
             tag: Tags to set; keys that exist get the new values.
             untag: Keys of tags to remove.
@@ -1184,19 +1175,19 @@ class Store:
             )
         self._to_change().catch_up()
         (entry,) = self.select([recording])
-        lines = []
-        for key in [untag] if isinstance(untag, str) else untag:
+        gone = [untag] if isinstance(untag, str) else [*untag]
+        for key in gone:
             if key not in entry.tags:
                 known = ", ".join(sorted(entry.tags)) or "none"
-                raise UsageError(f"{entry.label} has no tag {key!r}. Its tags: {known}.")
-            lines.append(journal.event(journal.UNTAGGED, key=key))
-        for key, value in tags.items():
-            lines.append(journal.event(journal.TAGGED, key=text(key), value=text(value)))
-        if note is not None:
-            lines.append(journal.event(journal.NOTED, text=text(note)))
-        if name is not None:
-            lines.append(journal.event(journal.RENAMED, name=text(name)))
-        edit.append(self.directory, self.catalog, entry, lines)
+                raise UsageError(f"{entry.name} has no tag {key!r}. Its tags: {known}.")
+        new = {text(key): text(value) for key, value in tags.items()}
+        notes = () if note is None else (Note(clock.time_ns(), text(note)),)
+
+        def change(now: Manifest) -> Manifest:
+            left = {key: value for key, value in now.tags.items() if key not in gone}
+            return replace(now, tags={**left, **new}, notes=(*now.notes, *notes))
+
+        edit.change(self.directory, self.catalog, entry, change, name)
         connected = self.shared.index.connected
         if connected is not None and self.shared.index.connection.may_write:
             with suppress(ConnectionLostError):  # the next connection mirrors it
@@ -1217,7 +1208,7 @@ class Store:
         """Set a mark at a time of a recording that has ended.
 
         Args:
-            recording: Label, name, or id.
+            recording: Name or id.
             moment: Log time, as for `Query.between`.
             note: Text of the mark.
             tags: Tags of the mark.
@@ -1256,7 +1247,7 @@ class Store:
         """Remove marks of a recording that were set after its end.
 
         Args:
-            recording: Label, name, or id.
+            recording: Name or id.
             note: Text of the marks.
             moment: Log time, as for `Query.between`; None for any.
 
@@ -1336,11 +1327,12 @@ class Store:
         progress: Progress | None,
     ) -> None:
         """Let the payloads of a recording go that were proved elsewhere."""
+        from hybridlog.maintenance.edit import remove_if
         from hybridlog.maintenance.keep import Keeper
         from hybridlog.maintenance.retention import Rules
 
         rules = Rules.of(self.directory.settings.retention)
-        keeper = Keeper(self.directory, self.remove)
+        keeper = Keeper(self.directory, partial(remove_if, self.shared))
         try:
             reason = f"it was copied to {where}"
             expired = keeper.expire_all(recording, digests, rules, reason, progress)

@@ -21,6 +21,11 @@ def listed(names: Iterable[str], most: int = MAX_LISTED) -> str:
     return f"{', '.join(known[:most])} and {len(known) - most} more"
 
 
+def file_name(text: str) -> str:
+    """Text as the name of a file that needs no quotes."""
+    return re.sub(r"[^A-Za-z0-9._-]+", "-", text).strip("-.")[:80] or "recording"
+
+
 def counted(number: int, what: str, plural: str | None = None) -> str:
     """`1 message`, `2 messages`."""
     return f"{number} {what if number == 1 else plural or what + 's'}"

@@ -32,7 +32,7 @@ class Columns:
 
     Args:
         folder: Its `payloads`.
-        listed: The files that the journal lists, by path.
+        listed: The files that the manifest lists, by path.
         recording: Id of the recording.
     """
 

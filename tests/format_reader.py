@@ -14,12 +14,12 @@ import re
 import struct
 import tomllib
 import zlib
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
 import zstandard
+from blake3 import blake3
 
 from tests.format_columns import Columns, WrongColumnsError
 
@@ -135,107 +135,49 @@ def unpacked(frame: bytes, size: int) -> bytes:
     return found
 
 
-# --- the journal ----------------------------------------------------------------------
-
-_KEYS: dict[str, dict[str, type]] = {
-    "begun": {"id": str, "store": str, "name": str, "tags": dict, "source": dict, "created": int},
-    "sealed": {"segment": int, "file": str, "bytes": int, "digest": str, "channels": list},
-    "ended": {"end": dict},
-    "renamed": {"name": str},
-    "tagged": {"key": str, "value": str},
-    "untagged": {"key": str},
-    "noted": {"at": int, "text": str},
-    "unmarked": {"segment": int},
-    "marked": {"time": int, "text": str, "tags": dict, "segment": int},
-    "adopted": {"store": str},
-    "removing": {},
-    "rebuilt": {"reason": str},
-}
+# --- the manifest ---------------------------------------------------------------------
 
 
-class Journal:
-    """What a journal says, by the section "Journal"."""
+class Manifest:
+    """What a manifest says, by the section "Manifest".
+
+    Raises:
+        Damaged: It is none.
+    """
 
     def __init__(self, data: bytes) -> None:
-        whole, _, self.torn = data.rpartition(b"\n")
-        self.lines: list[dict[str, Any] | None] = []
-        if len(self.torn) < len(data):
-            self.lines = [self._line(line) for line in whole.split(b"\n")]
-        self.damaged = [n for n, line in enumerate(self.lines, 1) if line is None]
-        events = [line for line in self.lines if line is not None]
-        begun = [line for line in events if line["event"] == "begun"]
-        self.begun: dict[str, Any] = begun[0] if begun else {}
-        self.id: str = self.begun.get("id", "")
-        self.starts = bool(self.lines) and self.lines[0] is not None and bool(begun)
-        self.starts = self.starts and self.lines[0] is self.begun
-        self.store: str = self.begun.get("store", "")
-        self.name: str = self.begun.get("name", "")
-        self.tags: dict[str, str] = dict(self.begun.get("tags", {}))
-        self.notes: list[tuple[int, str]] = []
-        self.marks: list[dict[str, Any]] = []
-        self.sealed: dict[int, dict[str, Any]] = {}
-        self.replaced: list[tuple[dict[str, Any], dict[str, Any]]] = []
-        self.end: dict[str, Any] | None = None
-        self.files: dict[str, dict[str, Any]] = {}  # of fields, by path
-        self.thinned: dict[int, list[tuple[str, int]]] = {}
-        self.is_rebuilt = False
-        self.is_removing = False
-        for line in events:
-            self._take(line)
-        self.marks = [mark for mark in self.marks if mark["segment"] in self.sealed]
-
-    @property
-    def is_proof(self) -> bool:
-        return self.starts and not self.damaged and not self.is_rebuilt
-
-    @staticmethod
-    def _line(line: bytes) -> dict[str, Any] | None:
-        if line[:9] != b"%08x " % zlib.crc32(line[9:]):
-            return None
-        try:
-            value = json.loads(line[9:].decode())
-        except ValueError:
-            return None
-        if not isinstance(value, dict) or not isinstance(value.get("event"), str):
-            return None
-        keys = _KEYS.get(value["event"], {})
-        return value if all(isinstance(value.get(k), t) for k, t in keys.items()) else None
-
-    def _take(self, line: dict[str, Any]) -> None:
-        match line["event"]:
-            case "sealed":
-                before = self.sealed.get(line["segment"])
-                if before is not None and before["digest"] != line["digest"]:
-                    self.replaced.append((before, line))
-                self.sealed[line["segment"]] = line
-            case "ended":
-                self.end = line["end"]
-            case "renamed":
-                self.name = line["name"]
-            case "tagged":
-                self.tags[line["key"]] = line["value"]
-            case "untagged":
-                self.tags.pop(line["key"], None)
-            case "noted":
-                self.notes.append((line["at"], line["text"]))
-            case "marked":
-                self.marks.append(line)
-            case "unmarked":
-                self.marks = [m for m in self.marks if m["segment"] != line["segment"]]
-                self.sealed.pop(line["segment"])
-            case "adopted":
-                self.store = line["store"]
-            case "expired":
-                self.files |= {file["file"]: file for file in line.get("files", ())}
-                for one in line.get("segments", ()):
-                    written = one["digest"], one["bytes"]
-                    self.thinned.setdefault(one["segment"], []).append(written)
-                for path in line.get("deleted", ()):
-                    self.files.pop(path, None)
-            case "rebuilt":
-                self.is_rebuilt = True
-            case "removing":
-                self.is_removing = True
+        lines = data.split(b"\n")
+        demand(len(lines) == 3 and not lines[2], "a manifest has two lines")
+        demand(blake3(lines[0]).hexdigest().encode() == lines[1], "the digest of the manifest")
+        said = json.loads(lines[0])
+        self.id: str = said["id"]
+        self.name: str = said["name"]
+        self.created: int = said["created"]
+        self.status: str = said.get("status", "open")
+        self.tags: dict[str, str] = said.get("tags", {})
+        self.notes = [(note["at"], note["text"]) for note in said.get("notes", ())]
+        self.marks: list[dict[str, Any]] = said.get("marks", [])
+        self.topics = {int(n): about["topic"] for n, about in said.get("channels", {}).items()}
+        self.logs = {one["number"]: one for one in said.get("files", ()) if one["kind"] == "log"}
+        self.fields = {one["file"]: one for one in said.get("fields", ())}
+        empty = {
+            "topic": None, "count": None, "from": None, "to": None, "reason": "", "file": "",
+            "offset": None, "length": None,
+        }  # fmt: skip
+        words = {"first": "from", "last": "to"}
+        self.losses = [
+            {**empty, **{words.get(key, key): value for key, value in row.items()}}
+            for row in said.get("losses", ())
+        ]
+        totals: dict[int, list[int]] = {}
+        for log in self.logs.values():
+            for channel, part in log.get("parts", {}).items():
+                found = totals.setdefault(int(channel), [0, 0])
+                found[0] += part[0]
+                found[1] += part[1]
+        for channel, about in said.get("channels", {}).items():
+            have = [about.get("messages", 0), about.get("bytes", 0)]
+            demand(have == totals.get(int(channel), [0, 0]), "the totals of a channel")
 
 
 # --- segments -------------------------------------------------------------------------
@@ -479,14 +421,13 @@ class Segment:
 
 
 class Recording:
-    """A recording: its journal, the segments that are believed, what follows from both."""
+    """A recording: its manifest, the segments that are believed, what follows from both."""
 
     _NAME: ClassVar = re.compile(r"(\d{6}|[1-9]\d{6,})\.mcap(\.open)?")
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        journal = path / "journal"
-        self.journal = Journal(journal.read_bytes()) if journal.exists() else None
+        self.manifest = Manifest((path / "manifest.json").read_bytes())
         sealed: dict[int, Segment | None] = {}
         self.open: set[int] = set()
         for file in sorted(path.iterdir()):
@@ -500,8 +441,8 @@ class Recording:
                 sealed[int(match[1])] = Segment(file)
             except Damaged:
                 sealed[int(match[1])] = None
-        self.id = self._id(sealed)
-        listed = self.journal.sealed if self.journal is not None else {}
+        self.id = self.manifest.id
+        listed = self.manifest.logs
         self.segments = {
             number: segment
             for number, segment in sorted(sealed.items())
@@ -513,24 +454,16 @@ class Recording:
             if not self._is_listed(number, segment, listed.get(number))
         }
         for segment in self.segments.values():
-            files = self.journal.files if self.journal is not None else {}
-            files = files or {f["file"]: f for f in (segment.compacted or {}).get("files", ())}
-            segment.columns = Columns(path / "payloads", files, self.id)
+            segment.columns = Columns(path / "payloads", self.manifest.fields, self.id)
         self.end = self._end()
         self.damage = dict(self._damage())
-        self.lost = [*self._lost_segments(listed), *self._lost_in_crash(), *self._lost_chunks()]
+        self.lost = [*self._lost_segments(listed), *self._lost_chunks()]
         self.lost += self._lost_fields()
         self.status = self._status()
 
-    def _id(self, sealed: Mapping[int, Segment | None]) -> str:
-        if self.journal is not None and self.journal.id:
-            return self.journal.id
-        ids = [s.about["id"] for _, s in sorted(sealed.items()) if s is not None]
-        return Counter(ids).most_common(1)[0][0] if ids else ""
-
     def _is_believed(self, number: int, segment: Segment, listed: Mapping[str, Any] | None) -> bool:
         about = segment.about
-        if about["format"] != 3 or (about["id"], about["segment"]) != (self.id, number):
+        if about["format"] != 4 or (about["id"], about["segment"]) != (self.id, number):
             return False
         if listed is None:
             return True
@@ -540,17 +473,15 @@ class Recording:
         return was in {(segment.digest, len(segment.data)), said}
 
     def _is_listed(self, number: int, segment: Segment, listed: Mapping[str, Any] | None) -> bool:
-        if listed is None or self.journal is None:
+        if listed is None:
             return False
-        are = segment.digest, len(segment.data)
-        is_whole = are == (listed["digest"], listed["bytes"])
-        return is_whole or are in self.journal.thinned.get(number, ())
+        are = [len(segment.data), segment.digest]
+        return are in ([listed["bytes"], listed["digest"]], listed.get("stored"))
 
     def _end(self) -> dict[str, Any] | None:
-        if self.journal is not None and self.journal.end is not None:
-            return self.journal.end
-        ends = [s.end for s in self.segments.values() if s.end is not None]
-        return ends[-1] if ends else None
+        if self.manifest.status == "open":
+            return None
+        return {"status": self.manifest.status, "losses": self.manifest.losses}
 
     def _damage(self) -> Iterator[tuple[tuple[int, int], str]]:
         for number, segment in self.segments.items():
@@ -562,25 +493,16 @@ class Recording:
                     yield (number, chunk), str(error)
 
     def _lost_segments(self, listed: Mapping[int, Mapping[str, Any]]) -> Iterator[dict[str, Any]]:
-        for number, line in listed.items():
+        for number, file in listed.items():
             if number in self.segments or number in self.open:
                 continue
-            row = _row(line["file"], None, line["bytes"], 0, None, None, None)
-            rows = [c for c in line["channels"] if c["messages"]]
-            for c in rows:
-                about = (c["messages"], c["topic"], c["first"], c["last"])
-                yield _row(line["file"], None, line["bytes"], *about)
-            if not rows:
+            row = _row(file["name"], None, file["bytes"], 0, None, None, None)
+            parts = {n: part for n, part in file.get("parts", {}).items() if part[0]}
+            for channel, (count, _, first, last) in parts.items():
+                topic = self.manifest.topics[int(channel)]
+                yield _row(file["name"], None, file["bytes"], count, topic, first, last)
+            if not parts:
                 yield row
-
-    def _lost_in_crash(self) -> Iterator[dict[str, Any]]:
-        for before, after in self.journal.replaced if self.journal is not None else ():
-            left = {c["id"]: c["messages"] for c in after["channels"]}
-            for c in before["channels"]:
-                count = c["messages"] - left.get(c["id"], 0)
-                if count > 0:
-                    about = (count, c["topic"], c["first"], c["last"])
-                    yield _row(before["file"], None, None, *about)
 
     def _lost_chunks(self) -> Iterator[dict[str, Any]]:
         for number, chunk in self.damage:
@@ -599,7 +521,7 @@ class Recording:
             for chunk in range(len(segment.chunks)):
                 for part in segment.parts_of(chunk) if segment.is_expired(chunk) else ():
                     gone.setdefault(segment.channels[part.channel][1], []).append(part)
-        for file in self.journal.files.values() if self.journal is not None else ():
+        for file in self.manifest.fields.values():
             path = self.path / "payloads" / file["file"]
             is_there = path.is_file() and path.stat().st_size == file["bytes"]
             parts = gone.get(file["topic"], [])
@@ -613,10 +535,8 @@ class Recording:
             return "open"
         if self.open:
             return "unfinished"
-        if self.lost:
+        if self.lost or any(row["cause"] == "segment" for row in self.manifest.losses):
             return "damaged"
-        if self.journal is None or not self.journal.is_proof or self.unlisted:
-            return "unproven"
         return str(self.end["status"]) if self.end is not None else "recovered"
 
     def _is_recorded(self) -> bool:
@@ -688,18 +608,30 @@ class FormatReader:
     def __init__(self, store: Path) -> None:
         self.store = store
         settings = tomllib.loads((store / "hybridlog.toml").read_text())
-        demand(settings["format"] == 3, "another format")
+        demand(settings["format"] == 4, "another format")
         demand({*settings.get("requires", [])} <= {"expired"}, "a feature that is unknown")
         self.store_id: str = settings["store_id"]
 
-    def labels(self) -> list[str]:
-        places = (self.store / "recordings").iterdir()
-        return sorted(
-            p.name for p in places if p.is_dir() and not p.is_symlink() and p.name[0] != "."
-        )
+    def names(self) -> list[str]:
+        return sorted(self._places())
 
-    def recording(self, label: str) -> Recording:
-        return Recording(self.store / "recordings" / label)
+    def recording(self, name: str) -> Recording:
+        found = Recording(self._places()[name])
+        demand(found.id == found.path.name, "a directory that is not named by its id")
+        return found
+
+    def _places(self) -> dict[str, Path]:
+        """Directories of recordings by name."""
+        places = (self.store / "recordings").iterdir()
+        return {
+            self._name(p): p
+            for p in places
+            if p.is_dir() and not p.is_symlink() and p.name[0] != "."
+        }
+
+    @staticmethod
+    def _name(path: Path) -> str:
+        return Manifest((path / "manifest.json").read_bytes()).name
 
 
 def collection_name(topic: str) -> str:

@@ -80,7 +80,6 @@ PLACES = {
     "directory_copy_wait_s": "hybridlog_storage.copy_places.WAIT_S",
     "manifest_bytes": "hybridlog_storage.manifest.MAX_BYTES",
     "manifest_wait_s": "hybridlog_storage.manifests.WAIT_S",
-    "max_journal": "hybridlog_storage.journal.MAX_JOURNAL",
     "inserted_bytes_together": "hybridlog_storage.mongo.database._MAX_COMMAND_BYTES",
     "mongod_silence_s": "hybridlog_storage.mongo.mongod.SILENCE_LIMIT_S",
     "mongod_room_bytes": "hybridlog_storage.mongo.mongod._ROOM",

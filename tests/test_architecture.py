@@ -32,7 +32,12 @@ HEAVY = ("mcap", "numpy", "pandas", "pyarrow", "pymongo", "rich", "rosbags", "zs
 ALLOWED = {
     "PIL": ("hybridlog.arrays.message_arrays", "hybridlog.drawing.images"),
     "av": ("hybridlog.arrays.video",),
-    "blake3": ("hybridlog_storage.manifest",),
+    "blake3": (
+        "hybridlog_storage.disk.append_file",
+        "hybridlog_storage.manifest",
+        "hybridlog_storage.recordings",
+        "hybridlog_storage.schemas",
+    ),
     "bson": (
         "hybridlog.schema.index_bodies",
         "hybridlog.schema.objects",
@@ -61,8 +66,13 @@ ALLOWED = {
     ),
     "mcap_protobuf": ("hybridlog.schema.protobuf_codec",),
     "msgspec": (
+        "hybridlog.entries",
+        "hybridlog.maintenance",
+        "hybridlog.record.capture",
         "hybridlog_storage.catalog",
         "hybridlog_storage.manifest",
+        "hybridlog_storage.recordings",
+        "hybridlog_storage.segments.statements",
         "hybridlog_storage.summary",
     ),
     "obstore": ("hybridlog_storage.remote.bucket",),

@@ -26,6 +26,7 @@ from hybridlog_storage.segments.recovery import recover_segment
 from hybridlog_storage.segments.segment_check import SegmentCheck
 from hybridlog_storage.segments.segment_reader import SegmentReader
 from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests import places
 from tests.cli.running import run
 from tests.copies import bring
 
@@ -204,7 +205,7 @@ def test_nothing_is_lost_on_the_way(log: Path, tmp_path: Path) -> None:
         report = store.record(packed, settings=SegmentSettings(segment_size=100))
         assert report.entry.segments > 3
         store.edit("drive", name="other name")
-        assert listed(store.attachments("other-name")) == ATTACHMENTS
+        assert listed(store.attachments("other name")) == ATTACHMENTS
     for derived in (CATALOG, "mongod", "tables"):
         shutil.rmtree(tmp_path / "s" / derived, ignore_errors=True)
         (tmp_path / "s" / derived).unlink(missing_ok=True)
@@ -215,8 +216,8 @@ def test_nothing_is_lost_on_the_way(log: Path, tmp_path: Path) -> None:
         assert (entry.attachments, entry.metadata_records) == (5, 3)
     with hl.open(tmp_path / "t", create=True) as other:
         bring(other, tmp_path / "s")
-        assert listed(other.attachments("other-name")) == ATTACHMENTS
-        assert other.metadata("other-name") == METADATA
+        assert listed(other.attachments("other name")) == ATTACHMENTS
+        assert other.metadata("other name") == METADATA
         query = other.all_topics()
         write_answer(query, "mcap", tmp_path / "out.mcap", extras=extras_of(query))
     assert contents(tmp_path / "out.mcap") == contents(log)
@@ -241,7 +242,7 @@ def test_a_wrong_checksum_in_the_log_is_told(log: Path, tmp_path: Path) -> None:
 def test_damage_in_the_store(log: Path, tmp_path: Path) -> None:
     with hl.open(tmp_path / "s", create=True) as store:
         store.record(log)
-        (segment,) = (tmp_path / "s" / "recordings" / "drive").glob("*.mcap")
+        (segment,) = places.folder(tmp_path / "s", "drive").glob("*.mcap")
         damaged_log(segment, segment)
         data = segment.read_bytes().replace(b"b" * 1000, b"b" * 999 + b"c")
         segment.write_bytes(data)
@@ -265,7 +266,7 @@ def test_damage_in_the_store(log: Path, tmp_path: Path) -> None:
 def test_a_crash_leaves_them_in_the_segment(log: Path, tmp_path: Path) -> None:
     with hl.open(tmp_path / "s", create=True) as store:
         store.record(log)
-    (segment,) = (tmp_path / "s" / "recordings" / "drive").glob("*.mcap")
+    (segment,) = places.folder(tmp_path / "s", "drive").glob("*.mcap")
     whole = segment.read_bytes()
     with SegmentReader(segment, 0) as reader:
         begun = reader.summary()

@@ -79,7 +79,7 @@ def test_a_wrong_size_in_the_environment_or_the_settings(
     monkeypatch.delenv("HYBRIDLOG_CACHE_SIZE")
     settings = tmp_path / "hybridlog.toml"
     for value in ("'300'", "1", "300.5", "true"):
-        settings.write_text(f"format = 3\nstore_id = 'x'\ncache_mb = {value}\n")
+        settings.write_text(f"format = 4\nstore_id = 'x'\ncache_mb = {value}\n")
         with pytest.raises(StoreError, match=r"hybridlog.toml: cache_mb must be a number of MB"):
             hl.open(tmp_path)
 

@@ -57,7 +57,7 @@ MADE = [
     Made("run[1]", {}, {"/scan": (SCAN, [0])}),
     Made("run1", {"robot": ""}, {"/imu": (IMU, [6, 7])}),
 ]
-LABELS = ["monday-1", "monday-2", "tuesday", "run-1", "run1"]
+NAMES = ["monday 1", "monday 2", "tuesday", "run[1]", "run1"]
 
 
 def write(path: Path, day: int, topics: dict[str, tuple[str, list[int]]]) -> None:
@@ -101,40 +101,40 @@ def call(store: hl.Store, *words: str, typed: str | None = None) -> Called:
 
 
 CHOSEN: list[tuple[dict[str, Any], list[str]]] = [
-    ({}, LABELS),
-    ({"name": "monday*"}, ["monday-1", "monday-2"]),
-    ({"name": "*[12]"}, ["monday-1", "monday-2", "run-1", "run1"]),
-    ({"name": "run[1]"}, ["run-1"]),  # a whole name before a glob
+    ({}, NAMES),
+    ({"name": "monday*"}, ["monday 1", "monday 2"]),
+    ({"name": "*[12]"}, ["monday 1", "monday 2", "run1"]),
+    ({"name": "run[1]"}, ["run[1]"]),  # a whole name before a glob
     ({"name": "run[12]"}, ["run1"]),
-    ({"name": "monday ?"}, ["monday-1", "monday-2"]),  # by name, not by label
-    ({"name": ["tues", "monday-1"]}, ["monday-1", "tuesday"]),
-    ({"tag": "robot=7"}, ["monday-1", "tuesday"]),
-    ({"tag": "robot"}, ["monday-1", "monday-2", "tuesday", "run1"]),
+    ({"name": "monday ?"}, ["monday 1", "monday 2"]),
+    ({"name": ["tues", "monday 1"]}, ["monday 1", "tuesday"]),
+    ({"tag": "robot=7"}, ["monday 1", "tuesday"]),
+    ({"tag": "robot"}, ["monday 1", "monday 2", "tuesday", "run1"]),
     ({"tag": "robot="}, ["run1"]),
-    ({"tag": ["robot=7", "place"]}, ["monday-1"]),
-    ({"tag": {"robot": "8"}}, ["monday-2"]),
-    ({"tag": {"robot": None, "place": "lab"}}, ["monday-1"]),
-    ({"has": "scan"}, ["monday-1", "monday-2", "tuesday", "run-1"]),
-    ({"has": "/scan"}, ["monday-1", "monday-2", "run-1"]),
-    ({"has": ["scan", "imu"]}, ["monday-2"]),
-    ({"has": "re:/(odd|imu)"}, ["monday-2", "tuesday", "run1"]),
-    ({"has": "IMU"}, ["monday-2", "run1"]),  # another case, if nothing fits it
-    ({"type": "sensor_msgs/Imu"}, ["monday-2", "run1"]),
-    ({"type": "sensor_msgs/msg/LaserScan"}, ["monday-1", "monday-2", "tuesday", "run-1"]),
-    ({"type": "Imu"}, ["monday-2", "tuesday", "run1"]),
+    ({"tag": ["robot=7", "place"]}, ["monday 1"]),
+    ({"tag": {"robot": "8"}}, ["monday 2"]),
+    ({"tag": {"robot": None, "place": "lab"}}, ["monday 1"]),
+    ({"has": "scan"}, ["monday 1", "monday 2", "tuesday", "run[1]"]),
+    ({"has": "/scan"}, ["monday 1", "monday 2", "run[1]"]),
+    ({"has": ["scan", "imu"]}, ["monday 2"]),
+    ({"has": "re:/(odd|imu)"}, ["monday 2", "tuesday", "run1"]),
+    ({"has": "IMU"}, ["monday 2", "run1"]),  # another case, if nothing fits it
+    ({"type": "sensor_msgs/Imu"}, ["monday 2", "run1"]),
+    ({"type": "sensor_msgs/msg/LaserScan"}, ["monday 1", "monday 2", "tuesday", "run[1]"]),
+    ({"type": "Imu"}, ["monday 2", "tuesday", "run1"]),
     ({"type": "acme.*"}, ["tuesday"]),
     ({"type": "sensor_msgs/*", "has": "/odd"}, ["tuesday"]),
-    ({"during": ("2025-06-04", "2025-06-06")}, ["monday-2", "tuesday"]),
-    ({"during": (START + DAY + 10**9, START + 2 * DAY)}, ["monday-2"]),  # its last message
+    ({"during": ("2025-06-04", "2025-06-06")}, ["monday 2", "tuesday"]),
+    ({"during": (START + DAY + 10**9, START + 2 * DAY)}, ["monday 2"]),  # its last message
     ({"during": (START + DAY + 10**9 + 1, START + 2 * DAY + 1)}, ["tuesday"]),
-    ({"during": (None, "2025-06-04")}, ["monday-1"]),
-    ({"during": ("2025-06-06", "end")}, ["run-1", "run1"]),
-    ({"during": ("start", "now")}, LABELS),
-    ({"where": "scan: n > 3"}, ["monday-2", "tuesday"]),
-    ({"where": "/scan: n > 3"}, ["monday-2"]),
-    ({"where": "**: n = 1"}, ["monday-1", "tuesday"]),
-    ({"where": ["scan: n = 2", "imu: n = 5"]}, ["monday-2"]),
-    ({"where": "imu"}, ["monday-2", "run1"]),
+    ({"during": (None, "2025-06-04")}, ["monday 1"]),
+    ({"during": ("2025-06-06", "end")}, ["run[1]", "run1"]),
+    ({"during": ("start", "now")}, NAMES),
+    ({"where": "scan: n > 3"}, ["monday 2", "tuesday"]),
+    ({"where": "/scan: n > 3"}, ["monday 2"]),
+    ({"where": "**: n = 1"}, ["monday 1", "tuesday"]),
+    ({"where": ["scan: n = 2", "imu: n = 5"]}, ["monday 2"]),
+    ({"where": "imu"}, ["monday 2", "run1"]),
     ({"tag": "robot=7", "where": "scan: n >= 4"}, ["tuesday"]),
     ({"tag": "robot=9"}, []),
     ({"tag": "colour"}, []),
@@ -146,12 +146,12 @@ CHOSEN: list[tuple[dict[str, Any], list[str]]] = [
 ]
 
 
-@pytest.mark.parametrize(("asked", "labels"), CHOSEN, ids=[str(asked) for asked, _ in CHOSEN])
-def test_recordings_are_chosen(store: hl.Store, asked: dict[str, Any], labels: list[str]) -> None:
+@pytest.mark.parametrize(("asked", "names"), CHOSEN, ids=[str(asked) for asked, _ in CHOSEN])
+def test_recordings_are_chosen(store: hl.Store, asked: dict[str, Any], names: list[str]) -> None:
     found = store.recordings(**asked)
-    assert list(found.labels) == labels
-    assert [entry.label for entry in found] == labels
-    if labels:
+    assert list(found.names) == names
+    assert [entry.name for entry in found] == names
+    if names:
         assert found.check() is found
     else:
         with pytest.raises(TopicError, match="There is no recording"):
@@ -161,8 +161,8 @@ def test_recordings_are_chosen(store: hl.Store, asked: dict[str, Any], labels: l
 @pytest.mark.parametrize(
     ("asked", "error", "words"),
     [
-        ({"name": "nobody"}, TopicError, "'nobody' is not in the store. There are: monday-1"),
-        ({"name": "mon"}, TopicError, "ambiguous. There are: monday-1, monday-2."),
+        ({"name": "nobody"}, TopicError, "'nobody' is not in the store. There are: monday 1"),
+        ({"name": "mon"}, TopicError, "ambiguous. There are: monday 1, monday 2."),
         ({"tag": "=7"}, UsageError, "KEY=VALUE"),
         ({"has": "re:("}, TopicError, "refused"),
         ({"during": ("+1s", "end")}, TimeError, "absolute, not '[+]1s'"),
@@ -191,7 +191,7 @@ def test_a_choice_without_a_meaning_is_refused(
         (("--type", "x"), f"The store has: {ODD}, {SCAN}, {IMU}"),
         (("--during", "2030-01-01", "end"), "lie between 2025-06-03T00:00:00Z and 2025-06-07"),
         (("--with", "/scan: n > 99"), "3 with /scan were asked."),
-        (("-r", "x*"), "named 'x*'. There are: monday-1, monday-2, tuesday, run-1, run1."),
+        (("-r", "x*"), "named 'x*'. There are: monday 1, monday 2, tuesday, run[1], run1."),
     ],
 )
 def test_who_chooses_nothing_hears_why(store: hl.Store, words: tuple[str, ...], said: str) -> None:
@@ -203,10 +203,10 @@ def test_who_chooses_nothing_hears_why(store: hl.Store, words: tuple[str, ...], 
 
 def test_all_commands_choose_alike(store: hl.Store) -> None:
     chosen = ["--tag", "robot=7", "--with", "scan: n > 3"]
-    assert [one["recording"] for one in json.loads(call(store, "ls", *chosen, "--json").out)] == [
+    assert [one["name"] for one in json.loads(call(store, "ls", *chosen, "--json").out)] == [
         "tuesday"
     ]
-    assert [one["recording"] for one in json.loads(call(store, "info", *chosen, "--json").out)] == [
+    assert [one["name"] for one in json.loads(call(store, "info", *chosen, "--json").out)] == [
         "tuesday"
     ]
     assert call(store, "fetch", "-t", "scan", "--count", "-q", *chosen).out == "1\n"
@@ -227,19 +227,20 @@ def test_all_commands_choose_alike(store: hl.Store) -> None:
 
 def test_names_of_commands_may_be_globs(store: hl.Store) -> None:
     # JSON is a list unless one recording is named, however many fit.
-    assert json.loads(call(store, "info", "run[1]", "--json").out)["recording"] == "run-1"
+    assert json.loads(call(store, "info", "run[1]", "--json").out)["name"] == "run[1]"
     found = json.loads(call(store, "info", "tues*", "--json").out)
-    assert [one["recording"] for one in found] == ["tuesday"]
+    assert [one["name"] for one in found] == ["tuesday"]
     assert call(store, "verify", "mon*", "-r", "run1").out.startswith("3 recordings,")
 
 
 def test_tags_of_many_are_changed_at_once(store: hl.Store) -> None:
     assert (
-        call(store, "tag", "run*", "by=hand").out == "run-1: by=hand\nrun1: by=hand\nrun1: robot=\n"
+        call(store, "tag", "run*", "by=hand").out
+        == "run[1]: by=hand\nrun1: by=hand\nrun1: robot=\n"
     )
     assert call(store, "tag", "--has", "imu", "by=machine").code == 0
     store.refresh()
-    assert list(store.recordings(tag="by=machine").labels) == ["monday-2", "run1"]
+    assert list(store.recordings(tag="by=machine").names) == ["monday 2", "run1"]
     assert call(store, "tag", "-r", "*", "--remove", "by").code == 0  # also of those that lack it
     store.refresh()
     assert store.recordings(tag="by") == []
@@ -272,13 +273,12 @@ def test_who_is_asked_sees_what_goes(store: hl.Store, monkeypatch: pytest.Monkey
     monkeypatch.setattr(edit.click, "confirm", lambda text, err: shown.append(text) or False)
     many = [summary(n, (START, START), ["/a"])[0] for n in range(25)]
     with pytest.raises(edit.click.exceptions.Exit):
-        edit._confirm(["twin"], many, ["a talk"])
-    assert shown[0] == "  twin: a copy"
-    assert shown[1] == "  r0: 2025-06-03T00:00:00Z, 1 message, 1 B"
+        edit._confirm(many, ["a talk"])
+    assert shown[0] == "  r0: 2025-06-03T00:00:00Z, 1 message, 1 B"
     assert shown[-4:] == [
         "  and 5 more",
         "1 pin would go, too (a talk).",
-        "Delete these 26 recordings for good?",
+        "Delete these 25 recordings for good?",
         "Nothing is deleted.",
     ]
 
@@ -291,8 +291,8 @@ def test_queries_of_chosen_recordings(store: hl.Store) -> None:
     # A short name means one topic of all, and another one of the second recording.
     assert found.topic("scan").topics == ("/scan",)
     assert found[1:].topic("scan").topics == ("/left/scan",)
-    assert found[0].label == "monday-1"
-    assert found["tuesday"].label == "tuesday"
+    assert found[0].name == "monday 1"
+    assert found["tuesday"].name == "tuesday"
     assert store.topic("/scan").in_recording(tag="robot=8", where="imu: n = 5").count() == 2
     assert store.topic("/scan").in_recording("mon*").count() == 5
     with pytest.raises(TopicError, match="robot=9"):
@@ -300,7 +300,7 @@ def test_queries_of_chosen_recordings(store: hl.Store) -> None:
     # Whatever takes names takes recordings.
     assert store.verify(found).recordings == 2
     assert store.query(["/scan"], found).count() == 3
-    assert {size.recording for size in store.sizes(found).rows} == {"monday-1", "tuesday"}
+    assert {size.recording for size in store.sizes(found).rows} == {"monday 1", "tuesday"}
     assert store.select(found) == found
 
 
@@ -311,10 +311,10 @@ def test_tables_name_recordings_and_their_tags(store: hl.Store) -> None:
     assert list(frame.columns) == ["topic", "recording", "robot", "place", "n", "robot_"]
     assert set(frame["robot_"]) == {"x"}
     seen = frame.groupby("recording")[["robot", "place"]].first().to_dict("index")
-    assert seen["monday-1"] == {"robot": "7", "place": "lab"}
-    assert seen["monday-2"]["robot"] == "8"
+    assert seen["monday 1"] == {"robot": "7", "place": "lab"}
+    assert seen["monday 2"]["robot"] == "8"
     assert frame["place"].isna().sum() == len(frame) - 3
-    assert set(frame.loc[frame["recording"] == "run-1", "robot"].isna()) == {True}
+    assert set(frame.loc[frame["recording"] == "run[1]", "robot"].isna()) == {True}
     table = query.to_arrow()
     assert table.column_names[1:] == list(frame.columns)
     assert table.schema.field("robot").metadata == {b"hybridlog.tag": b"robot"}
@@ -329,11 +329,11 @@ def test_tables_name_recordings_and_their_tags(store: hl.Store) -> None:
 
 
 def test_one_recording_is_named_on_request(store: hl.Store) -> None:
-    one = store.topic("/scan").in_recording("tues*", "monday-1")
+    one = store.topic("/scan").in_recording("tues*", "monday 1")
     assert list(one.to_pandas().columns) == ["n", "robot"]
     assert list(one.tags("robot").to_pandas().columns) == ["robot", "n", "robot_"]
     assert one.fields("recording", "n").to_arrow().column("recording").unique().to_pylist() == [
-        "monday-1"
+        "monday 1"
     ]
     # Fields keep the order in which they were asked for.
     asked = one.tags("robot").fields("robot", "n").to_arrow()
@@ -362,7 +362,7 @@ def test_columns_of_recordings_in_files(store: hl.Store, tmp_path: Path) -> None
     done = call(store, *fetch, "-r", "mon*", "--fields", "n", "-F", "csv")
     assert done.out.splitlines()[:2] == [
         '"log_time","recording","robot","place","n"',
-        '2025-06-03 00:00:00.000000000Z,"monday-1","7","lab",1',
+        '2025-06-03 00:00:00.000000000Z,"monday 1","7","lab",1',
     ]
     assert call(store, *fetch, "-o", str(tmp_path / "x.parquet")).code == 0
     assert parquet.read_table(tmp_path / "x.parquet").column_names == [
@@ -382,7 +382,7 @@ def test_copy_from_chooses_in_the_other_store(store: hl.Store, tmp_path: Path) -
     path = tmp_path / "copy"
     words = ["copy", "--from", str(store.directory.path), "--store", str(path), "--tag", "robot=7"]
     done = CliRunner().invoke(app, words)
-    assert done.stdout == "copied monday-1\ncopied tuesday\n"
+    assert done.stdout == "copied monday 1\ncopied tuesday\n"
     nothing = CliRunner().invoke(app, [*words[:-1], "robot=9"])
     assert "robot=7" in str(nothing.exception)
 
@@ -415,28 +415,24 @@ def test_a_running_recording_reaches_until_now() -> None:
     ]
     snapshot = Snapshot([one for one, _ in made], {made[0][0].topics: ()})
 
-    def labels(begin: int, end: int) -> set[str]:
+    def chosen(begin: int, end: int) -> set[str]:
         found = snapshot.during(np.arange(4), begin, end, now)
-        return {snapshot.summaries[place].label for place in found.tolist()}
+        return {snapshot.summaries[place].name for place in found.tolist()}
 
-    assert labels(20, 30) == {"r1"}
-    assert labels(60, 70) == {"r1", "r2"}
-    assert labels(8, 9) == {"r1", "r3"}
-    assert labels(100, 200) == set()
+    assert chosen(20, 30) == {"r1"}
+    assert chosen(60, 70) == {"r1", "r2"}
+    assert chosen(8, 9) == {"r1", "r3"}
+    assert chosen(100, 200) == set()
 
 
 def test_globs_mean_what_fnmatch_says() -> None:
     dice = random.Random(3)
     names = ["".join(dice.choices("ab[]-*?", k=3)) for _ in range(40)]
-    made = [summary(n, (n, n), ["/a"], label=f"l{n}", name=name) for n, name in enumerate(names)]
+    made = [summary(n, (n, n), ["/a"], name=name) for n, name in enumerate(names)]
     snapshot = Snapshot([one for one, _ in made], {made[0][0].topics: ()})
     for pattern in ("*", "a*", "[ab]*", "?-?", "[!a]*", "*]", "[", "a[", "l1?"):
         found = [snapshot.summaries[place] for place in snapshot.matching(pattern)]
-        assert [(one.label, one.name) for one in found] == [
-            (f"l{n}", name)
-            for n, name in enumerate(names)
-            if fnmatchcase(name, pattern) or fnmatchcase(f"l{n}", pattern)
-        ]
+        assert [one.name for one in found] == [n for n in names if fnmatchcase(n, pattern)]
 
 
 def test_lists_say_how_many_they_leave_out() -> None:
@@ -465,15 +461,15 @@ def test_a_name_means_its_recording_while_others_are_recorded(tmp_path: Path) ->
                 time.sleep(0.02)
             for label in ("first", "second", *(f"ended-{number}" for number in range(3))):
                 with hl.open(tmp_path / "store") as other:
-                    assert [entry.label for entry in other.recordings(label)] == [label]
+                    assert [entry.name for entry in other.recordings(label)] == [label]
                 with hl.open(tmp_path / "store") as other:
-                    assert [one.label for one in other.recordings(label).summaries] == [label]
+                    assert [one.name for one in other.recordings(label).summaries] == [label]
                     query = other.topic("said").in_recording(label)
                     assert {message.recording for message in query} == {other.entry(label).id}
                 with hl.open(tmp_path / "store") as other:
                     found = other.recordings(where="said: n > 0", name=label)
-                    assert [entry.label for entry in found] == [label]
+                    assert [entry.name for entry in found] == [label]
             assert not run("tag", "ended-2", "owner=anna", store=tmp_path / "store").err
             with hl.open(tmp_path / "store") as other:
-                tagged = [one.label for one in other.summaries() if one.tags]
+                tagged = [one.name for one in other.summaries() if one.tags]
             assert tagged == ["ended-2"]

@@ -15,6 +15,7 @@ import pytest
 from hybridlog.index import consent
 from hybridlog_storage.errors import DatabaseError, StoreError
 from hybridlog_storage.settings import StoreSettings, write_settings
+from tests import places
 from tests.cli.running import run
 
 pytestmark = pytest.mark.mongo("embedded")
@@ -154,7 +155,7 @@ def listener() -> Iterator[Listener]:
 def foreign(tmp_path: Path, listener: Listener) -> Path:
     """A store of somebody else's that leads to a server."""
     store = tmp_path / "foreign"
-    (store / "recordings").mkdir(parents=True)
+    places.root(store).mkdir(parents=True)
     write_settings(store, StoreSettings("f0", listener.uri))
     return store
 

@@ -18,7 +18,6 @@ import sys
 import termios
 import threading
 import typing
-import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -37,12 +36,15 @@ from hybridlog.query import times, topics
 from hybridlog.query.predicate.parser import parse
 from hybridlog.query.predicate.types import check
 from hybridlog_storage import errors
-from hybridlog_storage.errors import HybridlogError
+from hybridlog_storage.errors import HybridlogError, ManifestError
+from hybridlog_storage.manifests import read_in
+from tests import places
 from tests.cli.fork_server import ForkServer
 from tests.format_reader import (
     Content,
     Damaged,
     FormatReader,
+    Manifest,
     Recording,
     Told,
     collection_name,
@@ -817,10 +819,10 @@ def recorded(tmp_path_factory: pytest.TempPathFactory, demo_bag: Path) -> Iterat
         yield store
 
 
-def entry_of(store: Path, label: str) -> RecordingEntry:
+def entry_of(store: Path, name: str) -> RecordingEntry:
     """What hybridlog says of a recording when it opens a store."""
     with hl.open(store) as opened:
-        return next(entry for entry in opened.recordings() if entry.label == label)
+        return next(entry for entry in opened.recordings() if entry.name == name)
 
 
 def bare(rows: Iterable[Mapping[str, Any]], *, of_files: bool) -> list[dict[str, Any]]:
@@ -834,15 +836,13 @@ def bare(rows: Iterable[Mapping[str, Any]], *, of_files: bool) -> list[dict[str,
 def test_a_second_reader_gets_the_same_messages(recorded: hl.Store) -> None:
     second = FormatReader(recorded.directory.path)
     assert second.store_id == recorded.directory.settings.store_id
-    assert second.labels() == ["cut", "robot", "weather"]
+    assert second.names() == ["cut", "robot", "weather"]
     assert len(second.recording("robot").segments) > 2
-    for label in second.labels():
-        recording = second.recording(label)
-        (entry,) = recorded.select([label])
+    for name in second.names():
+        recording = second.recording(name)
+        (entry,) = recorded.select([name])
         assert (recording.id, recording.status) == (entry.id, entry.status)
-        assert recording.journal is not None
-        assert (recording.journal.name, recording.journal.tags) == (entry.name, entry.tags)
-        assert recording.journal.store == second.store_id
+        assert (recording.manifest.name, recording.manifest.tags) == (entry.name, entry.tags)
         for of_files in (False, True):
             losses = bare(entry.end.get("losses", ()), of_files=of_files)
             assert bare(recording.losses, of_files=of_files) == losses
@@ -854,7 +854,7 @@ def test_a_second_reader_gets_the_same_messages(recorded: hl.Store) -> None:
         }
         ours = sorted(
             (m.seq, m.topic, m.type, m.log_time_ns, m.publish_time_ns, m.sequence, m.raw)
-            for m in recorded.all_topics().in_recording(label)
+            for m in recorded.all_topics().in_recording(name)
         )
         theirs = [(t.seq, t.topic, t.schema[0] if t.schema else "", *t[4:]) for t in told]
         assert theirs == ours
@@ -865,7 +865,7 @@ def test_a_second_reader_gets_the_same_messages(recorded: hl.Store) -> None:
                 assert channel.schema is not None
                 assert message.schema[1:] == (channel.schema.encoding, channel.schema.data)
                 assert message.encoding == channel.message_encoding
-    statuses = [second.recording(label).status for label in second.labels()]
+    statuses = [second.recording(name).status for name in second.names()]
     assert statuses == ["damaged", "complete", "complete"]
 
 
@@ -873,7 +873,7 @@ def test_a_second_reader_gets_the_same_messages(recorded: hl.Store) -> None:
 def older(recorded: hl.Store, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Segment 1 of `robot` as a crash would have left it: whole, and with fewer messages."""
     store = tmp_path_factory.mktemp("older") / "store"
-    robot = copied(recorded, store) / "robot"
+    robot = places.folder(copied(recorded, store), "robot")
     (robot / "000001.mcap").rename(robot / "000001.mcap.open")
     os.truncate(robot / "000001.mcap.open", (robot / "000001.mcap.open").stat().st_size // 2)
     before, after = FormatReader(store).recording("robot"), entry_of(store, "robot")
@@ -885,14 +885,10 @@ def older(recorded: hl.Store, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def copied(recorded: hl.Store, store: Path) -> Path:
-    """A copy of the files that are the truth; returns the directory of its recordings."""
+    """A copy of the files that are the truth."""
     hidden = shutil.ignore_patterns("mongod*", "catalog*")
     shutil.copytree(recorded.directory.path, store, ignore=hidden)
-    return store / "recordings"
-
-
-def lines_of(path: Path) -> list[bytes]:
-    return path.read_bytes().splitlines(keepends=True)
+    return store
 
 
 def lose_segment(robot: Path, _older: Path) -> None:
@@ -918,48 +914,15 @@ def use_older_segment(robot: Path, older: Path) -> None:
 
 
 def use_foreign_segment(robot: Path, _older: Path) -> None:
-    shutil.copyfile(robot.with_name("weather") / "000000.mcap", robot / "000001.mcap")
+    shutil.copyfile(places.segment(robot.parents[1], "weather"), robot / "000001.mcap")
 
 
 def add_foreign_segment(robot: Path, _older: Path) -> None:
-    shutil.copyfile(robot.with_name("weather") / "000000.mcap", robot / "000999.mcap")
+    shutil.copyfile(places.segment(robot.parents[1], "weather"), robot / "000999.mcap")
 
 
 def cut_segment(robot: Path, _older: Path) -> None:
     os.truncate(robot / "000001.mcap", (robot / "000001.mcap").stat().st_size - 1)
-
-
-def lose_journal(robot: Path, _older: Path) -> None:
-    (robot / "journal").unlink()
-
-
-def lose_journal_and_segment(robot: Path, _older: Path) -> None:
-    (robot / "journal").unlink()
-    (robot / "000001.mcap").unlink()
-
-
-def lose_first_line(robot: Path, _older: Path) -> None:
-    (robot / "journal").write_bytes(b"".join(lines_of(robot / "journal")[1:]))
-
-
-def flip_first_line(robot: Path, older: Path) -> None:
-    first, *rest = lines_of(robot / "journal")
-    (robot / "journal").write_bytes(b"".join([first.replace(b"robot", b"rObot", 1), *rest]))
-    add_foreign_segment(robot, older)
-
-
-def flip_checksum(robot: Path, _older: Path) -> None:
-    *rest, last = lines_of(robot / "journal")
-    (robot / "journal").write_bytes(b"".join([*rest, last[:8].upper() + b"_" + last[9:]]))
-
-
-def lose_last_lines(robot: Path, _older: Path) -> None:
-    (robot / "journal").write_bytes(b"".join(lines_of(robot / "journal")[:-2]))
-
-
-def tear_line(robot: Path, _older: Path) -> None:
-    *_, last = lines_of(robot / "journal")
-    (robot / "journal").write_bytes((robot / "journal").read_bytes() + last[:-1])
 
 
 FAULTS: dict[Callable[[Path, Path], None], str] = {
@@ -971,13 +934,6 @@ FAULTS: dict[Callable[[Path, Path], None], str] = {
     use_foreign_segment: "damaged",
     add_foreign_segment: "complete",
     cut_segment: "damaged",
-    lose_journal: "unproven",
-    lose_journal_and_segment: "unproven",
-    lose_first_line: "unproven",
-    flip_first_line: "unproven",
-    flip_checksum: "unproven",
-    lose_last_lines: "unproven",
-    tear_line: "complete",
 }
 """What is done to a recording, and the status that follows."""
 
@@ -986,12 +942,12 @@ FAULTS: dict[Callable[[Path, Path], None], str] = {
 def test_the_status_follows_from_the_page_alone(
     fault: Callable[[Path, Path], None], recorded: hl.Store, older: Path, tmp_path: Path
 ) -> None:
-    robot = copied(recorded, tmp_path / "store") / "robot"
+    robot = places.folder(copied(recorded, tmp_path / "store"), "robot")
     fault(robot, older)
     second = FormatReader(tmp_path / "store")
     before = second.recording("robot")
     entry = entry_of(tmp_path / "store", "robot")
-    after = second.recording("robot")  # hybridlog may have written the journal again
+    after = second.recording("robot")  # hybridlog may have changed the manifest
     for recording in (before, after):
         assert (recording.status, recording.id) == (FAULTS[fault], entry.id)
         assert entry.status == recording.status
@@ -1005,25 +961,23 @@ def test_the_status_follows_from_the_page_alone(
     with hl.open(tmp_path / "store") as store:
         (whole,) = recorded.select(["robot"])
         missing = sum(row["count"] for row in lost)
-        unknown = fault is lose_journal_and_segment
-        assert entry.messages + missing == whole.messages or unknown
+        assert entry.messages + missing == whole.messages
         seqs = [m.seq for m in store.all_topics().in_recording("robot")]
         assert sorted(seqs) == sorted(m.seq for _, m in after.messages())
 
 
 def test_a_damaged_chunk_is_the_same_loss_for_both(recorded: hl.Store, tmp_path: Path) -> None:
-    from hybridlog.maintenance.report import RepairReport
     from hybridlog.maintenance.verify import verify
 
-    robot = copied(recorded, tmp_path / "store") / "robot"
+    robot = places.folder(copied(recorded, tmp_path / "store"), "robot")
     whole = FormatReader(tmp_path / "store").recording("robot").segments[1]
     # In a chunk, in an arrival record, and in a message index, which no message needs.
-    places = (
+    flips = (
         (0, 60),
         (2, whole.chunks[2].length + whole.chunks[2].trailer - 3),
         (3, whole.chunks[3].length + 20),
     )
-    for number, behind in places:
+    for number, behind in flips:
         with (robot / "000001.mcap").open("r+b") as file:
             file.seek(whole.chunks[number].offset + behind)
             (byte,) = file.read(1)
@@ -1033,7 +987,7 @@ def test_a_damaged_chunk_is_the_same_loss_for_both(recorded: hl.Store, tmp_path:
     assert sorted(second.damage) == [(1, 0), (1, 2)]
     assert second.status == "damaged"
     with hl.open(tmp_path / "store") as store:
-        found = verify(store.directory, store.catalog, None, RepairReport(), labels=["robot"])
+        found = verify(store.directory, store.catalog, None, recordings=[store.entry("robot").id])
     assert {f.place.split(" byte ")[0] for f in found.findings} == {"000001.mcap"}
     assert len(found.findings) == 3
     with hl.open(tmp_path / "store", require_database=True) as store:
@@ -1043,7 +997,7 @@ def test_a_damaged_chunk_is_the_same_loss_for_both(recorded: hl.Store, tmp_path:
     assert lost == bare(second.losses, of_files=True)
 
 
-def test_what_people_wrote_is_read_from_the_journal(recorded: hl.Store, tmp_path: Path) -> None:
+def test_what_people_wrote_is_read_from_the_manifest(recorded: hl.Store, tmp_path: Path) -> None:
     copied(recorded, tmp_path / "store")
     with hl.open(tmp_path / "store") as store:
         store.edit("robot", name="Tuesday")
@@ -1052,13 +1006,12 @@ def test_what_people_wrote_is_read_from_the_journal(recorded: hl.Store, tmp_path
         store.edit("Tuesday", note="the left wheel squeaks")
         entry = store.mark("Tuesday", "+2s", "bump", {"how": "hard"})
     second = FormatReader(tmp_path / "store")
-    recording = second.recording(entry.label)
-    assert (entry.label, entry.status) == ("Tuesday", recording.status)
-    assert recording.journal is not None
-    assert recording.journal.name == "Tuesday"
-    assert recording.journal.tags == entry.tags == {"place": "lab"}
-    assert recording.journal.notes == [(n["at"], n["text"]) for n in entry.notes]
-    (mark,) = recording.journal.marks
+    recording = second.recording(entry.name)
+    assert (entry.name, entry.status) == ("Tuesday", recording.status)
+    assert recording.manifest.name == "Tuesday"
+    assert recording.manifest.tags == entry.tags == {"place": "lab"}
+    assert recording.manifest.notes == [(n["at"], n["text"]) for n in entry.notes]
+    (mark,) = recording.manifest.marks
     assert {name: mark[name] for name in ("time", "text", "tags", "segment")} == entry.marks[0]
     segment = recording.segments[mark["segment"]]
     ((_, message),) = segment.chunk(0)
@@ -1069,50 +1022,32 @@ def test_what_people_wrote_is_read_from_the_journal(recorded: hl.Store, tmp_path
     assert message.seq == seqs[-1]
 
 
-def test_what_is_reserved_is_ignored_or_refused(recorded: hl.Store, tmp_path: Path) -> None:
-    robot = copied(recorded, tmp_path / "store") / "robot"
-    before = FormatReader(tmp_path / "store").recording("robot")
-    assert before.journal is not None
-    with hl.open(tmp_path / "store") as store:
-        marked = store.mark("robot", "+2s", "bump", {"how": "hard"}, until="+3s")
-    *lines, line = (robot / "journal").read_bytes().splitlines()
-    last = json.loads(line[9:])
-    assert last["event"] in {"marked", "sealed"}
-    lines += [
-        line,
-        journal_line({"event": "pinned", "at": 1, "id": "a", "from": 0, "topics": ["/tf"]}),
-        journal_line({"event": "unpinned", "at": 2, "id": "a"}),
-        journal_line({"event": "expired", "at": 3, "segments": [], "files": []}),
-        journal_line({"event": "signature", "at": 4}),
-    ]
-    (robot / "journal").write_bytes(b"\n".join(lines) + b"\n")
-    named = robot.with_name(before.id)
-    robot.rename(named)
-    second = FormatReader(tmp_path / "store").recording(before.id)
-    assert second.journal is not None
-    assert second.journal.is_proof
-    with hl.open(tmp_path / "store") as store:
-        (entry,) = store.select([before.id])
-        assert (entry.label, entry.status) == (before.id, second.status)
-        marks = [{k: m[k] for k in entry.marks[0]} for m in second.journal.marks]
-        assert marks == list(entry.marks) == list(marked.marks)
-        assert entry.messages == sum(1 for _ in second.messages())
+def test_a_manifest_with_any_other_byte_is_damaged(recorded: hl.Store, tmp_path: Path) -> None:
+    robot = places.folder(copied(recorded, tmp_path / "store"), "robot")
+    manifest = robot / "manifest.json"
+    data = manifest.read_bytes()
+    for at in range(0, len(data), len(data) // 20):
+        manifest.write_bytes(data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :])
+        with pytest.raises(Damaged):
+            Manifest(manifest.read_bytes())
+        with pytest.raises(ManifestError):
+            read_in(robot)
+    manifest.write_bytes(data)
+    assert Manifest(data).id == robot.name
+
+
+def test_what_another_version_wrote_is_refused(recorded: hl.Store, tmp_path: Path) -> None:
+    copied(recorded, tmp_path / "store")
     settings = tmp_path / "store" / "hybridlog.toml"
     text = settings.read_text()
-    for feature in ("journal-pieces",):
-        settings.write_text(text + f'requires = ["{feature}"]\n')
-        with pytest.raises(HybridlogError, match=f"requires '{feature}'"):
-            hl.open(tmp_path / "store")
-        with pytest.raises(Damaged, match="a feature"):
-            FormatReader(tmp_path / "store")
-    settings.write_text(text.replace("format = 3", "format = 2"))
-    with pytest.raises(HybridlogError, match="of format 2, and"):
+    settings.write_text(text + 'requires = ["pieces"]\n')
+    with pytest.raises(HybridlogError, match="requires 'pieces'"):
         hl.open(tmp_path / "store")
-
-
-def journal_line(value: Mapping[str, Any]) -> bytes:
-    text = json.dumps(value).encode()
-    return b"%08x %s" % (zlib.crc32(text), text)
+    with pytest.raises(Damaged, match="a feature"):
+        FormatReader(tmp_path / "store")
+    settings.write_text(text.replace("format = 4", "format = 3"))
+    with pytest.raises(HybridlogError, match="of format 3, and"):
+        hl.open(tmp_path / "store")
 
 
 def test_the_index_is_as_specified(recorded: hl.Store) -> None:
@@ -1121,7 +1056,7 @@ def test_the_index_is_as_specified(recorded: hl.Store) -> None:
     from pymongo import MongoClient
 
     second = FormatReader(recorded.directory.path)
-    recordings = {(r := second.recording(label)).id[:16]: r for label in second.labels()}
+    recordings = {(r := second.recording(name)).id[-16:]: r for name in second.names()}
     told: dict[tuple[str, int], Told] = {}
     payloads: dict[tuple[str, int, int, int], bytes] = {}
     for key, recording in recordings.items():
@@ -1201,7 +1136,7 @@ def check_state(second: FormatReader, database: Any, recordings: Mapping[str, Re
     for key, entry in entries.items():
         recording = recordings[key]
         segments = recording.segments
-        assert (entry["id"], entry["label"]) == (recording.id, recording.path.name)
+        assert entry["id"] == recording.id == recording.path.name
         assert (entry["status"], entry["end"]) == (recording.status, recording.end)
         digests = {str(number): segment.digest for number, segment in segments.items()}
         assert entry["digests"] == entry["index"]["segments"] == digests
@@ -1230,9 +1165,10 @@ def test_the_specification_names_what_there_is() -> None:
     from dataclasses import fields
 
     from hybridlog.schema.index_bodies import ARRAY_LIMIT
-    from hybridlog_storage import journal
+    from hybridlog_storage import manifest
     from hybridlog_storage.catalog import CATALOG, ChannelStats, RecordingEntry
     from hybridlog_storage.disk import directory
+    from hybridlog_storage.manifests import MANIFEST
     from hybridlog_storage.mongo import index_state
     from hybridlog_storage.segments import chunk_table, segment_format
     from hybridlog_storage.settings import FORMAT, StoreSettings
@@ -1252,15 +1188,16 @@ def test_the_specification_names_what_there_is() -> None:
         assert all(f"`{name}`" in text for name in in_files)
     for kind in (chunk_table.CHUNK, chunk_table.PART, chunk_table.OTHER):
         assert all(f"`{name}`" in text for name in kind.names or ())
-    rows = sections(DOCS / "format.md", 3)["Events"]
-    events = {v for n, v in vars(journal).items() if n.isupper() and isinstance(v, str)}
-    for name in {*events, *journal.RESERVED} - {journal.JOURNAL}:
-        assert f"`{name}`" in rows, name
+    rows = sections(DOCS / "format.md", 2)["Manifest"]
+    m = manifest
+    for part in (m.Manifest, m.File, m.Mark, m.Pin, m.Fields, m.Loss):
+        for name in part.__struct_fields__:
+            assert f"`{name}`" in rows or name in {"copy", "gone", "uncounted_marks"}, name
     for state in typing.get_args(index_state.State):
         assert f"`{state}`" in text
     for name in (index_state.RECORDINGS, index_state.STORE):
         assert f"`{name}`" in text
-    for name in (CATALOG, directory.LOCK, journal.JOURNAL, directory.REMOVED, directory.IMPORTING):
+    for name in (CATALOG, directory.LOCK, MANIFEST, directory.REMOVED, directory.IMPORTING):
         assert name in sections(DOCS / "format.md", 2)["Directory"]
 
 

@@ -1,13 +1,12 @@
-"""What a recording's files say of it, held against its journal: without any server."""
+"""What a recording's files say of it, held against its manifest: without any server."""
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import sqlite3
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -20,25 +19,30 @@ import hybridlog as hl
 from hybridlog.entries import (
     Inventory,
     describe_now,
-    journal_from_segments,
-    new_id,
+    ended,
+    listed,
+    loss_values,
+    lost_in_crash,
+    made_again,
     read_summary,
     recording_metadata,
-    sealed_event,
-    sealed_line,
+    sealed_of,
     take_inventory,
     text,
+    unlisted,
 )
 from hybridlog.maintenance.opening import StoreFiles
 from hybridlog.maintenance.report import RepairReport
-from hybridlog_storage import journal
 from hybridlog_storage.catalog import CATALOG, Catalog, RecordingEntry
 from hybridlog_storage.disk.directory import StoreDirectory
-from hybridlog_storage.errors import CatalogError, SegmentError, StoreError
-from hybridlog_storage.journal import JOURNAL, Journal
+from hybridlog_storage.errors import CatalogError, ManifestError, SegmentError, StoreError
+from hybridlog_storage.manifest import File, Loss, Manifest, Note, Part, Source, new_id, with_file
+from hybridlog_storage.manifest import replace as changed
+from hybridlog_storage.manifests import MANIFEST, MANIFEST_OLD, change_in, old_in, read_in, write_in
 from hybridlog_storage.messages import Batch, Channel, Schema
 from hybridlog_storage.segments.segment_format import END_METADATA, LOSSES_METADATA, json_metadata
 from hybridlog_storage.segments.segment_writer import RecordingWriter, SegmentSettings
+from tests import places
 from tests.limits import Limit
 
 TEXT = Schema("std_msgs/String", "ros1msg", b"string data\n")
@@ -75,21 +79,19 @@ class Made:
 
     def __init__(self, directory: StoreDirectory, name: str = "run", segments: int = 4) -> None:
         self.directory = directory
-        self.label = directory.new_recording(name)
-        self.path = directory.recording(self.label)
-        self.id = new_id()
+        self.id = new_id(name)
+        directory.new_recording(self.id)
+        self.path = directory.recording(self.id)
         self.said = {
             "id": self.id,
             "name": name,
             "tags": {"place": "lab"},
-            "source": {"path": "/x", "kind": "test", "bytes": 5},
+            "source": {"path": "/x", "kind": "test", "bytes": 5, "profile": ""},
             "created": 77,
         }
-        self.journal = Journal(self.path, sync=False)
-        self.journal.append(
-            journal.event(
-                journal.BEGUN, store=directory.settings.store_id, origin={"host": "h"}, **self.said
-            )
+        source = Source(path="/x", kind="test", bytes=5)
+        write_in(
+            self.path, Manifest(self.id, name, 77, source=source, tags={"place": "lab"}), sync=False
         )
         self.end: dict[str, Any] | None = None
         writer = RecordingWriter(
@@ -108,28 +110,37 @@ class Made:
                 writer.add_extra(json_metadata(LOSSES_METADATA, {"rows": [LOSS]}))
         self.end = {"status": "complete", "losses": []}
         writer.close(json_metadata(END_METADATA, self.end))
-        self.segments = [path for _, path in directory.segments(self.label)]
+        self.segments = [path for _, path in directory.segments(self.id)]
         assert len(self.segments) == segments
 
     def _announce(self, sealed: Any) -> None:
-        lines = [sealed_event(sealed)]
+        self.change(listed(sealed))
         if self.end is not None:
-            lines.append(journal.event(journal.ENDED, end=self.end))
-        self.journal.append(*lines)
+            self.change(ended(self.end))
+
+    def change(self, how: Callable[[Manifest], Manifest]) -> None:
+        change_in(self.path, how, sync=False)
+
+    def set(self, **values: Any) -> None:
+        self.change(lambda now: changed(now, **values))
+
+    def drop(self, number: int) -> None:
+        """Let the manifest know nothing of a segment."""
+        self.change(
+            lambda now: changed(now, files=tuple(f for f in now.files if f.number != number))
+        )
+
+    def manifest(self) -> Manifest:
+        found = read_in(self.path)
+        assert found is not None
+        return found
 
     def inventory(self) -> Inventory:
-        return take_inventory(self.directory, self.label)
+        return take_inventory(self.directory, self.id)
 
     def entry(self, *, is_open: bool = False) -> RecordingEntry:
         with closing(Catalog(Path("/nowhere"), "x", in_memory=True)) as catalog:
-            return describe_now(self.directory, catalog, self.label, is_open=is_open).entry
-
-    def lines(self) -> list[bytes]:
-        return (self.path / JOURNAL).read_bytes().splitlines(keepends=True)
-
-    def keep_lines(self, keep: Callable[[Mapping[str, Any]], bool]) -> None:
-        kept = [line for line in self.lines() if keep(json.loads(line[9:]))]
-        (self.path / JOURNAL).write_bytes(b"".join(kept))
+            return describe_now(self.directory, catalog, self.id, is_open=is_open).entry
 
 
 @pytest.fixture
@@ -203,8 +214,8 @@ def test_a_whole_recording(made: Made) -> None:
     assert [(c.topic, c.stats.payload_bytes) for c in entry.channels] == [
         (topic, 8 * count) for topic, count in sorted(by_topic(0, 1, 2, 3).items())
     ]
-    assert (entry.id, entry.label, entry.name) == (made.id, made.label, "run")
-    assert (entry.tags, entry.created, entry.key) == ({"place": "lab"}, 77, made.id[:16])
+    assert (entry.id, entry.name) == (made.id, "run")
+    assert (entry.tags, entry.created, entry.key) == ({"place": "lab"}, 77, made.id[-16:])
     assert recording_metadata(entry) == made.said
     assert entry.chunks == sum(
         len(read_summary(path, number).table.chunks) for number, path in enumerate(made.segments)
@@ -212,14 +223,9 @@ def test_a_whole_recording(made: Made) -> None:
 
 
 def test_what_was_written_about_it_counts(made: Made) -> None:
-    made.journal.append(
-        journal.event(journal.RENAMED, name="other"),
-        journal.event(journal.TAGGED, key="who", value="me"),
-        journal.event(journal.UNTAGGED, key="place"),
-        journal.event(journal.NOTED, text="x"),
-    )
+    made.set(name="other", tags={"who": "me"}, notes=(Note(5, "x"),))
     entry = made.entry()
-    assert (entry.name, entry.tags, entry.label) == ("other", {"who": "me"}, made.label)
+    assert (entry.id, entry.name, entry.tags) == (made.id, "other", {"who": "me"})
     assert [note["text"] for note in entry.notes] == ["x"]
     check(entry)
 
@@ -235,9 +241,9 @@ def test_while_it_is_written_it_is_open(made: Made) -> None:
 
 
 def test_one_that_a_crash_ended(made: Made) -> None:
-    made.keep_lines(lambda line: line["event"] != journal.ENDED)
+    made.set(status="open")
     made.segments[3].unlink()
-    made.keep_lines(lambda line: line.get("segment") != 3)
+    made.drop(3)
     entry = made.entry()
     assert entry.status == "recovered"
     assert made.entry(is_open=True).status == "open"
@@ -245,11 +251,26 @@ def test_one_that_a_crash_ended(made: Made) -> None:
     assert lost(entry) == Counter()
 
 
+def test_the_end_of_a_recording_is_in_its_manifest(made: Made) -> None:
+    row = {**loss_values(Loss("source damaged", file="a.bag", offset=5, length=7)), "reason": "x"}
+    known = made.manifest()
+    again = ended({"status": "damaged", "losses": [row]})(changed(known, status="open"))
+    assert (again.status, again.losses[-1].file, again.losses[-1].reason) == (
+        "damaged",
+        "a.bag",
+        "x",
+    )
+    assert len(again.losses) == len(known.losses) + 1
+    made.set(status="open")
+    opened(made.directory)
+    assert made.manifest().status == "complete"  # the last segment says so
+
+
 @pytest.mark.parametrize("status", ["complete", "recovered", "damaged"])
-def test_how_it_ended_says_the_journal_or_else_the_last_segment(made: Made, status: str) -> None:
-    made.keep_lines(lambda line: line["event"] != journal.ENDED)
+def test_how_it_ended_says_the_manifest_or_else_the_last_segment(made: Made, status: str) -> None:
+    made.set(status="open")
     assert made.entry().status == "complete"
-    made.journal.append(journal.event(journal.ENDED, end={"status": status}))
+    made.set(status=status)
     assert made.entry().status == status
 
 
@@ -317,7 +338,7 @@ def test_one_of_another_recording_under_a_number_of_its_own(
 
 @pytest.mark.parametrize("number", [0, 3])
 def test_an_older_one(made: Made, tmp_path: Path, number: int) -> None:
-    """Whole, of this recording and of this number, and not what the journal lists."""
+    """Whole, of this recording and of this number, and not what the manifest lists."""
     old = tmp_path / "old"
     old.mkdir()
     writer = RecordingWriter(
@@ -371,18 +392,33 @@ def test_any_flipped_bit_of_a_summary_costs_that_segment(made: Made) -> None:
         check(made.entry(), 3)
 
 
-# Journals that are not what they should be.
+# Manifests that are not what they should be.
 
 
-def test_a_lost_journal_is_told_even_after_it_was_written_again(made: Made) -> None:
-    (made.path / JOURNAL).unlink()
-    lines = journal_from_segments(made.inventory(), "5" * 32, "it was not there")
-    made.journal.replace(lines)
+@pytest.mark.parametrize("harm", ["gone", "cut", "flipped", "empty"])
+def test_without_its_manifest_a_recording_answers_nothing(made: Made, harm: str) -> None:
+    path = made.path / MANIFEST
+    data = path.read_bytes()
+    if harm == "gone":
+        path.unlink()
+    else:
+        flipped = data[:20] + bytes([data[20] ^ 1]) + data[21:]
+        path.write_bytes({"cut": data[:-2], "flipped": flipped, "empty": b""}[harm])
+    with pytest.raises(ManifestError, match="`hybridlog verify --repair` makes it again"):
+        made.entry()
+    assert all(segment.exists() for segment in made.segments)
+
+
+def test_a_manifest_that_was_made_again_is_told(made: Made) -> None:
+    before = made.entry()
+    (made.path / MANIFEST).unlink()
     inventory = made.inventory()
-    assert inventory.state is not None
-    assert inventory.state.sealed.keys() == {0, 1, 2, 3}
+    assert (inventory.id, inventory.name, inventory.is_proven) == (made.id, "run", False)
+    write_in(made.path, made_again(inventory, None))
+    inventory = made.inventory()
+    assert made.manifest().logs.keys() == {0, 1, 2, 3}
     assert (inventory.misfits, inventory.lost, inventory.is_proven) == ([], [], False)
-    assert made.entry().status == "unproven"
+    assert made.entry() == unproven(before)
     # From here on it is watched over again.
     made.segments[3].unlink()
     entry = made.entry()
@@ -390,118 +426,98 @@ def test_a_lost_journal_is_told_even_after_it_was_written_again(made: Made) -> N
     assert lost(entry) == by_topic(3)
 
 
-def test_without_a_journal_most_segments_say_what_recording_it_is(
-    made: Made, directory: StoreDirectory
-) -> None:
-    other = Made(directory, "other")
-    shutil.copy(other.segments[0], made.segments[0])
-    (made.path / JOURNAL).unlink()
-    entry = made.entry()
-    assert entry.id == made.id
-    assert entry.status == "unproven"
-    assert kept(entry) == by_topic(1, 2, 3)
-
-
-@pytest.mark.parametrize("number", range(6))
-def test_a_damaged_line(made: Made, number: int) -> None:
-    """Whichever it is: no answer is another, and it is told."""
-    before = made.entry()
-    lines = made.lines()
-    assert len(lines) == 6
-    data = bytearray(lines[number])
-    data[20] ^= 1
-    (made.path / JOURNAL).write_bytes(
-        b"".join([*lines[:number], bytes(data), *lines[number + 1 :]])
-    )
-    inventory = made.inventory()
-    assert inventory.state is not None
-    assert inventory.state.damaged == [number + 1]
-    assert (inventory.id, inventory.is_proven) == (made.id, False)
-    assert made.entry() == replace(before, status="unproven")
-    # What the other lines list is watched over all the same.
-    for segment in range(4):
-        if number != segment + 1:
-            aside = made.segments[segment].rename(made.path / "aside")
-            entry = made.entry()
-            assert entry.status == "damaged"
-            assert lost(entry) == by_topic(segment)
-            aside.rename(made.segments[segment])
-
-
-def test_a_journal_that_is_written_again_keeps_what_can_be_read(made: Made) -> None:
-    made.journal.append(
-        journal.event(journal.RENAMED, name="other"),
-        journal.event(journal.TAGGED, key="who", value="me"),
-        journal.event(journal.NOTED, text="x") | {"at": 5},
-    )
+def test_a_manifest_that_was_made_again_says_what_the_old_one_said(made: Made) -> None:
+    made.set(name="other", tags={"who": "me"})
+    made.set(notes=(Note(5, "x"),))
     made.segments[2].unlink()
     before = made.entry()
-    lines = made.lines()
-    # The lines of a segment that is there, and of how it ended.
-    (made.path / JOURNAL).write_bytes(
-        b"".join([*lines[:1], b"damaged\n", *lines[2:5], b"x\n", *lines[6:]])
-    )
-    again = journal_from_segments(made.inventory(), made.directory.settings.store_id, "damaged")
-    made.journal.replace(again)
-    state = made.inventory().state
-    assert state is not None
-    assert (state.damaged, state.rebuilt) == ([], "damaged")
-    assert state.begun["origin"] == {"host": "h"}
-    assert state.sealed.keys() == {0, 1, 2, 3}
+    (made.path / MANIFEST).unlink()
+    write_in(made.path, made_again(made.inventory(), old_in(made.path)))
+    # What is missing does not come back; only the last change is lost.
     entry = made.entry()
-    # What is missing does not come back because the journal was written again.
-    assert entry == before
+    assert entry == replace(before, notes=[], end={**before.end, "status": "unproven"})
     assert entry.status == "damaged"
     assert lost(entry) == by_topic(2)
 
 
-def test_a_segment_that_the_journal_does_not_list(made: Made) -> None:
+def test_the_old_manifest_may_lack_the_last_segment_and_the_end(made: Made) -> None:
     before = made.entry()
-    made.keep_lines(lambda line: line.get("segment") != 1)
+    whole = made.manifest()
+    write_in(made.path, changed(whole, status="open", files=whole.files[:3]))
+    (made.path / MANIFEST).rename(made.path / MANIFEST_OLD)
+    write_in(made.path, made_again(made.inventory(), old_in(made.path)))
+    assert made.manifest().logs.keys() == {0, 1, 2, 3}
+    assert made.entry() == unproven(before)
+
+
+def test_without_a_manifest_most_segments_say_what_recording_it_is(
+    made: Made, directory: StoreDirectory
+) -> None:
+    other = Made(directory, "other")
+    shutil.copy(other.segments[0], made.segments[0])
+    (made.path / MANIFEST).unlink()
+    inventory = made.inventory()
+    assert inventory.id == made.id
+    assert inventory.summaries.keys() == {1, 2, 3}
+    write_in(made.path, made_again(inventory, None))
+    entry = made.entry()
+    assert (entry.id, entry.status) == (made.id, "unproven")
+    assert kept(entry) == by_topic(1, 2, 3)
+
+
+def test_a_segment_that_the_manifest_does_not_list(made: Made) -> None:
+    before = made.entry()
+    made.drop(1)
     inventory = made.inventory()
     (misfit,) = inventory.misfits
     assert (misfit.segment, misfit.is_unlisted, misfit.belongs) == (1, True, None)
-    assert (inventory.lost, inventory.is_proven) == ([], False)
-    # It answers, and nobody can say that there was not another one.
-    assert made.entry() == replace(before, status="unproven")
-    made.journal.append(sealed_line(inventory, 1))
-    assert made.inventory().is_proven
+    assert inventory.lost == []
+    # It answers, and is listed by the next one that may write.
+    assert made.entry() == before
+    how = unlisted(inventory)
+    assert how is not None
+    made.change(how)
+    assert made.inventory().misfits == []
+    assert unlisted(made.inventory()) is None
     assert made.entry() == before
 
 
 def test_what_a_crash_took_of_a_listed_segment(made: Made) -> None:
     """It was listed with all its messages, and came out of the crash with fewer."""
-    before = made.inventory()
-    assert before.state is not None
-    listed = before.state.sealed[3]
-    more = [
-        {**c, "messages": c["messages"] + (10 if c["topic"] != "/c" else 0)}
-        for c in listed.channels
-    ]
-    extra = {"id": 9, "topic": "/d", "messages": 2, "payload_bytes": 5, "first": 7, "last": 8}
-    fuller = journal.event(
-        journal.SEALED, segment=3, file=listed.file, bytes=9, digest="sha256:of more",
-        channels=[*more, extra],
-    )  # fmt: skip
-    made.keep_lines(lambda line: line.get("segment") != 3)
-    made.journal.append(fuller, sealed_line(before, 3))
-    inventory = made.inventory()
-    assert inventory.misfits == []
+    sealed = sealed_of(made.inventory(), 3)
+    there = made.manifest().logs[3]
+    topics = {n: channel.topic for n, channel in made.manifest().channels.items()}
+    gone = Counter({"/a": 10, "/b": 10})
+    parts = {
+        n: changed_part(part, 10 if topics[n] != "/c" else 0) for n, part in there.parts.items()
+    }
+    made.change(lambda now: with_file(now, 3, bytes=9, digest=f"sha256:{5:064x}", parts=parts))
+    losses = tuple(lost_in_crash(made.manifest(), sealed))
+    made.change(lambda now: changed(listed(sealed)(now), losses=losses, status="damaged"))
+    assert made.inventory().misfits == []
     entry = made.entry()
     assert entry.status == "damaged"
     assert kept(entry) == by_topic(0, 1, 2, 3)
-    assert lost(entry) == Counter({"/a": 10, "/b": 10, "/d": 2})
-    # Also when the journal is written again.
-    made.journal.replace(journal_from_segments(inventory, "5" * 32, "x"))
-    assert lost(made.entry()) == Counter({"/a": 10, "/b": 10, "/d": 2})
+    assert lost(entry) == gone
+    # Also when the manifest is made again.
+    made.set(notes=(Note(5, "x"),))
+    (made.path / MANIFEST).unlink()
+    write_in(made.path, made_again(made.inventory(), old_in(made.path)))
+    entry = made.entry()
+    assert (entry.status, lost(entry)) == ("damaged", gone)
+
+
+def unproven(entry: RecordingEntry) -> RecordingEntry:
+    return replace(entry, status="unproven", end={**entry.end, "status": "unproven"})
+
+
+def changed_part(part: Part, more: int) -> Part:
+    return Part(part.messages + more, part.bytes, part.first, part.last)
 
 
 def test_a_lost_segment_of_which_nothing_is_known_is_a_row_all_the_same(made: Made) -> None:
-    made.journal.append(
-        journal.event(
-            journal.SEALED, segment=4, file="000004.mcap", bytes=9, digest="sha256:x", channels=[]
-        )
-    )
+    file = File(4, 4, "000004.mcap", "log", 9, f"sha256:{5:064x}", 5)
+    made.change(lambda now: changed(now, files=(*now.files, file)))
     entry = made.entry()
     assert entry.status == "damaged"
     (row,) = [r for r in entry.end["losses"] if r["cause"] == "segment"]
@@ -517,7 +533,7 @@ def test_chunks_that_cannot_be_read_are_lost_by_topic(made: Made) -> None:
     parts = summary.table.parts[bounds[0] : bounds[1]]
     with closing(Catalog(Path("/nowhere"), "x", in_memory=True)) as catalog:
         catalog.put_damage(made.id, {(2, 0): "its checksum differs", (2, 99): "x", (9, 0): "y"})
-        entry = describe_now(made.directory, catalog, made.label).entry
+        entry = describe_now(made.directory, catalog, made.id).entry
     assert entry.status == "damaged"
     rows = [row for row in entry.end["losses"] if row["cause"] == "segment"]
     assert {row["file"] for row in rows} == {"000002.mcap"}
@@ -534,17 +550,19 @@ def test_chunks_that_cannot_be_read_are_lost_by_topic(made: Made) -> None:
 
 
 def test_nothing_says_what_recording_it_is(directory: StoreDirectory) -> None:
-    label = directory.new_recording("x")
-    (directory.recording(label) / "000000.mcap").write_bytes(b"nothing")
+    directory.new_recording("x")
+    places.segment(directory.path, "x").write_bytes(b"nothing")
     with closing(Catalog(Path("/nowhere"), "x", in_memory=True)) as catalog:
-        with pytest.raises(SegmentError, match="neither a journal nor a segment"):
-            describe_now(directory, catalog, label)
+        with pytest.raises(ManifestError, match="x has no manifest"):
+            describe_now(directory, catalog, "x")
+    with pytest.raises(SegmentError, match="neither a manifest nor a segment"):
+        made_again(take_inventory(directory, "x"), None)
 
 
-def test_a_journal_that_cannot_be_read_is_told(made: Made, tmp_path: Path) -> None:
-    (made.path / JOURNAL).rename(tmp_path / "elsewhere")
-    (made.path / JOURNAL).symlink_to(tmp_path / "elsewhere")
-    with pytest.raises(StoreError, match=JOURNAL):
+def test_a_manifest_that_cannot_be_read_is_told(made: Made, tmp_path: Path) -> None:
+    (made.path / MANIFEST).rename(tmp_path / "elsewhere")
+    (made.path / MANIFEST).symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(StoreError, match=MANIFEST):
         made.inventory()
 
 
@@ -567,9 +585,6 @@ def test_names_that_are_no_segments_are_passed_over(made: Made, name: str) -> No
 def test_names_are_text(made: Made) -> None:
     assert text("ä") == "ä"
     assert text(os.fsdecode(b"a\xff")) == "a\\xff"
-    ids = {new_id() for _ in range(100)}
-    assert len(ids) == 100
-    assert all(len(i) == 32 and set(i) <= set("0123456789abcdef") for i in ids)
 
 
 # At the opening.
@@ -623,17 +638,25 @@ def test_a_byte_that_changes_behind_the_catalog(made: Made) -> None:
     check(entry, 3)
 
 
-def test_a_lost_journal_is_written_again_at_the_opening(made: Made) -> None:
+def test_a_lost_manifest_is_told_at_every_opening(made: Made) -> None:
+    """Nothing is deleted, and nothing made again unasked."""
     opened(made.directory)
-    (made.path / JOURNAL).unlink()
+    names = sorted(path.name for path in made.path.iterdir())
+    (made.path / MANIFEST).unlink()
+    for _ in range(2):
+        entries, report = opened(made.directory)
+        assert entries == []
+        assert report.unreadable.keys() == {made.id}
+        assert "has no manifest" in report.unreadable[made.id]
+        assert sorted({*(path.name for path in made.path.iterdir()), MANIFEST}) == names
+
+
+def test_an_unlisted_segment_is_listed_at_the_opening(made: Made) -> None:
+    made.drop(1)
     (entry,), report = opened(made.directory)
-    assert report.journals == [made.label]
-    assert (entry.status, kept(entry)) == ("unproven", by_topic(0, 1, 2, 3))
-    state = journal.read(made.path)
-    assert state is not None
-    assert (state.id, state.rebuilt) == (made.id, "it was not there")
-    (again,), report = opened(made.directory)
-    assert (again, report.journals) == (entry, [])
+    check(entry)
+    assert not report.unreadable
+    assert made.inventory().misfits == []
 
 
 @pytest.mark.parametrize("kind", ["summary", "entry", "topics", "schema"])
@@ -693,6 +716,6 @@ def test_another_process_may_keep_the_catalog_locked(made: Made, limit: Limit) -
                 with opened_store:
                     check(*opened_store.recordings())
                     assert [m.raw for m in opened_store.all_topics()] == wanted
-                    opened_store.edit(opened_store.recordings()[0].label, tag={"seen": "yes"})
+                    opened_store.edit(opened_store.recordings()[0].id, tag={"seen": "yes"})
     with hl.open(made.directory.path) as store:
         assert [entry.tags["seen"] for entry in store.recordings()] == ["yes"]

@@ -27,15 +27,16 @@ from mcap.writer import Writer
 import hybridlog as hl
 from benchmarks.simulator.topics import RobotConfig
 from benchmarks.simulator.write import write_bag
-from hybridlog_storage import journal
 from hybridlog_storage.catalog import CATALOG, RecordingEntry
 from hybridlog_storage.errors import DatabaseError, IndexChangedError, SegmentError, StoreError
+from hybridlog_storage.manifest import replace as changed
+from hybridlog_storage.manifests import change_in
 from hybridlog_storage.mongo.database import Database
 from hybridlog_storage.mongo.index_state import RECORDINGS, STORE, IndexState, Through
 from hybridlog_storage.mongo.mongod import EmbeddedMongod
 from hybridlog_storage.segments.segment_reader import SegmentReader
 from hybridlog_storage.segments.segment_writer import SegmentSettings
-from tests import independent
+from tests import independent, places
 from tests.calls import Calls
 from tests.cli import running
 from tests.some import in_turn
@@ -95,7 +96,7 @@ def store(path: Path, short: Path) -> Iterator[hl.Store]:
     with hl.open(path, require_database=True) as opened:
         settings = SegmentSettings(chunk_size=16 << 10, segment_size=55_000, span_size=0)
         report = opened.record(short, settings=settings)
-        assert report.entry.label == "short"
+        assert report.entry.name == "short"
         assert report.entry.segments > 2
         yield opened
 
@@ -139,7 +140,7 @@ def run(
 
 def bytes_of(store: Path, recording: str) -> int:
     try:
-        return sum(p.stat().st_size for p in (store / "recordings" / recording).iterdir())
+        return sum(p.stat().st_size for p in places.folder(store, recording).iterdir())
     except FileNotFoundError:
         return 0
 
@@ -172,7 +173,7 @@ def test_a_killed_recorder_loses_nothing_that_was_written(
         name = f"torn{number}"
         kill_recorder(path, robot, name, moment)
         with hl.open(path, require_database=True) as store:
-            if name not in store.directory.labels():
+            if name not in {one.name for one in store.summaries()}:
                 assert moment <= 1
                 continue
             (entry,) = store.select([name])
@@ -219,23 +220,19 @@ def unsealed(store: hl.Store, size: int, *, listed: bool) -> None:
     Args:
         store: With the recording `short`.
         size: Bytes of the segment that are on the disk.
-        listed: Whether the journal had listed it already, whole.
+        listed: Whether the manifest had listed it already, whole.
     """
     (entry,) = store.select(["short"])
     last = chunk_entries(store.catalog, entry)[-1]
-    number, path = store.directory.segments("short")[-1]
+    number, path = store.directory.segments(places.id_of(store.directory.path, "short"))[-1]
     path.with_name(path.name + ".open").write_bytes(path.read_bytes()[:size])
     path.unlink()
     if not listed:
-        log = path.with_name(journal.JOURNAL)
-        lines = log.read_bytes().splitlines(keepends=True)
-        events = {line: journal.decode(line[:-1]) or {} for line in lines}
-        log.write_bytes(
-            b"".join(
-                line
-                for line, event in events.items()
-                if event["event"] != journal.ENDED and event.get("segment") != number
-            )
+        change_in(
+            path.parent,
+            lambda now: changed(
+                now, status="open", files=tuple(one for one in now.files if one.number != number)
+            ),
         )
     assert store.database is not None
     state = IndexState(store.database)
@@ -249,7 +246,7 @@ def test_the_index_may_be_ahead_of_the_file(
     store: hl.Store, said: Counter[Message], listed: bool
 ) -> None:
     """Power fails: the system had not written the file yet, but MongoDB its documents."""
-    number, path = store.directory.segments("short")[-1]
+    number, path = store.directory.segments(places.id_of(store.directory.path, "short"))[-1]
     with SegmentReader(path, number) as reader:
         chunks = reader.summary().chunks
     assert len(chunks) > 3
@@ -261,7 +258,7 @@ def test_the_index_may_be_ahead_of_the_file(
         assert 0 < len(messages) < said.total()
         assert not content(messages) - said
         assert entry.messages == len(messages)
-        # Of what the journal had listed nothing goes missing without a word.
+        # Of what the manifest had listed nothing goes missing without a word.
         assert entry.status == ("damaged" if listed else "recovered")
         assert lost(entry) == (topics_of(said - content(messages)) if listed else Counter())
         topics = sorted({m.topic for m in messages})
@@ -272,7 +269,7 @@ def test_the_index_may_be_ahead_of_the_file(
 def test_a_chunk_without_arrival_numbers_comes_after_the_earlier_segments(
     store: hl.Store, said: Counter[Message]
 ) -> None:
-    number, path = store.directory.segments("short")[-1]
+    number, path = store.directory.segments(places.id_of(store.directory.path, "short"))[-1]
     assert number > 0
     before = {m.seq for m in fetched(store, "short")}
     with SegmentReader(path, number) as reader:
@@ -397,7 +394,7 @@ def test_a_disk_that_fills_up(path: Path, robot: Path) -> None:
     assert "No space left" in done.stderr
     with hl.open(path, require_database=True) as store:
         assert store.recordings() == []
-        assert list((path / "recordings").iterdir()) == []
+        assert places.folders(path) == []
         assert store.database is not None
         for name in store.database.list_collections():
             if name not in {"hybridlog.store", "hybridlog.topics"}:
@@ -418,7 +415,7 @@ def test_a_disk_that_is_full_when_a_crash_is_mended(
     path: Path, short: Path, said: Counter[Message]
 ) -> None:
     run("record", short, "--quiet", store=path, code=0)
-    segment = path / "recordings/short/000000.mcap"
+    segment = places.segment(path, "short")
     sealed = segment.read_bytes()
     end = data_end(sealed)
     segment.unlink()
@@ -450,7 +447,7 @@ class Place:
 
 
 def place_in_the_middle(store: hl.Store) -> Place:
-    number, path = store.directory.segments("short")[1]
+    number, path = store.directory.segments(places.id_of(store.directory.path, "short"))[1]
     with SegmentReader(path, number) as reader:
         chunks = reader.summary().chunks
     chunk = chunks[len(chunks) // 2]
@@ -539,7 +536,7 @@ def test_a_flipped_bit(store: hl.Store, said: Counter[Message]) -> None:
 def test_a_segment_that_is_lost(
     store: hl.Store, said: Counter[Message], harm: str, which: int
 ) -> None:
-    number, path = store.directory.segments("short")[which]
+    number, path = store.directory.segments(places.id_of(store.directory.path, "short"))[which]
     size = path.stat().st_size
     if harm == "truncated":
         os.truncate(path, size - 1)
@@ -562,7 +559,7 @@ def test_a_segment_that_is_lost(
 
 
 def test_a_recording_without_any_segment_is_told(store: hl.Store, said: Counter[Message]) -> None:
-    segments = store.directory.segments("short")
+    segments = store.directory.segments(places.id_of(store.directory.path, "short"))
     for _, path in segments:
         path.unlink()
     findings = store.verify().findings
@@ -673,8 +670,8 @@ def list_otherwise(path: Path, place: int, change: Callable[[int], int]) -> None
 def test_a_chunk_that_is_listed_otherwise_than_it_is(
     store: hl.Store, said: Counter[Message], place: int, change: Callable[[int], int]
 ) -> None:
-    """Checksum and all: the journal knows the summary by its digest."""
-    (number, path), *_ = store.directory.segments("short")
+    """Checksum and all: the manifest knows the summary by its digest."""
+    (number, path), *_ = store.directory.segments(places.id_of(store.directory.path, "short"))
     list_otherwise(path, place, change)
     with reopened(store) as opened:
         check_what_is_missing(opened, said, {number})
@@ -690,7 +687,7 @@ def test_a_chunk_that_is_listed_otherwise_than_it_is(
 def test_segments_that_changed_places_are_found_and_put_back(
     store: hl.Store, said: Counter[Message]
 ) -> None:
-    (_, one), (_, other), *_ = store.directory.segments("short")
+    (_, one), (_, other), *_ = store.directory.segments(places.id_of(store.directory.path, "short"))
     first, second = one.read_bytes(), other.read_bytes()
     one.write_bytes(second)
     other.write_bytes(first)
@@ -861,7 +858,7 @@ def test_reindex_does_not_cost_a_running_recording_its_index(
     with Writing(path, robot) as writing, hl.open(path, require_database=True) as store:
         with pytest.raises(StoreError, match="being written"):
             store.index.rebuild(["robot"])
-        assert [entry.label for entry in store.index.rebuild()] == ["short"]
+        assert [entry.name for entry in store.index.rebuild()] == ["short"]
         assert content(fetched(store, "short")) == said
     (report,) = writing.result
     assert not isinstance(report, Exception), report
@@ -903,10 +900,9 @@ def test_opening_does_not_take_the_directory_of_a_recording_that_begins(
     """Another process opens the store after the directory is made, before it is locked."""
     from hybridlog_storage.disk.directory import StoreDirectory
 
-    def made(recording: str, *_: object) -> str:
+    def made(found: None, *_: object) -> None:
         with hl.open(path, require_database=True) as other:
             assert other.recordings() == []
-        return recording
 
     calls.change(StoreDirectory, "new_recording", made)
     with hl.open(path, require_database=True) as store:

@@ -17,6 +17,7 @@ from hybridlog_storage.disk import files
 from hybridlog_storage.disk.files import System
 from hybridlog_storage.errors import DiskFullError
 from hybridlog_storage.messages import Channel
+from tests import places
 from tests.calls import Calls
 from tests.cli.within import answer
 
@@ -51,18 +52,18 @@ def test_a_crash_on_a_full_disk_waits_for_room(
         patch.setattr(files, "system", FullDisk())
         with hl.open(tmp_path / "after", mongo=NOWHERE) as store:
             assert store.repairs.disk_full is not None
-            assert {r.label: r.status for r in store.recordings()} == {
+            assert {r.name: r.status for r in store.recordings()} == {
                 "whole": "complete",
                 "crash": "unfinished",
             }
             assert [bytes(m.raw) for m in store.topic("/a").in_recording("whole")] == [b'{"n": 1}']
             store.remove("whole")
-            assert [r.label for r in store.recordings()] == ["crash"]
-            assert not (tmp_path / "after" / "recordings" / "whole").exists()
+            assert [r.name for r in store.recordings()] == ["crash"]
+            assert "whole" not in places.names(tmp_path / "after")
     with hl.open(tmp_path / "after", mongo=NOWHERE) as store:
         assert store.repairs.disk_full is None
         (entry,) = store.recordings()
-        assert (entry.label, entry.status, entry.messages) == ("crash", "recovered", 50)
+        assert (entry.name, entry.status, entry.messages) == ("crash", "recovered", 50)
 
 
 def test_nothing_is_said_to_have_crashed_on_a_full_disk(tmp_path: Path, calls: Calls) -> None:

@@ -12,6 +12,7 @@ import pytest
 import hybridlog as hl
 from benchmarks.simulator.write import write_bag
 from hybridlog_storage.settings import StoreSettings, write_settings
+from tests import places
 from tests.other_user import User, needs_root, open_place
 from tests.waiting import wait_for
 
@@ -122,7 +123,7 @@ def test_two_users_of_a_group_share_a_store(place: Path, umask: int) -> None:
     ann.run("rm", "-y", "bobs", *where)
     assert bob.run("ls", "--json", *where).json == []
     ann.run("index", "rebuild", "-q", *where)
-    assert [p.name for p in (store / "recordings").iterdir()] == []
+    assert places.names(store) == []
 
 
 @needs_root
@@ -131,12 +132,12 @@ def test_a_crash_of_one_is_mended_by_the_other(place: Path) -> None:
     bob = User(place, 12346, 12346, (LAB,), 0o002)
     store = place / "lab" / "store"
     ann.python("-c", CRASH, store, code=9)
-    assert list(store.glob("recordings/cut/*.mcap.open"))
+    assert list(places.folder(store, "cut").glob("*.mcap.open"))
     done = bob.run("ls", "--store", store)
     assert f"{MESSAGES} messages of it are recovered" in done.err
     listed = bob.run("ls", "--json", "--store", store).json
     assert [r["messages"] for r in listed] == [MESSAGES]
-    assert not list(store.glob("recordings/cut/*.mcap.open"))
+    assert not list(places.folder(store, "cut").glob("*.mcap.open"))
     ann.run("rm", "-y", "cut", "--store", store)
 
 
@@ -187,11 +188,11 @@ def test_root_takes_no_ones_server(place: Path) -> None:
 def test_a_name_that_is_taken(place: Path) -> None:
     ann = User(place, 12345, 12345, (LAB,), 0o002)
     store = place / "lab" / "store"
-    (store / "recordings").mkdir(parents=True)
+    places.root(store).mkdir(parents=True)
     for name in ("mongod", f"mongod-{ann.uid}"):
         (store / name).mkdir()
     write_settings(store, StoreSettings("x"))
-    (store / "recordings").chmod(0o2775)
+    places.root(store).chmod(0o2775)
     store.chmod(0o2775)
     done = ann.run("verify", "--store", store, code=6)
     assert "belongs to another user" in done.err

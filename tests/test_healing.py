@@ -292,7 +292,7 @@ def test_a_recording_is_removed_from_an_index_that_ends(store: Path) -> None:
     with hl.open(store, require_database=True) as opened:
         kill_mongod(store)
         opened.remove("one")
-        assert [r.label for r in opened.recordings()] == ["two"]
+        assert [r.name for r in opened.recordings()] == ["two"]
         assert not opened.verify().findings
 
 
@@ -326,7 +326,7 @@ def test_a_recording_is_made_and_edited_though_its_mongod_ended(
         report = opened.record(log)
         assert report.indexed == report.entry.messages > 0
         kill_mongod(store)
-        assert opened.edit("one", name="first").label == "first"
+        assert opened.edit("one", name="first").name == "first"
         assert opened.edit("first", tag={"place": "lab"}).tags == {"place": "lab"}
         verified = opened.verify()
         assert verified.index

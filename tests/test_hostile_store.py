@@ -23,6 +23,7 @@ from benchmarks.simulator.write import write_bag
 from hybridlog_storage.errors import HybridlogError, StoreError
 from hybridlog_storage.mongo import mongod_keeper
 from hybridlog_storage.mongo.mongod import EmbeddedMongod
+from tests import places
 from tests.cli.running import run
 from tests.waiting import wait_for
 
@@ -35,20 +36,20 @@ FILES = {
     "catalog": "catalog.sqlite",
     "journal of the catalog": "catalog.sqlite-journal",
     "log of the catalog": "catalog.sqlite-wal",
-    "journal": "recordings/small/journal",
-    "lock": "recordings/small/writer.lock",
-    "segment": "recordings/small/000000.mcap",
-    "next segment": "recordings/small/000001.mcap",
-    "open segment": "recordings/small/000001.mcap.open",
-    "segment of a new recording": "recordings/live/000000.mcap.open",
+    "manifest": "{small}/manifest.json",
+    "manifest before": "{small}/manifest.old",
+    "lock of the manifest": "{small}/manifest.lock",
+    "lock": "{small}/writer.lock",
+    "segment": "{small}/000000.mcap",
+    "next segment": "{small}/000001.mcap",
+    "open segment": "{small}/000001.mcap.open",
     "sign of a recorder": "recorders/live.json",
     "sign of another recorder": "recorders/other.json",
 }
 FOLDERS = {
-    "recordings": "recordings",
-    "recording": "recordings/small",
-    "new recording": "recordings/live",
-    "removed recording": "recordings/.removed-small-0123abcd",
+    "recordings": "{root}",
+    "recording": "{small}",
+    "removed recording": "{root}/.removed-small-0123abcd",
     "recorders": "recorders",
     "tables": "tables",
     "unfinished tables": "tables.part",
@@ -189,7 +190,7 @@ def use(path: Path, mongo: str | None, bag: Path) -> list[HybridlogError]:
 
         running(path)
         with suppress(StoreError):
-            ControlServer(path, "live", {}).close()
+            ControlServer(path, "live", "live", {}).close()
         store.start("live").close()
 
     def record(store: hl.Store) -> None:
@@ -201,6 +202,16 @@ def use(path: Path, mongo: str | None, bag: Path) -> list[HybridlogError]:
     attempt(False, lambda store: store.remove("small"))
     attempt(False, look)
     return refused
+
+
+def name_of(store: Path, kind: str) -> str:
+    """The path of a kind of file in a store."""
+    found = {
+        "root": places.root(store),
+        "small": places.folder(store, "small"),
+    }
+    inside = {key: path.relative_to(store) for key, path in found.items()}
+    return {**FILES, **FOLDERS}[kind].format(**inside)
 
 
 def planted(template: Path, tmp_path: Path, name: str, target: Path) -> Path:
@@ -225,7 +236,7 @@ def test_a_place_that_leads_elsewhere(
     template: Path, tmp_path: Path, server: str, bag: Path, kind: str, leads: str
 ) -> None:
     victims = Victims(tmp_path / "victims")
-    name = {**FILES, **FOLDERS}[kind]
+    name = name_of(template, kind)
     original = template / name
     if leads == "to nothing":
         target = victims.place / "new"
@@ -233,7 +244,7 @@ def test_a_place_that_leads_elsewhere(
         target = victims.file(original.read_bytes() if original.is_file() else b"precious")
     else:
         target = victims.folder(
-            template / "recordings/small" if "recording" in kind[1:] else original
+            places.folder(template, "small") if "recording" in kind[1:] else original
         )
     store = planted(template, tmp_path, name, target)
     victims.watch()
@@ -426,13 +437,12 @@ def test_the_commands(tmp_path: Path, bag: Path) -> None:
     wait_for(lambda: not (store / "mongod/mongod.json").exists())
     victims = Victims(tmp_path / "victims")
     targets = {
-        "mongod/mongod.log": "a",
-        "mongod/mongod.json.new": "b",
-        "recordings/small/writer.lock": "new",
-        "recorders/live.json": "d",
+        store / "mongod/mongod.log": "a",
+        store / "mongod/mongod.json.new": "b",
+        places.folder(store, "small") / "writer.lock": "new",
+        store / "recorders/live.json": "d",
     }
-    for name, victim in targets.items():
-        place = store / name
+    for place, victim in targets.items():
         place.parent.mkdir(exist_ok=True)
         place.unlink(missing_ok=True)
         place.symlink_to(victims.place / victim)
@@ -481,11 +491,13 @@ def test_every_kind_of_file_is_tried(tmp_path: Path, bag: Path) -> None:
         live = store.start("live")
         place = store.directory.path
         seen |= {str(p.relative_to(place)) for p in place.rglob("*")}
+        begun = places.folder(place, "live").relative_to(place)
         live.close()
         store.record(bag, name="small")
         seen |= {str(p.relative_to(place)) for p in place.rglob("*")}
-    known = {*FILES.values(), *FOLDERS.values()}
-    alike = {name.replace("/live/", "/small/") for name in seen}
+        small = places.folder(place, "small").relative_to(place)
+    known = {name_of(place, kind) for kind in (*FILES, *FOLDERS)}
+    alike = {name.replace(f"{begun}/", f"{small}/") for name in seen - {str(begun)}}
     alike = {re.sub(r"/\d+\.mcap", "/000001.mcap", name) for name in alike}
     # Tables, whose names are drawn, are tried by themselves.
     drawn = (OF_MONGOD, OF_TABLES)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 import shutil
 import struct
+import time
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -15,17 +16,19 @@ import pytest
 import hybridlog as hl
 from hybridlog.cli.keep import keep_command
 from hybridlog.cli.open import print_unplayed
+from hybridlog.maintenance import edit, expiry
 from hybridlog.maintenance import keep as keeping
-from hybridlog.maintenance.expiry import Expired
 from hybridlog.maintenance.keep import Keeper
 from hybridlog.maintenance.retention import Rules
 from hybridlog.maintenance.sizes import disk_bytes
-from hybridlog_storage import journal
 from hybridlog_storage.disk import files
 from hybridlog_storage.disk.directory import StoreDirectory
 from hybridlog_storage.errors import HybridlogError, PayloadError, StoreError, TimeError
+from hybridlog_storage.manifest import File, Manifest, new_id, replace
+from hybridlog_storage.manifests import MANIFEST, change_in, read_in, write_in
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests import places
 from tests.calls import Calls
 from tests.cli.running import run
 from tests.cli.within import answer
@@ -65,6 +68,12 @@ def store(recorded: Path, tmp_path: Path) -> Path:
 
 
 keep = partial(answer, "keep")
+
+
+def logs_of(store: Path) -> dict[int, File]:
+    manifest = read_in(places.folder(store, "run"))
+    assert manifest is not None
+    return manifest.logs
 
 
 def pin(at: str, around: str, path: Path) -> None:
@@ -112,18 +121,18 @@ def test_a_pass_makes_room_and_leaves_counts_fields_and_pins(store: Path) -> Non
     assert f"more than 90% of {quota / 1000:.1f} kB" in first["reason"]
     gone = sorted(n for step in done["plan"]["steps"] for n in step["segments"])
     # The oldest went, but for those with what is pinned.
-    state = journal.read(store / "recordings" / "run")
-    assert state is not None
+    manifest = read_in(places.folder(store, "run"))
+    assert manifest is not None
     free = [
         number
-        for number, one in state.sealed.items()
+        for number, log in manifest.logs.items()
         if all(
-            c["last"] < BEGIN + 8 * SECOND or c["first"] > BEGIN + 12 * SECOND
-            for c in one.channels
-            if c["topic"] == "/camera"
+            part.last < BEGIN + 8 * SECOND or part.first > BEGIN + 12 * SECOND
+            for channel, part in log.parts.items()
+            if manifest.channels[channel].topic == "/camera"
         )
     ]
-    assert len(state.sealed) - 2 <= len(free) < len(state.sealed)
+    assert len(manifest.logs) - 2 <= len(free) < len(manifest.logs)
     assert gone == free[: len(gone)]
     left = payloads(store)
     assert all(raw is None or raw == image(n) for n, raw in left.items())
@@ -191,16 +200,15 @@ def test_too_little_may_go(store: Path) -> None:
 
 
 def test_a_damaged_segment_stays_and_the_others_go(store: Path) -> None:
-    with (store / "recordings" / "run" / "000001.mcap").open("r+b") as file:
+    with places.segment(store, "run", 1).open("r+b") as file:
         file.seek(20_000)
         file.write(b"damaged")
     found = keep("--max-age", "0s", store=store, code=None)
     assert "000001.mcap" in found.err
     assert "stay until the file is restored from a copy" in found.err
-    state = journal.read(store / "recordings" / "run")
-    assert state is not None
-    assert {n for n, topics in state.expired.items() if "/camera" in topics} >= {0, 2, 3}
-    assert 1 not in state.expired
+    logs = logs_of(store)
+    assert {n for n, log in logs.items() if "/camera" in log.expired} >= {0, 2, 3}
+    assert not logs[1].expired
 
 
 def test_a_rule_that_fits_no_topic_is_told(store: Path) -> None:
@@ -216,8 +224,7 @@ def test_a_plan_promises_what_goes(store: Path) -> None:
     done = keep(*words, store=store).json
     # What is left of a message takes some room, and the segment of the mark stays.
     assert 0.85 < done["freed_bytes"] / step["bytes"] <= 1
-    segments = sorted(journal.read(store / "recordings" / "run").sealed)  # type: ignore[union-attr]
-    assert step["segments"] == segments[:-1]
+    assert step["segments"] == sorted(logs_of(store))[:-1]
     gone = sum(raw is None for raw in payloads(store).values())
     assert f"{gone} payloads deleted" in answer("ls", store=store).out
     assert answer("ls", "--json", store=store).json[0]["expired"] == gone
@@ -315,7 +322,7 @@ def test_usage_that_is_refused(store: Path, words: list[str]) -> None:
 
 
 def files_of(path: Path) -> dict[str, bytes]:
-    names = [p for p in (path / "recordings").rglob("*") if p.is_file() and p.name != "writer.lock"]
+    names = [p for p in places.root(path).rglob("*") if p.is_file() and p.name != "writer.lock"]
     return {str(p): p.read_bytes() for p in [*names, path / "hybridlog.toml"]}
 
 
@@ -333,21 +340,49 @@ def test_the_options_are_those_of_the_table() -> None:
     assert {"quota", "min_free", "max_age", "topic", "never_tag", "fields_age"} <= names
 
 
-def test_a_pin_set_meanwhile_stops_what_is_not_announced(
-    store: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("what", ["pin", "tag"])
+@pytest.mark.parametrize("when", ["expire", "replace_chunks"])
+def test_what_is_said_meanwhile_stops_what_is_not_listed(
+    store: Path, monkeypatch: pytest.MonkeyPatch, when: str, what: str
 ) -> None:
-    def pinned_before(*words: Any, **options: Any) -> Expired:
-        with hl.open(store, mongo="none") as other:
-            (entry,) = other.recordings()
-            line = keeping.pin_of("now", (None, None), None, "")
-            journal.Journal(other.directory.recording(entry.label)).append(line)
-        monkeypatch.undo()
-        return keeping.expire(*words, **options)
+    """Before the fields are written, and when they are listed and segments are to be replaced."""
 
-    monkeypatch.setattr(keeping, "expire", pinned_before)
-    assert "a pin was set meanwhile" in keep("--max-age", "0s", store=store).err
+    def said(now: Manifest) -> Manifest:
+        if what == "tag":
+            return replace(now, tags={"stay": "yes"})
+        return replace(now, pins=(keeping.pin_of("now", (None, None), None, ""),))
+
+    module: Any = keeping if when == "expire" else expiry
+    work = getattr(module, when)
+
+    def said_before(*words: Any, **options: Any) -> Any:
+        change_in(places.folder(store, "run"), said)
+        return work(*words, **options)
+
+    monkeypatch.setattr(module, when, said_before)
+    found = keep("--max-age", "0s", "--never-tag", "stay", store=store)
+    assert "was set meanwhile" in found.err
     assert all(raw == image(n) for n, raw in payloads(store).items())
     check_answers(store)
+
+
+@pytest.mark.parametrize("what", ["pin", "tag"])
+def test_what_is_said_meanwhile_keeps_a_recording(
+    store: Path, monkeypatch: pytest.MonkeyPatch, what: str
+) -> None:
+    keep("--max-age", "0s", store=store)
+    announce = edit.announce_removal
+
+    def said_before(*words: Any) -> None:
+        pin = keeping.pin_of("now", (None, None), None, "")
+        said = {"tags": {"stay": "yes"}} if what == "tag" else {"pins": (pin,)}
+        change_in(places.folder(store, "run"), lambda now: replace(now, **said))
+        announce(*words)
+
+    monkeypatch.setattr(edit, "announce_removal", said_before)
+    found = keep("--fields-age", "0s", "--never-tag", "stay", store=store)
+    assert "was set meanwhile" in found.err
+    assert places.names(store) == ["run"]
 
 
 def test_one_process_at_a_time(store: Path) -> None:
@@ -431,21 +466,23 @@ class Counting(files.System):
         return super().open(name, flags, mode, folder=folder)
 
 
-def test_a_plan_opens_each_journal_once(recorded: Path, tmp_path: Path, calls: Calls) -> None:
+def test_a_plan_opens_each_manifest_once(recorded: Path, tmp_path: Path, calls: Calls) -> None:
     with hl.open(tmp_path / "many", mongo="none", create=True) as store:
         directory = store.directory
-    data = (recorded / "recordings" / "run" / "journal").read_bytes()
-    lines = [line for _, line in journal.read_lines(data) if line is not None]
-    for number in range(1000):
-        lines[0]["id"] = f"{number:032x}"
-        (directory.recordings / f"r{number}").mkdir()
-        journal.Journal(directory.recordings / f"r{number}", sync=False).append(*lines)
-    keeper = Keeper(directory, lambda _: None)
+    manifest = read_in(places.folder(recorded, "run"))
+    assert manifest is not None
+    for _ in range(1000):
+        one = replace(manifest, id=new_id("run"))
+        folder = directory.recording(one.id)
+        folder.mkdir()
+        write_in(folder, one, sync=False)
+    keeper = Keeper(directory, lambda *_: None)
     rules = Rules.of({"max-age": "0s"})
     counting = Counting()
+    time.sleep(0.1)  # what was written just now is read again
     calls.system(counting)
     assert len(keeper.plan(rules).steps) == 1000
-    assert counting.opened == ["journal"] * 1000
+    assert counting.opened == [MANIFEST] * 1000
     counting.opened.clear()
     assert keeper.plan(rules).steps
     assert counting.opened == []

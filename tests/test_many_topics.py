@@ -64,7 +64,7 @@ def database_of(store: hl.Store) -> Database:
 def documents(store: hl.Store) -> Counter[str]:
     """Documents by collection and recording."""
     found: Counter[str] = Counter()
-    labels = {entry.key: entry.label for entry in store.recordings()}
+    labels = {entry.key: entry.name for entry in store.recordings()}
     for name in database_of(store).list_collections():
         if name == SHARED or not name.startswith("hybridlog."):
             for document in database_of(store).find(name, {}, {"_meta.rec": 1}):

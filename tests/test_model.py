@@ -2,7 +2,7 @@
 
 The model is a list of messages and a stable sort; it knows nothing of chunks or MongoDB,
 and of segments only that they can be lost. Hypothesis records logs, removes, renames, tags
-and marks recordings, moves and copies their directories, loses segments, journals, the
+and marks recordings, moves and copies their directories, loses segments, manifests, the
 catalog and the database, kills recorders at a random byte, and asks; every answer must be
 the list's, in its order.
 """
@@ -12,9 +12,7 @@ from __future__ import annotations
 import json
 import random
 import re
-import shutil
 import struct
-import zlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -48,9 +46,13 @@ from hybridlog.query.topics import matcher
 from hybridlog.record.recorder import RecordOptions
 from hybridlog_storage.catalog import CATALOG, RecordingEntry
 from hybridlog_storage.errors import TimeError, TopicError
+from hybridlog_storage.manifest import Manifest
+from hybridlog_storage.manifest import replace as changed
+from hybridlog_storage.manifests import MANIFEST, MANIFEST_OLD, change_in
 from hybridlog_storage.mongo.index_state import IndexState, Through
 from hybridlog_storage.mongo.mongod import EmbeddedMongod
 from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests import places
 from tests.storage.chunk_entries import chunk_entries
 
 pytestmark = pytest.mark.mongo("embedded")
@@ -107,8 +109,8 @@ BAG_CHANNELS = (
 )
 MARKS = "/hybridlog/marks"
 TOPICS = sorted({MARKS, *(c.topic for c in (*MCAP_CHANNELS, *BAG_CHANNELS))})
-NAMES = {"run": "run", "calm sea": "calm-sea", "x/y": "x-y", "log1": "log1", "\u00e9": "recording"}
-"""Names that people give, and the labels that are made from them."""
+NAMES = {"run": "run", "calm sea": "calm sea", "x/y": "x-y", "log1": "log1", "\u00e9": "\u00e9"}
+"""Names that people give, and those that recordings get."""
 
 
 @dataclass(frozen=True)
@@ -145,7 +147,7 @@ class Said:
 
     @property
     def order(self) -> tuple[int, str, int]:
-        return self.log_time, self.recording[:16], self.seq
+        return self.log_time, self.recording[-16:], self.seq
 
 
 def drafts_of(seed: int, size: int) -> list[Draft]:
@@ -353,7 +355,6 @@ class Recording:
 
     messages: list[Said]
     kinds: set[Kind]
-    label: str
     name: str
     tags: dict[str, str]
     status: str = "complete"
@@ -378,10 +379,10 @@ class Recording:
 
     @property
     def findings(self) -> Counter[tuple[str, str]]:
-        """What `verify` must find: label and place."""
-        found = Counter((self.label, f"segment {number}") for number in self.lost)
+        """What `verify` must find: name and place."""
+        found = Counter((self.name, f"segment {number}") for number in self.lost)
         if self.status == "unproven":
-            found[self.label, "journal"] += 1
+            found[self.name, "manifest"] += 1
         return found
 
 
@@ -398,8 +399,6 @@ class Machine(RuleBasedStateMachine):
         self.changed = True
         self.written = 0
         self.store = hl.open(self.path, create=True, require_database=True)
-        for copy in list(self.store.repairs.copies):
-            self.store.remove(copy)
         for recording in self.store.recordings():
             self.store.remove(recording.id)
 
@@ -455,11 +454,11 @@ class Machine(RuleBasedStateMachine):
             between=between,
             again=True,
         )
-        before = self.store.directory.labels()
+        before = self.store.directory.ids()
         if wanted is not None and not kept:
             with pytest.raises(TopicError):
                 self.store.record(path, options)
-            assert self.store.directory.labels() == before
+            assert self.store.directory.ids() == before
             path.unlink()
             return
         report = self.store.record(path, options)
@@ -476,8 +475,7 @@ class Machine(RuleBasedStateMachine):
             for spec in (BAG_CHANNELS if is_bag else MCAP_CHANNELS)
             if wanted is None or spec.topic in wanted
         }
-        label = self.free_label(path.stem)
-        self.model[entry.id] = Recording(numbered, kinds, label, path.stem, tags)
+        self.model[entry.id] = Recording(numbered, kinds, self.free_name(path.stem), tags)
         self.changed = True
 
     @precondition(lambda self: self.model)
@@ -500,7 +498,7 @@ class Machine(RuleBasedStateMachine):
         with pymongo.MongoClient[dict[str, Any]](self.uri) as client:
             client.drop_database(name)
         self.open_again()
-        assert set(self.store.repairs.indexed) == {k.label for k in self.model.values()}
+        assert set(self.store.repairs.indexed) == {k.name for k in self.model.values()}
         self.changed = True
 
     @rule(how=st.sampled_from(["deleted", "page", "byte"]), spot=st.integers(0, SPOTS))
@@ -541,9 +539,8 @@ class Machine(RuleBasedStateMachine):
     def rename(self, which: int, name: str) -> None:
         recording = self.chosen(which)
         known = self.model[recording]
-        known.name, known.label = name, self.free_label(NAMES[name], but=known.label)
-        entry = self.store.edit(recording, name=name)
-        assert (entry.name, entry.label) == (known.name, known.label)
+        known.name = self.free_name(NAMES[name], but=known.name)
+        assert self.store.edit(recording, name=name).name == known.name
         self.changed = True
 
     @precondition(lambda self: self.model)
@@ -603,51 +600,6 @@ class Machine(RuleBasedStateMachine):
 
     # What happens to directories and files.
 
-    @precondition(lambda self: self.model)
-    @rule(which=st.integers(0, 9), label=st.sampled_from(["moved", "log1", "zzz"]))
-    def move_the_directory(self, which: int, label: str) -> None:
-        recording = self.chosen(which)
-        known = self.model[recording]
-        self.store.close()
-        directory = self.store.directory
-        after = self.free_label(label, but=known.label)
-        if after != known.label:
-            directory.recording(known.label).rename(directory.recording(after))
-        known.label = after
-        self.store = hl.open(self.path, require_database=True)
-        assert mended(self.store) == set()
-        self.changed = True
-
-    @precondition(lambda self: any(not k.lost for k in self.model.values()))
-    @rule(
-        which=st.integers(0, 9), label=st.sampled_from(["aaa", "zzz"]), loses=st.booleans(),
-        first=st.booleans(),
-    )  # fmt: skip
-    def copy_the_directory(self, which: int, label: str, loses: bool, first: bool) -> None:
-        """One of both answers, and it is the one that is whole."""
-        recording = self.chosen(which, lambda known: not known.lost)
-        known = self.model[recording]
-        self.store.close()
-        directory = self.store.directory
-        copy = self.free_label(label)
-        shutil.copytree(directory.recording(known.label), directory.recording(copy))
-        rest = copy
-        segments = directory.segments(known.label)
-        if loses and known.messages:
-            # The copy is the whole one from now on.
-            held = [p for _, p in segments if self.messages_in(recording, p)]
-            (held[0] if first else held[-1]).unlink()
-            rest, known.label = known.label, copy
-        self.store = hl.open(self.path, require_database=True)
-        assert self.store.repairs.copies == {rest: known.label}
-        everything = Asked(tuple(sorted(known.topics)), None, "log", None, None, 1, reverse=False)
-        if everything.topics:
-            check(self.store, self.model, everything)
-        assert (rest, "recording") in {(f.recording, f.place) for f in self.store.verify().findings}
-        self.store.remove(rest)
-        assert rest not in self.store.directory.labels()
-        self.changed = True
-
     def messages_in(self, recording: str, path: Path) -> bool:
         """Whether there are messages in a segment, by its own summary."""
         with path.open("rb") as file:
@@ -661,7 +613,7 @@ class Machine(RuleBasedStateMachine):
     def lose_a_segment(self, which: int, segment: int, reopened: bool) -> None:
         recording = self.chosen(which)
         known = self.model[recording]
-        segments = self.store.directory.segments(known.label)
+        segments = self.store.directory.segments(recording)
         if not segments:
             return
         number, path = segments[segment % len(segments)]
@@ -688,7 +640,7 @@ class Machine(RuleBasedStateMachine):
         recording = self.chosen(which, lambda known: bool(known.lost))
         known = self.model[recording]
         number, lost = known.lost.popitem()
-        path = self.store.directory.recording(known.label) / f"{number:06d}.mcap"
+        path = places.segment(self.store.directory.path, recording, number)
         path.write_bytes(lost.content)
         known.messages += lost.messages
         self.open_again()
@@ -696,18 +648,28 @@ class Machine(RuleBasedStateMachine):
         self.changed = True
 
     @precondition(lambda self: any(not known.lost for known in self.model.values()))
-    @rule(which=st.integers(0, 9))
-    def lose_a_journal(self, which: int) -> None:
-        """What people wrote is gone, no message is, and nobody calls it proven again."""
+    @rule(which=st.integers(0, 9), has_old=st.booleans())
+    def lose_a_manifest(self, which: int, has_old: bool) -> None:
+        """What people wrote last is gone, no message is, and nobody calls it proven again."""
         recording = self.chosen(which, lambda known: not known.lost)
         known = self.model[recording]
-        (self.store.directory.recording(known.label) / "journal").unlink()
+        folder = places.folder(self.store.directory.path, recording)
+        self.store.edit(recording, note="the last change")
+        (folder / MANIFEST).unlink()
         known.status = "unproven"
-        known.name, known.tags = known.first_name, dict(known.first_tags)
-        known.notes.clear()
-        known.marks.clear()
+        if not has_old:
+            (folder / MANIFEST_OLD).unlink()
+            known.name = self.free_name(known.first_name, but=known.name)
+            known.tags = dict(known.first_tags)
+            known.notes.clear()
+            known.marks.clear()
         self.open_again()
-        assert self.store.repairs.journals == [known.label]
+        assert self.store.repairs.unreadable.keys() == {recording}
+        assert recording not in {one.id for one in self.store.recordings()}
+        cured = [one.place for one in self.store.verify(repair=True) if one.is_cured]
+        assert "manifest" in cured
+        self.open_again()
+        assert not self.store.repairs.unreadable
         assert not self.store.repairs.removed
         self.changed = True
 
@@ -732,7 +694,7 @@ class Machine(RuleBasedStateMachine):
         recording = self.chosen(which, can_crash)
         known = self.model[recording]
         entry = self.store.entry(recording)
-        number, path = self.store.directory.segments(known.label)[-1]
+        number, path = self.store.directory.segments(recording)[-1]
         content = path.read_bytes()
         laid = Laid.out(content)
         cut = len(content) if part == "sealed" else laid.cut(spot, part)
@@ -752,15 +714,8 @@ class Machine(RuleBasedStateMachine):
             if chunk.segment < number or (chunk.segment == number and chunk.number in kept):
                 through = Through(chunk.segment, chunk.number, chunk.offset, 0)
                 IndexState(self.store.database).put_through(entry.key, through)
-        # In the journal the segment is listed, or nothing is from there on.
-        journal = path.with_name("journal")
-        journal.write_bytes(
-            b"".join(
-                line
-                for line in journal.read_bytes().splitlines(keepends=True)
-                if not is_of_the_end(line, number, sealed=part != "sealed")
-            )
-        )
+        # The manifest lists the segment, or nothing from there on.
+        change_manifest(path.parent, None if part == "sealed" else number, status="open")
         path.with_name(path.name + ".open").write_bytes(content[:cut])
         path.unlink()
         self.open_again()
@@ -768,7 +723,7 @@ class Machine(RuleBasedStateMachine):
         by_seq = {m.seq: m for m in known.messages}
         in_segment = {seq for part in arrivals.values() for seq in part}
         survivors = {seq: m for seq, m in by_seq.items() if seq not in in_segment}
-        assert list(self.store.repairs.recovered) == [known.label]
+        assert list(self.store.repairs.recovered) == [known.name]
         survivors |= {seq: by_seq[seq] for n in whole for seq in arrivals[n]}
         for chunk in torn:
             # Its arrival numbers are lost: it arrived after all else, in its own order.
@@ -780,7 +735,7 @@ class Machine(RuleBasedStateMachine):
             for seq, old in zip(new, arrivals[chunk], strict=True):
                 survivors[seq] = replace(by_seq[old], seq=seq)
         if number == 0 and laid.described > cut:
-            assert known.label not in self.store.directory.labels()
+            assert recording not in self.store.directory.ids()
             del self.model[recording]
             return
         known.messages = list(survivors.values())
@@ -794,18 +749,14 @@ class Machine(RuleBasedStateMachine):
         """A mark is there, or it is not; its recording is what it was."""
         recording = self.chosen(which, has_late_mark)
         known = self.model[recording]
-        number, path = self.store.directory.segments(known.label)[-1]
+        number, path = self.store.directory.segments(recording)[-1]
         content = path.read_bytes()
         last = max(known.messages, key=lambda m: m.seq)
         assert last.topic == MARKS
         self.store.close()
         if not is_listed:
             content = content[: len(content) * spot // SPOTS]
-            journal = path.with_name("journal")
-            lines = journal.read_bytes().splitlines(keepends=True)
-            left = [line for line in lines if not is_of_mark(line, number)]
-            assert len(left) < len(lines)
-            journal.write_bytes(b"".join(left))
+            change_manifest(path.parent, number)
             known.messages.remove(last)
             known.mark_segments -= 1
             if known.marks:
@@ -845,7 +796,7 @@ class Machine(RuleBasedStateMachine):
         self.changed = False
         entries = {r.id: r for r in self.store.recordings()}
         assert set(entries) == set(self.model)
-        assert {k.label for k in self.model.values()} == set(self.store.directory.labels())
+        assert self.model.keys() == set(self.store.directory.ids())
         findings: Counter[tuple[str, str]] = Counter()
         for name, known in self.model.items():
             entry = entries[name]
@@ -865,11 +816,11 @@ class Machine(RuleBasedStateMachine):
         able = [name for name, known in self.model.items() if fits(known)]
         return able[which % len(able)]
 
-    def free_label(self, base: str, *, but: str = "") -> str:
-        """The label that a recording gets whose name makes this one."""
-        taken = {known.label for known in self.model.values()} - {but}
-        labels = (base if n == 1 else f"{base}-{n}" for n in count(1))
-        return next(label for label in labels if label not in taken)
+    def free_name(self, base: str, *, but: str = "") -> str:
+        """The name that a recording gets for which this one is wanted."""
+        taken = {known.name for known in self.model.values()} - {but}
+        names = (base if n == 1 else f"{base}-{n}" for n in count(1))
+        return next(name for name in names if name not in taken)
 
     def open_again(self) -> None:
         self.store.close()
@@ -879,7 +830,7 @@ class Machine(RuleBasedStateMachine):
 def compare(entry: RecordingEntry, known: Recording) -> None:
     """Hold what the store says of a recording against the model."""
     assert entry.messages == len(known.messages)
-    assert (entry.name, entry.label, entry.tags) == (known.name, known.label, known.tags)
+    assert (entry.name, entry.tags) == (known.name, known.tags)
     assert [note["text"] for note in entry.notes] == known.notes
     assert [(mark["time"], mark["text"]) for mark in entry.marks] == known.marks
     times = [m.log_time for m in known.messages]
@@ -918,24 +869,15 @@ def has_late_mark(known: Recording) -> bool:
     return bool(known.mark_segments) and not known.lost and known.status != "unproven"
 
 
-def is_of_the_end(line: bytes, number: int, *, sealed: bool) -> bool:
-    """Whether a line of a journal is written when a recording ends with a segment."""
-    told = journal_line(line)
-    ends = told["event"] == "ended"
-    return ends or (sealed and told["event"] == "sealed" and told["segment"] == number)
+def change_manifest(folder: Path, without: int | None, **values: Any) -> None:
+    """As it was before a segment was listed, with its mark if it is one's."""
 
+    def how(now: Manifest) -> Manifest:
+        files = tuple(one for one in now.files if one.number != without)
+        marks = tuple(one for one in now.marks if one.segment != without or without is None)
+        return changed(now, files=files, marks=marks, **values)
 
-def is_of_mark(line: bytes, number: int) -> bool:
-    """Whether a line of a journal is about the segment of a mark."""
-    told = journal_line(line)
-    return told["event"] in {"sealed", "marked"} and told["segment"] == number
-
-
-def journal_line(line: bytes) -> dict[str, Any]:
-    crc, text = line.rstrip(b"\n").split(b" ", 1)
-    assert int(crc, 16) == zlib.crc32(text)
-    told: dict[str, Any] = json.loads(text)
-    return told
+    change_in(folder, how)
 
 
 def _exactly(topic: str) -> str:
@@ -1114,7 +1056,7 @@ class Index:
         self, database: pymongo.database.Database[dict[str, Any]], recording: str, number: int
     ) -> None:
         self._db = database
-        self._key = recording[:16]
+        self._key = recording[-16:]
         self._number = number
         names = database.list_collection_names()
         self._topics = [database[name] for name in names if not name.startswith("hybridlog.")]
@@ -1187,11 +1129,9 @@ def test_whatever_happens_happens(machine: type[Machine], is_bag: bool) -> None:
         lambda: model.crash(0, 0, "sealed", **again),  # type: ignore[arg-type]
         lambda: model.tag(0, {"kind": "$x"}, untagged=False),
         lambda: model.note(1, "it rained"),
-        lambda: model.move_the_directory(1, "moved"),
-        lambda: model.copy_the_directory(1, "aaa", loses=True, first=True),
-        lambda: model.copy_the_directory(0, "zzz", loses=False, first=True),
         model.lose_the_database,
-        lambda: model.lose_a_journal(0),
+        lambda: model.lose_a_manifest(0, has_old=True),
+        lambda: model.lose_a_manifest(0, has_old=False),
         lambda: model.mark(0, 7, "hit"),
         lambda: model.lose_a_segment(0, 9, reopened=True),
         lambda: model.lose_the_catalog("row", 1),

@@ -16,6 +16,7 @@ from hybridlog_storage.catalog import CATALOG
 from hybridlog_storage.errors import TopicError
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.mongo.collection_names import collection_of
+from tests import places
 from tests.calls import Calls
 from tests.cli.running import run
 from tests.copies import bring
@@ -86,7 +87,7 @@ def test_every_rebuild_keeps_it(store: hl.Store) -> None:
         (entry,) = again.recordings()
         assert [c.topic for c in entry.channels if not c.is_indexed] == LEFT_OUT
         index = StoreIndex(again.directory, again.catalog, again.connect())
-        assert index.catch_up(entry.label) == 0
+        assert index.catch_up(entry.id) == 0
 
 
 def test_what_has_no_documents_is_not_missing_among_those_of_others(
@@ -98,7 +99,7 @@ def test_what_has_no_documents_is_not_missing_among_those_of_others(
         store.record(log, name="part", again=True, no_index=matcher(["re:.*signal[23]"]))
         indexed = calls(StoreIndex, "catch_up")
         store.index.rebuild()
-        assert sorted(label for _, label in indexed) == ["part", "whole"]
+        assert sorted(one for _, one in indexed) == sorted(one.id for one in store.recordings())
         assert store.verify().findings == []
 
 
@@ -117,7 +118,7 @@ def test_documents_that_should_not_be_there_are_found(store: hl.Store) -> None:
 
 @pytest.mark.mongo("embedded")
 def test_copies_and_other_readers(store: hl.Store, tmp_path: Path) -> None:
-    (segment,) = (store.directory.path / "recordings" / "log").glob("*.mcap")
+    (segment,) = places.folder(store.directory.path, "log").glob("*.mcap")
     with segment.open("rb") as file:
         channels = make_reader(file).get_summary().channels.values()  # type: ignore[union-attr]
     marked = {c.topic for c in channels if c.metadata.get("hybridlog.no_index") == "1"}

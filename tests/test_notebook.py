@@ -156,12 +156,12 @@ def test_representations_are_short(store: hl.Store) -> None:
     path = store.directory.path
     assert repr(store) == f"<Store {path}>"
     (entry,) = store.recordings()
-    assert repr(store.recordings()) == f"<Recordings {entry.label}>"
-    assert repr(entry) == f"<Recording {entry.label}; 6 channels, 6 messages>"
+    assert repr(store.recordings()) == f"<Recordings {entry.name}>"
+    assert repr(entry) == f"<Recording {entry.name}; 6 channels, 6 messages>"
     assert repr(entry.channels[1]) == "<Channel /many ; 1 messages>"
     query = store.topic("/many").between("+0s", "end").where("f1 > 0").limit(3)
     assert repr(query) == (
-        f"<Query /many; recording {entry.label}; between +0s and end; where f1 > 0; at most 3>"
+        f"<Query /many; recording {entry.name}; between +0s and end; where f1 > 0; at most 3>"
     )
     assert "at most 3" in Parsed(query._repr_html_()).text
     wide = store.all_topics().where(" or ".join(f"f{n} > {n}" for n in range(40)))

@@ -413,7 +413,7 @@ def test_ties_are_broken_by_recording_and_arrival(ties: hl.Store) -> None:
 def test_tables_have_the_order_of_iteration(ties: hl.Store) -> None:
     one, both = ties.topic("/x"), ties.topic("/x", "/y")
     for query in (one, both, one.reverse(), both.every(3), one.limit(7).reverse()):
-        want = [(m.log_time_ns, ties.entry(m.recording).label, m.fields["n"]) for m in query]
+        want = [(m.log_time_ns, ties.entry(m.recording).name, m.fields["n"]) for m in query]
         frame = query.to_pandas()
         assert list(zip(frame.index.astype("int64"), frame["who"], frame["n"], strict=True)) == want
 

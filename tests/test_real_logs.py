@@ -16,7 +16,7 @@ from mcap.writer import Writer
 
 import hybridlog as hl
 from hybridlog_storage.errors import AlreadyRecordedError, SourceError
-from tests import independent
+from tests import independent, places
 from tests.data import DATA, needs_data
 
 pytestmark = [needs_data, pytest.mark.mongo]
@@ -123,10 +123,10 @@ def test_damaged_logs_give_what_can_be_read(store: hl.Store, name: str) -> None:
 
 @pytest.mark.parametrize("name", ["odd/empty-file.bag", "damaged/magic_only.bag", "CATALOGUE.md"])
 def test_what_is_no_log_leaves_nothing(store: hl.Store, name: str) -> None:
-    before = store.directory.labels()
+    before = store.directory.ids()
     with pytest.raises(SourceError, match=Path(name).name):
         store.record(DATA / name)
-    assert store.directory.labels() == before
+    assert store.directory.ids() == before
 
 
 def test_the_same_file_is_noticed(store: hl.Store) -> None:
@@ -137,14 +137,14 @@ def test_the_same_file_is_noticed(store: hl.Store) -> None:
     report = store.record(DATA / "real/tilt_laser.bag", again=True, name="twice")
     assert report.entry.messages == 4093
     store.remove("twice")
-    assert "twice" not in store.directory.labels()
+    assert "twice" not in {one.name for one in store.summaries()}
 
 
 def test_segments_pass_the_official_readers(store: hl.Store) -> None:
-    assert sorted(r.label for r in store.recordings()) == store.directory.labels()
+    assert sorted(r.id for r in store.recordings()) == store.directory.ids()
     for entry in store.recordings():
         counted = 0
-        for _, path in store.directory.segments(entry.label):
+        for _, path in store.directory.segments(entry.id):
             data = path.read_bytes()
             list(StreamReader(io.BytesIO(data), validate_crcs=True).records)
             reader = make_reader(io.BytesIO(data), validate_crcs=True)
@@ -164,7 +164,7 @@ def dump(store: hl.Store) -> dict[str, list[bytes]]:
     for name in ("hybridlog.recordings", "hybridlog.store"):
         documents = [bson.decode(document) for document in found[name]]
         found[name] = [
-            bson.encode({**d, "index": {**d["index"], "turn": 0}} if "label" in d else d)
+            bson.encode({**d, "index": {**d["index"], "turn": 0}} if d["_id"] != "store" else d)
             for d in documents
             if d["_id"] != "turn"
         ]
@@ -192,14 +192,14 @@ def test_verify_finds_nothing_and_reindex_changes_nothing(store: hl.Store) -> No
 def test_segments_are_hardly_larger_than_a_plain_mcap_file(name: str, tmp_path: Path) -> None:
     """One that the `mcap` package writes with its defaults: chunks of 1 MiB, zstd."""
     with hl.open(tmp_path / "store", create=True) as store:
-        label = store.record(DATA / name).entry.label
+        label = store.record(DATA / name).entry.name
     plain = io.BytesIO()
     writer = Writer(plain)
     writer.start()
     channels: dict[int, int] = {}
     schemas: dict[int, int] = {0: 0}
     size = 0
-    for path in sorted((tmp_path / "store" / "recordings" / label).glob("*.mcap")):
+    for path in sorted(places.folder(tmp_path / "store", label).glob("*.mcap")):
         size += path.stat().st_size
         with path.open("rb") as file:
             for schema, channel, message in make_reader(file).iter_messages():

@@ -10,9 +10,12 @@ from pathlib import Path
 import pytest
 
 import hybridlog as hl
-from hybridlog_storage import journal
 from hybridlog_storage.errors import SegmentError
+from hybridlog_storage.manifest import replace
+from hybridlog_storage.manifests import MANIFEST, MANIFEST_OLD, change_in, read_in, write_in
+from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests import places
 from tests.cli.within import answer
 from tests.test_identity import COUNT, make_log, payload
 
@@ -61,13 +64,13 @@ def repair(store: Path) -> dict[tuple[str, str], bool]:
 
 
 def file(store: Path, number: int) -> Path:
-    return store / "recordings" / "one" / f"{number:06d}.mcap"
+    return places.segment(store, "one", number)
 
 
 def test_a_store_that_is_whole(store: Path) -> None:
-    before = {p: p.read_bytes() for p in (store / "recordings").rglob("*") if p.is_file()}
+    before = {p: p.read_bytes() for p in places.root(store).rglob("*") if p.is_file()}
     assert repair(store) == {}
-    assert {p: p.read_bytes() for p in (store / "recordings").rglob("*") if p.is_file()} == before
+    assert {p: p.read_bytes() for p in places.root(store).rglob("*") if p.is_file()} == before
     assert look(store) == ("complete", COUNT, 0)
 
 
@@ -97,7 +100,7 @@ def cut_the_summary(store: Path) -> None:
 
 @pytest.mark.parametrize("fault", [exchange, turn_around, flip_the_summary, cut_the_summary])
 def test_what_can_be_proven_is_put_right(store: Path, fault: Callable[[Path], None]) -> None:
-    names = sorted(p.name for p in (store / "recordings" / "one").iterdir())
+    names = sorted(p.name for p in places.folder(store, "one").iterdir())
     whole = {n: file(store, n).read_bytes() for n in range(4)}
     fault(store)
     status, messages, lost = look(store)
@@ -107,7 +110,7 @@ def test_what_can_be_proven_is_put_right(store: Path, fault: Callable[[Path], No
     assert done
     assert all(done.values())
     assert {n: file(store, n).read_bytes() for n in range(4)} == whole
-    assert sorted(p.name for p in (store / "recordings" / "one").iterdir()) == names
+    assert sorted(p.name for p in places.folder(store, "one").iterdir()) == names
     assert look(store) == ("complete", COUNT, 0)
 
 
@@ -154,7 +157,7 @@ def test_a_missing_segment_is_said_again_and_again(store: Path) -> None:
 
 
 def test_a_segment_of_another_recording_is_not_believed(store: Path) -> None:
-    shutil.copy(store / "recordings" / "two" / "000001.mcap", file(store, 1))
+    shutil.copy(places.segment(store, "two", 1), file(store, 1))
     assert repair(store) == {("one", "000001.mcap"): False}
     status, messages, lost = look(store)
     assert (status, messages + lost) == ("damaged", COUNT)
@@ -167,57 +170,89 @@ def test_a_duplicate_is_told_and_the_original_answers(store: Path) -> None:
     assert look(store) == ("complete", COUNT, 0)
 
 
-def test_a_journal_with_a_damaged_line_is_written_again(store: Path) -> None:
-    path = store / "recordings" / "one" / "journal"
-    data = bytearray(path.read_bytes())
-    second = data.index(b"\n") + 30
-    data[second] ^= 1
-    path.write_bytes(data)
+def test_what_a_kill_has_left_is_sealed_before_its_manifest_is_made(store: Path) -> None:
+    folder = places.folder(store, "one")
+    for segment in [*folder.glob("*.mcap")]:
+        segment.rename(segment.with_name(f"{segment.name}.open"))
+    (folder / MANIFEST).write_bytes(b"")
+    (folder / MANIFEST_OLD).unlink()
+    assert repair(store) == {("one", "manifest"): True}
     assert look(store) == ("unproven", COUNT, 0)
-    assert repair(store) == {("one", "journal"): True}
-    assert look(store) == ("unproven", COUNT, 0)  # nobody can prove what the line said
-    assert path.with_name("journal.old").read_bytes() == data
-    state = journal.read(path.parent)
-    assert state is not None
-    assert not state.damaged
+
+
+@pytest.mark.parametrize("has_old", [True, False])
+@pytest.mark.parametrize("harm", ["gone", "flipped", "cut", "empty"])
+def test_a_manifest_is_made_again_when_it_is_asked_for(
+    store: Path, harm: str, has_old: bool
+) -> None:
+    folder = places.folder(store, "one")
+    with closing(hl.open(store, mongo=NOWHERE)) as opened:
+        opened.edit("one", tag={"place": "lab"})
+        opened.edit("one", note="wind")
+    path = folder / MANIFEST
+    data = path.read_bytes()
+    if harm == "gone":
+        path.unlink()
+    else:
+        flipped = data[:20] + bytes([data[20] ^ 1]) + data[21:]
+        path.write_bytes({"cut": data[:-2], "flipped": flipped, "empty": b""}[harm])
+    if not has_old:
+        (folder / MANIFEST_OLD).unlink()
+    before = sorted(p.name for p in folder.iterdir())
+    with closing(hl.open(store, mongo=NOWHERE)) as opened:
+        (reason,) = opened.repairs.unreadable.values()
+        assert "`hybridlog verify --repair` makes it again" in reason
+        assert [entry.name for entry in opened.recordings()] == ["two"]
+        assert opened.topic("/n").count() == COUNT
+        assert opened.topic("/n").completeness().has_losses
+        assert not opened.topic("/n").in_recording("two").completeness().has_losses
+        assert "manifest" in {one.place for one in opened.verify().findings}
+    assert sorted(p.name for p in folder.iterdir()) == before
+    assert repair(store) == {("one", "manifest"): True}
+    assert look(store) == ("unproven", COUNT, 0)
+    with closing(hl.open(store, mongo=NOWHERE)) as opened:
+        assert opened.entry("one").tags == ({"place": "lab"} if has_old else {})
+        (finding,) = opened.verify().findings
+        assert (finding.recording, finding.place) == ("one", "manifest")
     # What is lost from now on is seen.
     file(store, 3).unlink()
     status, messages, lost = look(store)
     assert (status, messages + lost) == ("damaged", COUNT)
 
 
-def test_a_line_that_was_cut_short_is_cut_off(store: Path) -> None:
-    path = store / "recordings" / "one" / "journal"
-    data = path.read_bytes()
-    path.write_bytes(data + b"12345678 {half of a li")
+def test_a_manifest_that_is_made_again_takes_no_name_of_another(store: Path) -> None:
+    folder = places.folder(store, "one")
+    with closing(hl.open(store, mongo="none")) as opened:
+        opened.edit("one", name="first")
+        with opened.start("one") as recording:
+            recording.write(Channel("/m", "json", None), b"{}", log_time=1)
+    (folder / MANIFEST).unlink()
+    (folder / MANIFEST_OLD).unlink()
+    answer("verify", "--repair", "--mongo", "none", store=store, code=None)
+    assert places.name_of(folder) == "one-2"
+
+
+def test_a_recording_without_a_manifest_is_named(store: Path) -> None:
+    (places.folder(store, "one") / MANIFEST).unlink()
+    recording = places.id_of(store, "one")
+    options = ("--mongo", "none")
+    for command in (("ls",), ("fetch", "-t", "/n", "--count"), ("verify",)):
+        said = answer(*command, *options, store=store, code=None)
+        assert recording in said.out + said.err, command
+        assert "manifest" in said.out + said.err, command
+    assert file(store, 0).exists()
+
+
+def test_segments_that_the_manifest_does_not_list(store: Path) -> None:
+    """The manifest is an older one, from a backup."""
+    folder = places.folder(store, "one")
+    change_in(folder, lambda now: replace(now, files=tuple(f for f in now.files if f.number != 3)))
+    assert read_in(folder).logs.keys().isdisjoint({3})  # type: ignore[union-attr]
     assert look(store) == ("complete", COUNT, 0)
-    repair(store)
-    assert path.read_bytes() == data
-
-
-def test_segments_that_the_journal_does_not_list(store: Path) -> None:
-    """The journal is an older one, from a backup."""
-    path = store / "recordings" / "one" / "journal"
-    lines = path.read_bytes().splitlines(keepends=True)
-    path.write_bytes(b"".join(line for line in lines if b'"segment":3' not in line))
-    assert look(store) == ("unproven", COUNT, 0)
-    assert repair(store) == {("one", "000003.mcap"): True}
-    assert look(store) == ("unproven", COUNT, 0)
+    # The opening has listed it.
+    assert 3 in read_in(folder).logs  # type: ignore[union-attr]
+    assert repair(store) == {}
     file(store, 3).unlink()
-    status, messages, lost = look(store)
-    assert (status, messages + lost) == ("damaged", COUNT)
-
-
-def test_a_journal_that_is_gone_is_written_again_unasked(store: Path) -> None:
-    path = store / "recordings" / "one" / "journal"
-    path.unlink()
-    with closing(hl.open(store, mongo=NOWHERE)) as opened:
-        assert opened.repairs.journals == ["one"]
-        (finding,) = opened.verify().findings
-        assert (finding.recording, finding.place) == ("one", "journal")
-    assert path.exists()
-    assert look(store) == ("unproven", COUNT, 0)
-    file(store, 0).unlink()
     status, messages, lost = look(store)
     assert (status, messages + lost) == ("damaged", COUNT)
 
@@ -248,20 +283,17 @@ def test_a_segment_that_was_restored_is_answered_from_again(store: Path) -> None
 
 def test_a_recording_without_its_end_gets_one(store: Path) -> None:
     """The crash came between two segments."""
-    path = store / "recordings" / "one" / "journal"
-    lines = path.read_bytes().splitlines(keepends=True)
-    path.write_bytes(b"".join(line for line in lines if b'"ended"' not in line))
-    status, messages, lost = look(store)
-    assert (messages, lost) == (COUNT, 0)
-    state = journal.read(path.parent)
-    assert state is not None
-    assert state.end is not None  # the last segment says it
-    assert status == state.end["status"] == "complete"
+    folder = places.folder(store, "one")
+    manifest = read_in(folder)
+    assert manifest is not None
+    write_in(folder, replace(manifest, status="open"))
+    assert look(store) == ("complete", COUNT, 0)  # the last segment says it
+    assert read_in(folder).status == "complete"  # type: ignore[union-attr]
 
 
 def test_a_mark_beside_a_lost_segment_takes_nothing_of_it(store: Path) -> None:
     """The segment comes back from a copy: its number and its arrival numbers are still its own."""
-    last = max((store / "recordings" / "one").glob("*.mcap"))
+    last = max(places.folder(store, "one").glob("*.mcap"))
     whole = last.read_bytes()
     last.unlink()
     with closing(hl.open(store, mongo=NOWHERE)) as opened:

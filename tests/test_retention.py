@@ -9,22 +9,11 @@ from typing import Any
 import pytest
 
 import hybridlog as hl
+from hybridlog.maintenance.keep import pin_of
 from hybridlog.maintenance.retention import Held, Plan, Rules, held_of, plan
 from hybridlog.record.capture import remote_segment_size
 from hybridlog_storage.errors import UsageError
-from hybridlog_storage.journal import (
-    BEGUN,
-    ENDED,
-    PINNED,
-    RETAINED,
-    SEALED,
-    TAGGED,
-    UNPINNED,
-    JournalState,
-    encode,
-    event,
-    parse,
-)
+from hybridlog_storage.manifest import Channel, File, Manifest, Part
 
 DAY = 86_400 * 10**9
 NOW = 20_000 * DAY  # 2024
@@ -32,41 +21,33 @@ MB = 10**6
 CAMERA, SCAN = "/camera/front", "/scan"
 
 
-def sealed(number: int, age: float, **other: Any) -> dict[str, Any]:
-    """A segment of 10 MB, 8 of them of a camera, that was written so many days ago."""
+def sealed(number: int, age: float, last: int | None = None, **other: Any) -> File:
+    """A segment of 10 MB, 8 of them of a camera, that was written so many days ago.
+
+    Args:
+        number: Its number.
+        age: Days.
+        last: Log time of all its messages; None for the day before it was written.
+        other: Further attributes.
+    """
     at = NOW - round(age * DAY)
-    channels = [
-        {"id": n, "topic": t, "messages": 9, "payload_bytes": b, "first": at - DAY, "last": at - 1}
-        for n, (t, b) in enumerate(((CAMERA, 8 * MB), (SCAN, 2 * MB)))
-    ]
-    values = {
-        "segment": number,
-        "file": f"{number:06d}.mcap",
-        "bytes": 10 * MB,
-        "digest": "sha256:a",
-        "channels": channels,
-    }
-    return {**event(SEALED, **{**values, **other}), "at": at}
+    span = (at - DAY, at - 1) if last is None else (last, last)
+    parts = {n: Part(9, size, *span) for n, size in enumerate((8 * MB, 2 * MB))}
+    name, digest = f"{number:06d}.mcap", f"sha256:{number:064x}"
+    return File(number, number, name, "log", 10 * MB, digest, at, *span, parts, **other)
 
 
-def state_of(name: str, *lines: Mapping[str, Any], ended: bool = True) -> JournalState:
-    begun = event(
-        BEGUN,
-        id=f"{sum(name.encode()):032x}",
-        store="5" * 32,
-        name=name,
-        tags={},
-        source={"path": "", "kind": "", "bytes": 0},
-        created=NOW - 400 * DAY,
+def held(name: str, *files: File, ended: bool = True, **values: Any) -> Held:
+    manifest = Manifest(
+        f"{name}-{sum(name.encode()):016x}",
+        name,
+        NOW - 400 * DAY,
+        status="complete" if ended else "open",
+        channels={0: Channel(CAMERA), 1: Channel(SCAN)},
+        files=files,
+        **values,
     )
-    end = [event(ENDED, end={"status": "complete", "losses": []})] if ended else []
-    state = parse(b"".join(map(encode, [begun, *lines, *end])))
-    assert not state.damaged
-    return state
-
-
-def held(name: str, *lines: Mapping[str, Any], ended: bool = True) -> Held:
-    return held_of(name, state_of(name, *lines, ended=ended), NOW)
+    return held_of(manifest, NOW)
 
 
 def made(rules: Mapping[str, Any], *recordings: Held, used: float = 0, free: float = 1e12) -> Plan:
@@ -137,18 +118,12 @@ def test_topics_go_in_the_order_of_their_rules() -> None:
 
 
 def test_what_went_does_not_go_again() -> None:
-    once = held(
-        "old",
-        sealed(0, 50),
-        sealed(1, 40),
-        event(RETAINED, segments=[0]),
-        event(RETAINED, segments=[1], topics=[CAMERA]),
-    )
+    once = held("old", sealed(0, 50, retained=None), sealed(1, 40, retained=(CAMERA,)))
     assert told(made({"topic": {CAMERA: "7d"}}, once)) == []
     found = made({"max-age": "30d"}, once)
     assert told(found) == [("old", (1,), (), "older than 30d")]
     # All topics of a segment are gone, and what shared chunks with others is left.
-    both = held("old", sealed(1, 40), event(RETAINED, segments=[1], topics=[CAMERA, SCAN]))
+    both = held("old", sealed(1, 40, retained=(CAMERA, SCAN)))
     assert told(made({"max-age": "30d"}, both)) == [("old", (1,), (), "older than 30d")]
 
 
@@ -161,26 +136,29 @@ def test_all_topics_of_a_segment_are_the_segment() -> None:
     ("pin", "whole", "topics"),
     [
         ({}, [], []),
-        ({"from": NOW - 41 * DAY, "to": NOW - 40 * DAY}, [0, 2], [0, 2]),
+        ({"span": (NOW - 41 * DAY, NOW - 40 * DAY)}, [0, 2], [0, 2]),
         # Half-open: it ends where the second segment begins.
-        ({"to": NOW - 41 * DAY}, [1, 2], [1, 2]),
-        ({"from": NOW - 40 * DAY}, [0, 1], [0, 1]),
+        ({"span": (None, NOW - 41 * DAY)}, [1, 2], [1, 2]),
+        ({"span": (NOW - 40 * DAY, None)}, [0, 1], [0, 1]),
         ({"topics": [SCAN]}, [], [0, 1, 2]),
-        ({"topics": [CAMERA], "from": NOW - 30 * DAY}, [0, 1], [0, 1]),
+        ({"topics": [CAMERA], "span": (NOW - 30 * DAY, None)}, [0, 1], [0, 1]),
         ({"topics": ["/other"]}, [0, 1, 2], [0, 1, 2]),
     ],
 )
 def test_what_a_pin_touches_never_goes(
     pin: dict[str, Any], whole: list[int], topics: list[int]
 ) -> None:
-    lines = sealed(0, 50), sealed(1, 40), sealed(2, 20), event(PINNED, id="a", reason="", **pin)
+    files = sealed(0, 50), sealed(1, 40), sealed(2, 20)
+    pins = (pin_of("a", pin.get("span", (None, None)), pin.get("topics"), ""),)
     for rules, left in (({"max-age": "1d"}, whole), ({"topic": {CAMERA: "1d"}}, topics)):
-        found = made({**rules, "quota": "1MB", "fields-age": "10d"}, held("r", *lines), used=1e9)
+        found = made(
+            {**rules, "quota": "1MB", "fields-age": "10d"}, held("r", *files, pins=pins), used=1e9
+        )
         assert [n for one in found.steps for n in one.segments if not one.topics] == whole
         assert {n for one in found.steps for n in one.segments} == {*left}
     assert found.pins == 1
     assert found.is_short
-    without = held("r", *lines, event(UNPINNED, id="a"))
+    without = held("r", *files)
     assert [one.segments for one in made({"max-age": "1d"}, without).steps] == [(0, 1, 2)]
 
 
@@ -190,7 +168,7 @@ def test_nothing_pinned_is_no_reason() -> None:
 
 
 def test_a_tag_keeps_a_recording_and_is_told_like_pins() -> None:
-    tagged = held("old", sealed(0, 50), event(TAGGED, key="keep", value="yes"))
+    tagged = held("old", sealed(0, 50), tags={"keep": "yes"})
     for tag in ("keep=yes", "keep"):
         rules = {"max-age": "1d", "fields-age": "1d", "quota": "10MB", "never-tag": [tag]}
         found = made(rules, tagged, NEW, used=20 * MB)
@@ -232,14 +210,13 @@ def test_fields_go_with_their_recording() -> None:
     ],
 )
 def test_ages_in_spite_of_clocks(ages: list[int], last: int | None, old: list[int]) -> None:
-    lines = [sealed(number, age) for number, age in enumerate(ages)]
+    files = [sealed(number, age) for number, age in enumerate(ages)]
     if last is not None:
-        for channel in lines[0]["channels"]:
-            channel["first"] = channel["last"] = NOW + last * DAY
-    found = made({"max-age": "30d"}, held("r", *lines))
+        files[0] = sealed(0, ages[0], NOW + last * DAY)
+    found = made({"max-age": "30d"}, held("r", *files))
     assert [n for one in found.steps for n in one.segments] == old
     # By room they go all the same, in their order.
-    room = made({"quota": "1MB"}, held("r", *lines), used=1e9)
+    room = made({"quota": "1MB"}, held("r", *files), used=1e9)
     assert [n for one in room.steps for n in one.segments] == [*range(len(ages))]
 
 

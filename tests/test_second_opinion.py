@@ -109,7 +109,7 @@ def test_another_reader_sees_the_same_messages(store: hl.Store, reader: Path) ->
     # Which segment a message lies in, the index says.
     ours: dict[Path, list[hl.Message]] = defaultdict(list)
     for entry in store.recordings():
-        paths = dict(store.directory.segments(entry.label))
+        paths = dict(store.directory.segments(entry.id))
         for number, path in paths.items():
             ours[path] = []
             topics = sorted({c.topic for c in entry.channels})
@@ -142,7 +142,7 @@ def test_another_reader_refuses_what_was_altered(
 ) -> None:
     """The test above can fail: a flipped bit in a chunk is no match."""
     entry = next(r for r in store.recordings() if r.name == "none")
-    _, path = store.directory.segments(entry.label)[0]
+    _, path = store.directory.segments(entry.id)[0]
     data = bytearray(path.read_bytes())
     data[chunk_entries(store.catalog, entry)[0].offset + 200] ^= 4
     altered = tmp_path / "altered.mcap"

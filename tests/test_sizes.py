@@ -17,6 +17,7 @@ from hybridlog_storage.catalog import Catalog
 from hybridlog_storage.mongo import topic_places
 from hybridlog_storage.mongo.database import CollectionStats, Database
 from hybridlog_storage.mongo.topic_places import SHARED
+from tests import places
 from tests.calls import Calls
 from tests.cli.running import run
 from tests.many_topics import BASE
@@ -83,7 +84,7 @@ def test_sums_are_those_of_the_files(store: hl.Store) -> None:
     sizes, root = store.sizes(), store.directory.path
     for row in sizes.by_recording():
         entry = store.entry(row.recording)
-        segments = (root / "recordings" / row.recording).glob("*.mcap")
+        segments = places.folder(root, row.recording).glob("*.mcap")
         assert row.segment_bytes == entry.stored_bytes == sum(p.stat().st_size for p in segments)
         assert row.table_bytes > 0
         assert row.messages == entry.messages

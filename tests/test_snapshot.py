@@ -16,9 +16,9 @@ from mcap.writer import Writer
 import hybridlog as hl
 from hybridlog.maintenance.opening import StoreFiles
 from hybridlog.snapshot import Snapshot
-from hybridlog_storage import journal
 from hybridlog_storage.errors import TopicError
-from hybridlog_storage.journal import Journal
+from hybridlog_storage.manifest import replace
+from hybridlog_storage.manifests import change_in
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.summary import (
     RecordingSummary,
@@ -26,6 +26,7 @@ from hybridlog_storage.summary import (
     hash_of,
     topics_to_json,
 )
+from tests import places
 from tests.calls import Calls
 from tests.limits import Limit
 
@@ -39,9 +40,8 @@ def topics_of(text: str) -> tuple[TopicType, ...]:
 def summary(number: int, span: tuple[int, int] | None, topics: list[str], **other: Any) -> Any:
     kinds = topics_to_json(TopicType(topic, "json", "") for topic in topics)
     values: dict[str, Any] = {
-        "id": f"{number:032x}",
-        "label": f"r{number}",
-        "name": f"run {number % 3}",
+        "id": f"20261128-run-{number:016x}",
+        "name": f"r{number}",
         "tags": {},
         "source": {},
         "created": 0,
@@ -85,18 +85,18 @@ def test_recordings_are_chosen_by_topic_and_time(
         range(len(found)),
         key=lambda n: (found[n][0] is None, found[n][0] or (0, 0), f"r{n}"),
     )
-    assert [one.label for one in snapshot.summaries] == [f"r{n}" for n in order]
+    assert [one.name for one in snapshot.summaries] == [f"r{n}" for n in order]
     assert snapshot.topics == sorted({topic for _, held in found for topic in held})
     having = snapshot.having(topics)
     wanted = [n for n in order if set(found[n][1]) & set(topics)]
-    assert [snapshot.summaries[place].label for place in having] == [f"r{n}" for n in wanted]
+    assert [snapshot.summaries[place].name for place in having] == [f"r{n}" for n in wanted]
     inside = [
         n
         for n in wanted
         if (span := found[n][0]) is not None and begin < end and span[0] < end and span[1] >= begin
     ]
     between = snapshot.between(having, begin, end)
-    assert [snapshot.summaries[place].label for place in between] == [f"r{n}" for n in inside]
+    assert [snapshot.summaries[place].name for place in between] == [f"r{n}" for n in inside]
     examples = snapshot.differing(having)
     assert {frozenset(snapshot.topics_of(one)) for one in examples} == {
         frozenset(found[n][1]) for n in wanted
@@ -104,20 +104,27 @@ def test_recordings_are_chosen_by_topic_and_time(
     assert len(examples) == len({frozenset(found[n][1]) for n in wanted})
 
 
-def test_a_name_means_a_label_before_all_else() -> None:
+def test_a_name_means_an_id_before_all_else() -> None:
+    one = f"20261128-run-{1:016x}"
     made = [
-        summary(1, (0, 1), ["/a"], label="x"),
-        summary(2, (1, 2), ["/a"], label="y", name="x"),
-        summary(3, (2, 3), ["/a"], label="yard", name="other"),
+        summary(1, (0, 1), ["/a"], name="x"),
+        summary(2, (1, 2), ["/a"], name="y"),
+        summary(3, (2, 3), ["/a"], name="yard"),
+        summary(4, (3, 4), ["/a"], name=one),
+        summary(5, (4, 5), ["/a"], name="yard"),
     ]
-    snapshot = Snapshot([one for one, _ in made], {made[0][0].topics: ()})
+    snapshot = Snapshot([each for each, _ in made], {made[0][0].topics: ()})
     assert snapshot.named("x") == [0]
-    assert snapshot.named("other") == [2]
-    assert snapshot.named("ya") == [2]
+    assert snapshot.named("ya") == [2, 4]
+    assert snapshot.named("yard") == [2, 4]
     assert snapshot.named("y") == [1]
-    assert snapshot.named(f"{2:032x}") == [1]
-    assert snapshot.named(f"{3:032x}"[:4]) == [0, 1, 2]
-    assert snapshot.named("no") == []
+    assert snapshot.named(one) == [0]
+    assert snapshot.named(f"{2:016x}") == [1]
+    assert snapshot.named("20261128-run") == [3]
+    assert snapshot.named("0000") == [0, 1, 2, 3, 4]
+    assert snapshot.named("000") == snapshot.named("no") == []
+    ids = [each.id for each in snapshot.summaries]
+    assert snapshot.ids_called() == {"x": ids[0], "y": ids[1]} | {each: each for each in ids}
 
 
 KINDS = st.lists(st.sampled_from(TOPICS), unique=True)
@@ -146,7 +153,7 @@ def test_a_recording_that_has_changed_is_as_if_it_had_been_so(
         columns = (snapshot.begin, snapshot.end, snapshot.is_open)
         having = {topic: snapshot.having([topic]).tolist() for topic in TOPICS}
         tags = {key: dict(values) for key, values in snapshot.tags.items()}
-        names = snapshot.by_id, snapshot.by_label, snapshot.topics_at(places[:1])
+        names = snapshot.by_id, snapshot.by_name, snapshot.topics_at(places[:1])
         held = [snapshot.topics_of(one) for one in snapshot.summaries]
         rows = [column.tolist() for column in columns]
         return snapshot.summaries, rows, having, tags, names, held, [*snapshot.summaries]
@@ -156,7 +163,7 @@ def test_a_recording_that_has_changed_is_as_if_it_had_been_so(
     known = {one.topics: kinds for one, kinds in all_made}
     before = Snapshot([one for one, _ in all_made], known)
     was = told(before)
-    now, kinds = made(place, change, **({"label": "other"} if is_renamed else {}))
+    now, kinds = made(place, change, **({"name": "other"} if is_renamed else {}))
     rest = [one for one, _ in all_made if one.id != now.id]
     used = {one.topics for one in rest}
     left = {digest: of for digest, of in known.items() if digest in used}
@@ -228,15 +235,15 @@ def test_messages_are_in_order_however_recordings_are_grouped(
     assert store.topic("/n").at(moment).log_time_ns == moment
 
 
-def test_a_journal_that_has_grown_is_read_at_the_opening(tmp_path: Path) -> None:
+def test_a_manifest_that_has_changed_is_read_at_the_opening(tmp_path: Path) -> None:
     """As by a process that was killed before it told the catalog."""
     with hl.open(tmp_path / "store", create=True) as store:
         with store.start("talk") as recording:
             recording.write(Channel("/n", "json", None), b"{}")
-        path = store.directory.recording("talk")
+        path = places.folder(store.directory.path, "talk")
         (before,) = store.summaries()
     assert before.tags == {}
-    Journal(path).append(journal.event(journal.TAGGED, key="place", value="hall"))
+    change_in(path, lambda now: replace(now, tags={"place": "hall"}))
     with hl.open(tmp_path / "store") as store:
         (now,) = store.summaries()
     assert now.tags == {"place": "hall"}
@@ -263,8 +270,7 @@ def test_topics_that_another_process_changes_meanwhile(
                 recording.write(Channel(f"/{name}", "json", None, {}), b"{}", log_time=10**18)
     with hl.open(path, mongo="none") as store, hl.open(path, mongo="none") as other:
         assert len(store.recordings()) == 2
-        lines = Journal(path / "recordings" / "b")
-        lines.append(journal.event(journal.TAGGED, key="seen", value="yes"))
+        change_in(places.folder(path, "b"), lambda now: replace(now, tags={"seen": "yes"}))
         ask = store.catalog.recording
 
         def asked(recording: str) -> Any:

@@ -144,7 +144,7 @@ def test_a_server_that_is_away_gets_its_index_later(bag: Path, tmp_path: Path) -
         store.connect()
         (entry,) = store.recordings()
         assert entry.is_decoded
-        assert store.repairs.indexed == {entry.label: entry.chunks}
+        assert store.repairs.indexed == {entry.name: entry.chunks}
         assert store.verify().findings == []
 
 
@@ -179,7 +179,7 @@ def test_a_store_is_adopted_where_mongodb_is(
     with hl.open(path, create=True, mongo=NONE) as store:
         for name in ("one", "two"):
             store.record(bag, name=name, again=True, settings=SMALL)
-        chunks = {entry.label: entry.chunks for entry in store.recordings()}
+        chunks = {entry.name: entry.chunks for entry in store.recordings()}
     read = WalkedSegment.chunks
     left = [chunks["one"] + chunks["two"] // 2]
 

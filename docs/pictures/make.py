@@ -37,7 +37,7 @@ def look(store: hl.Store, browser: str, output: Path) -> None:
     assert entry.span is not None
     near = next(iter(store.topic("scan").where("ranges.min < 0.5")))
     state = {
-        "recording": entry.label,
+        "recording": entry.name,
         "at": near.log_time_ns - entry.span[0],
         "ask": QUESTION,
     }

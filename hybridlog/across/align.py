@@ -192,7 +192,7 @@ class Aligned:
             for partner in partners:
                 partner.enter(recording, _end_of(resolved, self._clock))
             for times, table in self._base.tables(recording):
-                label = resolved.summary.label if several else None
+                name = resolved.summary.name if several else None
                 left = None if told is None else told - self.rows
                 for rows in _pieces(times, partners, left):
                     own = table.slice(rows.start, rows.stop - rows.start)
@@ -204,7 +204,7 @@ class Aligned:
                     else:
                         self._empty.clear()
                         self._empty.update(before)
-                    yield _side_by_side(own, label, beside)
+                    yield _side_by_side(own, name, beside)
                 given = given or bool(table.num_rows)
         if not given:
             empty = self._base.empty()
@@ -515,11 +515,11 @@ def _end_of(resolved: Resolved, clock: Clock) -> int | None:
     return resolved.bounds[1] if resolved.bounds is not None and clock == "log" else None
 
 
-def _side_by_side(table: pa.Table, label: str | None, parts: Sequence[pa.Table]) -> pa.Table:
+def _side_by_side(table: pa.Table, recording: str | None, parts: Sequence[pa.Table]) -> pa.Table:
     columns = dict(zip(table.column_names, table.columns, strict=True))
     found: dict[str, Any] = {TIME: columns.pop(TIME)}
-    if label is not None:
-        text = label.encode("utf-8", "replace").decode()
+    if recording is not None:
+        text = recording.encode("utf-8", "replace").decode()
         found[RECORDING] = pa.repeat(pa.scalar(text, pa.string()), table.num_rows)
     found |= columns
     for part in parts:

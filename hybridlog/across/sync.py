@@ -92,7 +92,7 @@ class Synced(Sequence[tuple["Message", ...]]):
         limit = None if tolerance is None else parse_duration(tolerance)
         snapshot = session.look()
         shared = [set(session.chosen(question).tolist()) for question in questions]
-        labels: list[str] = []
+        ids: list[str] = []
         found: list[list[_Found]] = []
         known = np.zeros((2, len(questions)), np.int64)  # messages, those with a time
         places = sorted(set.intersection(*shared))
@@ -104,12 +104,12 @@ class Synced(Sequence[tuple["Message", ...]]):
                 for q in questions
             ]
             rows = approximate_sets([column.time for column in columns], limit)
-            labels += [recording] * len(rows)
+            ids += [recording] * len(rows)
             found.append([column.take(rows[:, n]) for n, column in enumerate(columns)])
             known += [[len(c.log_time) for c in columns], [len(c.time) for c in columns]]
-        self.recordings = tuple(labels)
+        self.recordings = tuple(ids)
         left_out = [
-            _left_out(session, question, read, places, len(labels))
+            _left_out(session, question, read, places, len(ids))
             for question, read in zip(questions, known.T.tolist(), strict=True)
         ]
         self.left_out = tuple(messages for messages, _ in left_out)

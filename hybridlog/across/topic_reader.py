@@ -136,12 +136,12 @@ class TopicReader:
         is_near = (snapshot.begin[places] < snapshot.end[place]) & (
             snapshot.begin[place] < snapshot.end[places]
         )
-        labels = [snapshot.summaries[n].label for n in places[is_near].tolist()]
-        if not labels:
+        names = [snapshot.summaries[n].name for n in places[is_near].tolist()]
+        if not names:
             return "the messages are of other recordings"
         return (
             "the messages of that time are of other recordings "
-            f"({listed(labels, _MAX_NAMES)}), which --beside or across_recordings takes"
+            f"({listed(names, _MAX_NAMES)}), which --beside or across_recordings takes"
         )
 
     def lost(self, recording: str) -> NDArray[np.int64]:

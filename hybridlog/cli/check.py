@@ -68,7 +68,7 @@ def check_command(given: _Check) -> None:
         rules = Contract.read(contract)
         with given.opened(snapshot=True) as store:
             chosen = given.recordings_in(store)
-            results = [one for label in chosen.labels for one in store.judge(rules, label)]
+            results = [one for name in chosen.ids for one in store.judge(rules, name)]
         _show_verdict(results, len(chosen), given)
         return
     with answering(given) as asked:

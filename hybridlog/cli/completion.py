@@ -41,9 +41,10 @@ _STARTUP: Final = {
 
 
 def complete_recording(context: click.Context, _: click.Parameter, incomplete: str) -> list[str]:
-    """Labels of recordings that begin with what was typed."""
-    with _nothing_on_error():
-        return [i for i in _store(context).labels() if i.startswith(incomplete)]
+    """Names of recordings that begin with what was typed."""
+    with _nothing_on_error(), _opened(context) as session:
+        names = (one.name for one in session.look().summaries)
+        return [name for name in names if name.startswith(incomplete)]
     return []
 
 
@@ -70,11 +71,13 @@ def complete_type(context: click.Context, _: click.Parameter, incomplete: str) -
 
 
 def complete_running(context: click.Context, _: click.Parameter, incomplete: str) -> list[str]:
-    """Ids of running recorders that begin with what was typed."""
+    """Names of running recorders that begin with what was typed."""
     from hybridlog.live.control_server import running
 
     with _nothing_on_error():
-        return [name for name in running(_store(context).path) if name.startswith(incomplete)]
+        return [
+            name for name in running(_store(context).path).values() if name.startswith(incomplete)
+        ]
     return []
 
 

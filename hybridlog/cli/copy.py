@@ -172,12 +172,12 @@ def _print(
     if given.as_json:
         (output.print_json_line if is_short else output.print_json)(asdict(report))
     elif not given.quiet:
-        for label in report.copied:
-            output.say(f"copied {label}")
-        for label in () if is_short else report.known:
-            lacks = label in report.lacking
+        for name in report.copied:
+            output.say(f"copied {name}")
+        for name in () if is_short else report.known:
+            lacks = name in report.lacking
             more = f"; payloads that were deleted {there} were not copied" if lacks else ""
-            output.say(f"{label} is {there} already{more}")
+            output.say(f"{name} is {there} already{more}")
         if report.freed_bytes > 0:  # of a few messages, fields may take more than payloads
             output.say(f"{output.size(report.freed_bytes)} freed")
 

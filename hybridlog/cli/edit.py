@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -56,7 +56,7 @@ def edit_command(given: _Edit) -> None:
         (entry,) = store.select([given.recording])
         entry = store.edit(entry.id, name=given.name, note=given.note)
     if given.name is not None and not given.quiet:
-        output.say(f"renamed to {entry.label}")
+        output.say(f"renamed to {entry.name}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,13 +81,13 @@ def tag_command(given: _Tag) -> None:
             # Of several recordings, some may lack a tag.
             keys = given.remove if is_one else [key for key in given.remove if key in one.tags]
             changed = store.edit(one.id, tag=tags, untag=keys) if keys or tags else one
-            found[one.label] = changed.tags
+            found[one.name] = changed.tags
     if given.as_json:
         output.print_json(next(iter(found.values())) if is_one else found)
     elif not given.quiet:
-        for label, own in found.items():
+        for name, own in found.items():
             for key, value in sorted(own.items()):
-                output.say(f"{key}={value}" if is_one else f"{label}: {key}={value}")
+                output.say(f"{key}={value}" if is_one else f"{name}: {key}={value}")
 
 
 def _named_or_chosen(store: Store, given: _Tag) -> tuple[Recordings, Sequence[str], bool]:
@@ -143,16 +143,16 @@ def mark_command(given: _Mark) -> None:
             store.unmark(given.recording[0], given.text, at)
         return
     if at is None:
-        labels = _mark_running(given.text, tags, given.recording, given.store)
+        marked = _mark_running(given.text, tags, given.recording, given.store)
     elif len(given.recording) == 1:
         (recording,) = given.recording
         with given.opened() as store:
-            labels = iter([store.mark(recording, at, given.text, tags, until=given.until).label])
+            marked = iter([store.mark(recording, at, given.text, tags, until=given.until).name])
     else:
         raise UsageError("A mark at a time needs one recording: name it with --recording.")
-    for label in labels:
+    for name in marked:
         if not given.quiet:
-            output.note(f"Marked in {label}.")
+            output.note(f"Marked in {name}.")
 
 
 def _mark_running(
@@ -187,54 +187,44 @@ def rm_command(given: _Remove) -> None:
             "`hybridlog ls` lists all; -r '*' is all of them."
         )
     with given.opened() as store:
-        copies = [name for name in choice.name if name in store.repairs.copies]
-        rest = replace(choice, name=tuple(n for n in choice.name if n not in copies))
-        chosen: Sequence[RecordingSummary] = ()
-        if not copies or not rest.is_everything:
-            chosen = recordings_of(store, rest).summaries
-        targets = {copy: copy for copy in copies} | {one.id: one.label for one in chosen}
+        chosen = recordings_of(store, choice).summaries
         if not given.yes:
             pins = [pin["reason"] for one in chosen for pin in store.entry(one.id).pins]
-            _confirm(copies, chosen, pins)
-        for recording, label in targets.items():
+            _confirm(chosen, pins)
+        for one in chosen:
             with if_stopped(
                 "A recording whose removal began is gone; the next command that opens the "
                 "store removes the rest of it."
             ):
-                store.remove(recording)
+                store.remove(one.id)
             if not given.quiet:
-                output.say(f"deleted {label}")
+                output.say(f"deleted {one.name}")
 
 
-def _confirm(
-    copies: Sequence[str], chosen: Sequence[RecordingSummary], pins: Sequence[str]
-) -> None:
+def _confirm(chosen: Sequence[RecordingSummary], pins: Sequence[str]) -> None:
     """Ask for consent; several recordings are shown with what would be lost.
 
     Args:
-        copies: Labels of copies of recordings.
-        chosen: Other recordings.
+        chosen: The recordings.
         pins: Reasons of their pins.
     """
-    labels = [*copies, *(one.label for one in chosen)]
     why = f" ({listed([one for one in dict.fromkeys(pins) if one])})" if any(pins) else ""
     pinned = f" {output.counted(len(pins), 'pin')} would go, too{why}." if pins else ""
-    several = len(labels) > 1
-    names = f"{len(labels)} recordings ({listed(labels)})" if several else labels[0]
+    several = len(chosen) > 1
+    names = f"{len(chosen)} recordings ({listed(one.name for one in chosen)})"
+    names = names if several else chosen[0].name
     if not sys.stdin.isatty():
         raise UsageError(f"Deleting {names} for good needs --yes.{pinned}")
     if several:
-        for copy in copies:
-            output.note(f"  {copy}: a copy")
         for one in chosen[:_MAX_ROWS]:
             span = "" if one.span is None else f"{output.short_time(one.span[0])}, "
             output.note(
-                f"  {one.label}: {span}{output.counted(one.messages, 'message')}, "
+                f"  {one.name}: {span}{output.counted(one.messages, 'message')}, "
                 f"{output.size(one.stored_bytes)}"
             )
         if len(chosen) > _MAX_ROWS:
             output.note(f"  and {len(chosen) - _MAX_ROWS} more")
-        names = f"these {len(labels)} recordings"
+        names = f"these {len(chosen)} recordings"
     if pinned:
         output.note(pinned.strip())
     if not click.confirm(f"Delete {names} for good?", err=True):

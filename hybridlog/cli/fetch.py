@@ -175,7 +175,7 @@ def _follow(query: Query, choices: _Choices, form: str) -> None:
         print_remarks(asked)
         for one in asked.summaries():
             if one.status != "open":
-                output.note(f"{one.label} has ended: {status_text(one)}.")
+                output.note(f"{one.name} has ended: {status_text(one)}.")
     if stopped is not None:
         raise stopped
 

@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from functools import partial
+from shlex import quote
 from typing import TYPE_CHECKING
 
 import click
@@ -132,13 +133,14 @@ def rebuild(given: _Rebuild) -> None:
             progress_bar("index rebuild", total, quiet=given.quiet) as bar,
         ):
             done = store.index.rebuild(None if given.choice.is_everything else chosen, Stages(bar))
-    left = [entry.label for entry in chosen.summaries if entry.id not in {r.id for r in done}]
-    for label in left:
-        output.note(f"Recording {label} is in use, and was left as it is.")
+    left = [entry.name for entry in chosen.summaries if entry.id not in {r.id for r in done}]
+    for name in left:
+        output.note(f"Recording {name} is in use, and was left as it is.")
     for entry in done:
         if entry.status == "damaged":
             output.note(
-                f"{entry.label} is damaged: `hybridlog info {entry.label} --losses` shows where."
+                f"{entry.name} is damaged: `hybridlog info {quote(entry.name)} --losses` shows "
+                "where."
             )
     messages = sum(r.documents for r in done)
     without = sum(r.messages for r in done) - messages
@@ -246,16 +248,16 @@ def _look(store: Store, given: _Shared) -> Iterator[StoreError]:
     try:
         store.connect()
     finally:
-        for label in [*repairs.indexed]:
-            chunks = repairs.indexed.pop(label)
+        for name in [*repairs.indexed]:
+            chunks = repairs.indexed.pop(name)
             if not chunks:  # another process was faster
                 continue
             if given.as_json:
-                output.print_json_line({"recording": label, "chunks": chunks})
+                output.print_json_line({"recording": name, "chunks": chunks})
             elif not given.quiet:
-                output.say(f"{label}  {output.counted(chunks, 'chunk')}")
-    for label, problem in sorted(repairs.unreadable.items()):
-        yield StoreError(f"Recording {label} cannot be read: {problem}")
+                output.say(f"{name}  {output.counted(chunks, 'chunk')}")
+    for recording, problem in sorted(repairs.unreadable.items()):
+        yield StoreError(f"Recording {recording} cannot be read: {problem}")
 
 
 def _print(found: list[FieldIndex], given: _Shared) -> None:

@@ -187,7 +187,7 @@ def _extras(
         attachments = store.attachments(entry)
         metadata = store.metadata(entry)
     except SegmentError as error:
-        output.note(f"{entry.label}: {error}")
+        output.note(f"{entry.name}: {error}")
     return attachments, metadata, coverage(entry, losses_of(entry))
 
 
@@ -211,7 +211,7 @@ def _videos(store: Store, entry: RecordingEntry) -> dict[str, VideoSummary]:
         try:
             found[topic] = summary_of(store.session, entry.id, topic)
         except SegmentError as error:
-            output.note(f"{entry.label}: {error}")
+            output.note(f"{entry.name}: {error}")
     return found
 
 
@@ -291,14 +291,13 @@ def _print_recording(
     summary = summary_of(entry)
     status = status_text(summary)
     if entry.status == "open":
-        status += f"; `hybridlog top {entry.label}` shows it"
+        status += f"; `hybridlog top {quote(entry.name)}` shows it"
     held = (
         f"{output.size(entry.stored_bytes)} in {output.counted(entry.segments, 'segment')}, "
         f"{output.counted(entry.chunks, 'chunk')}"
     )
     rows = [
         ("id", entry.id),
-        ("name", entry.name),
         ("status", status),
         ("source", _source(source)),
         ("start", format_time(span[0]) if span else "-"),
@@ -315,7 +314,7 @@ def _print_recording(
         *_cut("metadata", [f"{m.name} ({', '.join(m.values)})" for m in metadata]),
         ("index", index),
     ]
-    output.print_table([("recording", "left"), (entry.label, "left")], rows)
+    output.print_table([("recording", "left"), (entry.name, "left")], rows)
     if not entry.channels:
         return
     output.say()
@@ -388,7 +387,7 @@ def _densities(store: Store, entry: RecordingEntry) -> Density | None:
     try:
         return density(store.session, entry, (begin, end), _LETTERS, most_work=_DRAWN_WORK)
     except SegmentError as error:
-        output.note(f"{entry.label}: {error}")
+        output.note(f"{entry.name}: {error}")
         return None
 
 
@@ -486,7 +485,7 @@ def show_segment(path: Path, *, as_json: bool) -> None:
     Raises:
         StoreError: It is being written, or is no segment of a store.
     """
-    from hybridlog_storage.journal import JOURNAL
+    from hybridlog_storage.manifests import MANIFEST
     from hybridlog_storage.segments.segment_reader import SegmentReader
 
     stem = path.name.split(".")[0]
@@ -501,7 +500,7 @@ def show_segment(path: Path, *, as_json: bool) -> None:
             summary = reader.summary()
             bytes_all = reader.size
     except SegmentError:
-        if not (path.parent / JOURNAL).exists():
+        if not (path.parent / MANIFEST).exists():
             _refuse_log(path)
         raise
     chunks = summary.chunks

@@ -8,6 +8,7 @@ from dataclasses import asdict
 from fnmatch import fnmatchcase
 from functools import partial
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 from hybridlog.cli import output
@@ -46,7 +47,7 @@ def show_topics(store: Store, query: Query, topics: Sequence[str], *, as_json: b
             recorded.recording.id if schema is None else repr(schema),
         )
         if key in seen:
-            seen[key]["recordings"].append(recorded.recording.label)
+            seen[key]["recordings"].append(recorded.recording.name)
         else:
             seen[key] = _topic_as_dict(store, recorded)
     if not seen:
@@ -105,7 +106,7 @@ def _topic_as_dict(store: Store, recorded: RecordedChannel) -> dict[str, Any]:
         "message_encoding": channel.message_encoding,
         "schema_encoding": schema.encoding if schema is not None else None,
         "definition": text,
-        "recordings": [recorded.recording.label],
+        "recordings": [recorded.recording.name],
         "not_indexed": codec.reason,
         "observed": observed,
         "arrays": channel.topic in store.directory.settings.arrays,
@@ -132,7 +133,7 @@ def show_losses(entries: Sequence[RecordingEntry], topics: Sequence[str], *, as_
 
     fits = matcher(topics) if topics else None
     rows = [
-        {"recording": entry.label, **loss}
+        {"recording": entry.name, **loss}
         for entry in entries
         for loss in losses_of(entry)
         if fits is None or (loss.get("topic") is not None and fits(loss["topic"]))
@@ -147,8 +148,8 @@ def show_losses(entries: Sequence[RecordingEntry], topics: Sequence[str], *, as_
     for entry in entries:
         if entry.status == "open":
             output.note(
-                f"{entry.label} is still being recorded; `hybridlog top {entry.label}` shows later "
-                "losses."
+                f"{entry.name} is still being recorded; `hybridlog top {quote(entry.name)}` shows "
+                "later losses."
             )
 
 
@@ -370,7 +371,7 @@ def show_tables(store: Store, query: Query, *, as_json: bool) -> None:
     ended = [one for one in recordings if one.status not in UNFINISHED]
     found = _tables_of(store, [one for one in channels if one.recording.status not in UNFINISHED])
     tables = store.session.tables
-    lacking = [one.label for one in ended if missing(store.directory, one, tables, [topic])]
+    lacking = [one.name for one in ended if missing(store.directory, one, tables, [topic])]
     if as_json:
         output.print_json({"tables": found, "missing": lacking})
         return

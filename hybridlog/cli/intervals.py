@@ -116,7 +116,7 @@ def _intervals(given: _Given, query: Query) -> Intervals:
 def _show(given: _Given, found: Intervals, asked: Answering) -> None:
     from hybridlog.query.times import format_duration
 
-    labels = {recording.id: recording.label for recording in asked.store.summaries()}
+    names = {recording.id: recording.name for recording in asked.store.summaries()}
     columns: list[output.Column] = [
         ("recording", "left"),
         ("begin", "whole"),
@@ -134,12 +134,12 @@ def _show(given: _Given, found: Intervals, asked: Answering) -> None:
             str(row["messages"]),
         ]
 
-    given.answer((_as_dict(row, labels) for row in found), columns, cells)
+    given.answer((_as_dict(row, names) for row in found), columns, cells)
 
 
-def _as_dict(row: Interval, labels: Mapping[str, str]) -> dict[str, object]:
+def _as_dict(row: Interval, names: Mapping[str, str]) -> dict[str, object]:
     return {
-        "recording": labels[row.recording],
+        "recording": names[row.recording],
         "begin_ns": row.begin_ns,
         "end_ns": row.end_ns,
         "messages": row.messages,

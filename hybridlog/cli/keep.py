@@ -189,7 +189,7 @@ def _are_marks(store: Store, topics: Sequence[str]) -> bool:
 
 def _show_pins(store: Store, given: _Given) -> None:
     chosen = given.recordings_in(store)
-    rows = [{"recording": entry.label, **pin} for entry in chosen for pin in entry.pins]
+    rows = [{"recording": entry.name, **pin} for entry in chosen for pin in entry.pins]
     if given.as_json:
         output.print_json(rows)
     elif rows:

@@ -76,7 +76,7 @@ class LiveSummary:
             rows = closing_rows(reports[0], state, self._unreached)
             if self._recorder.reason:
                 rows.append(("ended", self._recorder.reason))
-            output.print_table([("recording", "left"), (reports[0].entry.label, "left")], rows)
+            output.print_table([("recording", "left"), (reports[0].entry.name, "left")], rows)
         elif reports:
             _print_snapshots(reports)
         elif state.snapshots is None:
@@ -154,7 +154,7 @@ def _print_snapshots(reports: Sequence[RecordReport]) -> None:
         [("snapshot", "left"), ("because of", "left"), ("messages", "right"), ("stored", "right")],
         [
             (
-                report.entry.label,
+                report.entry.name,
                 report.entry.tags.get("trigger", ""),
                 str(report.entry.messages),
                 output.size(report.entry.stored_bytes),
@@ -167,7 +167,7 @@ def _print_snapshots(reports: Sequence[RecordReport]) -> None:
 def _summary(reports: Sequence[RecordReport], state: RecorderState, reason: str) -> dict[str, Any]:
     recordings = [
         {
-            "recording": report.entry.label,
+            "recording": report.entry.name,
             "status": report.entry.status,
             "tags": report.entry.tags,
             "messages": report.entry.messages,

@@ -24,15 +24,15 @@ class _Given(Choosing, InStore, AsJson):
 @command(_Given)
 def ls_command(given: _Given) -> None:
     """List the recordings."""
-    with given.opened(snapshot=True) as store:
+    with given.opened() as store:
         if store.directory.look_closely():
             store.refresh()
-        recordings = given.recordings_in(store).summaries
+        recordings = given.recordings_in(store.snapshot()).summaries
     if given.as_json:
         output.print_json([recording_dict(entry) for entry in recordings])
     elif recordings:
         _print(recordings)
-    else:
+    elif not store.repairs.unreadable:
         output.note(store.directory.when_empty)
 
 
@@ -68,14 +68,12 @@ def _row(entry: RecordingSummary, *, narrow: bool) -> list[str]:
     for number, what in ((entry.expired, "deleted"), (entry.not_copied, "not copied yet")):
         if number:
             notes.append(f"{number if narrow else output.counted(number, 'payload')} {what}")
-    if entry.name != entry.label:
-        notes.append(entry.name)
     notes.extend(f"{key}={value}" for key, value in sorted(entry.tags.items()))
     if not narrow:
         notes.extend(output.cut(note["text"]) for note in entry.notes)
     start = output.short_time(span[0], minutes=narrow) if span else "-"
     return [
-        entry.label,
+        entry.name,
         start,
         output.short_duration(span[1] - span[0]) if span else "-",
         str(entry.topic_count),
@@ -91,7 +89,7 @@ _STATUS = {
     "damaged": "source damaged",
     "recovered": "cut short by a crash",
     "unfinished": "cut short by a crash, not recovered yet",
-    "unproven": "journal lost",
+    "unproven": "manifest lost",
 }
 
 
@@ -106,7 +104,6 @@ def recording_dict(recording: RecordingSummary) -> dict[str, Any]:
     """A recording in short, for JSON."""
     span = recording.span
     return {
-        "recording": recording.label,
         "id": recording.id,
         "name": recording.name,
         "tags": recording.tags,

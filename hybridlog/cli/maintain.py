@@ -33,7 +33,7 @@ def verify_command(given: _Verify) -> None:
     """Read everything, check checksums and references.
 
     Exits with 1 when it finds a problem, and prints a cure for each. With --repair, it restores
-    the names of segments, writes damaged summaries and journals again, and brings catalog and
+    the names of segments, makes damaged summaries and lost manifests again, and brings catalog and
     index up to date; it exits with 1 when only a copy can restore the rest.
     """
     if given.repair:
@@ -53,7 +53,7 @@ def verify_command(given: _Verify) -> None:
         output.print_json({**asdict(result), "seconds": round(elapsed, 3)})
     else:
         _print(result, elapsed, quiet=given.quiet)
-        running = [one.label for one in chosen.summaries if one.status == "open"]
+        running = [one.name for one in chosen.summaries if one.status == "open"]
         if running and not given.quiet:
             output.note(f"Still being recorded, and checked as far as sealed: {listed(running)}.")
     is_wanted = not isinstance(why, WithoutMongoError)

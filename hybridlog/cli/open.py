@@ -143,7 +143,7 @@ def _written(store: Store, query: Query, given: _Given) -> Path:
 
     if given.path is None:
         ids = query.recordings
-        name = store.entry(ids[0]).label if len(ids) == 1 else "slice"
+        name = store.entry(ids[0]).name if len(ids) == 1 else "slice"
         return SliceCache().get(query, name, write)
     with if_stopped(partial(not_written, given.path)):
         write(query, given.path)
@@ -286,11 +286,11 @@ def view_command(given: _View) -> None:
     with given.opened(is_lasting=True) as store:
         server = ViewServer(store, given.port or 0, viewers=given.mcap, origins=given.origins)
         url = server.url
-        label = ""
+        name = ""
         if given.recording is not None:
             (entry,) = store.select([given.recording])
-            label = quote(entry.label, safe="")
-            url += f"#recording={label}"
+            name = quote(entry.name, safe="")
+            url += f"#recording={name}"
         if given.as_json:
             shown = {"url": url, "port": server.port}
             output.print_json(shown | ({"mcap": f"{server.url}mcap/"} if given.mcap else {}))
@@ -298,7 +298,7 @@ def view_command(given: _View) -> None:
             click.echo(url)
             output.note("Open this address in a browser. Ctrl-C ends the server.")
             if given.mcap:
-                _print_mcap(f"{server.url}mcap/", label)
+                _print_mcap(f"{server.url}mcap/", name)
         sys.stdout.flush()
         if given.opens:
             threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()
@@ -306,16 +306,16 @@ def view_command(given: _View) -> None:
             server.run()
 
 
-def _print_mcap(url: str, label: str) -> None:
+def _print_mcap(url: str, name: str) -> None:
     """Print where other viewers find selections.
 
     Args:
         url: Address of all selections.
-        label: Label of a recording for the examples, as in a URL; empty without one.
+        name: Name of a recording for the examples, as in a URL; empty without one.
     """
     from urllib.parse import quote
 
-    file = f"{url}slice.mcap?recording={label or 'RECORDING'}"
+    file = f"{url}slice.mcap?recording={name or 'RECORDING'}"
     foxglove = f"https://app.foxglove.dev/?ds=remote-file&ds.url={quote(file, safe='')}"
     output.note(f"MCAP file: {file}")
     output.note(f"In Foxglove: {foxglove}")

@@ -128,19 +128,6 @@ def _print_repairs(store: Store, doing: str) -> None:
     repairs = store.repairs
     for recording, segments in repairs.recovered.items():
         _print_recovered(recording, segments)
-    for recording in repairs.journals:
-        note(
-            f"Recording {recording} has lost its journal, or lines of it. They were written again, "
-            "but a missing segment would go unnoticed: compare the recording with a copy if you "
-            "have one."
-        )
-    for recording in repairs.adopted:
-        note(f"Recording {recording} came from another store; it belongs to this one now.")
-    for copy, original in repairs.copies.items():
-        note(
-            f"{copy} is a copy of recording {original}, which is used. Remove one of them: "
-            f"`hybridlog rm {copy}`."
-        )
     _print_unreadable(store, ())
     if repairs.disk_full is not None:
         note(

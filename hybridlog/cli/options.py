@@ -103,8 +103,7 @@ class Choosing:
 
     names: ClassVar[tuple[str, ...]] = ()
     recording: tuple[str, ...] = option(
-        "Only this recording: label, name, the beginning of a label or an id, or a glob "
-        "such as 'monday*'.",
+        "Only this recording: name, id, the beginning of one, or a glob such as 'monday*'.",
         "RECORDING",
         short="-r",
         shell_complete=complete_recording,
@@ -415,7 +414,7 @@ class Slices(Latched, Forced):
 
 
 def one_recording(
-    what: str = "A recording: label, name, or the beginning of its id.",
+    what: str = "A recording: name, id, or the beginning of one.",
     metavar: str = "RECORDING",
 ) -> Any:
     """The argument that names one recording."""

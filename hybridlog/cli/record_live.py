@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 _STATE_S = 1.0
 _RECOVERY_POLL_S = 0.05
 _EXPLAIN_AFTER_S = 2.0  # a longer wait at the end is explained
-_SNAPSHOT = re.compile(r"snapshot \S+ because of ")
+_SNAPSHOT = re.compile(r"snapshot .+ because of ")
 """A message of a recorder that is no problem: `--quiet` leaves it out."""
 
 
@@ -79,8 +79,8 @@ def _record(choices: RecordChoices) -> None:
                 pass
         ending = LiveSummary(reports, recorder, sources, options)
         if options.contract is not None:
-            labels = [report.entry.label for report in reports]
-            results = [one for label in labels for one in store.judge(options.contract, label)]
+            ids = [report.entry.id for report in reports]
+            results = [one for each in ids for one in store.judge(options.contract, each)]
             ending.add_verdict(results)
         ending.print_and_exit(as_json=choices.as_json, quiet=quiet)
 

@@ -427,7 +427,7 @@ class Results:
         elif not self._choices.as_json and not self._choices.quiet:
             entry = report.entry
             output.say(
-                f"{entry.label}: {output.counted(entry.messages, 'message')}, "
+                f"{entry.name}: {output.counted(entry.messages, 'message')}, "
                 f"{output.size(entry.stored_bytes)}, from {path}"
             )
 
@@ -516,7 +516,7 @@ def _summary(path: Path, report: RecordReport) -> dict[str, Any]:
     entry = report.entry
     return {
         "path": str(path),
-        "recording": entry.label,
+        "recording": entry.name,
         "id": entry.id,
         "status": entry.status,
         "topics": _topics(report),
@@ -556,7 +556,7 @@ def _print_one(path: Path, report: RecordReport) -> None:
         what = "latched or frames of video" if videos else "latched"
         left_out += f"; {report.latched} of them {what}, from before the time range"
     output.print_table(
-        [("recording", "left"), (entry.label, "left")],
+        [("recording", "left"), (entry.name, "left")],
         [
             ("source", f"{path} ({entry.source['kind']})"),
             ("topics", str(_topics(report))),
@@ -606,7 +606,7 @@ class _Figures(NamedTuple):
 def _print_several(reports: Sequence[RecordReport]) -> None:
     lines = [
         _Figures(
-            report.entry.label,
+            report.entry.name,
             _topics(report),
             report.entry.messages,
             int(report.entry.source["bytes"]),

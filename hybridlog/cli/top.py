@@ -68,21 +68,23 @@ def top_command(given: _Given) -> None:
     fields = [_field(text) for text in given.field]
     span = parse_duration(given.window)
     path = store_path(given.store)
-    (name,) = choose(path, [] if given.recording is None else [given.recording])
+    (recorder,) = choose(path, [] if given.recording is None else [given.recording])
+    name = recorder
     on_screen = not given.as_json and sys.stdout.isatty() and not given.once
     with _ended_by_ctrl_c(), at_safe_points(), ExitStack() as held:
         opened = None
         if fields:
             opened = held.enter_context(given.opened(is_lasting=True, quiet=False))
         table = held.enter_context(LiveTable(error=False)) if on_screen else None
-        for raw in states(path, name, _EVERY_S):
+        for raw in states(path, recorder, _EVERY_S):
             if not raw:
                 continue  # it has just started
+            name = raw["name"]
             values = []
             if fields and raw.get("snapshots") is not None:
-                values = _values_of_ring(path, name, raw, fields, span)
+                values = _values_of_ring(path, recorder, raw, fields, span)
             elif opened is not None:
-                values = _values(opened, name, raw, fields, span)
+                values = _values(opened, recorder, raw, fields, span)
             if given.as_json:
                 print(json.dumps({**raw, "fields": values}), flush=True)  # noqa: T201
             elif table is not None:

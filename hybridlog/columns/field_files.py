@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from hybridlog_storage.journal import PayloadFile
+    from hybridlog_storage.manifest import Fields
     from hybridlog_storage.messages import Channel
     from hybridlog_storage.segments.chunk import StoredChunk
 
@@ -58,12 +58,6 @@ class FieldColumns:
         self._codec = codec_for(channel)
         self._is_reduced = state_of(channel.message_encoding) is State.REDUCED
         self._shape = FieldShape()
-        self.replaces: Sequence[str] = ()
-        """Paths of the files whose rows the new one has, if there are any."""
-
-    def about(self) -> dict[str, Any]:
-        """Further metadata of a file."""
-        return {"replaces": [*self.replaces]} if self.replaces else {}
 
     def table(
         self, chunk: StoredChunk, rows: NDArray[np.intp], has_publish_time: Mapping[int, bool]
@@ -122,15 +116,14 @@ class FieldFile(ColumnFile):
     """One file with what is left of the expired messages of a topic. Thread safe.
 
     Attributes:
-        listed: As the journal lists it.
+        listed: As the manifest lists it.
         places: Rows of each chunk, by segment and number.
-        replaces: Paths of the files that it was joined of.
 
     Raises:
         StoreError: It is missing, damaged, or another file than the listed one.
     """
 
-    def __init__(self, folder: Path, listed: PayloadFile, cache: Cache | None = None) -> None:
+    def __init__(self, folder: Path, listed: Fields, cache: Cache | None = None) -> None:
         self.listed = listed
         self._cache = cache or Cache()
         path = folder / listed.file
@@ -140,12 +133,10 @@ class FieldFile(ColumnFile):
             raise StoreError(f"The file of fields {path} is missing.{RESTORE}") from error
         if (self.size_bytes, self.digest) != (listed.bytes, listed.digest):
             raise StoreError(
-                f"The file of fields {path} is not the one that the journal lists.{RESTORE}"
+                f"The file of fields {path} is not the one that the manifest lists.{RESTORE}"
             )
-        values = self.about.payloads
         try:
-            self.places = self._read_places(values["chunks"])
-            self.replaces = frozenset(map(str, values.get("replaces", ())))
+            self.places = self._read_places(self.about.payloads["chunks"])
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise StoreError(f"The description in {path} is invalid: {error!r}.") from error
 
@@ -187,7 +178,7 @@ def newest(files: Sequence[FieldFile], chunk: tuple[int, int]) -> list[FieldFile
     An expiry that a crash has stopped may have written the same rows before.
 
     Args:
-        files: The files, in the order of the journal.
+        files: The files, in the order of the manifest.
         chunk: Segment and number of the chunk.
 
     Raises:

@@ -1,8 +1,7 @@
 """Joins files of fields of a topic, of which each expiry writes one.
 
-The new file is forced to the disk, read, and compared with the others. Then one line of the
-journal lists it and deletes those. It names them itself, too: where the journal is lost, it is
-known what they were replaced by.
+The new file is forced to the disk, read, and compared with the others. Then one change of the
+manifest lists it and deletes those.
 """
 
 from __future__ import annotations
@@ -18,16 +17,15 @@ from hybridlog.columns.field_files import FieldColumns, FieldFile, newest
 from hybridlog.columns.layout import PAYLOAD_PARTS, table_schema_of
 from hybridlog.columns.payload_files import RecordingPayloads, next_number
 from hybridlog.columns.payload_writer import TopicWriter
-from hybridlog_storage import journal
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import StoreError
-from hybridlog_storage.journal import Journal
+from hybridlog_storage.manifests import read_in
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
     from pathlib import Path
 
-    from hybridlog_storage.journal import JournalState, PayloadFile
+    from hybridlog_storage.manifest import Fields, Manifest
     from hybridlog_storage.messages import Channel
 
 _SMALL_FILE = 64 << 20  # bytes
@@ -50,33 +48,32 @@ def join(path: Path, channels: Iterable[Channel], max_files: int) -> int:
     """
     freed = 0
     for channel in channels:
-        state = journal.read(path)
-        assert state is not None  # something has expired
+        manifest = read_in(path)
+        assert manifest is not None  # something has expired
         columns = FieldColumns(channel)
         beginning = f"{columns.folder}/{table_schema_of(channel)[:8]}-"
         small = [
             file
-            for file in state.payloads.values()
+            for file in manifest.fields
             if file.file.startswith(beginning) and file.bytes < _SMALL_FILE
         ]
         if len(small) > max_files:
-            freed += _join(path, state, channel, columns, small)
+            freed += _join(path, manifest, channel, columns, small)
     return freed
 
 
 def _join(
     path: Path,
-    state: JournalState,
+    manifest: Manifest,
     channel: Channel,
     columns: FieldColumns,
-    old: Sequence[PayloadFile],
+    old: Sequence[Fields],
 ) -> int:
     folder = path / PAYLOAD_PARTS
     files.remove_tree(folder)
     readers = _readers(RecordingPayloads(path, old), old)
-    columns.replaces = sorted({f.file for f in old}.union(*(r.replaces for r in readers)))
-    numbers = partial(next, count(next_number(state)))
-    writer = TopicWriter(folder, state.id, channel, columns, numbers)
+    numbers = partial(next, count(next_number(manifest)))
+    writer = TopicWriter(folder, manifest.id, channel, columns, numbers)
     having: dict[_Chunk, list[FieldFile]] = {}
     for reader in readers:
         for key in reader.places:
@@ -95,16 +92,14 @@ def _join(
         for key, found in having.items():
             if not _are_same(_tables(found, key), _tables(new.get(key, ()), key)):
                 raise StoreError(f"The joined fields of {path} do not come back.")
-        deleted = [file.file for file in old]
-        payload_files.announce(path, made, Journal(path), deleted)
+        payload_files.announce(path, made, [file.file for file in old])
     except BaseException:
-        payload_files.take_back(path, state)
+        payload_files.take_back(path)
         raise
-    payload_files.publish(path, journal.read(path))
     return sum(file.bytes for file in old) - sum(file.bytes for file in made)
 
 
-def _readers(payloads: RecordingPayloads, listed: Sequence[PayloadFile]) -> list[FieldFile]:
+def _readers(payloads: RecordingPayloads, listed: Sequence[Fields]) -> list[FieldFile]:
     return [payloads.reader(file) for file in listed]
 
 

@@ -5,8 +5,8 @@ tables/<type>~<shape8>/shared-<number>.parquet   several recordings
 tables/<type>~<shape8>/<id>-<number>.parquet     a long topic of one recording
 tables.part/r<id>/                               unfinished files
 tables.part/r<id>/<type>~<shape8>/               sealed segments of a recording in progress
-recordings/<label>/payloads/fields=<collection>/<schema8>-<number>.parquet
-recordings/<label>/payloads.part/                unfinished files
+recordings/<id>/payloads/fields=<collection>/<schema8>-<number>.parquet
+recordings/<id>/payloads.part/                unfinished files
 ```
 
 A folder of `tables` has the rows of all ended recordings of one message type. All of its

@@ -6,16 +6,17 @@ import re
 import threading
 from collections import defaultdict
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from hybridlog.columns.layout import PAYLOAD_PARTS
-from hybridlog_storage import journal
 from hybridlog_storage.cache import Cache
 from hybridlog_storage.disk import durability, files
 from hybridlog_storage.disk.directory import PAYLOADS, payload_names
-from hybridlog_storage.errors import SegmentError, StoreError
+from hybridlog_storage.errors import HybridlogError, SegmentError, StoreError
 from hybridlog_storage.lazy import lazy
+from hybridlog_storage.manifest import Stored, replace
+from hybridlog_storage.manifests import change_in, read_in
 from hybridlog_storage.segments.segment_file import sealed_name
 from hybridlog_storage.segments.segment_reader import SegmentReader
 
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     from hybridlog.columns.column_file import OpenFiles
     from hybridlog.columns.field_files import FieldFile
     from hybridlog.columns.topic_table import TopicTable
-    from hybridlog_storage.journal import Journal, JournalState, PayloadFile
+    from hybridlog_storage.manifest import Fields, File, Manifest
     from hybridlog_storage.segments.chunk import ExpiredMessages, StoredChunk
     from hybridlog_storage.segments.segment_reader import ChunkPlace, SegmentSummary
 
@@ -34,19 +35,32 @@ REPLACEMENT: Final = re.compile(r"(?P<number>\d{6,9})\.mcap\.thinned")
 """Name of a segment that is about to replace the whole one."""
 
 
-def next_number(state: JournalState) -> int:
+def next_number(manifest: Manifest) -> int:
     """The least number that no file of fields of a recording has had."""
-    names = (name.rpartition("-")[2] for name in state.payloads.keys() | state.deleted)
+    files = (*(file.file for file in manifest.fields), *manifest.deleted)
+    names = (name.rpartition("-")[2] for name in files)
     return 1 + max((int(name.partition(".")[0]) for name in names), default=-1)
 
 
 def announce(
-    recording: Path, made: Sequence[PayloadFile], log: Journal, deleted: Sequence[str] = ()
-) -> None:
-    """List new files, still among unfinished ones, and files that go, in the journal.
+    recording: Path,
+    made: Sequence[Fields],
+    deleted: Collection[str] = (),
+    check: Callable[[Manifest], object] = lambda _: None,
+) -> Manifest:
+    """List new files, which are complete, in the manifest, and give them their names.
+
+    Args:
+        recording: The recording's directory, locked by this process.
+        made: The files, among unfinished ones.
+        deleted: Files that they replace; they are removed.
+        check: Raises if the manifest must not be changed so any more.
+
+    Returns:
+        The manifest with them.
 
     Raises:
-        HybridlogError: The journal cannot be written.
+        HybridlogError: The manifest cannot be changed, or a file not renamed or removed.
         OSError: The names of the files cannot be forced to the disk.
     """
     parts = recording / PAYLOAD_PARTS
@@ -54,32 +68,38 @@ def announce(
         files.sync_folder(folder)
     files.sync_folder(parts)
     files.sync_folder(recording)
-    gone = {"deleted": deleted} if deleted else {}
-    log.append(journal.event(journal.EXPIRED, files=[asdict(file) for file in made], **gone))
+
+    def how(now: Manifest) -> Manifest:
+        check(now)
+        fields = {file.file: file for file in (*now.fields, *made) if file.file not in deleted}
+        gone = dict.fromkeys((*now.deleted, *deleted))
+        return replace(now, fields=tuple(fields.values()), deleted=tuple(gone))
+
+    manifest = change_in(recording, how)
+    publish(recording, manifest)
+    return manifest
 
 
-def take_back(recording: Path, before: JournalState) -> None:
-    """Remove unfinished files, unless the journal lists them: then the next opening goes on."""
-    with suppress(StoreError, OSError):
-        state = journal.read(recording)
-        if state is not None and state.payloads.keys() == before.payloads.keys():
-            files.remove_tree(recording / PAYLOAD_PARTS)
+def take_back(recording: Path) -> None:
+    """Remove unfinished files, unless the manifest lists them; the next opening does the rest."""
+    with suppress(HybridlogError, OSError):
+        publish(recording, read_in(recording))
 
 
-def publish(recording: Path, state: JournalState | None) -> None:
+def publish(recording: Path, manifest: Manifest | None) -> None:
     """Give finished files their names, remove the folder of unfinished files, and deleted ones.
 
     Args:
         recording: The recording's directory, locked by this process.
-        state: Its journal, which says what is finished and deleted; None without one.
+        manifest: Says what is finished and deleted; None if it is lost.
 
     Raises:
         HybridlogError: A file cannot be renamed or removed.
     """
     parts, final = recording / PAYLOAD_PARTS, recording / PAYLOADS
     try:
-        names = sorted(payload_names(recording, PAYLOAD_PARTS))
-        moved = [name for name in names if state is not None and name in state.payloads]
+        listed = set() if manifest is None else {file.file for file in manifest.fields}
+        moved = sorted(payload_names(recording, PAYLOAD_PARTS).keys() & listed)
         folders = {(final / name).parent for name in moved}
         for folder in folders:
             files.make_folders(folder)
@@ -91,24 +111,22 @@ def publish(recording: Path, state: JournalState | None) -> None:
         for folder in folders:
             files.sync_folder(folder)
         files.remove_tree(parts)
-        deleted = set() if state is None else state.deleted & payload_names(recording).keys()
-        for name in sorted(deleted):
+        deleted = () if manifest is None else manifest.deleted
+        for name in sorted(payload_names(recording).keys() & {*deleted}):
             files.unlink(final / name)
     except OSError as error:
         raise durability.explain(error, final, "moving fields to") from error
 
 
-def replace_segments(
-    recording: Path, names: Iterable[str], thinned: Mapping[int, Sequence[tuple[str, int]]]
-) -> list[str]:
+def replace_segments(recording: Path, names: Iterable[str], manifest: Manifest | None) -> list[str]:
     """Put finished segments with expired chunks in the place of the whole ones.
 
-    Those that the journal does not list are removed.
+    Those that the manifest does not list are removed.
 
     Args:
         recording: The recording's directory, locked by this process.
         names: Names of files in it.
-        thinned: Digest and size of such segments as the journal lists them, by number.
+        manifest: Its manifest; None if it is lost.
 
     Returns:
         Names of the segments that were replaced.
@@ -117,13 +135,15 @@ def replace_segments(
         HybridlogError: A file cannot be renamed or removed.
     """
     done = []
+    logs = {} if manifest is None else manifest.logs
     try:
         for name in names:
             found = REPLACEMENT.fullmatch(name)
             if found is None:
                 continue
             number = int(found["number"])
-            if _is_listed(recording / name, number, thinned.get(number, ())):
+            log = logs.get(number)
+            if log is not None and _is_stored(recording / name, log):
                 final = sealed_name(number)
                 files.rename(recording / name, recording / final)
                 done.append(final)
@@ -136,15 +156,14 @@ def replace_segments(
     return done
 
 
-def _is_listed(path: Path, number: int, listed: Sequence[tuple[str, int]]) -> bool:
-    if not listed:
-        return False
+def _is_stored(path: Path, log: File) -> bool:
+    """True if a file is the one that the manifest lists since payloads of a log have expired."""
     try:
-        with SegmentReader(path, number) as reader:
+        with SegmentReader(path, log.number) as reader:
             summary = reader.summary()
     except SegmentError:
         return False
-    return (summary.digest, summary.size) == listed[-1]
+    return log.stored == Stored(summary.size, summary.digest)
 
 
 class RecordingPayloads:
@@ -154,7 +173,7 @@ class RecordingPayloads:
 
     Args:
         recording: The recording's directory.
-        listed: The files; None for those that its journal lists.
+        listed: The files; None for those that its manifest lists.
         folder: Name of the folder that holds them.
         cache: Keeps rows that were read.
     """
@@ -162,7 +181,7 @@ class RecordingPayloads:
     def __init__(
         self,
         recording: Path,
-        listed: Sequence[PayloadFile] | None = None,
+        listed: Sequence[Fields] | None = None,
         folder: str = PAYLOADS,
         cache: Cache | None = None,
     ) -> None:
@@ -176,18 +195,18 @@ class RecordingPayloads:
         self._lock = threading.RLock()
 
     @lazy
-    def listed(self) -> Sequence[PayloadFile]:
+    def listed(self) -> Sequence[Fields]:
         """The files.
 
         Raises:
-            StoreError: The journal cannot be read.
+            StoreError: The manifest cannot be read.
         """
         if self._given is not None:
             return self._given
-        state = journal.read(self._recording)
-        return [] if state is None else list(state.payloads.values())
+        manifest = read_in(self._recording)
+        return () if manifest is None else manifest.fields
 
-    def reader(self, listed: PayloadFile) -> FieldFile:
+    def reader(self, listed: Fields) -> FieldFile:
         """The reader of a file.
 
         Raises:

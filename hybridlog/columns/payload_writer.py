@@ -15,7 +15,7 @@ from hybridlog.columns.layout import (
 )
 from hybridlog.columns.parquet_file import ParquetFileWriter
 from hybridlog_storage.disk import durability, files
-from hybridlog_storage.journal import PayloadFile
+from hybridlog_storage.manifest import Fields
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -82,7 +82,7 @@ class TopicWriter:
         self.columns = columns
         self._number = number
         self._open: dict[pa.Schema, _OpenFile] = {}
-        self.written: list[PayloadFile] = []
+        self.written: list[Fields] = []
         """Complete files; they are on the disk."""
 
     def add(self, table: pa.Table, segment: int, chunk: int, digest: str) -> None:
@@ -142,11 +142,11 @@ class TopicWriter:
         if file.tables:
             self._flush(file)
         assert file.writer is not None
-        payloads = {**self.columns.about(), "chunks": file.chunks}
+        payloads = {"chunks": file.chunks}
         topics = {self.channel.topic: TopicCounts(file.rows)}
         section = Section(self._recording, 0, file.segments, topics)
         try:
             size, digest = file.writer.close([section], payloads=payloads, sync=True)
         except OSError as error:
             raise durability.explain(error, file.writer.path, "writing") from error
-        self.written.append(PayloadFile(file.name, size, digest, self.channel.topic, file.rows))
+        self.written.append(Fields(file.name, size, digest, self.channel.topic, file.rows))

@@ -26,7 +26,6 @@ RECORDINGS: Final = pa.schema(
     [
         ("recording", pa.string()),
         ("id", pa.string()),
-        ("name", pa.string()),
         ("tags", TAGS),
         ("status", pa.string()),
         ("created", TIME),
@@ -48,9 +47,8 @@ def recordings_table(summaries: Iterable[RecordingSummary]) -> pa.Table:
     """A row for each recording."""
     rows = [
         {
-            "recording": one.label,
+            "recording": one.name,
             "id": one.id,
-            "name": one.name,
             "tags": list(one.tags.items()),
             "status": one.status,
             "created": one.created // 1000,
@@ -84,12 +82,12 @@ def write_recordings_file(catalog: Catalog, present: set[str]) -> None:
         StoreError: The catalog cannot be read or locked.
     """
     with catalog.unchanged() as summaries:
-        if catalog.is_in_memory or not present <= {one.label for one in summaries}:
+        if catalog.is_in_memory or not present <= {one.id for one in summaries}:
             return
         ended = [one for one in summaries if one.status not in UNFINISHED]
         ended.sort(key=lambda one: (one.extent, one.id))
         # In tables, `recording` is the id, which stays when a recording is renamed.
-        names = {"recording": "label", "id": "recording"}
+        names = {"recording": "name", "id": "recording"}
         table = recordings_table(ended)
         sink = pa.BufferOutputStream()
         pq.write_table(

@@ -265,7 +265,7 @@ class TableWriter:
     Args:
         root: The store.
         recording: Id of the recording.
-        label: Its label, for people.
+        name: Its name, for people.
         topics: The topics with tables; None for all.
         is_new: True if the recording has no tables yet.
     """
@@ -274,14 +274,14 @@ class TableWriter:
         self,
         root: Path,
         recording: str,
-        label: str,
+        name: str,
         *,
         topics: Collection[str] | None = None,
         is_new: bool = True,
     ) -> None:
         self._root = root
         self._recording = recording
-        self._label = label
+        self._name = name
         self._wanted = topics
         self._is_new = is_new
         self._arrays = frozenset(read_settings(root).arrays)
@@ -373,7 +373,7 @@ class TableWriter:
         except Exception as error:
             self.has_failed = True
             reason = getattr(error, "strerror", None) or error or repr(error)
-            _log.warning("Recording %s has no tables yet: %s", self._label, reason)
+            _log.warning("Recording %s has no tables yet: %s", self._name, reason)
             self.discard()
 
     # From chunks to rows in memory.

@@ -38,7 +38,7 @@ class Result:
     """One rule of a contract on one recording.
 
     Attributes:
-        recording: Label of the recording.
+        recording: Name of the recording.
         topic: Full name of the topic; empty for the whole recording.
         rule: Name of the rule, as in the contract; `messages` for a topic that must be there.
         wanted: What the rule asks for.
@@ -182,7 +182,7 @@ class _Judge:
         )
 
     def _result(self, topic: str, rule: str, wanted: str, found: str, *, holds: bool) -> Result:
-        return Result(self._summary.label, topic, rule, wanted, found, holds)
+        return Result(self._summary.name, topic, rule, wanted, found, holds)
 
     def _question(self, *topics: str) -> Question:
         return Question(*self._session.having(topics, [self._summary.id]))

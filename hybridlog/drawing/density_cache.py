@@ -175,7 +175,7 @@ class _Recorded:
         chunks = self.follow(recording)
         unknown = set(topics).difference(chunks.topics())
         if unknown:
-            raise TopicError(f"{recording.label} has no topic {min(unknown)!r}.")
+            raise TopicError(f"{recording.name} has no topic {min(unknown)!r}.")
         level = max(-(-(span[1] - span[0]) // pixels) - 1, 0).bit_length()
         begin, end = span[0] >> level, -(-span[1] >> level)
         fine = self._fine_level(chunks, topics, level, begin, end)

@@ -93,8 +93,8 @@ def draw(axes: Axes, found: Sequence[Line]) -> None:
     recordings = {(line.recording, line.start) for line in found}
     since = "the beginning of each recording"
     if len(recordings) == 1:
-        ((label, start),) = recordings
-        since = f"{format_time(start)}, {label}"
+        ((name, start),) = recordings
+        since = f"{format_time(start)}, {name}"
     _label(axes.set_xlabel(""), f"{unit} since {since}")
     topics = list(dict.fromkeys(line.topic for line in found))
     _label(axes.set_title("", loc="left", fontsize="medium"), ", ".join(topics))

@@ -31,7 +31,7 @@ class Line:
 
     Attributes:
         topic: Full name.
-        recording: Label.
+        recording: Name.
         start: Beginning of the recording, ns.
         series: The values.
     """
@@ -75,7 +75,7 @@ def lines(query: Query, fields: Sequence[str], *, pixels: int) -> list[Line]:
                         continue
                     query.counters.add(part.counters)
                     had.update(group)
-                    found += [Line(one.topics[0], about.label, about.extent[0], x) for x in drawn]
+                    found += [Line(one.topics[0], about.name, about.extent[0], x) for x in drawn]
                 if len(found) > MAX_LINES:
                     raise UsageError(
                         f"A plot has at most {MAX_LINES} lines: name fewer fields, or choose "

@@ -44,7 +44,7 @@ def _recording_row(one: RecordingSummary) -> list[str]:
         first, last = one.span
         start, duration = format_time(first - first % 10**9), format_duration(last - first)
     tags = listed(f"{key}={value}" for key, value in sorted(one.tags.items())) if one.tags else ""
-    return [one.label, start, duration, str(one.topic_count), str(one.messages), tags]
+    return [one.name, start, duration, str(one.topic_count), str(one.messages), tags]
 
 
 def properties_html(title: str, properties: Mapping[str, object]) -> str:

@@ -154,7 +154,7 @@ def _table_blocks(planner: Planner, part: Part, values: Iterator[Values]) -> Ite
     for found in values:
         rows = len(found.log_time)
         planner.counters.messages += rows
-        names = {"topic": part.topic, "recording": part.recording.label}
+        names = {"topic": part.topic, "recording": part.recording.name}
         own = {name: _text(names[name], rows) for name in _own(planner)}
         own |= _tags_of(part.recording, tag_columns(planner.question.tags), rows)
         yield Block(part.topic, found.log_time, found.seq + rank, own, found.records.cast(kind), 0)
@@ -323,7 +323,7 @@ def _own_column(
     if name == "topic":
         return _text(channel.channel.topic, rows)
     if name == "recording":
-        return _text(channel.recording.label, rows)
+        return _text(channel.recording.name, rows)
     if name == "seq":
         return numbers(seq)
     if name == "sequence":

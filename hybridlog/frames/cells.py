@@ -123,7 +123,7 @@ def shown(table: pa.Table, most: int) -> dict[str, Any]:
     Returns:
         `columns`, pairs of the name and whether it is a number; `columns_left_out`, their
         number; `rows`, texts; `times`, the log times that each row may be of, ns since 1970
-        (timestamps have microseconds), and `recordings`, the label of its recording: both empty
+        (timestamps have microseconds), and `recordings`, the name of its recording: both empty
         without such columns.
     """
     first = table.select(range(min(table.num_columns, most)))

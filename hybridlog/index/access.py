@@ -140,13 +140,13 @@ class IndexAccess:
             self._places = None
             self._is_complete = False
         repairs = RepairReport()
-        has_changed = False
+        changed: set[str] = set()
         try:
             database = self.connection.open()
             if brings and self.connection.may_write:
                 store = index.StoreIndex(shared.directory, shared.catalog, database, self._progress)
                 session = self._shared.now()
-                has_changed = store.bring_up_to_date(
+                changed = store.bring_up_to_date(
                     session.snapshot(),
                     session.entry_of,
                     index=self.connection.index,
@@ -163,9 +163,9 @@ class IndexAccess:
         self._rests_until = 0.0
         if brings:
             self._stale = set()
-            if has_changed:
-                shared.invalidate()
             self._is_complete = True
+            if changed:
+                shared.catch_up(*changed)  # what came meanwhile is seen, and indexed next
         return database
 
     def disconnect(self) -> None:

@@ -53,7 +53,7 @@ class ChunkIndexer:
 
     def __init__(self, recording: str, *, has_documents: bool = True) -> None:
         self.recording = recording
-        self._key = recording[:16]
+        self._key = recording[-16:]
         self._has_documents = has_documents
         self._parts: dict[int, tuple[Codec, DocumentAssembler, bool]] = {}
         self._lock = threading.Lock()

@@ -47,6 +47,7 @@ class ControlServer:
 
     Args:
         store: The store's directory.
+        recorder: Id of its recording, or another word that no other recorder has.
         name: Name of the recorder, which is that of its recording.
         requests: Handler of each kind of request.
 
@@ -54,10 +55,12 @@ class ControlServer:
         StoreError: The socket cannot be created.
     """
 
-    def __init__(self, store: Path, name: str, requests: Mapping[str, Answer]) -> None:
+    def __init__(
+        self, store: Path, recorder: str, name: str, requests: Mapping[str, Answer]
+    ) -> None:
         self.name = name
         self._requests = requests
-        self._socket_file = _socket_file(store, name)
+        self._socket_file = _socket_file(store, recorder)
         self._path = new_socket(store, "control.sock")
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
@@ -97,7 +100,8 @@ class ControlServer:
     def _write_socket_file(self) -> None:
         with suppress(FileExistsError):
             files.make_folder(self._socket_file.parent)
-        content = json.dumps({"socket": str(self._path), "pid": os.getpid()}) + "\n"
+        said = {"socket": str(self._path), "pid": os.getpid(), "name": self.name}
+        content = json.dumps(said) + "\n"
         files.write_file(self._socket_file, content.encode(), sync=False)
 
     def _serve(self) -> None:
@@ -134,71 +138,76 @@ class ControlServer:
             return {"error": str(error), "exit_code": error.exit_code}
 
 
-def running(store: Path) -> list[str]:
-    """Names of the recorders that run on a store, in the order of their start."""
-    found: list[tuple[float, str]] = []
+def running(store: Path) -> dict[str, str]:
+    """Names of the recorders that run on a store, by their ids, in the order of their start."""
+    found: list[tuple[float, str, str]] = []
     try:
         socket_files = files.names(store / _SOCKET_FILES)
     except OSError:
-        return []
+        return {}
     for file_name, about in socket_files.items():
-        name, suffix = os.path.splitext(file_name)  # noqa: PTH122 - not a path
+        recorder, suffix = os.path.splitext(file_name)  # noqa: PTH122 - not a path
         if suffix != _SUFFIX or file_name[0] == ".":
             continue
         # A recorder that was killed leaves its socket file behind.
         with suppress(OSError, StoreError):
-            _connect(store, name).close()
-            found.append((about.st_mtime, name))
-    return [name for _, name in sorted(found)]
+            _connect(store, recorder).close()
+            found.append((about.st_mtime, recorder, _read(store, recorder)[1]))
+    return {recorder: name for _, recorder, name in sorted(found)}
 
 
-def request(store: Path, name: str, ask: str, **content: Any) -> dict[str, Any]:
-    """Send a request to a running recorder.
+def request(store: Path, recorder: str, ask: str, **content: Any) -> dict[str, Any]:
+    """Send a request to a running recorder, by its id.
 
     Raises:
         StoreError: The recorder does not answer.
         UsageError: The recorder refuses.
     """
     try:
-        with _connect(store, name) as connection:
+        with _connect(store, recorder) as connection:
             connection.sendall(json.dumps({"ask": ask, **content}).encode() + b"\n")
             answer = json.loads(_line(connection, _MAX_ANSWER))
     except (OSError, ValueError) as error:
-        raise StoreError(_gone(name)) from error
+        raise StoreError(_gone(recorder)) from error
     if not isinstance(answer, dict):
-        raise StoreError(_gone(name))
+        raise StoreError(_gone(recorder))
     if "error" in answer:
         raise UsageError(str(answer["error"]))
     return answer
 
 
-def _socket_file(store: Path, name: str) -> Path:
-    return store / _SOCKET_FILES / f"{_as_id(name)}{_SUFFIX}"
+def _socket_file(store: Path, recorder: str) -> Path:
+    return store / _SOCKET_FILES / f"{_ODD.sub('-', recorder).strip('-.') or '-'}{_SUFFIX}"
 
 
-def _as_id(name: str) -> str:
-    """The name as it appears in ids and file names."""
-    return _ODD.sub("-", name).strip("-.") or "-"
+def _gone(recorder: str) -> str:
+    return f"The recorder {recorder!r} does not answer; it has ended or was killed."
 
 
-def _gone(name: str) -> str:
-    return f"The recorder {name!r} does not answer; it has ended or was killed."
+def _read(store: Path, recorder: str) -> tuple[str, str]:
+    """The path of a recorder's socket, and its name.
+
+    Raises:
+        StoreError: No socket exists, or it belongs to another user.
+    """
+    try:
+        said = json.loads(files.read_file(_socket_file(store, recorder), _MAX_SOCKET_FILE))
+        path, name = said["socket"], said["name"]
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        raise StoreError(_gone(recorder)) from error
+    if not (isinstance(path, str) and isinstance(name, str) and is_our_socket(path)):
+        raise StoreError(_gone(recorder))
+    return path, name
 
 
-def _connect(store: Path, name: str) -> socket.socket:
+def _connect(store: Path, recorder: str) -> socket.socket:
     """A connection to a recorder's socket.
 
     Raises:
         StoreError: No socket exists, or it belongs to another user.
         OSError: The recorder does not answer.
     """
-    try:
-        text = files.read_file(_socket_file(store, name), _MAX_SOCKET_FILE)
-        path = json.loads(text)["socket"]
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise StoreError(_gone(name)) from error
-    if not isinstance(path, str) or not is_our_socket(path):
-        raise StoreError(_gone(name))
+    path, _ = _read(store, recorder)
     connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
         connection.settimeout(_TIMEOUT_S)
@@ -209,12 +218,12 @@ def _connect(store: Path, name: str) -> socket.socket:
     return connection
 
 
-def states(store: Path, name: str, every_s: float) -> Iterator[dict[str, Any]]:
+def states(store: Path, recorder: str, every_s: float) -> Iterator[dict[str, Any]]:
     """Poll the state of a recorder until it ends."""
     while True:
         started = time.monotonic()
         try:
-            yield request(store, name, "state")
+            yield request(store, recorder, "state")
         except StoreError:
             return
         pause(max(every_s - (time.monotonic() - started), 0))
@@ -234,11 +243,11 @@ def _line(connection: socket.socket, max_bytes: int) -> bytes:
 
 
 def choose(store: Path, named: Sequence[str]) -> list[str]:
-    """Resolve the names of running recorders; without names, the only one.
+    """The ids of running recorders; without names, the only one.
 
     Args:
         store: The store's directory.
-        named: Names by the user: id or name of a recording, or the beginning of the id. A
+        named: Names by the user: id or name of a recording, or the beginning of one. A
             recorder with a ring has the name of its future snapshots.
 
     Raises:
@@ -261,27 +270,27 @@ def choose(store: Path, named: Sequence[str]) -> list[str]:
             )
         raise UsageError("No recorder runs on this store; start one with `hybridlog record`.")
     if len(names) > 1:
-        raise UsageError(f"Several recorders run; name one of {', '.join(names)}.")
-    return names
+        raise UsageError(f"Several recorders run; name one of {', '.join(names.values())}.")
+    return [*names]
 
 
-def _resolve(name: str, running_names: Sequence[str]) -> str:
-    """The running recorder that a user's name means.
+def _resolve(name: str, recorders: Mapping[str, str]) -> str:
+    """The id of the running recorder that a user's name means.
 
     Raises:
         UsageError: No recorder matches, or several do.
     """
-    wanted = _as_id(name)
-    ring = re.compile(rf"{re.escape(wanted)}-ring-\d+")
+    ring = re.compile(rf"{re.escape(name)}-ring-\d+")
     fitting = (
-        [one for one in running_names if one == name]
-        or [one for one in running_names if one == wanted]
-        or [one for one in running_names if ring.fullmatch(one)]
-        or [one for one in running_names if name and one.startswith(name)]
+        [one for one, known in recorders.items() if name in {one, known}]
+        or [one for one, known in recorders.items() if ring.fullmatch(known)]
+        or [one for one, known in recorders.items() if name and known.startswith(name)]
+        or [one for one in recorders if name and one.startswith(name)]
     )
     if len(fitting) > 1:
-        raise UsageError(f"{name!r} is ambiguous: it may be {', '.join(fitting)}.")
+        found = ", ".join(recorders[one] for one in fitting)
+        raise UsageError(f"{name!r} is ambiguous: it may be {found}.")
     if not fitting:
-        known = ", ".join(running_names) or "none"
+        known = ", ".join(recorders.values()) or "none"
         raise UsageError(f"No running recorder matches {name!r}; running: {known}.")
     return fitting[0]

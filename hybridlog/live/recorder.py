@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
@@ -38,6 +39,7 @@ from hybridlog.live.recording import (
 from hybridlog.live.silence import RULE, Commands, SilenceWatch
 from hybridlog.live.snapshots import SnapshotOptions, Snapshots
 from hybridlog.live.statistics import Lateness, Tally, TopicRates, TopicState
+from hybridlog.maintenance.edit import remove_if
 from hybridlog.maintenance.keep import Own, RetentionThread
 from hybridlog.query.times import format_duration, format_time
 from hybridlog.record.losses import Cause, Loss
@@ -124,7 +126,7 @@ class RecorderState:
     """State of a recorder at one time.
 
     Attributes:
-        name: Name of the recorder: the label of its recording.
+        name: Name of the recorder: that of its recording.
         elapsed_s: Seconds since its start.
         topics: Topics with publishers or messages, by name.
         messages: Messages received so far.
@@ -252,9 +254,9 @@ class Recorder:
         self._target: LiveRecording | Snapshots
         if options.snapshots is None:
             self._target = self._begin(store, {})
-            self.name = self._target.label
+            self.name, recorder = self._target.name, self._target.id
         else:
-            self.name = f"{options.name}-ring-{os.getpid()}"
+            self.name = recorder = f"{options.name}-ring-{os.getpid()}"
             self._target = Snapshots(
                 options.snapshots,
                 options.budget_bytes,
@@ -264,9 +266,12 @@ class Recorder:
                 clock=self._clock,
             )
         try:
-            self._retention = RetentionThread(store.directory, store.remove, self._own(), self.say)
+            self._retention = RetentionThread(
+                store.directory, partial(remove_if, store.shared), self._own(), self.say
+            )
             self._control = ControlServer(
                 store.directory.path,
+                recorder,
                 self.name,
                 {
                     "state": self._ask_state,
@@ -304,7 +309,7 @@ class Recorder:
         target = self._target
         if isinstance(target, Snapshots):
             return None
-        return Own(self.name, lambda: target.first_unread, lambda: target.sealed)
+        return Own(target.id, lambda: target.first_unread, lambda: target.sealed)
 
     # Methods for the program that runs the recorder.
 
@@ -330,7 +335,7 @@ class Recorder:
         now = self._clock.now()
         if self._newest is not None and self._newest.created > now:
             says = f"the clock of this machine says {format_time(now)}"
-            self._note_clock(f"{says}, and recording {self._newest.label} was begun later", {}, now)
+            self._note_clock(f"{says}, and recording {self._newest.name} was begun later", {}, now)
         self._retention.start()
 
     def wait(self, seconds: float) -> bool:

@@ -237,8 +237,8 @@ class LiveRecording:
             self._frozen = self._frozen.pop_all()
         self.id = self._capture.entry.id
         """Recording id."""
-        self.label = self._capture.entry.label
-        """Name of the recording's directory."""
+        self.name = self._capture.entry.name
+        """Its name in the store."""
         self._thread = threading.Thread(target=self._run, name="hybridlog-record", daemon=True)
         self._thread.start()
 
@@ -422,7 +422,7 @@ class LiveRecording:
         """Begin to close or to abort, once; the caller holds `_closing`."""
         if self._is_closing:
             raise UsageError(
-                f"The recording {self.label!r} is being closed, or closing it was interrupted; "
+                f"The recording {self.name!r} is being closed, or closing it was interrupted; "
                 "the next opening of the store seals the flushed messages."
             )
         self._is_closing = True
@@ -511,7 +511,7 @@ class LiveRecording:
         if self.failure is not None:
             raise self.failure
         if self._ended:
-            raise UsageError(f"The recording {self.label!r} was closed.")
+            raise UsageError(f"The recording {self.name!r} was closed.")
 
     def _is_under_pressure(self, timer: _PressureTimer) -> bool:
         return timer.is_high(self._unwritten()) and not self._ended

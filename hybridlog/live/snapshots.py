@@ -420,7 +420,7 @@ class Snapshots:
                     detail=row["reason"],
                 )
             )
-        self._say(f"snapshot {recording.label} because of {reason!r}")
+        self._say(f"snapshot {recording.name} because of {reason!r}")
         try:
             for message in messages:
                 while recording.filled > _RING_SHARE and recording.failure is None:
@@ -434,7 +434,7 @@ class Snapshots:
                 )
         except HybridlogError as error:
             self._failure = error
-            self._say(f"snapshot {recording.label} is not complete: {error}")
+            self._say(f"snapshot {recording.name} is not complete: {error}")
 
     def _end(self, recording: LiveRecording) -> None:
         """Let the worker close a snapshot; the caller holds the lock."""
@@ -449,7 +449,7 @@ class Snapshots:
             self.cut_off.update(recording.cut_off)
         except HybridlogError as error:
             self._failure = error
-            self._say(f"snapshot {recording.label} is not complete: {error}")
+            self._say(f"snapshot {recording.name} is not complete: {error}")
             return
         self._reports.append(report)
         self._stored = (self._stored[0] + stored[0], self._stored[1] + stored[1])

@@ -1,6 +1,6 @@
 """Store maintenance: recovery, index, verification, repair, removal, import.
 
-Segments and journals are the truth. The functions here compare catalog and index with them
+Segments and manifests are the truth. The functions here compare catalog and index with them
 and repair catalog and index, never the reverse. The intent is on the disk before the first
 destructive step, and the next opening of the store finishes interrupted work.
 """

@@ -58,7 +58,7 @@ def index_arrays(
         known.look_again_for(entry, wanted)
         for topic in wanted:
             is_left = _differs(known, entry, found[topic], off=off)
-            (found[topic].left if is_left else found[topic].recordings).append(entry.label)
+            (found[topic].left if is_left else found[topic].recordings).append(entry.name)
     after = _bytes(directory.path, types)
     for topic, one in found.items():
         one.bytes_before, one.bytes_after = before[topic], after[topic]

@@ -11,14 +11,14 @@ import platform
 import tempfile
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import asdict, replace
+from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from hybridlog.columns.folders import Addition, TableFolders, files_of
 from hybridlog.columns.layout import SHARED, SUFFIX
-from hybridlog.entries import describe, put_entry, take_inventory
+from hybridlog.entries import describe, free_name_in, made_again, put_entry, take_inventory
 from hybridlog.maintenance.copying import at_work
 from hybridlog.maintenance.keep import pin_of
 from hybridlog.maintenance.opening import is_at_work, open_catalog
@@ -28,34 +28,41 @@ from hybridlog.maintenance.places import (
     CopiedFile,
     CopiedSegment,
     RefusedError,
-    adopted_line,
-    check_proven,
     content_of,
+    copied_file,
     copied_of,
-    edits_of,
+    digests_of,
     has_lost,
+    manifest_of,
+    marked_there,
+    merged,
     pieces_of,
     problems_of,
+    proven_manifest,
     segments_of,
 )
 from hybridlog.schema.states import expired_messages
-from hybridlog_storage import journal
+from hybridlog_storage import manifest as truth
 from hybridlog_storage.disk import files
 from hybridlog_storage.disk.directory import PAYLOADS, SENDING
 from hybridlog_storage.errors import (
     HeldError,
+    ManifestError,
     ObjectChangedError,
     ObjectExistsError,
+    SegmentError,
     StoreError,
     unreadable,
 )
-from hybridlog_storage.journal import JOURNAL, JournalState
+from hybridlog_storage.manifest import Manifest, Mark, Note, encode, new_random
+from hybridlog_storage.manifests import MANIFEST
 from hybridlog_storage.remote import TRIES
 from hybridlog_storage.remote.bucket import Upload, other_name, path_of
-from hybridlog_storage.remote.lists import RECORDINGS, TABLES, ListedRecording
-from hybridlog_storage.segments.segment_file import sealed_name
+from hybridlog_storage.remote.lists import RECORDINGS, TABLES
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
     from hybridlog.columns.tables import Tables
     from hybridlog_storage.catalog import Catalog, RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
@@ -105,10 +112,9 @@ class BucketPlace:
     def have(self, recordings: Sequence[str]) -> dict[str, Copied]:
         """As of `Place`."""
         self._target.refresh()
-        labels = self._target.labels_by_id()
-        return {one: self._copied(labels[one], one) for one in recordings if one in labels}
+        return {one: self._copied(one) for one in recordings if self._target.has(one)}
 
-    def _copied(self, label: str, recording: str) -> Copied:
+    def _copied(self, recording: str) -> Copied:
         self._target.source.compare(recording)
         self._target.source.bucket.lost.update(self._damaged)
         row = self._own.recording(recording)
@@ -117,15 +123,15 @@ class BucketPlace:
             if not own and name and not is_at_work(self._source, SENDING + name):
                 self._pins.add((recording, pin["id"]))
         if row is None or expired_messages(row[1]):
-            found = copied_of(self._target, label)
+            found = copied_of(self._target, recording)
+            found = found if row is None else replace(found, name=row[1].name)
         else:
-            found = Copied(label, content=content_of(_digests(row[1])))
-        return replace(found, is_damaged=bool(self._target.lost_of(label)))
+            found = Copied(row[1].name, content=content_of(_digests(row[1])))
+        return replace(found, is_damaged=bool(self._target.lost_of(recording)))
 
     def segments(self, recording: str) -> dict[int, CopiedSegment]:
         """As of `Place`."""
-        label = self._target.labels_by_id().get(recording)
-        return {} if label is None else segments_of(journal.read(self._target.recording(label)))
+        return segments_of(manifest_of(self._target, recording))
 
     def begin(self, recording: str, *, wants_payloads: bool) -> Begun:
         """As of `Place`."""
@@ -136,9 +142,10 @@ class BucketPlace:
         if known is not None:
             if not (wants_payloads and (known.lacks_payloads or known.is_damaged)):
                 return Begun(known)
-            listed = {one.name for one in self._target.files_of(known.label).values()}
-            self._is_mending = not (known.lacks_payloads or self._has_lost_lines(known.label))
-            lost = [*self._lost(known.label).values()] if self._is_mending else None
+            listed = {one.name for one in self._target.files_of(recording).values()}
+            has_manifest = manifest_of(self._target, recording) is not None
+            self._is_mending = has_manifest and not known.lacks_payloads
+            lost = [*self._lost(recording).values()] if self._is_mending else None
         self._recording = recording
         bucket, folder = self._target.source.bucket, f"{RECORDINGS}/{recording}/"
         damaged = {one.name for one in self._damaged}  # whatever their entity tags say
@@ -148,20 +155,16 @@ class BucketPlace:
         sizes = {path.removeprefix(f"{PAYLOADS}/"): o.size for path, o in self._there.items()}
         return Begun(sizes=sizes, lost=lost)
 
-    def _has_lost_lines(self, label: str) -> bool:
-        """True if lines of the journal are lost, so that nothing says what else is."""
-        return any(map(_is_lines, self._target.lost_of(label)))
-
-    def _lost(self, label: str) -> dict[str, CopiedFile]:
-        """The files of a recording whose objects are lost, as its journal lists them."""
-        state = journal.read(self._target.recording(label)) or JournalState()
-        listed = {f"{PAYLOADS}/{name}": file for name, file in state.payloads.items()}
-        found = {path: CopiedFile(**asdict(file)) for path, file in listed.items()}
-        for number, sealed in state.sealed.items():
-            digest, size = [(sealed.digest, sealed.bytes), *state.thinned.get(number, ())][-1]
-            name = sealed_name(number)
-            found[name] = CopiedFile(name, size, digest)
-        lost = self._target.lost_of(label)
+    def _lost(self, recording: str) -> dict[str, CopiedFile]:
+        """The files of a recording whose objects are lost, as its manifest lists them."""
+        manifest = manifest_of(self._target, recording)
+        if manifest is None:
+            return {}
+        found = {f"{PAYLOADS}/{one.file}": copied_file(one) for one in manifest.fields}
+        for log in manifest.logs.values():
+            now = log.stored or log
+            found[log.name] = CopiedFile(log.name, now.bytes, now.digest)
+        lost = self._target.lost_of(recording)
         return {path: file for path, file in found.items() if path in lost}
 
     def digest(self, file: CopiedFile, length: int) -> str:
@@ -189,54 +192,58 @@ class BucketPlace:
         self._proven[file.file] = file
         return True
 
-    def publish(self, label: str, lines: bytes, *, lacks_payloads: bool) -> str:
+    def publish(self, data: bytes) -> str:
         """As of `Place`."""
         if self._is_mending:
             return self._mend()
-        target, recording, state = self._target, self._recording, journal.parse(lines)
-        check_proven(state, recording, self._proven)
+        target, recording = self._target, self._recording
+        new = proven_manifest(data, recording, self._proven)
         found = {_path(file): self._there[_path(file)] for file in self._proven.values()}
-        lines += journal.encode(adopted_line(target, state, lacks_payloads=lacks_payloads))
         entry = self._entry(recording)
         fields = {} if entry is None else self._bring_fields(entry)
         for _ in range(TRIES):
             with suppress(ObjectExistsError), target.changing():
                 known = self.have([recording]).get(recording)
-                there = {} if known is None else target.files_of(known.label)
+                there = {} if known is None else target.files_of(recording)
                 is_whole = known is not None and not (known.lacks_payloads or known.is_damaged)
-                if is_whole:  # another process was faster
+                if known is not None and is_whole:  # another process was faster
                     # Of large files the last one to come replaced what the other one had sent.
                     names = {one.name for one in there.values()}
                     listed = {**there, **{p: o for p, o in found.items() if o.name in names}}
+                    name = known.name
                 else:
-                    bucket, name = target.source.bucket, f"{RECORDINGS}/{recording}/{JOURNAL}"
-                    edits, marks = self._added(there, state)
+                    if known is None:
+                        name = free_name_in(self._own, new.name, recording)
+                        made = truth.replace(new, name=name)
+                    else:
+                        made = self._merged(new)
+                        name = made.name
+                    bucket, path = target.source.bucket, f"{RECORDINGS}/{recording}/{MANIFEST}"
+                    marks = {log: there[log] for log in marked_there(made, new) if log in there}
                     listed = {**marks, **found}
-                    if known is not None and self._has_lost_lines(known.label):
-                        self._check_holds_more(there, listed, state.name)
-                    listed[JOURNAL] = bucket.create_beside(name, lines + edits)
-                label = known.label if known is not None else target.free_label(label)
+                    if known is not None and manifest_of(target, recording) is None:
+                        self._check_holds_more(there, listed, new.name)
+                    listed[MANIFEST] = bucket.create_beside(path, encode(made))
                 if listed != there:
-                    target.add_recording(label, ListedRecording(recording, listed), fields)
-                    self._describe(label, entry)
+                    target.add_recording(recording, listed, fields)
+                    self._describe(recording, entry)
                 break
         else:
             raise StoreError(f"{self.name} changes all the time. Copy again.")
-        if is_whole and has_lost(self.segments(recording), segments_of(state)):
+        if is_whole and has_lost(self.segments(recording), segments_of(new)):
             raise HeldError(
                 f"another process has copied it into {self.name} at this moment, with fewer "
                 "payloads.",
                 is_recording=False,
             )
-        return label
+        return name
 
     def _entry(self, recording: str) -> RecordingEntry | None:
         """The entry of a recording in the store that is copied, as its files are now."""
         row = self._catalog.recording(recording)
         if row is None:
             return None
-        label = self._source.label_now(row[1].label, recording)
-        return describe(self._catalog, take_inventory(self._source, label)).entry
+        return describe(self._catalog, take_inventory(self._source, recording)).entry
 
     def _mend(self) -> str:
         """List what was sent in the place of what was lost; the rest stays as it is.
@@ -253,40 +260,58 @@ class BucketPlace:
                     raise RefusedError(f"It was removed from {self.name} meanwhile. Copy again.")
                 found = {
                     path: self._there[path]
-                    for path, file in self._lost(known.label).items()
+                    for path, file in self._lost(recording).items()
                     if file in proven
                 }
                 target.look_closely()
-                if any(path.startswith(f"{TABLES}/") for path in target.lost_of(known.label)):
+                if any(path.startswith(f"{TABLES}/") for path in target.lost_of(recording)):
                     fields = fields or ({} if entry is None else self._bring_fields(entry))
                 if found or fields is not None:
-                    target.mend(known.label, found, fields)
-                    self._own.put(describe(self._own, take_inventory(target, known.label)))
-                left = target.lost_of(known.label)
+                    target.mend(recording, found, fields)
+                    self._own.put(describe(self._own, take_inventory(target, recording)))
+                left = target.lost_of(recording)
                 break
         else:
             raise StoreError(f"{self.name} changes all the time. Copy again.")
         if left:
             raise RefusedError(
-                f"{known.label} in {self.name} has lost {', '.join(sorted(left))}, which this "
+                f"{known.name} in {self.name} has lost {', '.join(sorted(left))}, which this "
                 "store does not have either: their payloads were deleted here, or were never "
                 "here. All else of it stays as it is. Another store may have them."
             )
-        return known.label
+        return known.name
 
-    def _added(
-        self, there: Mapping[str, Object], state: JournalState
-    ) -> tuple[bytes, dict[str, Object]]:
-        """Lines that users added there to a recording, and the segments of their marks.
+    def _merged(self, new: Manifest) -> Manifest:
+        """What is sent, with what users have said of it there."""
+        return merged(manifest_of(self._target, new.id) or self._known(new), new)
 
-        Raises:
-            RefusedError: It was marked here, too.
-        """
-        parts = {int(p.partition(".")[2] or 0): o for p, o in there.items() if _is_lines(p)}
-        data = self._target.source.read([one for _, one in sorted(parts.items())])
-        edits, marks = edits_of(data, state, self.name)
-        lines = b"".join(map(journal.encode, edits))
-        return lines, {name: there[name] for name in marks if name in there}
+    def _known(self, new: Manifest) -> Manifest:
+        """A copy there that has lost its manifest, by its segments and its row of the catalog."""
+        row = self._own.recording(new.id)
+        if row is None:
+            return new
+        there = new
+        with suppress(SegmentError):  # all segments are lost, too
+            there = made_again(take_inventory(self._target, new.id), None)
+        sent = {*digests_of(new).values()}
+        logs = {number: log for number, log in there.logs.items() if log.digest not in sent}
+        marks = [
+            Mark(new_random(), one["time"], one["text"], one["tags"], one.get("end"), log.number)
+            for one in row[1].marks
+            if (log := logs.get(one["segment"])) is not None
+        ]
+        pins = [
+            pin_of(one["id"], (one["from"], one["to"]), one["topics"], one["reason"])
+            for one in row[1].pins
+        ]
+        return truth.replace(
+            there,
+            name=row[1].name,
+            tags=row[1].tags,
+            notes=tuple(Note(note["at"], note["text"]) for note in row[1].notes),
+            marks=tuple(marks),
+            pins=tuple(pins),
+        )
 
     def _check_holds_more(
         self, there: Mapping[str, Object], found: Mapping[str, Object], name: str
@@ -303,11 +328,11 @@ class BucketPlace:
         ]
         if more:
             raise RefusedError(
-                f"Recording {name!r} in {self.name} has lost its journal, and has payloads that "
+                f"Recording {name!r} in {self.name} has lost its manifest, and has payloads that "
                 f"are not here, in {', '.join(sorted(more))}. It stays as it is."
             )
 
-    def _describe(self, label: str, entry: RecordingEntry | None) -> None:
+    def _describe(self, recording: str, entry: RecordingEntry | None) -> None:
         """Make the row of the catalog from what is there, as it is read back."""
         if entry is not None:  # what decoding found out, too
             found = []
@@ -317,9 +342,9 @@ class BucketPlace:
                     found.append((number, digest, rows))
             self._own.put_stamps(entry.id, found)
             self._own.put_damage(entry.id, self._catalog.damage(entry.id))
-        inventory = take_inventory(self._target, label)
+        inventory = take_inventory(self._target, recording)
         if inventory.misfits or not inventory.is_proven:
-            raise StoreError(f"What was copied of recording {label!r} does not fit together.")
+            raise StoreError(f"What was copied of recording {recording!r} does not fit together.")
         self._own.put(describe(self._own, inventory))
 
     def hold(self, recordings: Sequence[str]) -> bool:
@@ -330,22 +355,27 @@ class BucketPlace:
         self.leave()
         folder = self._held.enter_context(at_work(self._source))
         name = self._mine + folder.name.removeprefix(SENDING)
+        self._pins = {(recording, name) for recording in recordings}
         reason = "held for a copy that deletes payloads at its source; unpin it if none runs"
         pin = pin_of(name, (None, None), None, reason)
-        self._pins = {(recording, name) for recording in recordings}
-        self._note([(recording, pin) for recording in recordings])
+
+        def pinned(now: Manifest) -> Manifest:
+            others = [one for one in now.pins if one.id != name]
+            return truth.replace(now, pins=(*others, pin))
+
+        self._change(recordings, pinned)
         return True
 
-    def _note(self, lines: Sequence[tuple[str, journal.Event]]) -> None:
-        """Append lines to journals of recordings, in one change."""
+    def _change(self, recordings: Iterable[str], how: Callable[[Manifest], Manifest]) -> None:
+        """Change the manifests of recordings at once; lost ones are left out."""
         target = self._target
         for _ in range(TRIES):
             with suppress(ObjectExistsError), target.changing():
-                labels = target.labels_by_id()
-                for recording, line in lines:
-                    if recording in labels:
-                        target.append(labels[recording], line)
-                        put_entry(target, self._own, labels[recording])
+                for recording in recordings:
+                    if target.has(recording):
+                        with suppress(ManifestError):
+                            target.change(recording, how)
+                            put_entry(target, self._own, recording)
                 return
         raise StoreError(f"{self.name} changes all the time. Copy again.")
 
@@ -358,16 +388,21 @@ class BucketPlace:
         pins, self._pins = self._pins, set()
         with self._held:
             if pins:
-                self._note([(one, journal.event(journal.UNPINNED, id=pin)) for one, pin in pins])
+                ids = {pin for _, pin in pins}
+                self._change(
+                    {one for one, _ in pins},
+                    lambda now: truth.replace(
+                        now, pins=tuple(pin for pin in now.pins if pin.id not in ids)
+                    ),
+                )
         self._recording, self._upload, self._is_mending = "", None, False
         self._there.clear()
         self._proven.clear()
 
     def problems(self, recording: str) -> list[str]:
         """As of `Place`; damaged objects count as lost from here on."""
-        label = self._target.labels_by_id().get(recording)
         self._target.look_closely()
-        objects = {} if label is None else self._target.files_of(label)
+        objects = self._target.files_of(recording) if self._target.has(recording) else {}
 
         def is_whole(file: CopiedFile) -> bool:
             """True if an object is, whatever was kept of it here."""
@@ -381,7 +416,7 @@ class BucketPlace:
                     return False
             return True
 
-        return problems_of(self._target, label, is_whole)
+        return problems_of(self._target, recording, is_whole)
 
     def _bring_fields(self, entry: RecordingEntry) -> dict[str, Object]:
         """Create the objects of a recording's fields; each file has no other recording."""
@@ -422,11 +457,6 @@ class BucketPlace:
 def _path(file: CopiedFile) -> str:
     """The path of a file below its recording."""
     return file.below(Path()).as_posix()
-
-
-def _is_lines(path: str) -> bool:
-    """True for the journal of a recording, and for objects with later lines of it."""
-    return path.partition(".")[0] == JOURNAL
 
 
 def _digests(entry: RecordingEntry) -> dict[int, str]:

@@ -1,7 +1,7 @@
 """Copies recordings from a store to a place, with checks; resumes after an interruption.
 
 A file is sent from the byte on that the place has of it; the place then proves the whole file
-(`places.py`). The journal goes last.
+(`places.py`). The manifest goes last.
 """
 
 from __future__ import annotations
@@ -11,7 +11,8 @@ import secrets
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+from shlex import quote
 from typing import TYPE_CHECKING, Final
 
 from hybridlog.entries import take_inventory
@@ -21,17 +22,18 @@ from hybridlog.maintenance.places import (
     CopiedFile,
     RefusedError,
     content_of,
+    digests_of,
     files_of,
     has_lost,
     pieces_of,
     segments_of,
 )
 from hybridlog.wording import counted
-from hybridlog_storage import journal
 from hybridlog_storage.disk import durability, files
-from hybridlog_storage.disk.directory import REMOVED, SENDING, StoreDirectory
-from hybridlog_storage.errors import HeldError, StoreError, TopicError, UsageError, unreadable
-from hybridlog_storage.journal import JOURNAL, JournalState
+from hybridlog_storage.disk.directory import REMOVED, SENDING, StoreDirectory, gone
+from hybridlog_storage.errors import HeldError, StoreError, TopicError, UsageError
+from hybridlog_storage.manifest import Manifest, encode, replace
+from hybridlog_storage.manifests import read_in, write_in
 from hybridlog_storage.remote.bucket import digest_like
 from hybridlog_storage.segments.segment_format import not_copied_record
 from hybridlog_storage.stopping import pause
@@ -78,10 +80,10 @@ class CopyReport:
     """The result of `copy`.
 
     Attributes:
-        copied: Labels, in the place, of the copied recordings.
-        known: Labels of recordings that were there already.
+        copied: Names, in the place, of the copied recordings.
+        known: Names there of recordings that were there already.
         lacking: Those of them whose payloads were deleted there, and are here.
-        refused: Why recordings were not copied, by their labels here.
+        refused: Why recordings were not copied, by their names here.
         held: Ids of recordings that another process held, here or there: what is left of them can
             be done later.
         bytes_copied: Bytes copied now, without those that were there after an interruption.
@@ -146,7 +148,7 @@ class _Copying:
         self._options = options
         self._progress = progress
         self._report = report
-        self._proven: dict[str, JournalState] = {}  # as it was sent, by the recording's id
+        self._proven: dict[str, Manifest] = {}  # as it was sent, by the recording's id
         self._done = self._total = 0
         self._due = 0.0  # time from which more may be sent
 
@@ -173,14 +175,14 @@ class _Copying:
             try:
                 self._copy(one)
             except RefusedError as error:
-                self._report.refused[one.label] = str(error)
+                self._report.refused[one.name] = str(error)
                 self._total -= one.stored_bytes
             except HeldError as error:
-                self._report.refused[one.label] = f"Recording {one.label!r} is not copied: {error}"
+                self._report.refused[one.name] = f"Recording {one.name!r} is not copied: {error}"
                 self._report.held.append(one.id)
             except TopicError as error:  # it was removed here meanwhile
                 self._place.drop()
-                self._report.refused[one.label] = str(error)
+                self._report.refused[one.name] = str(error)
                 self._total -= one.stored_bytes
             finally:
                 self._place.leave()
@@ -245,7 +247,8 @@ class _Copying:
             return there is not None
         if there.is_damaged or not there.lacks_payloads:
             return not there.is_damaged
-        return self._state(recording).lacks_payloads
+        here = self._manifest(recording)
+        return here is not None and here.lacks_payloads
 
     def _checked(self, there: Mapping[str, Copied]) -> dict[str, Copied]:
         """Read what is there; where damaged files can be replaced, the place notes them."""
@@ -254,8 +257,8 @@ class _Copying:
             found = self._place.have([recording]).get(recording)
             if problems and not (found is not None and found.is_damaged):
                 self._report.problems.append(
-                    f"{known.label} in {self._place.name} is damaged: {'; '.join(problems[:3])}. "
-                    f"{self._cure(recording, known.label)}"
+                    f"{known.name} in {self._place.name} is damaged: {'; '.join(problems[:3])}. "
+                    f"{self._cure(recording, known.name)}"
                 )
         return self._place.have([*there])
 
@@ -263,80 +266,78 @@ class _Copying:
         """Advice about a damaged copy: it is only to be removed if all of it is here."""
         segments = self._place.segments(recording)
         with suppress(StoreError):
-            for label in self._source.labels_of(recording):
-                inventory = take_inventory(self._source, label)
-                state = inventory.state or JournalState()
-                is_less = state.lacks_payloads or has_lost(segments_of(state), segments)
-                if (
-                    inventory.is_proven
-                    and not (inventory.misfits or is_less)
-                    and segments.keys() <= state.sealed.keys()
-                ):
-                    return (
-                        f"Restore it, or remove it there (`hybridlog rm {there}`), and copy again."
-                    )
+            inventory = take_inventory(self._source, recording)
+            here = inventory.manifest
+            if (
+                here is not None
+                and inventory.is_proven
+                and not inventory.misfits
+                and not here.lacks_payloads
+                and not has_lost(segments_of(here), segments)
+                and segments.keys() <= here.logs.keys()
+            ):
+                command = f"`hybridlog rm {quote(there)}`"
+                return f"Restore it, or remove it there ({command}), and copy again."
         return "Restore it from another copy: not all of it is here."
 
-    def _state(self, recording: str) -> JournalState:
-        """The journal of a recording here; an empty one if it cannot be read."""
+    def _manifest(self, recording: str) -> Manifest | None:
+        """The manifest of a recording here; None if it cannot be read."""
         with suppress(StoreError):
-            for label in self._source.labels_of(recording):
-                return journal.read(self._source.recording(label)) or JournalState()
-        return JournalState()
+            return read_in(self._source.recording(recording))
+        return None
 
     def _note_known(self, one: RecordingEntry | RecordingSummary, known: Copied) -> None:
-        state = JournalState() if self._source.is_remote else self._state(one.id)
-        missing = self._missing(one.id, state, known)
+        here = None if self._source.is_remote else self._manifest(one.id)
+        missing = 0 if here is None else self._missing(here, known)
         if missing:
-            self._report.refused[one.label] = (
-                f"{known.label} in {self._place.name} lacks {counted(missing, 'segment')} of "
-                f"recording {one.label!r}: it may have been copied by hand before its end. "
-                f"{self._cure(one.id, known.label)}"
+            self._report.refused[one.name] = (
+                f"{known.name} in {self._place.name} lacks {counted(missing, 'segment')} of "
+                f"recording {one.name!r}: it may have been copied by hand before its end. "
+                f"{self._cure(one.id, known.name)}"
             )
             return
-        self._report.known.append(known.label)
+        self._report.known.append(known.name)
         if known.is_damaged:
             self._report.problems.append(
-                f"{known.label} in {self._place.name} is damaged: `hybridlog copy` without "
+                f"{known.name} in {self._place.name} is damaged: `hybridlog copy` without "
                 "--only-fields mends it."
             )
         may_lack = known.expired and not known.lacks_payloads
-        if may_lack and has_lost(self._place.segments(one.id), segments_of(state)):
-            self._report.lacking.append(known.label)
-        self._check_there(one, known, state)
+        if may_lack and has_lost(self._place.segments(one.id), segments_of(here)):
+            self._report.lacking.append(known.name)
+        if here is not None:
+            self._check_there(known, here)
 
-    def _check_there(
-        self, one: RecordingEntry | RecordingSummary, known: Copied, state: JournalState
-    ) -> None:
+    def _check_there(self, known: Copied, here: Manifest) -> None:
         """Read a copy that is there before payloads expire here."""
         if self._options.then_expire:
-            problems = self._place.problems(one.id)
-            if known.lacks_payloads or has_lost(self._place.segments(one.id), segments_of(state)):
+            problems = self._place.problems(here.id)
+            if known.lacks_payloads or has_lost(self._place.segments(here.id), segments_of(here)):
                 problems.append("payloads of it have expired there")
             if problems:
                 self._report.problems.append(
-                    f"Payloads of {known.label} stay: its copy in {self._place.name} is not "
+                    f"Payloads of {known.name} stay: its copy in {self._place.name} is not "
                     f"whole: {'; '.join(problems[:3])}."
                 )
             else:
-                self._proven[one.id] = state
+                self._proven[here.id] = here
 
-    def _missing(self, recording: str, state: JournalState, known: Copied) -> int:
+    def _missing(self, here: Manifest, known: Copied) -> int:
         """Number of segments that its copy does not have, but for marks: they do not follow."""
-        listed = {number: one.digest for number, one in state.sealed.items()}
-        if self._source.is_remote or content_of(listed) == known.content:
+        listed = digests_of(here)
+        if content_of(listed) == known.content:
             return 0
-        there, marks = self._place.segments(recording), {mark["segment"] for mark in state.marks}
+        there, marks = self._place.segments(here.id), {mark.segment for mark in here.marks}
         same = {number for number, one in there.items() if listed.get(number) == one.digest}
         return len(listed.keys() - marks - same)
 
     def _copy(self, one: RecordingEntry | RecordingSummary) -> None:
-        """Copy a recording, whatever label it has now.
+        """Copy a recording.
 
         Raises:
             RefusedError: It has not ended, or is damaged.
         """
-        name = f"Recording {one.label!r} of {self._source.place}"
+        name = f"Recording {one.name!r} of {self._source.place}"
         if one.status == "open":
             raise RefusedError(f"{name} is being written. Copy it when it has ended.")
         if one.status == "unfinished":
@@ -346,9 +347,11 @@ class _Copying:
             )
         only_fields, left = self._options.only_fields, _TRIES
         while True:
-            label, sent = self._source.label_now(one.label, one.id), None
+            sent = None
+            if not self._source.has(one.id):
+                raise gone(one.name)
             try:
-                with self._sent(label, one.id) as sent:
+                with self._sent(one.id) as sent:
                     # Fields may take a while to prepare, and a server waits only so long.
                     begun = self._place.begin(one.id, wants_payloads=not only_fields)
                     if begun.known is not None:  # another process has copied it meanwhile
@@ -362,14 +365,14 @@ class _Copying:
             except StoreError:
                 left -= 1
                 has_changed = left > 0 and sent is not None and sent.has_changed()
-                if self._source.has_label(label, one.id) and not has_changed:
+                if self._source.has(one.id) and not has_changed:
                     raise
-        there = self._place.publish(one.label, sent.lines, lacks_payloads=sent.lacks_payloads)
+        there = self._place.publish(encode(sent.manifest))
         self._report.copied.append(there)
         if begun.lost is not None:  # the rest of it was not sent
-            self._check_there(one, self._place.have([one.id])[one.id], sent.state)
+            self._check_there(self._place.have([one.id])[one.id], sent.manifest)
         elif self._options.then_expire and not only_fields:
-            self._proven[one.id] = sent.state
+            self._proven[one.id] = sent.manifest
 
     def _bring(self, sent: _Sent, file: CopiedFile, there: int) -> None:
         """Send what a place lacks of a file.
@@ -398,7 +401,7 @@ class _Copying:
         for data in sent.pieces(file, at, file.bytes, piece):
             place.append(file, at, data)
             at += len(data)
-            self._count(sent.label, len(data))
+            self._count(sent.manifest.name, len(data))
         if not place.prove(file):
             raise damaged
         if not (place.proves or is_there or self._is_same_there(sent, file, file.bytes)):
@@ -411,71 +414,59 @@ class _Copying:
         digest = self._place.digest(file, length)
         return digest == digest_like(digest, sent.pieces(file, 0, length, _READ))
 
-    def _count(self, label: str, size: int) -> None:
+    def _count(self, name: str, size: int) -> None:
         """Count bytes that were sent, and wait as long as the limit of the rate asks for."""
         self._report.bytes_copied += size
         self._done += size
         if self._progress is not None:
-            self._progress(label, self._done, max(self._total, self._done))
+            self._progress(name, self._done, max(self._total, self._done))
         if self._options.limit_rate is not None:
             now = time.monotonic()
             self._due = max(self._due, now) + size / self._options.limit_rate
             pause(max(self._due - now, 0.0))
 
     @contextmanager
-    def _sent(self, label: str, recording: str) -> Iterator[_Sent]:
+    def _sent(self, recording: str) -> Iterator[_Sent]:
         """The recording as it is sent."""
         if not self._options.only_fields:
-            yield _Sent(self._source, label, recording)
+            yield _Sent(self._source, recording)
             return
-        whole = _Sent(self._source, label, recording)
+        whole = _Sent(self._source, recording)
         with _with_fields(self._source, whole) as scratch:
-            sent = _Sent(scratch, label, recording)
-            sent.lacks_payloads = sent.lines != whole.lines  # small messages stay whole
+            sent = _Sent(scratch, recording)
+            if sent.files != whole.files:  # small messages stay whole
+                sent.manifest = replace(sent.manifest, lacks_payloads=True)
             yield sent
 
 
 class _Sent:
-    """A recording as it is sent: its files, and its journal by which they are checked.
+    """A recording as it is sent: its files, and its manifest by which they are checked.
 
     Args:
         directory: Its store.
-        label: Its label.
         recording: Its id.
 
     Attributes:
-        lacks_payloads: Whether payloads are left for later.
-        state: Its journal.
+        manifest: Its manifest.
 
     Raises:
         RefusedError: It is incomplete.
     """
 
-    def __init__(self, directory: StoreDirectory, label: str, recording: str) -> None:
-        self.label = label
-        self.lacks_payloads = False
-        self.path = directory.recording(label)
-        inventory = take_inventory(directory, label)
+    def __init__(self, directory: StoreDirectory, recording: str) -> None:
+        self.path = directory.recording(recording)
+        inventory = take_inventory(directory, recording)
         if inventory.id != recording or inventory.misfits or not inventory.is_proven:
             raise RefusedError(
-                f"Recording {label!r} of {directory.place} is incomplete: `hybridlog verify "
-                f"--store {directory.place} {label}` shows what is missing. It was not copied."
+                f"Recording {inventory.name!r} of {directory.place} is incomplete: `hybridlog "
+                f"verify --store {directory.place} {quote(inventory.name)}` shows what is missing. "
+                "It was not copied."
             )
-        assert inventory.state is not None  # it is proven
-        self.state: JournalState = inventory.state
+        assert inventory.manifest is not None  # it is proven
+        self.manifest: Manifest = inventory.manifest
         self.files = files_of(inventory)
         self.segments = [*inventory.summaries]
         self.bytes = sum(file.bytes for file in self.files)
-        self.lines = self._read()
-        if replace(journal.parse(self.lines), torn=self.state.torn) != self.state:
-            raise StoreError(f"{self.path} has changed meanwhile. Run it again.")
-
-    def _read(self) -> bytes:
-        path = self.path / JOURNAL
-        try:
-            return files.read_file(path, journal.MAX_JOURNAL)[: self.state.length]
-        except OSError as error:
-            raise unreadable(error, path) from error
 
     def pieces(self, file: CopiedFile, at: int, end: int, piece: int) -> Iterator[bytes]:
         """The bytes of a file, a piece at a time.
@@ -489,12 +480,11 @@ class _Sent:
             raise RefusedError(str(error)) from error
 
     def has_changed(self) -> bool:
-        """True if files of it were replaced since: the journal says so."""
-        state = journal.read(self.path)
-        return state is not None and (state.thinned, state.payloads, state.sealed) != (
-            self.state.thinned,
-            self.state.payloads,
-            self.state.sealed,
+        """True if files of it were replaced since: the manifest says so."""
+        now = read_in(self.path)
+        return now is not None and (now.files, now.fields) != (
+            self.manifest.files,
+            self.manifest.fields,
         )
 
 
@@ -509,14 +499,14 @@ def _with_fields(source: StoreDirectory, sent: _Sent) -> Iterator[StoreDirectory
 
     with at_work(source) as folder:
         scratch = StoreDirectory.create(folder / "store")
-        path = scratch.recording(sent.label)
+        path = scratch.recording(sent.manifest.id)
         files.make_folder(path)
         for file in sent.files:
             target = file.below(path)
             files.make_folders(target.parent)
             files.link(file.below(sent.path), target)
-        files.write_file(path / JOURNAL, sent.lines)
-        expire(scratch, sent.label, sent.segments, record=not_copied_record)
+        write_in(path, sent.manifest)
+        expire(scratch, sent.manifest.id, sent.segments, record=not_copied_record)
         yield scratch
 
 

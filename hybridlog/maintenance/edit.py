@@ -2,30 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack, suppress
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
 from hybridlog.entries import (
     announce_removal,
+    free_name_in,
+    listed,
     put_entry,
     recording_metadata,
-    sealed_event,
     take_inventory,
 )
 from hybridlog.maintenance import tables
 from hybridlog.maintenance.index import decode_again, remove_documents
-from hybridlog.maintenance.opening import finish_renaming, remove_marks
+from hybridlog.maintenance.opening import remove_marks
 from hybridlog.query.times import TimeLike, format_time, parse_time
 from hybridlog.record.losses import extent_of
 from hybridlog.record.marks import mark_channel, mark_payload
-from hybridlog_storage import journal
 from hybridlog_storage.disk import files
-from hybridlog_storage.disk.directory import LOCK_WAIT_S
-from hybridlog_storage.errors import StoreError, TimeError, TopicError, UsageError
-from hybridlog_storage.journal import Journal
+from hybridlog_storage.disk.directory import LOCK_WAIT_S, gone
+from hybridlog_storage.errors import (
+    ConnectionLostError,
+    RecordingGoneError,
+    StoreError,
+    TimeError,
+    UsageError,
+)
+from hybridlog_storage.manifest import Manifest, Mark, new_random, replace, with_totals
+from hybridlog_storage.manifests import change_in, read_in
 from hybridlog_storage.messages import EXPIRED_IDS, Batch, Channel
 from hybridlog_storage.mongo.index_state import IndexState
 from hybridlog_storage.remote.store import RemoteDirectory
@@ -37,6 +44,7 @@ from hybridlog_storage.segments.segment_reader import SegmentReader
 
 if TYPE_CHECKING:
     from hybridlog.entries import Inventory
+    from hybridlog.opened import OpenStore
     from hybridlog_storage.catalog import Catalog, RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.mongo.database import Database
@@ -44,30 +52,40 @@ if TYPE_CHECKING:
     from hybridlog_storage.segments.segment_file import Sealed
 
 
-def append(
+def change(
     directory: StoreDirectory,
     catalog: Catalog,
     entry: RecordingEntry,
-    lines: Sequence[journal.Event],
+    how: Callable[[Manifest], Manifest],
+    name: str | None = None,
 ) -> None:
-    """Append lines to the journal of a recording; a new name changes its directory's label.
+    """Change the manifest of a recording, also of a running one, and give it another name.
+
+    Args:
+        directory: The store.
+        catalog: Its catalog.
+        entry: The recording.
+        how: The change.
+        name: The name; it gets a number if another recording has it. None to leave it.
 
     Raises:
-        StoreError: It is being written, or its journal cannot be written.
-        TopicError: It is gone.
+        StoreError: The manifest cannot be written.
+        TopicError: The recording is gone.
     """
-    with directory.writing(entry.label, entry.id, wait_s=LOCK_WAIT_S) as label:
-        directory.append(label, *[_with_labels(directory, label, line) for line in lines])
-        state = journal.read(directory.recording(label))
-        put_entry(directory, catalog, finish_renaming(directory, label, state))
+    with ExitStack() as held:
+        held.enter_context(directory.changing())
+        if name is not None:
+            held.enter_context(directory.alone())
+            free, others = free_name_in(catalog, name, entry.id), how
 
+            def how(now: Manifest) -> Manifest:
+                return replace(others(now), name=free)
 
-def _with_labels(directory: StoreDirectory, label: str, line: journal.Event) -> journal.Event:
-    """A line of the journal; a renaming line also has the old and the new label."""
-    if line["event"] != journal.RENAMED:
-        return line
-    new = directory.free_label(str(line["name"]), but=label)
-    return line if new == label else {**line, "from": label, "to": new}
+        try:
+            directory.change(entry.id, how)
+        except RecordingGoneError as error:
+            raise gone(entry.name) from error
+        put_entry(directory, catalog, entry.id, is_open=directory.is_recorded(entry.id))
 
 
 def time_of_mark(entry: RecordingEntry, moment: TimeLike) -> int:
@@ -86,7 +104,7 @@ def time_of_mark(entry: RecordingEntry, moment: TimeLike) -> int:
         ends = f"begins at {format_time(start)}" if time < start else f"ends at {format_time(end)}"
         is_ = f"{moment} is {format_time(time)}, and " if isinstance(moment, str) else ""
         raise TimeError(
-            f"{is_ or f'A mark cannot be at {format_time(time)}: '}{entry.label} {ends}; ten "
+            f"{is_ or f'A mark cannot be at {format_time(time)}: '}{entry.name} {ends}; ten "
             "seconds from its beginning are +10s, ten before its end -10s."
         )
     return time
@@ -102,7 +120,7 @@ def mark(
     tags: Mapping[str, str],
     end: int | None = None,
 ) -> None:
-    """Set a mark: a segment of one message, and a line of the journal.
+    """Set a mark: a segment of one message, and a line of the manifest.
 
     Args:
         directory: The store.
@@ -122,25 +140,22 @@ def mark(
         raise TimeError("A mark cannot be set before 1970: its log time has no sign.")
     if end is not None and end < moment:
         raise TimeError("A mark cannot end before it begins.")
-    with directory.writing(entry.label, entry.id, wait_s=LOCK_WAIT_S) as label:
-        with directory.at_hand(label) as here:
-            path = here.recording(label)
-            inventory = take_inventory(directory, label)
+    with directory.writing(entry.id, entry.name, wait_s=LOCK_WAIT_S):
+        with directory.at_hand(entry.id) as here:
+            path = here.recording(entry.id)
+            inventory = take_inventory(directory, entry.id)
             numbers = {*inventory.listing.sealed, *inventory.listing.open}
-            numbers.update(inventory.state.sealed if inventory.state is not None else ())
+            numbers.update(inventory.manifest.logs if inventory.manifest is not None else ())
             number = max(numbers, default=-1) + 1
             channel, channel_id, schema_id = _channel(inventory)
             payload = mark_payload(text, tags, end)
-            seq = _next_seq(directory, label, inventory)
+            seq = _next_seq(directory, inventory)
             segment = SegmentFile.create(path, number, recording_metadata(entry), seq)
-            until = {} if end is None else {"end": end}
-            marked = journal.event(
-                journal.MARKED, time=moment, **until, text=text, tags=dict(tags), segment=number
-            )
+            marked = Mark(new_random(), moment, text, dict(tags), end, number)
 
             def announce(sealed: Sealed) -> None:
-                # In this order: a mark whose segment is not listed does not exist.
-                Journal(path).append(marked, sealed_event(sealed))
+                change = listed(sealed)
+                change_in(path, lambda now: replace(change(now), marks=(*now.marks, marked)))
 
             try:
                 segment.define([(channel_id, schema_id, channel)])
@@ -152,7 +167,7 @@ def mark(
                 segment.abandon()
                 _take_back(segment)
                 raise
-        now = put_entry(directory, catalog, label)
+        now = put_entry(directory, catalog, entry.id)
         if entry.is_decoded:
             decode_again(directory, catalog, now)
 
@@ -165,7 +180,7 @@ def unmark(
     *,
     text: str,
 ) -> None:
-    """Remove the marks of a text: lines of the journal, then their segments.
+    """Remove the marks of a text from the manifest, then their segments.
 
     Args:
         directory: The store.
@@ -179,36 +194,44 @@ def unmark(
         TopicError: It is gone.
         UsageError: It has no such mark.
     """
-    with directory.writing(entry.label, entry.id, wait_s=LOCK_WAIT_S) as label:
-        state = journal.read(directory.recording(label))
-        marks = state.marks if state is not None else []
-        gone = [m for m in marks if m["text"] == text and moment in {None, m["time"]}]
-        if not gone:
+    with directory.writing(entry.id, entry.name, wait_s=LOCK_WAIT_S):
+        manifest = read_in(directory.recording(entry.id))
+        marks = manifest.marks if manifest is not None else ()
+        chosen = [mark for mark in marks if mark.text == text and moment in {None, mark.time}]
+        if not chosen:
             when = "" if moment is None else " at this time"
             raise UsageError(
-                f"{label} has no mark {text!r}{when} that was set after it was recorded: those of "
-                "a recorder are messages, and stay."
+                f"{entry.name} has no mark {text!r}{when} that was set after it was recorded: "
+                "those of a recorder are messages, and stay."
             )
-        lines = [journal.event(journal.UNMARKED, segment=mark["segment"]) for mark in gone]
-        with directory.at_hand(label, [mark["segment"] for mark in gone]) as here:
-            path = here.recording(label)
-            Journal(path).append(*lines)
-            state = journal.read(path)
-            assert state is not None
-            remove_marks(path, state)
-        now = put_entry(directory, catalog, label)
+        numbers = [mark.segment for mark in chosen if mark.segment is not None]
+        ids = {mark.id for mark in chosen}
+
+        def change(now: Manifest) -> Manifest:
+            made = replace(
+                now,
+                marks=tuple(mark for mark in now.marks if mark.id not in ids),
+                files=tuple(one for one in now.files if one.number not in numbers),
+                unmarked=(*now.unmarked, *(one for one in numbers if one not in now.unmarked)),
+            )
+            return with_totals(made)
+
+        with directory.at_hand(entry.id, numbers) as here:
+            path = here.recording(entry.id)
+            remove_marks(path, change_in(path, change))
+        now = put_entry(directory, catalog, entry.id)
         if entry.is_decoded:
             decode_again(directory, catalog, now)
 
 
 def _take_back(segment: SegmentFile) -> None:
-    """Remove the segment of a failed mark, unless the journal lists it.
+    """Remove the segment of a failed mark, unless the manifest lists it.
 
     The next opening of the store finishes a removal that fails, or a listed mark.
     """
     with suppress(StoreError, OSError):
-        state = journal.read(segment.path.parent)
-        if state is not None and segment.number not in state.sealed:
+        manifest = read_in(segment.path.parent)
+        if manifest is not None and segment.number not in manifest.logs:
             files.unlink(segment.path)
 
 
@@ -225,12 +248,12 @@ def _channel(inventory: Inventory) -> tuple[Channel, int, int]:
             if same and channel.message_encoding == wanted.message_encoding:
                 return channel, channel_id, summary.schema_ids[channel_id]
     # Ids of a lost segment are not reused either.
-    lost = (int(c["id"]) for sealed in inventory.lost for c in sealed.channels)
+    lost = (number for file in inventory.lost for number in file.parts)
     ids = [number % EXPIRED_IDS for number in known]
     return wanted, max([*ids, *lost], default=-1) + 1, schemas + 1
 
 
-def _next_seq(directory: StoreDirectory, label: str, inventory: Inventory) -> int:
+def _next_seq(directory: StoreDirectory, inventory: Inventory) -> int:
     """One more than the greatest arrival number of a recording.
 
     Raises:
@@ -240,7 +263,7 @@ def _next_seq(directory: StoreDirectory, label: str, inventory: Inventory) -> in
     for number, summary in sorted(inventory.summaries.items(), reverse=True):
         if not summary.chunks:
             continue
-        path = directory.recording(label) / inventory.listing.sealed[number]
+        path = directory.recording(inventory.folder) / inventory.listing.sealed[number]
         with SegmentReader(path, number) as reader:
             starts = summary.table.part_bounds()[:-1]
             messages = np.add.reduceat(summary.table.parts["messages"], starts)
@@ -249,7 +272,8 @@ def _next_seq(directory: StoreDirectory, label: str, inventory: Inventory) -> in
         if following >= int(cast("int", summary.recording.get("next_seq", 0))):
             break
     # Numbers of a lost segment are not reused: it may be restored from a copy.
-    return following + sum(sealed.messages for sealed in inventory.lost)
+    lost = (part for file in inventory.lost for part in file.parts.values())
+    return following + sum(part.messages for part in lost)
 
 
 def _chunk(channel_id: int, moment: int, payload: bytes, seq: int) -> PackedChunk:
@@ -269,15 +293,36 @@ def _chunk(channel_id: int, moment: int, payload: bytes, seq: int) -> PackedChun
     return pack(Compressor("none"), *builder.take())
 
 
+def remove_if(
+    shared: OpenStore, recording: str, check: Callable[[Manifest], None] = lambda _: None
+) -> None:
+    """Delete a recording of an open store, by its id.
+
+    Args:
+        shared: The open store.
+        recording: The recording.
+        check: Called with the newest manifest; raises to keep the recording.
+    """
+    try:
+        entry = shared.now().entry(recording)
+        remove(shared.directory, shared.catalog, shared.index.writable_database, entry, check)
+    except ConnectionLostError:
+        shared.invalidate()
+        shared.index.connect()  # a new connection removes the rest
+    finally:
+        shared.catch_up()
+
+
 def remove(
     directory: StoreDirectory,
     catalog: Catalog,
     database: Database | None,
     entry: RecordingEntry,
+    check: Callable[[Manifest], None],
 ) -> None:
     """Delete a recording.
 
-    The journal announces it first. Then the directory gets a hidden name, and the recording
+    The manifest announces it first. Then the directory gets a hidden name, and the recording
     is gone; the next opening removes remaining files. In a bucket it is listed no more, and its
     objects stay for those who read them.
 
@@ -286,20 +331,22 @@ def remove(
         catalog: Its catalog.
         database: The index; None if it is unavailable: the next connection clears it.
         entry: The recording.
+        check: Called with the newest manifest; raises to keep the recording.
 
     Raises:
         StoreError: It is being written, or cannot be removed.
         TopicError: It is gone.
         DatabaseError: MongoDB fails; the files are gone, and the next connection clears it.
     """
-    with directory.writing(entry.label, entry.id, wait_s=LOCK_WAIT_S) as label:
+    with directory.writing(entry.id, entry.name, wait_s=LOCK_WAIT_S):
         if isinstance(directory, RemoteDirectory):
-            directory.drop(label)
+            check(cast("Manifest", read_in(directory.recording(entry.id))))
+            directory.drop(entry.id)
             catalog.remove(entry.id)
             return
-        announce_removal(directory, label)
+        announce_removal(directory, entry.id, check)
         tables.announce_removal(directory, entry.id)
-        hidden = directory.hide(label)
+        hidden = directory.hide(entry.id)
         try:
             catalog.remove(entry.id)
             with suppress(OSError):  # the next connection removes them
@@ -318,16 +365,3 @@ def _clear(database: Database, entry: RecordingEntry) -> None:
     if indexed is not None:
         state.put(entry, "removing", turn=indexed.turn + 1)
     remove_documents(database, entry.key, indexed)
-
-
-def remove_copy(directory: StoreDirectory, label: str, recording: str) -> None:
-    """Delete a directory with a copy of a recording; the index stays.
-
-    Raises:
-        StoreError: It is being written, or cannot be removed.
-        TopicError: It is no copy of the recording any more.
-    """
-    with directory.writing(label, recording, wait_s=LOCK_WAIT_S) as now:
-        if now != label or directory.labels_of(recording) == [label]:
-            raise TopicError(f"{label!r} is no longer a copy of another recording.")
-        directory.remove(label)

@@ -2,13 +2,13 @@
 
 First the rows of what goes are written to files of their own: the fields as in tables, the
 index documents, times, sizes and hashes (`columns/field_files.py`). They are forced to the
-disk, and read and compared; then the journal lists them. From then on they are the truth.
+disk, and read and compared; then the manifest lists them. From then on they are the truth.
 Then each segment is written again with short records in place of the chunks that go
-(`thinning.py`), the journal announces the new one, and it takes the place of the old one. A
+(`thinning.py`), the manifest lists the new one, and it takes the place of the old one. A
 segment that loses all of its payloads keeps its definitions, times, arrival numbers, metadata
 and attachments in a small file.
 
-A crash before the first line leaves files that the next opening removes. After it, fields of
+A crash before the first change leaves files that the next opening removes. After it, fields of
 chunks that are still there do no harm: readers use them for expired chunks alone, and the
 next expiry writes them anew.
 
@@ -30,11 +30,10 @@ from hybridlog.columns.layout import PAYLOAD_PARTS, table_schema_of
 from hybridlog.columns.payload_files import RecordingPayloads, next_number, walk
 from hybridlog.maintenance.report import reporter
 from hybridlog.maintenance.thinning import replace_chunks
-from hybridlog_storage import journal
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk import durability, files
 from hybridlog_storage.errors import HybridlogError, SegmentError, StoreError
-from hybridlog_storage.journal import Journal
+from hybridlog_storage.manifests import read_in
 from hybridlog_storage.segments.segment_format import expired_record
 from hybridlog_storage.settings import EXPIRED
 
@@ -48,7 +47,7 @@ if TYPE_CHECKING:
     from hybridlog.columns.payload_writer import TopicWriter
     from hybridlog.maintenance.report import Progress
     from hybridlog_storage.disk.directory import StoreDirectory
-    from hybridlog_storage.journal import JournalState, PayloadFile
+    from hybridlog_storage.manifest import Fields, Manifest
     from hybridlog_storage.messages import Batch, Buffer, Channel
     from hybridlog_storage.segments.chunk import StoredChunk
     from hybridlog_storage.segments.segment_reader import ChunkPlace, SegmentSummary
@@ -66,14 +65,12 @@ class Expired:
     """The result of an expiry.
 
     Attributes:
-        label: The recording.
         segments: Numbers of the segments that lost payloads.
         messages: Number of messages whose payloads went, by topic.
         freed: Bytes of the disk that became free, what was written subtracted.
         field_bytes: Bytes of the files of fields that were written.
     """
 
-    label: str
     segments: list[int] = field(default_factory=list)
     messages: dict[str, int] = field(default_factory=dict)
     freed: int = 0
@@ -82,11 +79,11 @@ class Expired:
 
 def expire(
     directory: StoreDirectory,
-    label: str,
+    recording: str,
     segments: Collection[int],
     topics: Collection[str] | None = None,
     *,
-    log: Journal | None = None,
+    check: Callable[[Manifest], object] = lambda _: None,
     record: Callable[[Buffer], bytes] = expired_record,
     progress: Progress | None = None,
     min_bytes: int = MIN_BYTES,
@@ -98,25 +95,23 @@ def expire(
 
     Args:
         directory: The store.
-        label: The recording; it may be running, then it is the caller who records it.
+        recording: Its id; it may be running, then it is the caller who records it.
         segments: Numbers of sealed segments.
         topics: Full names of the topics whose payloads go; None for all. Messages of other
             topics in the same chunk keep theirs, and so the chunk stays.
-        log: The journal of a running recording, which its recorder appends to; None to open it.
+        check: Part of each change of the manifest; raises if these payloads must stay by now.
         record: Makes the record in place of that of a chunk.
         progress: Called after each chunk.
         min_bytes: Chunks with fewer stored bytes a message stay.
         max_files: Small files of fields that a topic may have.
 
     Raises:
-        StoreError: Files cannot be read or written; what was not announced is as before.
+        StoreError: Files cannot be read or written; what is not listed is as before.
         DiskFullError: There is no room for the fields; nothing is deleted.
     """
-    path = directory.recording(label)
-    work = _Expiry(
-        path, sorted(segments), topics, log or Journal(path), record=record, min_bytes=min_bytes
-    )
-    done = work.run(directory, label, progress)
+    path = directory.recording(recording)
+    work = _Expiry(path, sorted(segments), topics, check=check, record=record, min_bytes=min_bytes)
+    done = work.run(directory, progress)
     # Files that cannot be joined stay as they are, and the next expiry tries again.
     with suppress(HybridlogError, OSError):
         done.freed += work.join(max_files)
@@ -131,39 +126,36 @@ class _Expiry:
         path: Path,
         segments: list[int],
         topics: Collection[str] | None,
-        log: Journal,
         *,
+        check: Callable[[Manifest], object],
         record: Callable[[Buffer], bytes],
         min_bytes: int,
     ) -> None:
         self._path = path
         self._min_bytes = min_bytes
         self._topics = topics
-        self._log = log
+        self._check = check
         self._record = record
-        self._state = self._journal()
+        manifest = read_in(path)
+        if manifest is None:
+            raise StoreError(f"{path} has no manifest: run `hybridlog verify --repair` first.")
+        self._manifest = manifest
         self._chosen: dict[int, set[int]] = {}  # numbers of chunks by segment
         self._summaries: dict[int, SegmentSummary] = {}
         self._writers: dict[_Key, TopicWriter] = {}
         self._written: dict[tuple[int, int], list[int]] = {}  # checksums by segment and chunk
-        self._made: list[PayloadFile] = []
-        self._numbers = count(next_number(self._state))
+        self._made: list[Fields] = []
+        self._numbers = count(next_number(manifest))
         for segment in walk(path, segments):
             self._choose(segment)
-
-    def _journal(self) -> JournalState:
-        state = journal.read(self._path)
-        if state is None:
-            raise StoreError(f"{self._path} has no journal: run `hybridlog verify --repair` first.")
-        return state
 
     def _choose(self, segment: WalkedSegment) -> None:
         """Note the chunks of a segment that go."""
         number, summary = segment.number, segment.summary
-        sealed = self._state.sealed.get(number)
-        if sealed is None or summary.whole_digest != sealed.digest:
+        log = self._manifest.logs.get(number)
+        if log is None or summary.whole_digest != log.digest:
             raise StoreError(
-                f"{segment.reader.path} is not the segment that the journal lists; nothing was "
+                f"{segment.reader.path} is not the segment that the manifest lists; nothing was "
                 "deleted. Run `hybridlog verify --repair` first."
             )
         chosen = {place.number for place in summary.chunks if self._goes(place, summary)}
@@ -179,24 +171,22 @@ class _Expiry:
         names = {summary.channels[number].topic for number in place.channels}
         return self._topics is None or names <= {*self._topics}
 
-    def run(self, directory: StoreDirectory, label: str, progress: Progress | None) -> Expired:
-        done = Expired(label)
+    def run(self, directory: StoreDirectory, progress: Progress | None) -> Expired:
+        done = Expired()
         sizes = sum(summary.size for summary in self._summaries.values())
-        report = reporter(progress, label, sizes)
+        report = reporter(progress, self._manifest.name, sizes)
         try:
             made = self._write(report)
             if not self._chosen:
                 return done
             directory.require(EXPIRED)
-            payload_files.announce(self._path, made, self._log)
+            self._manifest = payload_files.announce(self._path, made, check=self._check)
         except BaseException as error:
-            payload_files.take_back(self._path, self._state)
+            payload_files.take_back(self._path)
             if isinstance(error, OSError):
                 raise durability.explain(error, self._path, "writing fields of") from error
             raise
-        self._state = self._journal()
-        payload_files.publish(self._path, self._state)
-        if self._state.end is not None:
+        if self._manifest.is_ended:
             self._remove_arrays(directory)
         done.field_bytes = sum(file.bytes for file in made)
         done.freed = -done.field_bytes
@@ -218,8 +208,8 @@ class _Expiry:
             if channel.topic in directory.settings.arrays
         }
         if gone:
-            digests = {str(number): one.digest for number, one in self._state.sealed.items()}
-            folders = TableFolders(directory.path, self._state.id, digests)
+            digests = {str(number): log.digest for number, log in self._manifest.logs.items()}
+            folders = TableFolders(directory.path, self._manifest.id, digests)
             with suppress(OSError):
                 folders.add({}, {*gone}, {type_prefix(kind) for kind in gone.values()})
 
@@ -232,7 +222,7 @@ class _Expiry:
             topic = summary.channels[int(part["channel"])].topic
             done.messages[topic] = done.messages.get(topic, 0) + int(part["messages"])
 
-    def _write(self, report: Callable[[int], None]) -> list[PayloadFile]:
+    def _write(self, report: Callable[[int], None]) -> list[Fields]:
         """Write what is left of the chosen messages, and compare it with them."""
         folder = self._path / PAYLOAD_PARTS
         files.remove_tree(folder)
@@ -288,7 +278,7 @@ class _Expiry:
 
             columns, number = FieldColumns(channel), partial(next, self._numbers)
             folder = self._path / PAYLOAD_PARTS
-            found = TopicWriter(folder, self._state.id, channel, columns, number)
+            found = TopicWriter(folder, self._manifest.id, channel, columns, number)
             self._writers[key] = found
         return found
 
@@ -305,13 +295,12 @@ class _Expiry:
         chosen = self._chosen[segment.number]
         return replace_chunks(
             self._path,
-            self._state,
+            self._manifest,
             segment.reader,
             segment.summary,
             dict.fromkeys(chosen, self._record),
-            files=self._state.payloads.values(),
-            log=self._log,
             contents=RecordingPayloads(self._path, self._made),
+            check=self._check,
         )
 
 

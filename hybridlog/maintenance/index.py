@@ -21,7 +21,6 @@ from hybridlog_storage.errors import (
     HeldError,
     HybridlogError,
     SegmentError,
-    StoreError,
     TopicError,
 )
 from hybridlog_storage.mongo.index_state import NOTHING, Indexed, IndexState, Through
@@ -44,7 +43,6 @@ if TYPE_CHECKING:
 
 Place = tuple[int, int]
 """Number of a segment, and number of a chunk in it."""
-_TRIES = 10
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +75,7 @@ class StoreIndex:
         index: str,
         stale: Collection[str],
         report: RepairReport,
-    ) -> bool:
+    ) -> set[str]:
         """Index missing chunks, and remove documents of removed recordings.
 
         Recordings that the catalog knows to be in this index are not looked at, unless the
@@ -91,7 +89,7 @@ class StoreIndex:
             report: Collects the actions.
 
         Returns:
-            Whether an entry has changed.
+            Ids of the recordings whose entries have changed.
         """
         directory, state = self.directory, self._state
         tables.remove_unfinished(directory, snapshot)
@@ -102,29 +100,27 @@ class StoreIndex:
             behind = snapshot.summaries
         has_orphans = is_other or tables.are_left(directory, snapshot)
         if not behind and not has_orphans:
-            return False
+            return set()
         if has_orphans:
             known = state.of()
-        has_changed = False
-        current = []
+        changed, current = set(), []
         for summary in behind:
             entry = entry_of(summary)
             indexed = known.get(entry.key)
             is_whole = indexed is not None and indexed.is_whole(entry)
             if indexed is not None and is_whole and self._restore_damage(entry, indexed):
-                has_changed = True
-                entry = put_entry(directory, self.catalog, entry.label)
-                if entry.id != summary.id:  # another recording has the label now
-                    continue
+                changed.add(entry.id)
+                entry = put_entry(directory, self.catalog, entry.id)
             if is_whole and _is_current(indexed, entry):
                 current.append(entry.id)
             elif directory.is_writable:  # else the segments answer, without an index
                 self._bring_one(entry, report)
+                changed.add(entry.id)
         if current:
             self.catalog.put_indexed(current, index)
         if has_orphans:
             self._remove_orphans(known, report)
-        return has_changed or bool(report.indexed) or bool(current)
+        return changed.union(current)
 
     def _restore_damage(self, entry: RecordingEntry, indexed: Indexed) -> bool:
         """Copy the index's list of unreadable chunks to the catalog; True if it changed."""
@@ -136,28 +132,26 @@ class StoreIndex:
     def _bring_one(self, entry: RecordingEntry, report: RepairReport) -> None:
         """Bring one recording up to date, unless another process is writing it."""
         # The process that holds the lock indexes it.
-        with (
-            suppress(HeldError, TopicError),
-            self.directory.writing(entry.label, entry.id) as label,
-        ):
+        with suppress(HeldError, TopicError), self.directory.writing(entry.id):
             try:
-                chunks = self._bring_up(entry.key, label)
+                chunks = self._bring_up(entry)
             except SegmentError as error:
-                report.unreadable[label] = str(error)
+                report.unreadable[entry.id] = str(error)
             else:
                 if chunks is not None:
-                    report.indexed[label] = chunks
+                    report.indexed[entry.name] = chunks
 
-    def _bring_up(self, key: str, label: str) -> int | None:
+    def _bring_up(self, known: RecordingEntry) -> int | None:
         """Bring one recording, locked by this process, up to date.
 
         Returns:
             Number of indexed chunks; None if all were in the index.
         """
         # Read again, now that it is locked: another process may have indexed it meanwhile.
-        indexed, entry = self._state.one(key), put_entry(self.directory, self.catalog, label)
+        indexed = self._state.one(known.key)
+        entry = put_entry(self.directory, self.catalog, known.id)
         if indexed is None or not indexed.is_whole(entry):
-            return self.catch_up(label)
+            return self.catch_up(entry.id)
         if not entry.is_decoded:
             self._state.show(decode_again(self.directory, self.catalog, entry, self.progress))
             return 0
@@ -169,11 +163,9 @@ class StoreIndex:
         """Remove recordings without a directory from the index and the tables.
 
         The directories are listed after the index, so they include recordings that have begun
-        meanwhile. If one cannot be read, nothing is removed.
+        meanwhile.
         """
-        present = ids_present(self.directory)
-        if present is None:
-            return
+        present = keys_present(self.directory)
         for key, indexed in known.items():
             if key not in present:
                 remove_documents(self.database, key, indexed)
@@ -181,19 +173,19 @@ class StoreIndex:
         if self.directory.is_writable:
             tables.remove_orphans(self.directory, present)
 
-    def catch_up(self, label: str) -> int:
+    def catch_up(self, recording: str) -> int:
         """Index the missing chunks of a recording; return their number.
 
         An unreadable chunk is noted in the catalog, and the others are indexed.
 
         Args:
-            label: The recording, locked by this process for writing.
+            recording: Its id; it is locked by this process for writing.
 
         Raises:
             SegmentError: A segment cannot be read.
         """
         directory, catalog = self.directory, self.catalog
-        entry = put_entry(directory, catalog, label)
+        entry = put_entry(directory, catalog, recording)
         indexed = self._prepare(entry)
         whole = {int(number) for number in indexed.segments}
         missing = {
@@ -206,7 +198,7 @@ class StoreIndex:
         damage = catalog.damage(entry.id)
         self._index(entry, indexed.through, missing, damage)
         catalog.put_damage(entry.id, damage)
-        entry = finish(directory, catalog, self.database, label, turn=indexed.turn)
+        entry = finish(directory, catalog, self.database, recording, turn=indexed.turn)
         if not entry.is_decoded:  # documents indexed before
             self._state.show(decode_again(directory, catalog, entry, self.progress))
         return len(missing - damage.keys())
@@ -263,15 +255,15 @@ class StoreIndex:
 
         directory, catalog = self.directory, self.catalog
         topics = tables.missing(directory, entry)
-        writer = TableWriter(directory.path, entry.id, entry.label, topics=topics, is_new=False)
+        writer = TableWriter(directory.path, entry.id, entry.name, topics=topics, is_new=False)
         indexer, sender = ChunkIndexer(entry.id), DocumentSender(entry, self.database, through)
         sent = time.monotonic()
         # A chunk that is indexed already may be missing in the tables all the same.
         in_tables = tables.channels_of(entry, topics)
         numbers = [number for number, _, _ in entry.spans]
-        report = reporter(self.progress, entry.label, entry.stored_bytes)
+        report = reporter(self.progress, entry.name, entry.stored_bytes)
         try:
-            for segment in walk(directory.recording(entry.label), numbers, report=report):
+            for segment in walk(directory.recording(entry.id), numbers, report=report):
                 number, channels = segment.number, segment.summary.channels
                 stats: dict[int, Mapping[int, ChannelStats]] = {}
                 wanted = {
@@ -314,9 +306,9 @@ class StoreIndex:
         left: dict[str, HybridlogError] = {}
         for chosen in entries:
             try:
-                with self.directory.writing(chosen.label, chosen.id, wait_s=LOCK_WAIT_S) as label:
-                    self._clear(put_entry(self.directory, self.catalog, label))
-                    self.catch_up(label)
+                with self.directory.writing(chosen.id, chosen.name, wait_s=LOCK_WAIT_S):
+                    self._clear(put_entry(self.directory, self.catalog, chosen.id))
+                    self.catch_up(chosen.id)
             except (HeldError, TopicError) as error:
                 left[chosen.id] = error
         return left
@@ -355,18 +347,15 @@ class StoreIndex:
                 if missing < 0 or (missing > 0 and not self.catalog.damage(entry.id)):
                     again.add(entry.key)
         # Listed after the index: a recording that has begun meanwhile has a directory by now.
-        present = ids_present(self.directory) if orphans else None
+        present = keys_present(self.directory)
         for key in orphans:
-            if present is not None and not (isinstance(key, str) and key in present):
+            if not (isinstance(key, str) and key in present):
                 state.clear(key)
         for key in sorted(again):
             entry = known[key]
-            with (
-                suppress(HeldError, TopicError),
-                self.directory.writing(entry.label, entry.id) as label,
-            ):
+            with suppress(HeldError, TopicError), self.directory.writing(entry.id):
                 self._clear(entry, everywhere=True)
-                self.catch_up(label)
+                self.catch_up(entry.id)
 
 
 def _is_current(indexed: Indexed | None, entry: RecordingEntry) -> bool:
@@ -374,20 +363,10 @@ def _is_current(indexed: Indexed | None, entry: RecordingEntry) -> bool:
     return indexed is not None and indexed.mirrors(entry) and entry.is_decoded
 
 
-def ids_present(directory: StoreDirectory) -> set[str] | None:
-    """Keys of all recordings with a directory; None if one cannot be identified.
-
-    If one is renamed meanwhile, all are listed again, so that none is missed.
-    """
-    for _ in range(_TRIES):
-        looks = directory.looks(directory.labels())
-        try:
-            found = {directory.id_of(label)[:16] for label in looks}
-        except StoreError:
-            return None
-        if directory.looks(directory.labels()) == looks:
-            return found
-    return None
+def keys_present(directory: StoreDirectory) -> set[str]:
+    """Keys of all recordings with a directory."""
+    with directory.alone():  # a copy may be about to take the place of another
+        return {recording[-16:] for recording in directory.ids()}
 
 
 def remove_documents(database: Database, key: str, indexed: Indexed | None) -> None:
@@ -437,7 +416,7 @@ def finish(
     directory: StoreDirectory,
     catalog: Catalog,
     database: Database | None,
-    label: str,
+    recording: str,
     *,
     turn: int,
 ) -> RecordingEntry:
@@ -447,10 +426,10 @@ def finish(
         directory: The store.
         catalog: Its catalog.
         database: The index; None without one.
-        label: The recording.
+        recording: Its id.
         turn: As for `IndexState.put`.
     """
-    entry = put_entry(directory, catalog, label)
+    entry = put_entry(directory, catalog, recording)
     if database is not None:
         damage = catalog.damage(entry.id)
         state = IndexState(database)
@@ -473,7 +452,7 @@ def documents_in(entry: RecordingEntry, places: Mapping[str, TopicPlace]) -> Cou
 
 
 def mirror(catalog: Catalog, database: Database, recording: str) -> None:
-    """Update the mirror of a recording after its journal has grown.
+    """Update the mirror of a recording after its manifest has changed.
 
     Raises:
         DatabaseError: MongoDB fails; the next connection repeats it.
@@ -498,10 +477,10 @@ def decode_again(
     Raises:
         SegmentError: A segment cannot be opened.
     """
-    inventory = take_inventory(directory, entry.label)
+    inventory = take_inventory(directory, entry.id)
     found = _decoded(directory, catalog, entry, inventory, progress)
     catalog.put_stamps(entry.id, found)
-    return put_entry(directory, catalog, entry.label)
+    return put_entry(directory, catalog, entry.id)
 
 
 def _decoded(
@@ -517,8 +496,8 @@ def _decoded(
         for number, summary in inventory.summaries.items()
         if catalog.stamps(entry, number, summary.table) is None
     }
-    report = reporter(progress, entry.label, sum(summary.size for summary in missing.values()))
-    for segment in walk(directory.recording(entry.label), missing, report=report, known=missing):
+    report = reporter(progress, entry.name, sum(summary.size for summary in missing.values()))
+    for segment in walk(directory.recording(entry.id), missing, report=report, known=missing):
         summary = segment.summary
         stats: dict[int, Mapping[int, ChannelStats]] = {}
         for place, chunk in segment.chunks():

@@ -1,6 +1,6 @@
 """Passes of retention: takes stock, makes the plan, and lets `expire` do each step.
 
-A pass reads journals only. A recorder makes passes for its own recording and for those that
+A pass reads manifests only. A recorder makes passes for its own recording and for those that
 have ended; what others record is left to them.
 """
 
@@ -9,12 +9,14 @@ from __future__ import annotations
 import shutil
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Final
+from functools import partial
+from typing import TYPE_CHECKING, Final
 
-from hybridlog.maintenance.edit import append
+from msgspec import UNSET
+
 from hybridlog.maintenance.expiry import expire
 from hybridlog.maintenance.retention import (
     Held,
@@ -27,26 +29,27 @@ from hybridlog.maintenance.retention import (
 )
 from hybridlog.maintenance.sizes import disk_bytes
 from hybridlog.record.losses import extent_of
-from hybridlog_storage import journal
 from hybridlog_storage.disk.directory import LOCK_WAIT_S, is_stable
 from hybridlog_storage.errors import (
     DiskFullError,
     HeldError,
     HybridlogError,
+    RecordingGoneError,
     SegmentError,
     StoreError,
     TopicError,
     UsageError,
 )
-from hybridlog_storage.journal import Journal
+from hybridlog_storage.manifest import Pin, with_file
+from hybridlog_storage.manifests import read_in
 from hybridlog_storage.remote.store import RemoteDirectory
 from hybridlog_storage.settings import read_settings
 
 if TYPE_CHECKING:
     from hybridlog.maintenance.report import Progress
-    from hybridlog_storage.catalog import Catalog, RecordingEntry
+    from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
-    from hybridlog_storage.journal import Event, JournalState
+    from hybridlog_storage.manifest import Manifest
 
 
 _WHOLE: Final = -1
@@ -58,12 +61,12 @@ class Own:
     """The recording that this process makes; it holds the lock of it.
 
     Attributes:
-        label: Its label.
+        recording: Its id.
         first_unread: Returns the number of the first segment that it still reads.
         sealed: Returns the number of segments sealed so far.
     """
 
-    label: str
+    recording: str
     first_unread: Callable[[], int]
     sealed: Callable[[], int]
 
@@ -88,16 +91,16 @@ class Keeper:
 
     Args:
         directory: The store.
-        remove: Removes a whole recording, by its id.
+        remove: Removes a whole recording, by its id, unless a check of its manifest raises.
         own: The recording that this process makes; None if it makes none.
         is_wanted: Returns whether to go on; asked before each deletion.
-        changed: Called with the label of each recording that lost payloads, while it is held.
+        changed: Called with the id of each recording that lost payloads, while it is held.
     """
 
     def __init__(
         self,
         directory: StoreDirectory,
-        remove: Callable[[str], None],
+        remove: Callable[[str, Callable[[Manifest], None]], None],
         own: Own | None = None,
         *,
         is_wanted: Callable[[], bool] = lambda: True,
@@ -108,7 +111,7 @@ class Keeper:
         self._own = own
         self._is_wanted = is_wanted
         self._changed = changed
-        self._known: dict[str, tuple[str, Held]] = {}  # by label, with its look
+        self._known: dict[str, tuple[str, Held]] = {}  # by id, with its look
         # Ids and segments that this pass could not change; -1 for the whole recording.
         self._failed: set[tuple[str, int]] = set()
 
@@ -136,7 +139,7 @@ class Keeper:
                 for step in planned.steps:
                     if not self._is_wanted():
                         return found
-                    self._do(step, found, progress)
+                    self._do(step, rules, found, progress)
                 planned = self.plan(rules)
                 found.plan.steps += planned.steps
             found.plan.warnings, found.plan.is_short = planned.warnings, planned.is_short
@@ -170,9 +173,9 @@ class Keeper:
                     numbers = tuple(one.number for one in going)
                     size = sum(one.size for one in going)
                     if numbers:
-                        step = Step(held.label, held.id, numbers, (), size, reason, now, digests)
+                        step = Step(held.name, held.id, numbers, (), size, reason, now, digests)
                         found.plan.steps.append(step)
-                        self._do(step, found, progress)
+                        self._do(step, rules, found, progress)
         return found
 
     @contextmanager
@@ -188,45 +191,45 @@ class Keeper:
     def _held(self, now: int) -> Iterator[Held]:
         """The content of the recordings; damaged ones are left alone."""
         looks = self._directory.looks(self._directory.names())
-        self._known = {label: known for label, known in self._known.items() if label in looks}
-        for label, look in looks.items():
-            before, held = self._known.get(label, ("", None))
+        self._known = {one: known for one, known in self._known.items() if one in looks}
+        for recording, look in looks.items():
+            before, held = self._known.get(recording, ("", None))
             if before != look or held is None:
                 with suppress(StoreError):
-                    held = self._read(label, now)
+                    held = self._read(recording, now)
                 if held is not None and is_stable(look):
-                    self._known[label] = look, held
+                    self._known[recording] = look, held
             if held is None or (held.id, _WHOLE) in self._failed:
                 continue
             left = [s for s in held.segments if (held.id, s.number) not in self._failed]
             held = replace(held, segments=left)
-            if self._own is not None and label == self._own.label:
+            if self._own is not None and recording == self._own.recording:
                 unread = self._own.first_unread()
                 yield replace(held, segments=[s for s in held.segments if s.number < unread])
             else:
                 yield held if held.is_ended else replace(held, segments=[])
 
-    def _read(self, label: str, now: int) -> Held | None:
-        state = journal.read(self._directory.recording(label))
-        if state is None or not state.begun or state.damaged or state.removing:
+    def _read(self, recording: str, now: int) -> Held | None:
+        manifest = read_in(self._directory.recording(recording))
+        if manifest is None or manifest.id != recording or manifest.status == "removed":
             return None
-        return held_of(label, state, now)
+        return held_of(manifest, now)
 
-    def _do(self, step: Step, found: KeepReport, progress: Progress | None) -> None:
+    def _do(self, step: Step, rules: Rules, found: KeepReport, progress: Progress | None) -> None:
         try:
             if not step.segments:
-                self._remove(step.id)
+                self._remove(step.id, partial(_check, step, rules))
                 found.freed_bytes += step.bytes
                 return
-            with self._locked(step) as label:
-                found.freed_bytes += self._expire(step, label, progress)
+            with self._locked(step):
+                found.freed_bytes += self._expire(step, rules, progress)
         except DiskFullError:
             raise
         except (StoreError, TopicError) as error:
-            is_held = isinstance(error, HeldError | TopicError)
+            is_held = isinstance(error, HeldError | RecordingGoneError | TopicError)
             if len(step.segments) > 1 and not is_held:  # one of them may be damaged
                 for number in step.segments:
-                    self._do(replace(step, segments=(number,)), found, progress)
+                    self._do(replace(step, segments=(number,)), rules, found, progress)
                 return
             numbers = (_WHOLE,) if is_held else step.segments or (_WHOLE,)
             self._failed.update((step.id, number) for number in numbers)
@@ -236,32 +239,54 @@ class Keeper:
             found.problems.append(f"{error}{cure}")
 
     @contextmanager
-    def _locked(self, step: Step) -> Iterator[str]:
-        """The present label of a recording that nobody else writes."""
-        if self._own is not None and step.recording == self._own.label:
-            yield self._own.label
+    def _locked(self, step: Step) -> Iterator[None]:
+        """Let nobody else write a recording."""
+        if self._own is not None and step.id == self._own.recording:
+            yield
             return
-        with self._directory.writing(step.recording, step.id, wait_s=LOCK_WAIT_S) as label:
-            yield label
+        with self._directory.writing(step.id, step.recording, wait_s=LOCK_WAIT_S):
+            yield
 
-    def _expire(self, step: Step, label: str, progress: Progress | None) -> int:
-        def check(state: JournalState) -> None:
-            for number in step.segments:
-                digest = state.sealed[number].digest
-                if step.digests.get(number, digest) != digest:
-                    raise StoreError(f"{label}: segment {number} was replaced meanwhile.")
-                pinned = pinned_topics(state.sealed[number], state)
-                if pinned & {*step.topics} if step.topics else pinned:
-                    raise StoreError(f"{label}: a pin was set meanwhile.")
-
-        topics = step.topics or None
-        said = {} if topics is None else {"topics": [*topics]}
-        with self._directory.at_hand(label, step.segments) as here:
-            log = Journal(here.recording(label), check=check)
-            done = expire(here, label, step.segments, topics, log=log, progress=progress)
-            log.append(journal.event(journal.RETAINED, segments=[*step.segments], **said))
-        self._changed(label)
+    def _expire(self, step: Step, rules: Rules, progress: Progress | None) -> int:
+        check, topics = partial(_check, step, rules), step.topics or None
+        with self._directory.at_hand(step.id, step.segments) as here:
+            done = expire(here, step.id, step.segments, topics, check=check, progress=progress)
+            here.change(step.id, partial(_retained, step.segments, topics))
+        self._changed(step.id)
         return done.freed
+
+
+def _check(step: Step, rules: Rules, manifest: Manifest) -> None:
+    """Raise if what goes in a step must stay by now.
+
+    Raises:
+        StoreError: It must.
+    """
+    if rules.is_never(manifest.tags):
+        raise StoreError(f"{step.recording}: a tag that keeps it was set meanwhile.")
+    if not step.segments and manifest.pins:
+        raise StoreError(f"{step.recording}: a pin was set meanwhile.")
+    for number in step.segments:
+        log = manifest.logs.get(number)
+        if log is None or step.digests.get(number, log.digest) != log.digest:
+            raise StoreError(f"{step.recording}: segment {number} was replaced meanwhile.")
+        pinned = pinned_topics(log, manifest)
+        if pinned & {*step.topics} if step.topics else pinned:
+            raise StoreError(f"{step.recording}: a pin was set meanwhile.")
+
+
+def _retained(
+    segments: Iterable[int], topics: Iterable[str] | None, manifest: Manifest
+) -> Manifest:
+    """Note that a rule was applied to segments: payloads of topics, None for all, are gone."""
+    for number in segments:
+        before = manifest.logs[number].retained
+        known = () if before is UNSET else before
+        after = None
+        if topics is not None and known is not None:
+            after = tuple(sorted({*known, *topics}))
+        manifest = with_file(manifest, number, retained=after)
+    return manifest
 
 
 def may_hold(entry: RecordingEntry, begin: int | None, end: int | None) -> bool:
@@ -271,37 +296,20 @@ def may_hold(entry: RecordingEntry, begin: int | None, end: int | None) -> bool:
     return (end is None or end > start) and not (is_over and begin is not None and begin >= stop)
 
 
-def append_pins(
-    directory: StoreDirectory, catalog: Catalog, entry: RecordingEntry, line: Event
-) -> None:
-    """Append a line about a pin to the journal of a recording, also of a running one.
-
-    Raises:
-        StoreError: Another command holds it, or it cannot be written.
-        TopicError: It is gone.
-    """
-    label, recording = entry.label, entry.id
-    try:
-        append(directory, catalog, entry, [line])
-        return
-    except HeldError as error:
-        if not error.is_recording:
-            raise
-    path = directory.recording(directory.label_now(label, recording))
-    Journal(path).append(line)
-    state = journal.read(path)
-    if state is None or state.id != recording:  # it ended, and was renamed or removed
-        raise StoreError(f"Recording {label!r} was changed meanwhile. Try again.")
-
-
 def pin_of(
     name: str, span: tuple[int | None, int | None], topics: Sequence[str] | None, reason: str
-) -> dict[str, Any]:
-    """The line about a pin."""
+) -> Pin:
+    """A pin.
+
+    Args:
+        name: Its id.
+        span: First log time, and that after the last one, ns; None for no bound.
+        topics: Full names of topics; None for all.
+        reason: Why.
+    """
     begin, end = span
-    values: dict[str, Any] = {"id": name, "from": begin, "to": end, "topics": topics}
-    said = {key: value for key, value in values.items() if value is not None}
-    return journal.event(journal.PINNED, **said, reason=reason)
+    last = None if end is None else end - 1
+    return Pin(name, begin, last, None if topics is None else tuple(topics), reason)
 
 
 LOOK_S: Final = 5.0
@@ -318,7 +326,7 @@ class RetentionThread:
 
     Args:
         directory: The store.
-        remove: Removes a whole recording, by its id.
+        remove: Removes a whole recording, by its id, unless a check of its manifest raises.
         own: The recording in progress; None if there is none.
         say: Shows a line to the user, each text once.
     """
@@ -326,7 +334,7 @@ class RetentionThread:
     def __init__(
         self,
         directory: StoreDirectory,
-        remove: Callable[[str], None],
+        remove: Callable[[str, Callable[[Manifest], None]], None],
         own: Own | None,
         say: Callable[[str], None],
     ) -> None:

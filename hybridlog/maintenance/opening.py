@@ -6,36 +6,47 @@ are not opened.
 
 from __future__ import annotations
 
+import os
 import re
 import time
 from collections.abc import Collection, Mapping
 from collections.abc import Set as AbstractSet
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
+
+from msgspec import to_builtins
 
 from hybridlog.columns import payload_files
 from hybridlog.columns.layout import PAYLOAD_PARTS
 from hybridlog.entries import (
     announce_removal,
+    check_folder,
     describe_now,
-    journal_from_segments,
-    sealed_event,
+    ended,
+    listed,
+    lost_in_crash,
     take_inventory,
-    unlisted_lines,
+    unlisted,
 )
 from hybridlog.snapshot import UNFINISHED, Snapshot
-from hybridlog_storage import journal
 from hybridlog_storage.catalog import Catalog
 from hybridlog_storage.disk import durability, files
-from hybridlog_storage.disk.directory import LOCK, REMOVED, SENDING
+from hybridlog_storage.disk.directory import IMPORTING, LOCK, REMOVED, SENDING
 from hybridlog_storage.errors import (
     DiskFullError,
     HeldError,
     StoreError,
     TopicError,
 )
-from hybridlog_storage.journal import Journal
+from hybridlog_storage.manifest import Manifest, replace
+from hybridlog_storage.manifests import (
+    MANIFEST,
+    change_in,
+    clear_in,
+    is_being_written,
+    read_in,
+)
 from hybridlog_storage.segments.segment_file import sealed_name
 
 if TYPE_CHECKING:
@@ -45,14 +56,13 @@ if TYPE_CHECKING:
     from hybridlog.maintenance.report import RepairReport
     from hybridlog_storage.catalog import Described, RecordingEntry
     from hybridlog_storage.disk.directory import Listing, StoreDirectory
-    from hybridlog_storage.journal import JournalState
     from hybridlog_storage.segments.recovery import Recovered
     from hybridlog_storage.segments.segment_file import Sealed
     from hybridlog_storage.summary import RecordingSummary
 
 _OURS = frozenset({LOCK})
 """Names in a recording's directory that hold nothing that could be lost."""
-_LEFT_OVER = re.compile(r"\.(journal(\.old)?|\d{6}\.mcap)\.([0-9a-f]{16}|rebuilt)")
+_LEFT_OVER = re.compile(r"\.\d{6}\.mcap\.([0-9a-f]{16}|rebuilt)")
 """Names of files that were being written, and were to get another name when they were whole."""
 _MOVING = re.compile(r"(?P<before>\d{6}\.mcap)\.moving-(?P<number>\d{6})")
 _TRIES = 10
@@ -108,65 +118,50 @@ class StoreFiles:
             for name in directory.names():
                 if name.startswith(REMOVED):
                     directory.sweep(name)
+                elif name.startswith(IMPORTING):
+                    _finish_copy(directory, name)
             with suppress(OSError):  # the next opening tries again
                 clear_stopped(directory)
         rows = catalog.summaries()
-        known = {summary.label: summary for summary in rows}
-        for _ in range(_TRIES):
-            names = directory.names()
-            looks = directory.looks(names)
-            report.unreadable.clear()
-            found = self._find(looks, known, mends=mends)
-            # A recording that was renamed meanwhile must not be missed. If it has exchanged its
-            # label with another one, that one may have been seen twice.
-            is_twice = any(len(copies) > 1 for copies in found.values())
-            if directory.names() == names and not (is_twice and directory.looks(names) != looks):
-                break
-        report.copies.clear()
-        for recording, copies in found.items():
-            if len(copies) > 1:
-                found[recording] = [self._one_of(copies, known)]
-        report.noted.difference_update(report.copies)
+        report.unreadable.clear()
+        names = directory.names()
+        if any(name.startswith(IMPORTING) for name in names):
+            with directory.alone():  # one may be about to take the place of another
+                names = directory.names()
+        found = self._find(directory.looks(names), {one.id: one for one in rows}, mends=mends)
         for summary in rows if mends or catalog.is_in_memory else ():
             # The row of a recording that is unreadable now may be valid again later.
-            if summary.id not in found and summary.label not in report.unreadable:
+            if summary.id not in found and summary.id not in report.unreadable:
                 catalog.remove(summary.id)
                 gone.add(summary.id)
-        snapshot = snapshot_of(catalog, [summary for (summary,) in found.values()])
+        snapshot = snapshot_of(catalog, found.values())
         if gone and mends and not report.unreadable:
             tables.remove_unfinished(directory, snapshot)
             tables.remove_all(directory, gone - found.keys())
         return snapshot
 
-    def catch_up(self, snapshot: Snapshot, labels: AbstractSet[str]) -> Snapshot | None:
+    def catch_up(self, snapshot: Snapshot, recordings: AbstractSet[str]) -> Snapshot | None:
         """All recordings after changes of some of them, as of `look_at_all`.
 
         Args:
             snapshot: All recordings before.
-            labels: Names in the store that came, went, or whose files were changed.
+            recordings: Ids of those that came, went, or whose files were changed.
 
         Returns:
             All recordings; None if only `look_at_all` can tell.
         """
         directory, catalog, report = self.directory, self.catalog, self.report
-        if report.copies or report.unreadable:
+        if report.unreadable:
             return None
-        known = labels & snapshot.by_label.keys()
-        old = {snapshot.summaries[snapshot.by_label[label]].id for label in known}
         try:
-            looks = directory.looks(sorted(labels))
-            new = {directory.id_of(label) for label in looks.keys() - known}
-            rows = {summary.label: summary for summary in catalog.summaries(old | new)}
-            found = self._find(looks, rows)
-            is_twice = any(len(copies) > 1 for copies in found.values())
-            elsewhere = found.keys() & snapshot.by_id.keys() - old
-            if is_twice or elsewhere or report.unreadable:
+            rows = {summary.id: summary for summary in catalog.summaries(recordings)}
+            found = self._find(directory.looks(sorted(recordings)), rows)
+            if report.unreadable:
                 return None
-            changed = [summary for (summary,) in found.values()]
-            topics = {summary.topics: catalog.topics(summary.topics) for summary in changed}
+            topics = {one.topics: catalog.topics(one.topics) for one in found.values()}
         except StoreError:
             return None
-        return snapshot.with_changes(changed, topics, old)
+        return snapshot.with_changes(found.values(), topics, recordings)
 
     def _find(
         self,
@@ -174,43 +169,44 @@ class StoreFiles:
         known: Mapping[str, RecordingSummary],
         *,
         mends: bool = False,
-    ) -> dict[str, list[RecordingSummary]]:
+    ) -> dict[str, RecordingSummary]:
         """Summaries of recordings by id.
 
         Args:
-            looks: The look of each directory, by label.
-            known: Summaries in the catalog, by label.
+            looks: The look of each directory, by id.
+            known: Summaries in the catalog, by id.
             mends: Repair what a crash has left; otherwise it is noted.
         """
-        found: dict[str, list[RecordingSummary]] = {}
-        for label, look in looks.items():
-            summary = known.get(label)
+        found: dict[str, RecordingSummary] = {}
+        for recording, look in looks.items():
+            summary = known.get(recording)
             if summary is None or summary.look != look or summary.status in UNFINISHED:
                 try:
-                    summary = self._look_again(label, summary, mends=mends)
+                    summary = self._look_again(recording, summary, mends=mends)
                 except DiskFullError:
                     raise
                 except StoreError as error:
-                    if self.directory.has(label):  # another process may have removed or renamed it
-                        self.report.unreadable[label] = str(error)
+                    if self.directory.has(recording):  # another process may have removed it
+                        self.report.unreadable[recording] = str(error)
                     continue
             if summary is not None:
-                found.setdefault(summary.id, []).append(summary)
+                found[recording] = summary
         return found
 
     def _look_again(
-        self, label: str, summary: RecordingSummary | None, *, mends: bool
+        self, recording: str, summary: RecordingSummary | None, *, mends: bool
     ) -> RecordingSummary | None:
         """The summary of a recording as its files are now; None if it is gone."""
         if summary is not None:
-            listing = self.directory.listing(label)
-            row = self.catalog.recording(summary.id)
+            listing = self.directory.listing(recording)
+            row = self.catalog.recording(recording)
             if row is not None and _is_current(self.directory, row[1], row[0], listing):
                 now = summary._replace(look=listing.look)
                 if now.look != summary.look:
                     self.catalog.put_look(now)
                 return now
-        described = (self._mended if mends else self._refresh)(label)
+        mends = mends and self._may_mend(recording)
+        described = (self._mended if mends else self._refresh)(recording)
         return described.summary if described is not None else None
 
     def current_entry(self, summary: RecordingSummary) -> tuple[RecordingEntry | None, bool]:
@@ -224,53 +220,55 @@ class StoreFiles:
         """
         directory = self.directory
         row = self.catalog.recording(summary.id)
-        if row is not None and row[1].label == summary.label:
-            listing = directory.listing(summary.label)
+        if row is not None:
+            listing = directory.listing(summary.id)
             if _is_current(directory, row[1], row[0], listing):
                 return row[1], False
-        if not directory.has(summary.label):
+        if not directory.has(summary.id):
             return None, True
-        described = self._refresh(summary.label)
+        described = self._refresh(summary.id)
         return (described.entry if described is not None else None), True
 
-    def _refresh(self, label: str) -> Described | None:
+    def _refresh(self, recording: str) -> Described | None:
         """Read what is whole of a recording, keep it in memory, and note what to mend.
 
         None if the recording is gone.
         """
-        if _is_empty(self.directory, label):
+        if _is_empty(self.directory, recording):
             return None
-        is_open = self.directory.is_recorded(label)
-        if not (is_open or self.catalog.is_in_memory):
-            self.report.noted.add(label)
-        return self._describe(label, is_open=is_open)
+        is_open = self.directory.is_recorded(recording)
+        if not is_open and self._may_mend(recording):
+            self.report.noted.add(recording)
+        return self._describe(recording, is_open=is_open)
 
-    def _describe(self, label: str, *, is_open: bool) -> Described:
-        described = describe_now(self.directory, self.catalog, label, is_open=is_open)
+    def _may_mend(self, recording: str) -> bool:
+        if self.catalog.is_in_memory:
+            return False
+        return os.access(self.directory.recording(recording), os.W_OK)
+
+    def _describe(self, recording: str, *, is_open: bool) -> Described:
+        described = describe_now(self.directory, self.catalog, recording, is_open=is_open)
         self.catalog.put(described, waits=False)
         return described
 
-    def _mended(self, label: str) -> Described | None:
+    def _mended(self, recording: str) -> Described | None:
         """Recover a recording after a crash, and update its catalog row; None if it is gone."""
         directory, catalog = self.directory, self.catalog
-        if catalog.is_in_memory:
-            return self._refresh(label)
-        is_empty = _is_empty(directory, label)
+        is_empty = _is_empty(directory, recording)
         try:
-            with directory.writing(label):
-                is_new = is_empty and directory.is_beginning(label)
-                now = "" if is_new else recover(directory, label, self.report)
-                if not now:
+            with directory.writing(recording):
+                is_new = is_empty and directory.is_beginning(recording)
+                if is_new or not recover(directory, recording, self.report):
                     return None
-                described = describe_now(directory, catalog, now)
+                described = describe_now(directory, catalog, recording)
                 catalog.put(described)
                 return described
         except HeldError:
-            if not directory.id_of(label):
+            if _is_empty(directory, recording):
                 return None  # a process is about to begin it
         except TopicError:
             return None
-        return self._describe(label, is_open=directory.is_recorded(label))
+        return self._describe(recording, is_open=directory.is_recorded(recording))
 
     def mend(self, until: float) -> set[str]:
         """Recover the recordings that were noted, and update their catalog rows.
@@ -282,54 +280,25 @@ class StoreFiles:
             Ids of the recordings.
         """
         mended, report = set(), self.report
-        for label in sorted([*report.noted]):  # other threads note more
+        for recording in sorted([*report.noted]):  # other threads note more
             if (
-                _open_bytes(self.directory, label)
+                _open_bytes(self.directory, recording)
                 > (until - time.monotonic()) * _RECOVERED_BYTES_PER_S
             ):
                 continue
-            report.noted.discard(label)
-            report.unreadable.pop(label, None)
+            report.noted.discard(recording)
+            report.unreadable.pop(recording, None)
             try:
-                described = self._mended(label)
+                described = self._mended(recording)
             except DiskFullError:
                 raise
             except StoreError as error:
-                if self.directory.has(label):
-                    report.unreadable[label] = str(error)
+                if self.directory.has(recording):
+                    report.unreadable[recording] = str(error)
                 continue
             if described is not None:
                 mended.add(described.entry.id)
         return mended
-
-    def _one_of(
-        self, copies: list[RecordingSummary], known: Mapping[str, RecordingSummary]
-    ) -> RecordingSummary:
-        """Choose one of several directories with the same recording, and put it in the catalog.
-
-        The most complete one, with the most payloads; of equals the one in the catalog, then the
-        one with the older journal.
-        """
-        whole = ["complete", "open", "recovered", "unfinished", "unproven", "damaged"]
-
-        def rank(one: RecordingSummary) -> tuple[int, int, int, bool, int, str]:
-            place = whole.index(one.status) if one.status in whole else 0
-            was_known = one.label in known and known[one.label].id == one.id
-            try:
-                path = self.directory.recording(one.label) / journal.JOURNAL
-                written = files.status(path).st_ctime_ns
-            except OSError:
-                written = time.time_ns()
-            lacks = one.expired + one.not_copied
-            return -one.messages, place, lacks, not was_known, written, one.label
-
-        chosen, *others = sorted(copies, key=rank)
-        for other in others:
-            self.report.copies[other.label] = chosen.label
-        # The row may be that of the copy.
-        described = describe_now(self.directory, self.catalog, chosen.label)
-        self.catalog.put(described, waits=False)
-        return described.summary
 
 
 def snapshot_of(catalog: Catalog, summaries: Collection[RecordingSummary]) -> Snapshot:
@@ -349,97 +318,105 @@ def _is_current(
     if looks != listing.print:
         return False
     if listing.open or entry.status == "open" or any(map(is_left_over, listing.others)):
-        holder = directory.holder(entry.label)
+        holder = directory.holder(entry.id)
         return holder is not None and (holder.is_recording or entry.status != "open")
     return True
 
 
-def _is_empty(directory: StoreDirectory, label: str) -> bool:
-    listing = directory.listing(label)
+def _is_empty(directory: StoreDirectory, recording: str) -> bool:
+    listing = directory.listing(recording)
     # What a list names was not begun a moment ago: its objects are lost.
-    is_empty = not (listing.journal or listing.sealed or listing.open or directory.is_remote)
+    is_empty = not (listing.manifest or listing.sealed or listing.open or directory.is_remote)
     if is_empty and not _OURS.issuperset(listing.others):
-        raise StoreError("it has neither a journal nor a segment, but other files")
+        raise StoreError("it has neither a manifest nor a segment, but other files")
     return is_empty
 
 
-def _open_bytes(directory: StoreDirectory, label: str) -> int:
+def _open_bytes(directory: StoreDirectory, recording: str) -> int:
     """Size of the segments of a recording that are not sealed."""
-    path, found = directory.recording(label), 0
-    for name in directory.listing(label).open.values():
+    path, found = directory.recording(recording), 0
+    for name in directory.listing(recording).open.values():
         with suppress(OSError):
             found += files.status(path / name).st_size
     return found
 
 
-def recover(directory: StoreDirectory, label: str, report: RepairReport) -> str:
+def recover(directory: StoreDirectory, recording: str, report: RepairReport) -> bool:
     """Finish the interrupted work on a recording that this process has locked.
 
     Returns:
-        Its label, which an interrupted renaming may change; empty if it is gone.
+        False if it is gone.
 
     Raises:
-        StoreError: It cannot be written, or its journal cannot be read.
+        StoreError: It cannot be written, or its manifest cannot be read.
         DiskFullError: No room; nothing is lost.
     """
-    path = directory.recording(label)
-    clear_away(directory, label)
-    listing = directory.listing(label)
-    state = journal.read(path) if listing.journal else None
-    if state is not None and state.removing:
-        directory.remove(label)
-        report.removed.append(label)
-        return ""
-    if state is not None and state.torn:
-        Journal(path).append()
-    if PAYLOAD_PARTS in listing.others or (state is not None and state.deleted):
-        payload_files.publish(path, state)
-    if state is not None and state.unmarked & listing.sealed.keys():
-        remove_marks(path, state)
-    thinned = state.thinned if state is not None else {}
-    payload_files.replace_segments(path, listing.others, thinned)
-    recovered = _recover_segments(directory, label, listing, state)
-    inventory = take_inventory(directory, label)
-    is_empty = not inventory.summaries and not (state is not None and state.sealed)
-    if is_empty and not inventory.listing.sealed and (state is None or state.end is None):
-        announce_removal(directory, label)
-        directory.remove(label)
-        report.recovered[label] = recovered
-        return ""
+    path = directory.recording(recording)
+    manifest = read_in(path)
+    check_folder(directory, recording, manifest.id if manifest is not None else "")
+    if manifest is not None and manifest.status == "removed":
+        directory.remove(recording)
+        report.removed.append(manifest.name)
+        return False
+    clear_away(directory, recording)
+    listing = directory.listing(recording)
+    if PAYLOAD_PARTS in listing.others or (manifest is not None and manifest.deleted):
+        payload_files.publish(path, manifest)
+    if manifest is not None and {*manifest.unmarked} & listing.sealed.keys():
+        remove_marks(path, manifest)
+    payload_files.replace_segments(path, listing.others, manifest)
+    recovered = recover_segments(directory, recording, listing, manifest)
+    inventory = take_inventory(directory, recording)
+    is_empty = not inventory.summaries and not (manifest is not None and manifest.logs)
+    is_ended = manifest is not None and manifest.is_ended
+    if is_empty and not inventory.listing.sealed and not is_ended:
+        announce_removal(directory, recording)
+        directory.remove(recording)
+        report.recovered[inventory.name] = recovered
+        return False
     if recovered:
-        report.recovered[label] = recovered
-    lines: list[journal.Event] = []
-    if inventory.state is None:
-        reason = "it was not there"
-        events = journal_from_segments(inventory, directory.settings.store_id, reason)
-        Journal(path).replace(events)
-        report.journals.append(label)
-        inventory = take_inventory(directory, label)
-    state = inventory.state
-    if inventory.stored and (missing := unlisted_lines(inventory)):
-        lines += missing  # expired chunks are read from the files that the journal lists
-        report.journals.append(label)
-    if state is not None and state.end is None:
-        lines.append(journal.event(journal.ENDED, end=_end_of(inventory)))
-    if state is not None and state.store and state.store != directory.settings.store_id:
-        lines.append(journal.event(journal.ADOPTED, store=directory.settings.store_id))
-        report.adopted.append(label)
-    if lines:
-        Journal(path).append(*lines)
-    return finish_renaming(directory, label, state)
+        report.recovered[inventory.name] = recovered
+    if manifest is not None:
+        adopt = unlisted(inventory)
+        end = None if is_ended else _end_of(inventory)
+
+        def change(now: Manifest) -> Manifest:
+            now = now if adopt is None else adopt(now)
+            return now if end is None or now.is_ended else ended(end)(now)
+
+        change_in(path, change)
+    return True
+
+
+def _finish_copy(directory: StoreDirectory, hidden: str) -> None:
+    """Put a copy in its place that was whole: its manifest is written last."""
+    recording = hidden.removeprefix(IMPORTING)
+    if not directory.has(f"{hidden}/{MANIFEST}"):
+        return
+    with suppress(HeldError, TopicError), ExitStack() as held:
+        held.enter_context(directory.writing(hidden))
+        if directory.has(recording):
+            held.enter_context(directory.writing(recording))
+        held.enter_context(directory.alone())
+        directory.put_in_place(hidden, recording)
 
 
 def is_left_over(name: str) -> bool:
     """True if a file in a recording's directory is left from an interrupted step."""
     patterns = (_LEFT_OVER, _MOVING, payload_files.REPLACEMENT)
-    return name == PAYLOAD_PARTS or any(pattern.fullmatch(name) for pattern in patterns)
+    if name == PAYLOAD_PARTS or is_being_written(name):
+        return True
+    return any(pattern.fullmatch(name) for pattern in patterns)
 
 
-def clear_away(directory: StoreDirectory, label: str) -> None:
+def clear_away(directory: StoreDirectory, recording: str) -> None:
     """Remove temporary files, and finish the renaming of segments."""
-    finish_moves(directory, label)
-    path = directory.recording(label)
-    for name in directory.listing(label).others:
+    finish_moves(directory, recording)
+    path = directory.recording(recording)
+    others = directory.listing(recording).others
+    if any(map(is_being_written, others)):
+        clear_in(path)
+    for name in others:
         if _LEFT_OVER.fullmatch(name):
             try:
                 files.unlink(path / name)
@@ -477,31 +454,33 @@ def moving_name(name: str, number: int) -> str:
 
 
 def finish_moves(
-    directory: StoreDirectory, label: str, *, replace: bool = False
+    directory: StoreDirectory, recording: str, *, replace: bool = False
 ) -> list[tuple[str, str]]:
     """Finish the renaming of segments.
 
     Args:
         directory: The store.
-        label: The recording, locked by this process.
-        replace: Rename an existing file of that name to `.damaged`: the journal does not list
+        recording: The recording, locked by this process.
+        replace: Rename an existing file of that name to `.damaged`: the manifest does not list
             it. Otherwise it stays, as it may be renamed itself.
 
     Returns:
         Old and new name of each.
     """
-    path = directory.recording(label)
+    path = directory.recording(recording)
     done = []
     try:
-        for name in directory.listing(label).others:
+        for name in directory.listing(recording).others:
             moving = _MOVING.fullmatch(name)
             if moving is None:
                 continue
             final = path / sealed_name(int(moving["number"]))
-            if final.name in directory.listing(label).sealed.values():
+            if final.name in directory.listing(recording).sealed.values():
                 if not replace:
                     continue
-                files.rename(final, path / _free_name(directory, label, f"{final.name}.damaged"))
+                files.rename(
+                    final, path / _free_name(directory, recording, f"{final.name}.damaged")
+                )
             files.rename(path / name, final)
             done.append((moving["before"], final.name))
         if done:
@@ -511,59 +490,47 @@ def finish_moves(
     return done
 
 
-def _free_name(directory: StoreDirectory, label: str, name: str) -> str:
+def _free_name(directory: StoreDirectory, recording: str, name: str) -> str:
     """A free file name: this one, or one with a number before its suffix."""
-    taken = set(directory.listing(label).others)
+    taken = set(directory.listing(recording).others)
     stem, _, last = name.rpartition(".")
     return next(
         n for n in (name, *(f"{stem}.{i}.{last}" for i in range(2, 1 << 20))) if n not in taken
     )
 
 
-def finish_renaming(directory: StoreDirectory, label: str, state: JournalState | None) -> str:
-    """Give a directory the label that its journal announces; return its label.
-
-    A directory that a user has renamed meanwhile is unchanged.
-    """
-    if state is None or state.moving is None:
-        return label
-    before, after = state.moving
-    if label == before:
-        with directory.alone():  # a recording that begins takes a label, too
-            if after in directory.labels():
-                after = directory.free_label(state.name, but=label)
-            if label != after:
-                directory.move(label, after)
-        label = after
-    directory.append(label, journal.event(journal.RENAMED, name=state.name))
-    return label
-
-
-def _recover_segments(
-    directory: StoreDirectory, label: str, listing: Listing, state: JournalState | None
+def recover_segments(
+    directory: StoreDirectory, recording: str, listing: Listing, manifest: Manifest | None
 ) -> list[Recovered]:
+    """Seal what a killed recorder has left; the manifest, if there is one, lists it first."""
     from hybridlog_storage.segments.recovery import recover_segment
 
-    path = directory.recording(label)
-    log = Journal(path)
+    path = directory.recording(recording)
     said = None
-    if state is not None and state.begun:
-        said = {key: state.begun[key] for key in ("id", "name", "tags", "source", "created")}
+    if manifest is not None:
+        said = {
+            "id": manifest.id,
+            "name": manifest.name,
+            "tags": dict(manifest.tags),
+            "source": to_builtins(manifest.source),
+            "created": manifest.created,
+        }
 
     def announce(sealed: Sealed) -> None:
-        known = journal.read(path)
-        listed = known.sealed.get(sealed.segment) if known is not None else None
-        if known is not None and (listed is None or listed.digest != sealed.digest):
-            log.append(sealed_event(sealed))
+        if manifest is None:
+            return
+        before = manifest.logs.get(sealed.segment)
+        if before is None or before.digest != sealed.digest:
+            lost = () if before is None else lost_in_crash(manifest, sealed)
+
+            def change(now: Manifest) -> Manifest:
+                return replace(listed(sealed)(now), losses=(*now.losses, *lost))
+
+            change_in(path, change)
 
     recovered = []
     for number, name in listing.open.items():
-        if (
-            state is not None
-            and state.is_proof
-            and state.end is not None
-            and number not in state.sealed
-        ):
+        if manifest is not None and manifest.is_ended and number not in manifest.logs:
             # An unfinished mark of a recording that had ended.
             try:
                 files.unlink(path / name)
@@ -574,14 +541,14 @@ def _recover_segments(
     return recovered
 
 
-def remove_marks(path: Path, state: JournalState) -> None:
+def remove_marks(path: Path, manifest: Manifest) -> None:
     """Remove the segments of removed marks of a recording that this process has locked.
 
     Raises:
         HybridlogError: One cannot be removed.
     """
     try:
-        for number in state.unmarked:
+        for number in manifest.unmarked:
             with suppress(FileNotFoundError):
                 files.unlink(path / sealed_name(number))
         files.sync_folder(path)
@@ -590,5 +557,5 @@ def remove_marks(path: Path, state: JournalState) -> None:
 
 
 def _end_of(inventory: Inventory) -> dict[str, Any]:
-    """The `end` of a recording whose journal has no `ended` line."""
+    """The `end` of a recording whose manifest does not have it."""
     return dict(inventory.end or {"status": "recovered", "cut_bytes": 0, "damage": []})

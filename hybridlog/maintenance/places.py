@@ -1,8 +1,8 @@
 """Places that recordings are copied to: what one can do, and a store's directory as one.
 
 A place believes nothing that it is told. It takes bytes, and says itself whether a file is
-whole: a segment or a file of columns has a digest in the journal, of its own list of checksums
-of all of its bytes. A recording gets its name when every file that its journal names is whole.
+whole: a segment or a file of columns has a digest in the manifest, of its own list of checksums
+of all of its bytes. A recording gets its name when every file that its manifest lists is whole.
 """
 
 from __future__ import annotations
@@ -13,12 +13,13 @@ import re
 import stat
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Annotated, Final, NamedTuple, Protocol
 
-from hybridlog.entries import take_inventory
-from hybridlog_storage import journal
+from msgspec import Meta, convert, structs, to_builtins
+
+from hybridlog.entries import Inventory, check_folder, free_name_in, put_entry, take_inventory
 from hybridlog_storage.disk import durability, files
 from hybridlog_storage.disk.directory import (
     IMPORTING,
@@ -28,63 +29,65 @@ from hybridlog_storage.disk.directory import (
     REMOVED,
     payload_names,
 )
-from hybridlog_storage.errors import HeldError, StoreError, TopicError, unreadable
-from hybridlog_storage.journal import JOURNAL, JournalState
+from hybridlog_storage.errors import (
+    HeldError,
+    ManifestError,
+    StoreError,
+    TopicError,
+    unreadable,
+)
+from hybridlog_storage.manifest import (
+    MAX_BYTES,
+    Count,
+    Fields,
+    Manifest,
+    Topic,
+    decode,
+    is_id,
+    replace,
+)
+from hybridlog_storage.manifests import MANIFEST, MANIFEST_LOCK, read_in, write_in
 from hybridlog_storage.remote.bucket import digest_like
 from hybridlog_storage.segments.segment_check import SegmentCheck
-from hybridlog_storage.segments.segment_file import sealed_name
 from hybridlog_storage.settings import EXPIRED
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from hybridlog_storage.catalog import Catalog
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.messages import Buffer
 
-_SEGMENT: Final = re.compile(r"[0-9]{6,9}\.mcap")
-_ID: Final = re.compile(r"[0-9a-f]{32}")
+_SEGMENT: Final = re.compile(r"[0-9]{6}\.mcap")
+_FILE: Final = r"\A([0-9]{6}\.mcap|(?!\.)[^/\0]{1,255}/(?!\.)[^/\0]{1,255})\Z"
 _MARK: Final = re.compile(rf"{re.escape(REMOVED)}[0-9a-f]{{16}}")
 _PIECE: Final = 1 << 20
 _FETCHED: Final = 8 << 20  # bytes that a bucket is asked for
-_EDITS: Final = frozenset(
-    {
-        journal.TAGGED,
-        journal.UNTAGGED,
-        journal.NOTED,
-        journal.PINNED,
-        journal.UNPINNED,
-        journal.SEALED,
-        journal.MARKED,
-        journal.UNMARKED,
-    }
-)
-"""Events that users add to a recording that has ended; `sealed` is of the segment of a mark."""
 
 
 class RefusedError(StoreError):
     """A recording that is not copied; others are."""
 
 
-@dataclass(frozen=True, slots=True)
-class CopiedFile(journal.PayloadFile):
+class CopiedFile(Fields, frozen=True):
     """A file of fields; or a segment, whose `file` is its name."""
 
-    topic: str = ""
-    messages: int = 0
+    file: Annotated[str, Meta(pattern=_FILE)]
+    topic: Topic = ""
+    messages: Count = 0
 
     @classmethod
-    def of(cls, value: Mapping[str, Any]) -> CopiedFile:
+    def of(cls, value: object) -> CopiedFile:
         """A file from elsewhere.
 
         Raises:
-            KeyError, TypeError, ValueError: It is malformed.
+            ValueError: It is malformed.
         """
-        name = value["file"]
-        is_segment = isinstance(name, str) and _SEGMENT.fullmatch(name)
-        # Another valid name in its place: the journal has the rules for all other values.
-        file = f"segment/{name}" if is_segment else name
-        (found,) = journal.payload_files([{**value, "file": file}])
-        return cls(**{**asdict(found), "file": name})
+        return convert(value, cls)
+
+    def to_json(self) -> object:
+        """As of `of`."""
+        return to_builtins(self)
 
     @property
     def is_segment(self) -> bool:
@@ -117,14 +120,14 @@ class Copied:
     """A recording that a place has.
 
     Attributes:
-        label: Its label there.
+        name: Its name there.
         lacks_payloads: Whether only its fields were copied: the next copy completes it.
         is_damaged: Whether objects of it were lost: the next copy brings them back.
         expired: Number of expired topics there, summed over its segments.
         content: As of `content_of`.
     """
 
-    label: str
+    name: str
     lacks_payloads: bool = False
     expired: int = 0
     content: str = ""
@@ -205,16 +208,14 @@ class Place(Protocol):
     def prove(self, file: CopiedFile) -> bool:
         """Read a file and check all of its bytes; True if it is whole and on the disk."""
 
-    def publish(self, label: str, lines: bytes, *, lacks_payloads: bool) -> str:
-        """Give the recording its name, when all files that its journal names are proven.
+    def publish(self, data: bytes) -> str:
+        """Put the recording in its place, when all files that its manifest lists are proven.
 
         Args:
-            label: The label it should have.
-            lines: Its journal.
-            lacks_payloads: Whether payloads are to be copied later.
+            data: Its manifest.
 
         Returns:
-            The label it has.
+            Its name there: one that another recording has gets a number.
         """
 
     def hold(self, recordings: Sequence[str]) -> bool:
@@ -235,7 +236,7 @@ class DirectoryPlace:
 
     Args:
         directory: The store.
-        known: Returns labels of its recordings by id, as far as they are known.
+        catalog: Its catalog.
 
     Attributes:
         published: Ids of the recordings that were copied.
@@ -246,13 +247,12 @@ class DirectoryPlace:
 
     proves = True
 
-    def __init__(self, directory: StoreDirectory, known: Callable[[], Mapping[str, str]]) -> None:
+    def __init__(self, directory: StoreDirectory, catalog: Catalog) -> None:
         directory.check_writable()
         self.name = str(directory.path)
         self.published: list[str] = []
         self._directory = directory
-        self._known = known
-        self._ids: dict[str, str] = {}  # by label, as read
+        self._catalog = catalog
         self._recording = ""
         self._held = ExitStack()
         self._proven: dict[str, CopiedFile] = {}
@@ -273,28 +273,12 @@ class DirectoryPlace:
 
     def have(self, recordings: Sequence[str]) -> dict[str, Copied]:
         """As of `Place`."""
-        found = self._labels(recordings).items()
-        return {recording: copied_of(self._directory, label) for recording, label in found}
-
-    def _labels(self, recordings: Sequence[str]) -> dict[str, str]:
-        """Labels of those of some recordings that are here, by id."""
-        for _ in range(2):
-            known = {label: recording for recording, label in self._known().items()} | self._ids
-            self._ids = {}
-            for label in self._directory.labels():
-                with suppress(StoreError):
-                    self._ids[label] = known.get(label) or self._directory.id_of(label)
-            labels = {recording: label for label, recording in self._ids.items()}
-            found = {one: labels[one] for one in recordings if one in labels}
-            if all(self._directory.has_label(label, one) for one, label in found.items()):
-                break
-            self._ids, self._known = {}, dict  # other recordings have got their labels
-        return found
+        there = [recording for recording in recordings if self._directory.has(recording)]
+        return {recording: copied_of(self._directory, recording) for recording in there}
 
     def segments(self, recording: str) -> dict[int, CopiedSegment]:
         """As of `Place`."""
-        label = self._labels([recording]).get(recording)
-        return {} if label is None else segments_of(journal.read(self._directory.recording(label)))
+        return segments_of(manifest_of(self._directory, recording))
 
     def begin(self, recording: str, *, wants_payloads: bool, wait_s: float = LOCK_WAIT_S) -> Begun:
         """As of `Place`.
@@ -307,7 +291,7 @@ class DirectoryPlace:
         from hybridlog.maintenance.opening import clear_away
 
         self.leave()
-        if not _ID.fullmatch(recording):
+        if not is_id(recording):
             raise StoreError(f"{recording[:40]!r} is no id of a recording.")
         self._recording = recording
         hidden = self._path.name
@@ -322,7 +306,7 @@ class DirectoryPlace:
                 self._held.enter_context(self._directory.writing(hidden, wait_s=wait_s))
                 break
             except TopicError:
-                pass  # another process has given it its label
+                pass  # another process has put it in its place
             except HeldError as error:
                 raise HeldError(
                     f"another process copies it into {self.name} at this moment.",
@@ -407,42 +391,38 @@ class DirectoryPlace:
         self._proven[file.file] = file
         return True
 
-    def publish(self, label: str, lines: bytes, *, lacks_payloads: bool) -> str:
+    def publish(self, data: bytes) -> str:
         """As of `Place`."""
-        path, state = self._path, journal.parse(lines)
-        check_proven(state, self._recording, self._proven)
-        self._clear(state)
-        if state.payloads:
-            self._directory.require(EXPIRED)
-        added = [adopted_line(self._directory, state, lacks_payloads=lacks_payloads)]
+        directory, recording = self._directory, self._recording
+        new = proven_manifest(data, recording, self._proven)
+        self._clear(new)
+        if new.fields:
+            directory.require(EXPIRED)
         with ExitStack() as held:
-            before = self.have([self._recording]).get(self._recording)
-            if before is not None:
-                writing = self._directory.writing(before.label, self._recording, wait_s=LOCK_WAIT_S)
-                label = held.enter_context(writing)
-                added += self._edits(label, state)
-            content = lines + b"".join(map(journal.encode, added))
-            durability.write_new(path / JOURNAL, content)
-            inventory = take_inventory(self._directory, path.name)
-            if inventory.misfits or not inventory.is_proven:
-                files.unlink(path / JOURNAL)
-                raise StoreError(f"What was copied of recording {label!r} does not fit together.")
-            with self._directory.alone():
-                label = self._name(label, is_there=before is not None)
-        self.published.append(self._recording)
+            if self.have([recording]):
+                held.enter_context(directory.writing(recording, wait_s=LOCK_WAIT_S))
+                held.enter_context(directory.alone())
+                name = self._put_over(new)
+            else:
+                held.enter_context(directory.alone())
+                name = free_name_in(self._catalog, new.name, recording)
+                self._put(replace(new, name=name))
+            put_entry(directory, self._catalog, recording)
+        self.published.append(recording)
         self.leave()
-        return label
+        return name
 
-    def _clear(self, state: JournalState) -> None:
+    def _clear(self, new: Manifest) -> None:
         """Remove what an interrupted copy has left, and force the names of files to the disk."""
         path = self._path
-        keep = {LOCK, PAYLOADS, *map(sealed_name, state.sealed)}
+        keep = {LOCK, PAYLOADS, *(file.name for file in new.files)}
+        fields = {one.file for one in new.fields}
         try:
             for name in files.names(path).keys() - keep:
                 files.remove_tree(path / name)
-            for name in payload_names(path).keys() - state.payloads.keys():
+            for name in payload_names(path).keys() - fields:
                 files.remove_tree(path / PAYLOADS / name)
-            folders = {(path / PAYLOADS / name).parent for name in state.payloads}
+            folders = {(path / PAYLOADS / name).parent for name in fields}
             for folder in folders:
                 files.sync_folder(folder)
             if folders:
@@ -451,31 +431,36 @@ class DirectoryPlace:
         except OSError as error:
             raise durability.explain(error, path, "copying into") from error
 
-    def _edits(self, label: str, state: JournalState) -> list[journal.Event]:
-        """Lines that users added to a copy without payloads; segments of marks get a name here."""
-        old = self._directory.recording(label)
-        data = files.read_file(old / JOURNAL, journal.MAX_JOURNAL)
-        found, marks = edits_of(data, state, self.name)
-        for name in marks:
-            with suppress(FileExistsError):
-                files.link(old / name, self._path / name)
-        files.sync_folder(self._path)
-        return found
+    def _put(self, manifest: Manifest) -> None:
+        """Put the recording in its place."""
+        path = self._path
+        write_in(path, manifest)
+        inventory = take_inventory(self._directory, path.name)
+        if inventory.misfits or not inventory.is_proven:
+            files.unlink(path / MANIFEST)
+            raise StoreError(
+                f"What was copied of recording {manifest.name!r} does not fit together."
+            )
+        self._directory.put_in_place(path.name, self._recording)
 
-    def _name(self, label: str, *, is_there: bool) -> str:
-        """Give the recording its label; the copy that lacked payloads goes.
+    def _put_over(self, new: Manifest) -> str:
+        """Put the recording in the place of a copy without payloads; returns its name."""
+        old = self._directory.recording(self._recording)
 
-        After a crash in between there are two copies: the whole one answers, and the store names
-        the other one.
-        """
-        free = self._directory.free_label(label)
-        self._directory.move(self._path.name, free)
-        if not is_there:
-            return free
-        hidden = self._directory.hide(label)
-        self._directory.move(free, label)
-        self._directory.sweep(hidden)
-        return label
+        def put(there: Manifest) -> Manifest:
+            # The lock that keeps others from changes goes along: they wait, and change the new one.
+            made = merged(there, new)
+            try:
+                for name in (MANIFEST_LOCK, *marked_there(made, new)):
+                    with suppress(FileExistsError):
+                        files.link(old / name, self._path / name)
+                files.sync_folder(self._path)
+            except OSError as error:
+                raise durability.explain(error, self._path, "copying into") from error
+            self._put(made)
+            return there
+
+        return self._directory.change(self._recording, put).name
 
     def hold(self, recordings: Sequence[str]) -> bool:
         """As of `Place`."""
@@ -496,39 +481,48 @@ class DirectoryPlace:
 
     def problems(self, recording: str) -> list[str]:
         """As of `Place`."""
-        return problems_of(self._directory, self._labels([recording]).get(recording))
+        return problems_of(self._directory, recording)
 
 
 def problems_of(
     directory: StoreDirectory,
-    label: str | None,
+    recording: str,
     is_whole: Callable[[CopiedFile], bool] | None = None,
 ) -> list[str]:
     """Read a whole recording, and say what is wrong with it.
 
     Args:
         directory: Its store.
-        label: Its label; None if it is gone.
+        recording: Its id.
         is_whole: Reads a file of it; None to read it where it is.
     """
-    if label is None:
+    if not directory.has(recording):
         return ["it is gone"]
-    inventory = take_inventory(directory, label)
+    try:
+        inventory = take_inventory(directory, recording)
+    except ManifestError as error:
+        return [str(error)]
     found = [misfit.reason for misfit in inventory.misfits]
     if not inventory.is_proven:
         found.append("it is incomplete")
-    path = directory.recording(label)
+    path = directory.recording(recording)
     is_whole = is_whole or (lambda file: file.is_whole(path))
     return found + [f"{f.file} is damaged" for f in files_of(inventory) if not is_whole(f)]
 
 
-def segments_of(state: JournalState | None) -> dict[int, CopiedSegment]:
-    """As of `Place`, by the journal of a recording."""
-    state = state or JournalState()
-    now = {number: state.thinned[number][-1][0] for number in state.expired}
+def manifest_of(directory: StoreDirectory, recording: str) -> Manifest | None:
+    """The manifest of a recording; None if it is lost or damaged."""
+    with suppress(ManifestError):
+        return read_in(directory.recording(recording))
+    return None
+
+
+def segments_of(manifest: Manifest | None) -> dict[int, CopiedSegment]:
+    """As of `Place`, by the manifest of a recording."""
+    logs = {} if manifest is None else manifest.logs
     return {
-        n: CopiedSegment(one.digest, now.get(n, ""), tuple(state.expired.get(n, ())))
-        for n, one in state.sealed.items()
+        number: CopiedSegment(one.digest, one.stored.digest if one.stored else "", one.expired)
+        for number, one in logs.items()
     }
 
 
@@ -538,65 +532,96 @@ def has_lost(one: Mapping[int, CopiedSegment], other: Mapping[int, CopiedSegment
     return any({*segment.expired} - left.get(n, set()) for n, segment in one.items())
 
 
-def copied_of(directory: StoreDirectory, label: str) -> Copied:
-    """A recording of a store, by its journal."""
-    state = journal.read(directory.recording(label)) or JournalState()
-    digests = {number: sealed.digest for number, sealed in state.sealed.items()}
-    return Copied(label, state.lacks_payloads, expired_in(state), content_of(digests))
+def copied_of(directory: StoreDirectory, recording: str) -> Copied:
+    """A recording of a store, by its manifest.
+
+    Raises:
+        StoreError: Its folder has another one.
+    """
+    manifest = manifest_of(directory, recording)
+    if manifest is None:
+        return Copied(recording)
+    check_folder(directory, recording, manifest.id)
+    return Copied(
+        manifest.name,
+        manifest.lacks_payloads,
+        sum(len(log.expired) for log in manifest.logs.values()),
+        content_of(digests_of(manifest)),
+    )
 
 
-def edits_of(data: bytes, state: JournalState, place: str) -> tuple[list[journal.Event], list[str]]:
-    """Lines that users added to a copy, and the files of the marks that they set there.
+def merged(there: Manifest, new: Manifest) -> Manifest:
+    """A copy in the place of one that users have edited since.
+
+    What they said of it stays; so do marks that they set there, with their logs.
 
     Raises:
         RefusedError: A mark that was set here has the number of one there.
     """
-    lines = [line for _, line in journal.read_lines(data) if line is not None]
-    adopted = [n for n, line in enumerate(lines, 1) if line["event"] == journal.ADOPTED]
-    found: list[journal.Event] = []
-    for line in lines[max(adopted, default=0) :]:
-        if line["event"] == journal.RENAMED:
-            found.append(journal.event(journal.RENAMED, name=line["name"]))
-        elif line["event"] in _EDITS:
-            found.append(line)
-    now = journal.parse(data)
-    marked = {line["segment"] for line in found if line["event"] == journal.SEALED}
-    gone = marked & now.unmarked  # set and removed there: the number may be another mark's here
-    marks = marked - gone
-    if marks & state.sealed.keys() or marks - now.sealed.keys():
+    known = {mark.id for mark in new.marks}
+    marks = [mark for mark in there.marks if mark.id not in known]
+    numbers = {mark.segment for mark in marks}
+    if numbers & new.logs.keys():
         raise RefusedError(
-            f"Recording {state.name!r} was marked here and in {place}, where its payloads or "
-            "its journal have to be completed first: note the mark there, `hybridlog mark "
-            "--remove` it, copy again, and set it again."
+            f"Recording {new.name!r} was marked here and in its copy, where its payloads or its "
+            "manifest have to be completed first: note the mark there, `hybridlog mark --remove` "
+            "it, copy again, and set it again."
         )
-    left = [line for line in found if line.get("segment") not in gone]
-    return left, [sealed_name(number) for number in sorted(marks)]
+    logs = [log for number, log in there.logs.items() if number in numbers]
+    channels = {number: there.channels[number] for log in logs for number in log.parts}
+    return replace(
+        new,
+        name=there.name,
+        tags=there.tags,
+        notes=there.notes,
+        pins=there.pins,
+        marks=(*new.marks, *marks),
+        files=(*new.files, *logs),
+        channels={**channels, **new.channels},
+        unmarked=tuple(number for number in new.unmarked if number not in numbers),
+        changes=there.changes + 1,
+    )
 
 
-def adopted_line(
-    directory: StoreDirectory, state: JournalState, *, lacks_payloads: bool
-) -> journal.Event:
-    """The last line of the journal of a copy."""
-    lacks = {"lacks": "payloads"} if lacks_payloads or state.lacks_payloads else {}
-    return journal.event(journal.ADOPTED, store=directory.settings.store_id, **lacks)
+def marked_there(made: Manifest, new: Manifest) -> list[str]:
+    """Names of the logs that `merged` has added."""
+    return [log.name for number, log in made.logs.items() if number not in new.logs]
 
 
-def check_proven(state: JournalState, recording: str, proven: Mapping[str, CopiedFile]) -> None:
-    """Raise unless every file that a journal names is proven.
+def proven_manifest(data: bytes, recording: str, proven: Mapping[str, CopiedFile]) -> Manifest:
+    """The manifest of a copy, by its bytes.
 
     Raises:
-        StoreError: One is not, or it is another recording's journal.
+        StoreError: It is damaged, or of another recording; or a file that it lists is not proven.
     """
-    if state.id != recording or not state.is_proof or state.torn:
-        raise StoreError("The journal of the recording is damaged, or of another one.")
-    for number, sealed in state.sealed.items():
-        found = proven.get(sealed_name(number))
-        right = {(sealed.digest, sealed.bytes), *state.thinned.get(number, ())}
-        if found is None or (found.digest, found.bytes) not in right:
-            raise StoreError(f"{sealed_name(number)} was not copied, and the journal lists it.")
-    for name, file in state.payloads.items():
-        if proven.get(name) != CopiedFile(**asdict(file)):
-            raise StoreError(f"{name} was not copied, and the journal lists it.")
+    try:
+        if len(data) > MAX_BYTES:
+            raise ValueError("it is too large")
+        found = decode(data)
+        if found.id != recording:
+            raise ValueError(f"it is the one of {found.id}")
+        if found.status in {"open", "unproven", "removed"}:
+            raise ValueError(f"its recording is {found.status}")
+    except ValueError as error:
+        raise StoreError(
+            f"The manifest of the recording is damaged, or of another one: {error}."
+        ) from error
+    for log in found.files:
+        sent = proven.get(log.name)
+        right = {(log.digest, log.bytes)}
+        if log.stored is not None:
+            right.add((log.stored.digest, log.stored.bytes))
+        if not log.is_here or sent is None or (sent.digest, sent.bytes) not in right:
+            raise StoreError(f"{log.name} was not copied, and the manifest lists it.")
+    for one in found.fields:
+        if proven.get(one.file) != copied_file(one):
+            raise StoreError(f"{one.file} was not copied, and the manifest lists it.")
+    return found
+
+
+def digests_of(manifest: Manifest) -> dict[int, str]:
+    """Digests of the segments of a recording as they were sealed, by number."""
+    return {number: log.digest for number, log in manifest.logs.items()}
 
 
 def content_of(digests: Mapping[int, str]) -> str:
@@ -604,14 +629,14 @@ def content_of(digests: Mapping[int, str]) -> str:
     return hashlib.sha256(str(sorted(digests.items())).encode()).hexdigest()[:32]
 
 
-def expired_in(state: JournalState) -> int:
-    """Number of topics with expired messages, summed over the segments of a recording."""
-    return sum(map(len, state.expired.values()))
+def copied_file(fields: Fields) -> CopiedFile:
+    """A file of fields, as it is copied."""
+    return CopiedFile(**structs.asdict(fields))
 
 
-def files_of(inventory: Any) -> list[CopiedFile]:
+def files_of(inventory: Inventory) -> list[CopiedFile]:
     """The files of a recording, as they are copied."""
-    listed = [CopiedFile(**asdict(file)) for file in inventory.payloads.values()]
+    listed = [copied_file(one) for one in inventory.fields.values()]
     for number in inventory.summaries:
         digest, size = inventory.stored_file(number)
         listed.append(CopiedFile(inventory.listing.sealed[number], size, digest))

@@ -8,15 +8,16 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from hybridlog.columns.payload_files import open_segment
-from hybridlog.entries import journal_from_segments, put_entry, take_inventory, unlisted_lines
+from hybridlog.entries import free_name_in, made_again, put_entry, take_inventory, unlisted
 from hybridlog.maintenance import tables
 from hybridlog.maintenance.index import StoreIndex
-from hybridlog.maintenance.opening import finish_moves, moving_name
+from hybridlog.maintenance.opening import finish_moves, moving_name, recover_segments
 from hybridlog.maintenance.verify import RESTORE, damaged_files
 from hybridlog_storage.disk import durability, files
 from hybridlog_storage.disk.directory import LOCK_WAIT_S, PAYLOADS
-from hybridlog_storage.errors import HeldError, SegmentError, StoreError, TopicError
-from hybridlog_storage.journal import Journal
+from hybridlog_storage.errors import HeldError, ManifestError, SegmentError, StoreError, TopicError
+from hybridlog_storage.manifest import replace
+from hybridlog_storage.manifests import MANIFEST, change_in, old_in, read_in, write_in
 from hybridlog_storage.mongo.index_state import IndexState
 from hybridlog_storage.segments.recovery import rebuild_summary
 from hybridlog_storage.segments.segment_check import SegmentCheck
@@ -36,7 +37,7 @@ class Repaired:
     """A repair, or a problem that could not be repaired.
 
     Attributes:
-        recording: Label of the recording.
+        recording: Name of the recording.
         place: File or other subject.
         done: The repair, or the remaining work.
         is_cured: Whether the problem is solved.
@@ -54,71 +55,69 @@ def repair(
     repairs: RepairReport,
     entries: Iterable[RecordingEntry] | None,
 ) -> list[Repaired]:
-    """Repair files, journals and the catalog.
+    """Repair files, manifests and the catalog.
 
     Raises:
         StoreError: The store cannot be written.
     """
     directory.check_writable()
-    done = [Repaired(label, "journal", "rebuilt") for label in repairs.journals]
+    done: list[Repaired] = []
+    entries = None if entries is None else [*entries]
     checker = tables.TableChecker(directory)
-    chosen = [(label, "") for label in directory.labels()]
-    for label, recording in chosen if entries is None else [(e.label, e.id) for e in entries]:
-        if label in repairs.copies:
-            original = repairs.copies[label]
-            what = f"it is a copy of {original}; remove one: `hybridlog rm {label}`"
-            done.append(Repaired(label, "recording", what, is_cured=False))
-            continue
+    names = {one: one for one in directory.ids()}
+    if entries is not None:
+        names = {entry.id: entry.name for entry in entries}
+    for recording, name in names.items():
         try:
-            with directory.writing(label, recording, wait_s=LOCK_WAIT_S) as now:
-                done += _repair_one(directory, now)
-                entry = put_entry(directory, catalog, now)
+            with directory.writing(recording, name, wait_s=LOCK_WAIT_S):
+                done += _repair_one(directory, catalog, recording)
+                entry = put_entry(directory, catalog, recording)
             if entry.status not in {"damaged", "open"}:
                 # Tables of lost data are valid again after its restoration.
                 made = checker.repair(entry)
-                done += [Repaired(entry.label, f"table of {topic}", "made again") for topic in made]
+                done += [Repaired(entry.name, f"table of {topic}", "made again") for topic in made]
         except HeldError as error:
-            if recording:
-                done.append(Repaired(label, "recording", str(error), is_cured=False))
+            if entries is not None or recording in repairs.unreadable:
+                done.append(Repaired(name, "recording", str(error), is_cured=False))
         except (StoreError, TopicError) as error:
-            done.append(Repaired(label, "recording", str(error), is_cured=False))
+            done.append(Repaired(name, "recording", str(error), is_cured=False))
     return done
 
 
-def _repair_one(directory: StoreDirectory, label: str) -> list[Repaired]:
-    done = _put_segments_right(directory, label)
-    done += _put_journal_right(directory, label)
-    inventory = take_inventory(directory, label)
+def _repair_one(directory: StoreDirectory, catalog: Catalog, recording: str) -> list[Repaired]:
+    done = _put_manifest_right(directory, catalog, recording)
+    done += _put_segments_right(directory, recording)
+    inventory = take_inventory(directory, recording)
     for misfit in inventory.misfits:
         what = f"{misfit.reason}; restore it from a copy, if there is one"
         place = misfit.file or f"segment {misfit.segment}"
-        done.append(Repaired(label, place, what, is_cured=False))
-    return [*done, *_damage(directory.recording(label), inventory)]
+        done.append(Repaired(inventory.name, place, what, is_cured=False))
+    return [*done, *_damage(directory.recording(recording), inventory)]
 
 
 def _damage(path: Path, inventory: Inventory) -> Iterator[Repaired]:
     """Read every byte of segments and columns; damage in them can only be restored."""
     for file, problem in damaged_files(path, inventory):
         what = f"{problem}; {RESTORE}"
-        yield Repaired(inventory.label, f"{PAYLOADS}/{file}", what, is_cured=False)
+        yield Repaired(inventory.name, f"{PAYLOADS}/{file}", what, is_cured=False)
     for number in inventory.summaries:
         name = inventory.listing.sealed[number]
         with SegmentCheck(path / name) as check:
             for offset, problem in check.problems():
                 what = f"{problem}; {RESTORE}"
-                yield Repaired(inventory.label, f"{name} byte {offset}", what, is_cured=False)
+                yield Repaired(inventory.name, f"{name} byte {offset}", what, is_cured=False)
 
 
-def _put_segments_right(directory: StoreDirectory, label: str) -> list[Repaired]:
+def _put_segments_right(directory: StoreDirectory, recording: str) -> list[Repaired]:
     """Restore the names of segments and rebuild damaged summaries."""
-    path = directory.recording(label)
-    inventory = take_inventory(directory, label)
+    path = directory.recording(recording)
+    inventory = take_inventory(directory, recording)
     done = [
-        Repaired(label, misfit.file, "its summary was rebuilt")
+        Repaired(inventory.name, misfit.file, "its summary was rebuilt")
         for misfit in inventory.misfits
         if misfit.file and _rebuild(inventory, misfit, path)
     ]
-    inventory = take_inventory(directory, label)
+    inventory = take_inventory(directory, recording)
     moved = [m for m in inventory.misfits if m.belongs is not None]
     wanted = {m.belongs for m in moved if m.belongs not in inventory.summaries}
     try:
@@ -131,38 +130,43 @@ def _put_segments_right(directory: StoreDirectory, label: str) -> list[Repaired]
     except OSError as error:
         raise durability.explain(error, path, "renaming segments of") from error
     return done + [
-        Repaired(label, before, f"is {now} again")
-        for before, now in finish_moves(directory, label, replace=True)
+        Repaired(inventory.name, before, f"is {now} again")
+        for before, now in finish_moves(directory, recording, replace=True)
     ]
 
 
 def _rebuild(inventory: Inventory, misfit: Misfit, path: Path) -> bool:
-    """Rebuild a damaged summary, if the result has the digest in the journal."""
-    sealed = inventory.state.sealed.get(misfit.segment) if inventory.state is not None else None
+    """Rebuild a damaged summary, if the result has the digest in the manifest."""
+    manifest = inventory.manifest
+    sealed = manifest.logs.get(misfit.segment) if manifest is not None else None
     if sealed is None or misfit.belongs is not None:
         return False
     return rebuild_summary(path / misfit.file, sealed.digest)
 
 
-def _put_journal_right(directory: StoreDirectory, label: str) -> list[Repaired]:
-    path = directory.recording(label)
-    inventory = take_inventory(directory, label)
-    state = inventory.state
-    if state is None:
-        return []
-    log = Journal(path)
-    if state.damaged:
-        reason = f"{len(state.damaged)} of its lines could not be read"
-        log.replace(journal_from_segments(inventory, directory.settings.store_id, reason))
-        return [Repaired(label, "journal", "rebuilt; the old one is journal.old")]
+def _put_manifest_right(
+    directory: StoreDirectory, catalog: Catalog, recording: str
+) -> list[Repaired]:
+    path = directory.recording(recording)
+    old = old_in(path)
+    try:
+        lacks = read_in(path) is None
+    except ManifestError:
+        lacks = True
+        files.unlink(path / MANIFEST)
+    if lacks:
+        recover_segments(directory, recording, directory.listing(recording), None)
+    inventory = take_inventory(directory, recording)
+    if lacks:
+        made = made_again(inventory, old)
+        with directory.alone():
+            write_in(path, replace(made, name=free_name_in(catalog, made.name, recording)))
+        return [Repaired(inventory.name, "manifest", "made again")]
     done = []
-    if state.torn:
-        log.append()
-        done.append(Repaired(label, "journal", f"{state.torn} bytes after its last line cut off"))
-    if lines := unlisted_lines(inventory):
-        log.append(*lines)
-        unlisted = [misfit.file for misfit in inventory.misfits if misfit.is_unlisted]
-        done += [Repaired(label, file, "listed in the journal") for file in unlisted]
+    if (adopt := unlisted(inventory)) is not None:
+        change_in(path, adopt)
+        names = [misfit.file for misfit in inventory.misfits if misfit.is_unlisted]
+        done += [Repaired(inventory.name, file, "listed in the manifest") for file in names]
     return done
 
 
@@ -188,20 +192,20 @@ def repair_index(
             continue
         if _is_restored(directory, catalog, entry):
             if not index.rebuild([entry]):
-                done.append(Repaired(entry.label, "index", "damaged chunks are readable again"))
+                done.append(Repaired(entry.name, "index", "damaged chunks are readable again"))
             continue
         if indexed is not None and indexed.is_whole(entry) and entry.is_decoded:
             continue
-        with suppress(HeldError, TopicError), directory.writing(entry.label, entry.id) as label:
-            chunks = index.catch_up(label)
-            done.append(Repaired(label, "index", f"{chunks} chunks indexed"))
+        with suppress(HeldError, TopicError), directory.writing(entry.id):
+            chunks = index.catch_up(entry.id)
+            done.append(Repaired(entry.name, "index", f"{chunks} chunks indexed"))
     return done
 
 
 def _is_restored(directory: StoreDirectory, catalog: Catalog, entry: RecordingEntry) -> bool:
     """True if an unreadable chunk is readable again, after its file was restored."""
     for number, chunk in catalog.damage(entry.id):
-        path = directory.recording(entry.label) / f"{number:06d}.mcap"
+        path = directory.recording(entry.id) / f"{number:06d}.mcap"
         with suppress(SegmentError), open_segment(path, number) as reader:
             reader.read_chunk(reader.summary().chunks[chunk])
             return True

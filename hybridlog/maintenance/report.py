@@ -12,39 +12,33 @@ if TYPE_CHECKING:
     from hybridlog_storage.segments.recovery import Recovered
 
 Progress = Callable[[str, int, int], None]
-"""Called with the recording's label, bytes done and bytes in all."""
+"""Called with the recording's name, bytes done and bytes in all."""
 
 
-def reporter(progress: Progress | None, label: str, total: int) -> Callable[[int], None]:
+def reporter(progress: Progress | None, name: str, total: int) -> Callable[[int], None]:
     """Reports the bytes done of a recording."""
-    return lambda done: None if progress is None else progress(label, done, total)
+    return lambda done: None if progress is None else progress(name, done, total)
 
 
 @dataclass(slots=True)
 class RepairReport:
-    """Repairs of a store; recordings by label.
+    """Repairs of a store; recordings by name.
 
     Attributes:
         recovered: Segments that a crash left open.
         indexed: Recordings whose index was behind, and the number of missing chunks.
         removed: Recordings whose removal was finished, or whose files are gone.
-        journals: Recordings whose journal was rebuilt, or lacked lines.
-        adopted: Recordings that came from another store.
-        copies: Copies of a recording, and the label of the one in use.
-        unreadable: Recordings that could not be repaired, and the reason.
+        unreadable: Ids of recordings that could not be repaired, and the reason.
         damage: Reasons why data files of the embedded MongoDB were replaced by empty ones.
         tables: Recording and topic of tables that were missing or damaged, and made again.
         disk_full: The error if the disk had no room for repairs, else None.
-        noted: Recordings that a question met after a crash; they are yet to be repaired.
+        noted: Ids of recordings that a question met after a crash; they are yet to be repaired.
         noted_tables: Recording's id and topic of tables that a question met missing or damaged.
     """
 
     recovered: dict[str, list[Recovered]] = field(default_factory=dict)
     indexed: dict[str, int] = field(default_factory=dict)
     removed: list[str] = field(default_factory=list)
-    journals: list[str] = field(default_factory=list)
-    adopted: list[str] = field(default_factory=list)
-    copies: dict[str, str] = field(default_factory=dict)
     unreadable: dict[str, str] = field(default_factory=dict)
     damage: list[str] = field(default_factory=list)
     tables: list[tuple[str, str]] = field(default_factory=list)
@@ -59,11 +53,11 @@ class ArraysOfTopic:
 
     Attributes:
         topic: Full name.
-        recordings: Labels of the recordings whose tables were made anew.
+        recordings: Names of the recordings whose tables were made anew.
         bytes_before: Bytes of all tables of its message type before; topics and recordings
             share files.
         bytes_after: Bytes of them now.
-        left: Labels of recordings whose tables are as before: they are being written, or
+        left: Names of recordings whose tables are as before: they are being written, or
             cannot be read.
         has_arrays: False if its messages can have no long arrays, except of bytes, and tables
             stay as they are; None without tables.

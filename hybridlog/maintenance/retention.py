@@ -1,6 +1,6 @@
 """Rules of retention, and the plan: what goes, in what order, and why.
 
-The plan is a pure function. It knows recordings by their journals: sizes of segments, and
+The plan is a pure function. It knows recordings by their manifests: sizes of segments, and
 topics, times and bytes of their channels. Nothing is deleted here; see `keep.py`.
 """
 
@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
+
+from msgspec import UNSET
 
 from hybridlog.maintenance.expiry import MIN_BYTES
 from hybridlog.query.choice import Choice
@@ -22,7 +24,7 @@ from hybridlog_storage.errors import HybridlogError, TimeError, UsageError
 
 if TYPE_CHECKING:
     from hybridlog.query.topics import TopicMatcher
-    from hybridlog_storage.journal import JournalState, SealedSegment
+    from hybridlog_storage.manifest import File, Manifest, Part, Pin
 
 MIN_SEGMENT: Final = 4 << 20
 MAX_SEGMENT: Final = 1 << 30
@@ -196,7 +198,7 @@ class Held:
 
     Attributes:
         id: Its id.
-        label: Its label.
+        name: Its name.
         created: When it began, ns.
         written: When its last segment was written, or its last message if that is later, ns.
         tags: Its tags.
@@ -206,7 +208,7 @@ class Held:
     """
 
     id: str
-    label: str
+    name: str
     created: int
     written: int
     tags: Mapping[str, str]
@@ -215,68 +217,77 @@ class Held:
     pins: int = 0
 
 
-def held_of(label: str, state: JournalState, now: int) -> Held:
-    """The content of a recording, by its journal.
+def held_of(manifest: Manifest, now: int) -> Held:
+    """The content of a recording.
 
     Args:
-        label: Its label.
-        state: Its journal.
+        manifest: Its manifest.
         now: The time, ns.
     """
     found: list[HeldSegment] = []
     later, last = now, 0
-    for number, sealed in sorted(state.sealed.items(), reverse=True):
-        channels = [channel for channel in sealed.channels if channel["messages"]]
-        written = min(max([sealed.at, *(channel["last"] for channel in channels)]), now)
+    for _, log in sorted(manifest.logs.items(), reverse=True):
+        parts = _parts_of(log, manifest)
+        times = [part.last for _, part in parts if part.last is not None]
+        written = min(max([log.written, *times]), now)
         # A segment is not newer than those that follow it, whatever the clock was.
         later = min(later, written)
         last = max(last, written)
-        expired = state.retained.get(number, frozenset())
-        if channels and expired is not None:
-            segment = _segment(sealed, later, state, expired)
+        expired = () if log.retained is UNSET else log.retained
+        if parts and expired is not None:
+            segment = _segment(log, later, manifest, expired)
             found += [segment] if segment.topics or not segment.small else []
     found.reverse()
-    tags, created = state.tags, int(state.begun.get("created", 0))
-    return Held(state.id, label, created, last, tags, found, state.end is not None, len(state.pins))
+    return Held(
+        manifest.id,
+        manifest.name,
+        manifest.created,
+        last,
+        manifest.tags,
+        found,
+        manifest.is_ended,
+        len(manifest.pins),
+    )
 
 
-def _segment(
-    sealed: SealedSegment,
-    written: int,
-    state: JournalState,
-    expired: AbstractSet[str],
-) -> HeldSegment:
+def _parts_of(log: File, manifest: Manifest) -> list[tuple[str, Part]]:
+    """Topics of a log, and what it has of them; of each channel one."""
+    channels = manifest.channels
+    return [(channels[n].topic, part) for n, part in log.parts.items() if part.messages]
+
+
+def _segment(log: File, written: int, manifest: Manifest, expired: Collection[str]) -> HeldSegment:
     topics: Counter[str] = Counter()
     messages: Counter[str] = Counter()
-    for channel in sealed.channels:
-        if channel["messages"] and channel["topic"] not in expired:
-            topics[channel["topic"]] += channel["payload_bytes"]
-            messages[channel["topic"]] += channel["messages"]
+    for topic, part in _parts_of(log, manifest):
+        if topic not in expired:
+            topics[topic] += part.bytes
+            messages[topic] += part.messages
     # Chunks with few stored bytes a message stay. How well each is compressed, nobody knows yet.
-    packed = min(sealed.bytes / max(sum(c["payload_bytes"] for c in sealed.channels), 1), 1)
+    packed = min(log.bytes / max(sum(part.bytes for part in log.parts.values()), 1), 1)
     small = [t for t, count in topics.items() if count * packed < MIN_BYTES * messages[t]]
     stays = sum(topics.pop(topic) for topic in small)
-    _, held = state.thinned.get(sealed.segment, [("", sealed.bytes)])[-1]
-    pinned = frozenset(pinned_topics(sealed, state))
-    return HeldSegment(sealed.segment, written, held, topics, pinned, stays)
+    size = log.bytes if log.stored is None else log.stored.bytes
+    pinned = frozenset(pinned_topics(log, manifest))
+    return HeldSegment(log.number, written, size, topics, pinned, stays)
 
 
-def pinned_topics(sealed: SealedSegment, state: JournalState) -> set[str]:
-    """Topics of a segment of which a pin keeps messages."""
+def pinned_topics(log: File, manifest: Manifest) -> set[str]:
+    """Topics of a log of which a pin keeps messages."""
     return {
-        channel["topic"]
-        for channel in sealed.channels
-        for pin in state.pins.values()
-        if channel["messages"] and _touches(pin, channel)
+        topic
+        for topic, part in _parts_of(log, manifest)
+        for pin in manifest.pins
+        if _touches(pin, topic, part)
     }
 
 
-def _touches(pin: Mapping[str, Any], channel: Mapping[str, Any]) -> bool:
-    begin, end, topics = pin["from"], pin["to"], pin["topics"]
+def _touches(pin: Pin, topic: str, part: Part) -> bool:
+    # A part without times may have messages at any.
     return (
-        (topics is None or channel["topic"] in topics)
-        and (begin is None or begin <= channel["last"])
-        and (end is None or channel["first"] < end)
+        (pin.topics is None or topic in pin.topics)
+        and (pin.first is None or part.last is None or pin.first <= part.last)
+        and (pin.last is None or part.first is None or part.first <= pin.last)
     )
 
 
@@ -285,7 +296,7 @@ class Step:
     """A deletion.
 
     Attributes:
-        recording: Label of the recording.
+        recording: Name of the recording.
         id: Its id.
         segments: Numbers of the segments; empty for the whole recording, with its fields.
         topics: Topics whose payloads go; empty for all.
@@ -398,7 +409,7 @@ class _Planning:
             if one.is_ended and not one.pins and self._is_older(one.written, age_ns):
                 self._gone.add(one.id)
                 count, reason = sum(s.size for s in one.segments), f"fields older than {age}"
-                self._step(Step(one.label, one.id, (), (), count, reason, one.written))
+                self._step(Step(one.name, one.id, (), (), count, reason, one.written))
 
     def _by_age(self) -> None:
         age = self._rules.max_age
@@ -501,7 +512,7 @@ class _Planning:
         numbers = tuple(sorted(piece.segment.number for piece, _ in group))
         written = max(piece.segment.written for piece, _ in group)
         count = sum(share for _, share in group)
-        self._step(Step(held.label, held.id, numbers, topics, count, reason, written))
+        self._step(Step(held.name, held.id, numbers, topics, count, reason, written))
 
     def _step(self, step: Step) -> None:
         self._freed += step.bytes

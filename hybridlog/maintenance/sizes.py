@@ -41,7 +41,7 @@ class Size:
     """Bytes on the disk.
 
     Attributes:
-        recording: Label of the recording; empty for several.
+        recording: Name of the recording; empty for several.
         topic: Full name; empty for several, and for what belongs to no topic: definitions,
             checksums, attachments.
         messages: Number of messages.
@@ -87,7 +87,7 @@ class Sizes:
         groups: dict[str, list[Size]] = defaultdict(list)
         for row in self.rows:
             groups[row.recording].append(row)
-        return _largest_first(_sum(label, "", rows) for label, rows in groups.items())
+        return _largest_first(_sum(name, "", rows) for name, rows in groups.items())
 
     def by_topic(self) -> list[Size]:
         """The topics in all recordings, largest first."""
@@ -121,7 +121,7 @@ def sizes_of(
             payload[channel.topic] += channel.stats.payload_bytes
         rows += [
             Size(
-                entry.label,
+                entry.name,
                 topic,
                 messages[topic],
                 payload[topic],

@@ -29,6 +29,7 @@ from hybridlog_storage.errors import (
     StoreError,
     UsageError,
 )
+from hybridlog_storage.manifest import MAX_BYTES
 from hybridlog_storage.threads import Threads
 
 if TYPE_CHECKING:
@@ -37,10 +38,10 @@ if TYPE_CHECKING:
 
 DEFAULT_SSH: Final = "ssh -o ServerAliveInterval=15"
 """Notices within a minute that a connection is dead."""
-_PROTOCOL: Final = 1
+_PROTOCOL: Final = 3
 _HEAD: Final = struct.Struct(">II")
 _MAX_VALUE: Final = 1 << 20  # bytes of a JSON object
-_MAX_BODY: Final = 256 << 20  # of a journal; pieces of files are smaller
+_MAX_BODY: Final = MAX_BYTES  # of a manifest; pieces of files are smaller
 _MAX_AHEAD: Final = 16  # pieces of files without an answer
 _MAX_TEXT: Final = 2000  # characters of a message of the other side
 _IDLE_S: Final = 60.0
@@ -174,22 +175,21 @@ class Server:
 
     def digest(self, file: CopiedFile, length: int) -> str:
         """As of `Place`."""
-        return str(self._ask("digest", file=asdict(file), length=length))
+        return str(self._ask("digest", file=file.to_json(), length=length))
 
     def append(self, file: CopiedFile, at: int, data: Buffer) -> None:
         """As of `Place`; what fails there may be raised by one of the next calls."""
-        self._send({"do": "append", "file": asdict(file), "at": at}, data)
+        self._send({"do": "append", "file": file.to_json(), "at": at}, data)
         while self._ahead > _MAX_AHEAD:
             self._answer()
 
     def prove(self, file: CopiedFile) -> bool:
         """As of `Place`."""
-        return self._ask("prove", file=asdict(file)) is True
+        return self._ask("prove", file=file.to_json()) is True
 
-    def publish(self, label: str, lines: bytes, *, lacks_payloads: bool) -> str:
+    def publish(self, data: bytes) -> str:
         """As of `Place`."""
-        said = {"label": label, "lacks_payloads": lacks_payloads}
-        return str(self._ask("publish", lines, **said))
+        return str(self._ask("publish", data))
 
     def hold(self, recordings: Sequence[str]) -> bool:
         """As of `Place`."""
@@ -351,9 +351,7 @@ _ANSWERS: Final[Mapping[str, Callable[[DirectoryPlace, Mapping[str, Any], bytes]
         CopiedFile.of(request["file"]), int(request["at"]), body
     ),
     "prove": lambda place, request, _: place.prove(CopiedFile.of(request["file"])),
-    "publish": lambda place, request, body: place.publish(
-        str(request["label"]), body, lacks_payloads=bool(request["lacks_payloads"])
-    ),
+    "publish": lambda place, _, body: place.publish(body),
     "problems": lambda place, request, _: place.problems(str(request["recording"])),
     "leave": lambda place, *_: place.leave(),
 }
@@ -410,7 +408,7 @@ def _copied(value: object) -> Copied:
     found = _mapping(value)
     expired = found.get("expired")
     return Copied(
-        _shown(found.get("label")),
+        _shown(found.get("name")),
         found.get("lacks_payloads") is True,
         expired if isinstance(expired, int) else 0,
         _shown(found.get("content")),

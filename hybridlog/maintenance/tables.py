@@ -7,7 +7,6 @@ import os
 import time
 from collections.abc import Collection
 from contextlib import suppress
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from hybridlog.columns.layout import PARTS, parts_folder, topics_of, type_prefix
@@ -85,18 +84,15 @@ def make(
     if not wanted:
         return True
     try:
-        with directory.writing(entry.label, entry.id) as label:
+        with directory.writing(entry.id):
             from hybridlog.columns.table_writer import TableWriter
 
-            entry = replace(entry, label=label)
-            writer = TableWriter(
-                directory.path, entry.id, entry.label, topics=wanted, is_new=is_new
-            )
+            writer = TableWriter(directory.path, entry.id, entry.name, topics=wanted, is_new=is_new)
             try:
                 channels = channels_of(entry, wanted)
                 numbers = [number for number, _, _ in entry.spans]
-                report = reporter(progress, label, entry.stored_bytes)
-                for segment in walk(directory.recording(label), numbers, report=report):
+                report = reporter(progress, entry.name, entry.stored_bytes)
+                for segment in walk(directory.recording(entry.id), numbers, report=report):
                     for _, chunk in segment.chunks(lambda p: not channels.isdisjoint(p.channels)):
                         if time.monotonic() > until:
                             raise TimeoutError
@@ -145,7 +141,7 @@ def make_noted(
     if is_made:
         tables.look_again_for(entry, wanted)
         made = (one for one in sorted(wanted) if tables.of(entry, one) is not None)
-        report.tables += [(entry.label, one) for one in made]
+        report.tables += [(entry.name, one) for one in made]
     return True
 
 
@@ -157,7 +153,7 @@ def _sharing(
     numbers = [number for number, _, _ in entry.spans]
     together = {
         frozenset(topics[channel] for channel in place.channels if channel in topics)
-        for segment in walk(directory.recording(entry.label), numbers)
+        for segment in walk(directory.recording(entry.id), numbers)
         for place in segment.summary.chunks
     }
     found, before = {*wanted_topics}, 0
@@ -256,7 +252,7 @@ def remove_unfinished(directory: StoreDirectory, snapshot: Snapshot) -> None:
         if place is None:
             continue
         one = snapshot.summaries[place]
-        with suppress(OSError, StoreError, TopicError), directory.writing(one.label, one.id):
+        with suppress(OSError, StoreError, TopicError), directory.writing(one.id):
             files.remove_tree(directory.path / PARTS / name)
 
 
@@ -270,7 +266,7 @@ def remove_orphans(directory: StoreDirectory, present: Collection[str]) -> None:
     from hybridlog.columns.folders import recordings_of
 
     there = unfinished(directory) | recordings_of(directory.path)
-    remove_all(directory, {one for one in there if one[:16] not in present})
+    remove_all(directory, {one for one in there if one[-16:] not in present})
 
 
 def _names(directory: StoreDirectory, top: str) -> list[str]:

@@ -1,35 +1,37 @@
 """Puts a segment without the content of some chunks in the place of the whole one.
 
 It is written next to the old one, and every chunk of it is read and compared with the old one.
-Only then the journal announces it, and it takes the place of the old one. A crash before that
-line leaves a file that the next opening removes; after it, the next opening renames it. Until
+Only then the manifest lists it, and it takes the place of the old one. A crash before that
+change leaves a file that the next opening removes; after it, the next opening renames it. Until
 then both segments are right.
 """
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from msgspec import structs
 
 from hybridlog.columns import payload_files
 from hybridlog.columns.layout import replacement_name
 from hybridlog.columns.payload_files import open_segment
-from hybridlog_storage import journal
-from hybridlog_storage.errors import SegmentError
-from hybridlog_storage.journal import Journal
+from hybridlog_storage.errors import HybridlogError, SegmentError
+from hybridlog_storage.manifest import Stored, with_file
+from hybridlog_storage.manifests import change_in, read_in
 from hybridlog_storage.messages import EXPIRED_IDS
 from hybridlog_storage.segments.segment_check import SegmentCheck
 from hybridlog_storage.segments.segment_file import sealed_name
 from hybridlog_storage.segments.segment_thinning import thin
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Mapping
+    from collections.abc import Callable, Collection, Mapping
     from pathlib import Path
 
     from hybridlog.columns.payload_files import RecordingPayloads
-    from hybridlog_storage.journal import JournalState, PayloadFile
+    from hybridlog_storage.manifest import Manifest
     from hybridlog_storage.messages import Buffer
     from hybridlog_storage.segments.chunk import StoredChunk
     from hybridlog_storage.segments.segment_reader import (
@@ -40,26 +42,24 @@ if TYPE_CHECKING:
 
 def replace_chunks(
     path: Path,
-    state: JournalState,
+    manifest: Manifest,
     reader: SegmentReader,
     summary: SegmentSummary,
     records: Mapping[int, Callable[[Buffer], bytes]],
     *,
-    files: Iterable[PayloadFile],
-    log: Journal,
     contents: RecordingPayloads,
+    check: Callable[[Manifest], object],
 ) -> int:
     """Write a segment without the content of some chunks, prove it, and put it in place.
 
     Args:
         path: The recording's directory, locked by this process.
-        state: Its journal.
+        manifest: Its manifest, which lists the files that what is left of them lies in.
         reader: The segment.
         summary: Its footer.
         records: As for `thin`.
-        files: The files that what is left of them lies in.
-        log: The journal.
         contents: Has what is left of them.
+        check: Raises if they must not go any more.
 
     Returns:
         Bytes that became free.
@@ -70,28 +70,29 @@ def replace_chunks(
     """
     name = sealed_name(reader.number)
     target = path / replacement_name(name)
-    sealed = state.sealed.get(reader.number)
     about = {
         "digest": summary.whole_digest,
-        "bytes": sealed.bytes if sealed is not None else summary.size,
-        "files": [asdict(file) for file in files],
+        "bytes": manifest.logs[reader.number].bytes,
+        "files": [structs.asdict(file) for file in manifest.fields],
     }
-    listed = False
     try:
         written = thin(reader, target, records, about)
         _prove(target, reader, summary, records, contents)
         topics = summary.topics_in(one for one in summary.chunks if one.number in records)
-        line = {"segment": reader.number, "bytes": written.bytes, "digest": written.digest}
-        log.append(journal.event(journal.EXPIRED, segments=[{**line, "topics": topics}]))
-        listed = True
-        thinned = {reader.number: [(written.digest, written.bytes)]}
-        if payload_files.replace_segments(path, [target.name], thinned) != [name]:
-            raise SegmentError(f"{target} changed while it was to replace {name}")
+        stored = Stored(written.bytes, written.digest)
+
+        def how(now: Manifest) -> Manifest:
+            check(now)
+            expired = tuple(sorted({*now.logs[reader.number].expired, *topics}))
+            return with_file(now, reader.number, stored=stored, expired=expired)
+
+        now = change_in(path, how)
     except BaseException:
-        if not listed:
-            now = journal.read(path)
-            payload_files.replace_segments(path, [target.name], now.thinned if now else {})
+        with suppress(HybridlogError, OSError):  # the next opening does it
+            payload_files.replace_segments(path, [target.name], read_in(path))
         raise
+    if payload_files.replace_segments(path, [target.name], now) != [name]:
+        raise SegmentError(f"{target} changed while it was to replace {name}")
     return reader.size - written.bytes
 
 

@@ -1,20 +1,23 @@
-"""Checks every byte of segments and journals, and compares catalog and index with them."""
+"""Checks every byte of segments and manifests, and compares catalog and index with them."""
 
 from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from shlex import quote
 from typing import TYPE_CHECKING
 
 from hybridlog.columns import field_files
 from hybridlog.columns.payload_files import RecordingPayloads, walk
-from hybridlog.entries import describe, take_inventory
+from hybridlog.entries import describe, steady_inventory
 from hybridlog.index.indexing import ChunkIndexer, Documents
 from hybridlog.maintenance import tables
 from hybridlog.maintenance.index import documents_in
+from hybridlog_storage.disk import files
 from hybridlog_storage.disk.directory import LOCK, PAYLOADS
-from hybridlog_storage.errors import SegmentError, StoreError
+from hybridlog_storage.errors import ManifestError, SegmentError, StoreError
+from hybridlog_storage.manifests import MANIFEST, is_being_written
 from hybridlog_storage.mongo.index_documents import recording_key, with_prefix
 from hybridlog_storage.mongo.index_state import IndexState
 from hybridlog_storage.mongo.topic_places import TopicPlaces
@@ -25,9 +28,10 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from hybridlog.entries import Inventory
-    from hybridlog.maintenance.report import Progress, RepairReport
+    from hybridlog.maintenance.report import Progress
     from hybridlog_storage.catalog import Catalog, RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
+    from hybridlog_storage.manifest import Manifest
     from hybridlog_storage.messages import Channel
     from hybridlog_storage.mongo.database import Database
     from hybridlog_storage.mongo.topic_places import TopicPlace
@@ -38,7 +42,7 @@ _REPAIR = "run `hybridlog verify --repair`"
 RESTORE = "restore the file from a copy"
 _COPY_AGAIN = "`hybridlog copy --check` from a store that has it brings it back"
 _RESTORE_LOST = f"{RESTORE}; `hybridlog info --losses` lists the lost messages"
-_KNOWN = frozenset({LOCK, "journal.old", PAYLOADS})
+_KNOWN = frozenset({LOCK, PAYLOADS})
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +50,7 @@ class Finding:
     """A problem found by `verify`.
 
     Attributes:
-        recording: Label of the recording; empty for the store itself.
+        recording: Name of the recording; empty for the store itself.
         place: File and byte, or other subject.
         problem: The problem.
         cure: The cure.
@@ -66,7 +70,7 @@ class Verification:
         recordings: Number of recordings read.
         chunks: Number of chunks read.
         messages: Number of messages in them.
-        bytes_read: Bytes read from segments and journals.
+        bytes_read: Bytes read from segments and manifests.
         findings: All problems.
         index: True if the index was compared, too; MongoDB may be unavailable.
         without_documents: Messages of topics that were recorded with `--no-index`.
@@ -85,36 +89,37 @@ def verify(
     directory: StoreDirectory,
     catalog: Catalog,
     database: Database | None,
-    repairs: RepairReport,
     *,
-    labels: Iterable[str] | None,
+    recordings: Iterable[str] | None,
     progress: Progress | None = None,
 ) -> Verification:
-    """Check every byte of segments, journals and tables, and compare the index with them.
+    """Check every byte of segments, manifests and tables, and compare the index with them.
 
     The documents of each chunk are made again and compared with those in the database. This
     proves that each reference leads to its message. Without a database, only files are checked.
     """
     result = Verification(index=database is not None)
-    labels = None if labels is None else [*labels]
+    chosen = None if recordings is None else [*recordings]
     directory.look_closely()
-    index = None if database is None else _Index(database, count_all=labels is None)
+    index = None if database is None else _Index(database, count_all=chosen is None)
     checker = tables.TableChecker(directory)
-    for label in directory.labels() if labels is None else labels:
+    for recording in directory.ids() if chosen is None else chosen:
         result.recordings += 1
         try:
-            check = _Check(directory, catalog, index, label, result, checker=checker)
-            check.run(repairs, progress)
+            check = _Check(directory, catalog, index, recording, result, checker=checker)
+            check.run(progress)
+        except ManifestError as error:
+            result.findings.append(Finding(recording, "manifest", str(error), _REPAIR))
         except StoreError as error:
-            cure = "restore its files, or remove its directory"
-            result.findings.append(Finding(label, "recording", str(error), cure))
+            cure = "restore its files"
+            result.findings.append(Finding(recording, "recording", str(error), cure))
     return result
 
 
 def damaged_files(path: Path, inventory: Inventory) -> Iterator[tuple[str, str]]:
     """Read every byte of the files of fields; yield damaged ones and their problems."""
-    payloads = RecordingPayloads(path, list(inventory.payloads.values()))
-    for file in inventory.payloads.values():
+    payloads = RecordingPayloads(path, list(inventory.fields.values()))
+    for file in inventory.fields.values():
         try:
             payloads.reader(file).check()
         except StoreError as error:
@@ -179,7 +184,7 @@ class _Check:
         directory: StoreDirectory,
         catalog: Catalog,
         index: _Index | None,
-        label: str,
+        recording: str,
         result: Verification,
         *,
         checker: tables.TableChecker,
@@ -188,9 +193,9 @@ class _Check:
         self._directory = directory
         self._catalog = catalog
         self._indexed = index
-        self._label = label
+        self._recording = self._name = recording
         self._result = result
-        self._path = directory.recording(label)
+        self._path = directory.recording(recording)
         self._contents = RecordingPayloads(self._path)
         self._expected: Counter[str] = Counter()  # documents by collection
         self._indexer = ChunkIndexer("")
@@ -203,31 +208,26 @@ class _Check:
         if self._directory.is_remote:
             cure = _COPY_AGAIN
         if place not in self._lost:
-            self._result.findings.append(Finding(self._label, place, problem, cure))
+            self._result.findings.append(Finding(self._name, place, problem, cure))
 
-    def run(self, repairs: RepairReport, progress: Progress | None) -> None:
+    def run(self, progress: Progress | None) -> None:
         """Check the whole recording.
 
         Raises:
             StoreError: The recording cannot be read at all.
         """
-        if self._label in repairs.copies:
-            cure = f"remove one of them: `hybridlog rm {self._label}`"
-            self.found(
-                "recording",
-                f"it is a copy of {repairs.copies[self._label]}, which answers",
-                cure,
-            )
-        holder = self._directory.holder(self._label)
+        holder = self._directory.holder(self._recording)
         is_held = holder is not None
-        self._has_index = not is_held and self._label not in repairs.copies
-        inventory = take_inventory(self._directory, self._label)
-        lost = self._directory.lost_of(self._label)
-        for path in sorted(lost):
-            self.found(path, "its object is missing or was changed", _COPY_AGAIN)
-        self._lost = {*lost}
+        self._has_index = not is_held
+        inventory = steady_inventory(self._directory, self._recording)
+        self._name = inventory.name
+        found = self._directory.lost_of(self._recording)
+        lost = {"manifest" if path == MANIFEST else path for path in found}
+        for place in sorted(lost):
+            self.found(place, "its object is missing or was changed", _COPY_AGAIN)
+        self._lost = lost
         self._indexer = ChunkIndexer(inventory.id)
-        self._journal(inventory)
+        self._manifest(inventory.manifest)
         self._files(inventory, is_held=is_held)
         self._payloads(inventory)
         total = sum(summary.size for summary in inventory.summaries.values())
@@ -236,16 +236,19 @@ class _Check:
 
             def tell(at: int, before: int = before) -> None:
                 if progress is not None and total:
-                    progress(self._label, min(before + at, total), total)
+                    progress(self._name, min(before + at, total), total)
 
             self._segment(inventory, number, name, tell)
             before += inventory.summaries[number].size if number in inventory.summaries else 0
-        if self._label in repairs.copies or not inventory.id:
+        if inventory.manifest is None:
             return
         is_open = holder is not None and holder.is_recording
         entry = describe(self._catalog, inventory, is_open=is_open).entry
         row = self._catalog.recording(entry.id)
-        if row is not None and row[0] == inventory.listing.print and row[1] != entry:
+        looks = {inventory.listing.print, self._directory.listing(self._recording).print}
+        # What is decoded of a recording in progress is noted behind its entry, and somebody may
+        # edit it meanwhile.
+        if row is not None and not is_open and looks == {row[0]} and row[1] != entry:
             self.found("catalog", "its entry differs from the files", _REPAIR)
         self._result.without_documents += entry.messages - entry.documents
         if entry.status == "open":
@@ -253,23 +256,15 @@ class _Check:
         self._index(entry)
         self._tables(entry)
 
-    def _journal(self, inventory: Inventory) -> None:
-        state = inventory.state
-        if state is None:
-            self.found("journal", "it is missing, so other losses are unknown", _REPAIR)
+    def _manifest(self, manifest: Manifest | None) -> None:
+        if manifest is None:
+            self.found("manifest", "it is missing, so other losses are unknown", _REPAIR)
             return
-        self._result.bytes_read += state.length + state.torn
-        for number in state.damaged:
-            where = f"journal line {number}" if number else "journal"
-            problem = "it cannot be read" if number else "its first line is not the beginning"
-            self.found(where, problem, _REPAIR)
-        if state.torn:
-            self.found("journal", f"{state.torn} bytes after its last line", _REPAIR)
-        if state.rebuilt is not None:
+        self._result.bytes_read += files.status(self._path / MANIFEST).st_size
+        if manifest.status == "unproven":
             self.found(
-                "journal",
-                f"it was rebuilt from the segments ({state.rebuilt}), so a missing "
-                "segment could not be noticed",
+                "manifest",
+                "it was lost and made again, so a missing segment could not be noticed",
                 "compare with a copy, if there is one; nothing else can prove it",
             )
 
@@ -284,12 +279,13 @@ class _Check:
             if not is_held:
                 self.found(name, "a crash has left it open", "open the store with write permission")
         for name in inventory.listing.others:
-            if name not in _KNOWN and not name.endswith(".damaged"):
+            is_ours = name in _KNOWN or is_being_written(name)  # which an edit may do right now
+            if not is_ours and not name.endswith(".damaged"):
                 self.found(name, "it is not a file of a recording", "move it out of the store")
 
     def _payloads(self, inventory: Inventory) -> None:
         """Check every byte of the files of fields."""
-        listed = inventory.payloads
+        listed = inventory.fields
         if not listed and PAYLOADS not in inventory.listing.others:
             return
         for file, problem in damaged_files(self._path, inventory):
@@ -299,7 +295,7 @@ class _Check:
         for name in inventory.listing.payloads:
             if name not in listed:
                 cure = "move it out of the store"
-                self.found(f"{PAYLOADS}/{name}", "the journal does not list it", cure)
+                self.found(f"{PAYLOADS}/{name}", "the manifest does not list it", cure)
 
     def _segment(
         self,
@@ -342,7 +338,7 @@ class _Check:
         if self._indexed is None or not self._has_index:
             return
         documents, _ = self._indexer.documents_of([chunk], channels)
-        key = self._indexer.recording[:16]
+        key = self._indexer.recording[-16:]
         found = _by_collection(self._indexed.places, documents)
         for collection, (_, want) in found.items():
             self._expected[collection] += len(want)
@@ -358,7 +354,7 @@ class _Check:
 
     @property
     def _rebuild(self) -> str:
-        return f"run `hybridlog index rebuild -r {self._label}`"
+        return f"run `hybridlog index rebuild -r {quote(self._name)}`"
 
     def _index(self, entry: RecordingEntry) -> None:
         """Find documents that are not in the segments."""

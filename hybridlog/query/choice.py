@@ -24,7 +24,7 @@ class Choice:
     """Conditions for recordings; all of them must hold, and one of the names must match.
 
     Attributes:
-        name: Names, labels, ids, beginnings of labels or ids, globs.
+        name: Names, ids, beginnings of one, globs.
         tag: Keys and values of tags; None for any value.
         has: Topics that they have, as patterns.
         type: Types of messages that they have.

@@ -92,7 +92,7 @@ def choose(session: Session, choice: Choice) -> Chosen:
 
 
 def is_exact(session: Session, name: str) -> bool:
-    """True if a name is the whole label, id or name of one recording, or has no wildcards."""
+    """True if a name is the whole id or name of one recording, or has no wildcards."""
     return not _GLOB & set(name) or len(session.snapshot().called(name)) == 1
 
 
@@ -153,8 +153,8 @@ class _Choosing:
     def by_name(self, names: Sequence[str]) -> None:
         condition = f"named {' or '.join(map(repr, names))}"
         if not self._keep(placed(self._session, names), condition):
-            labels = (summary.label for summary in self._snapshot.summaries)
-            raise _NothingLeftError(f"There are: {listed(labels)}.")
+            there = listed(summary.name for summary in self._snapshot.summaries)
+            raise _NothingLeftError(f"There are: {there}.")
 
     def by_tag(self, key: str, value: str | None) -> None:
         tags = self._snapshot.tags

@@ -304,7 +304,7 @@ class ChunkScan:
                 table[channel_id] = index
         if chunk.fields is not None and not {*task.chunk.place.channels} & {*task.scan.channels}:
             raise StoreError(
-                f"Payloads of recording {task.scan.recording.label!r} were deleted while it was "
+                f"Payloads of recording {task.scan.recording.name!r} were deleted while it was "
                 "read. Ask again."
             )
         channel = table[batch.channel]

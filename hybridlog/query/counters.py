@@ -32,7 +32,7 @@ class Counters:
         unreadable: Messages of the predicate's topics that do not fit their definition, or lack
             arrays that it asks for.
         without_arrays: Those of them that lack arrays, since their payloads are gone.
-        not_indexed: Labels of recordings with the number of messages that the index lacks, if it
+        not_indexed: Names of recordings with the number of messages that the index lacks, if it
             has answered; several.
         no_transform: The frame asked for with a reason why points or poses are not in it, and
             the number of messages; several.

@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, NamedTuple
 from hybridlog.query.predicate.tokens import is_filter
 from hybridlog.query.question import Question
 from hybridlog.query.topics import split_topic
+from hybridlog.wording import file_name
 from hybridlog_storage.errors import UsageError
+from hybridlog_storage.manifest import free_name
 
 if TYPE_CHECKING:
     from hybridlog.query.query import Query
@@ -18,7 +20,7 @@ class Piece(NamedTuple):
     """A part of a question.
 
     Attributes:
-        name: Its label, number and text, such as `run-002-docking`.
+        name: That of its recording, number and text, as a name of a file: `run-002-docking`.
         query: The question about it.
     """
 
@@ -39,8 +41,9 @@ def pieces(query: Query, how: str) -> Iterator[Piece]:
         TopicError: There is no such topic.
     """
     if how == "recording":
+        names = _files_of(query)
         for one in query.summaries():
-            yield Piece(one.label, query.in_recording(one.id))
+            yield Piece(names[one.id], query.in_recording(one.id))
         return
     if how == "mark":
         yield from _of_intervals(query, _marks(query))
@@ -78,18 +81,27 @@ def _marks(query: Query) -> Iterator[tuple[str, int, int, str]]:
         yield one.recording, one.begin, end, one.text
 
 
+def _files_of(query: Query) -> dict[str, str]:
+    """A name of a file for each recording, by its id."""
+    found: dict[str, str] = {}
+    taken: set[str] = set()
+    for one in query.summaries():
+        found[one.id] = free_name(file_name(one.name), taken)
+        taken.add(found[one.id])
+    return found
+
+
 def _of_intervals(query: Query, rows: Iterable[tuple[str, int, int, str]]) -> Iterator[Piece]:
     import numpy as np
 
     from hybridlog.query.intervals import Intervals
-    from hybridlog_storage.disk.directory import label_of
 
-    labels = {one.id: one.label for one in query.summaries()}
-    number = dict.fromkeys(labels, 0)
+    names = _files_of(query)
+    number = dict.fromkeys(names, 0)
     for recording, begin, end, text in rows:
         number[recording] += 1
-        words: Sequence[str] = (labels[recording], f"{number[recording]:03d}")
-        name = "-".join([*words, label_of(text)] if text.strip() else words)
+        words: Sequence[str] = (names[recording], f"{number[recording]:03d}")
+        name = "-".join([*words, file_name(text)] if text.strip() else words)
         one = query.in_recording(recording)
         if query.question.is_unbounded:
             one = one.between(begin, end)  # with latched messages from before

@@ -439,7 +439,7 @@ class Planner:
         return found
 
     def not_indexed(self) -> tuple[tuple[str, int], ...]:
-        """Number of messages, in the range, that the index lacks, by label of their recording.
+        """Number of messages, in the range, that the index lacks, by name of their recording.
 
         Raises:
             DatabaseError: MongoDB is unavailable.
@@ -454,8 +454,8 @@ class Planner:
         for part, number in documents.items():
             channels = (*part.channels, *part.undecodable)
             whole = replace(part, channels=channels, undecodable=(), predicate=None)
-            found[part.recording.label] += max(self._count_stored(whole) - number, 0)
-        return tuple((label, number) for label, number in found.items() if number)
+            found[part.recording.name] += max(self._count_stored(whole) - number, 0)
+        return tuple((name, number) for name, number in found.items() if number)
 
     # Choosing.
 

@@ -59,9 +59,9 @@ class Query(MessageAnswers, TableAnswers, IntervalAnswers):
             found["recordings"] = str(error)
         else:
             summaries = session.snapshot().summaries
-            labels = listed((summaries[place].label for place in places[:4]), 3)
+            names = listed((summaries[place].name for place in places[:4]), 3)
             several = f"{len(places)} recordings"
-            found["recordings"] = several if len(places) != 1 else f"recording {labels}"
+            found["recordings"] = several if len(places) != 1 else f"recording {names}"
         if question.bounds is not None:
             begin, end = question.bounds
             clock = "" if question.clock == "log" else f" by {question.clock} time"

@@ -275,8 +275,8 @@ class RangeResolver:
             low, high = self.bounds_in(summaries[place])
             # `2025-01-01` to `end` is no mistake: the recording simply ends before.
             if low < high or low == start or high == end:
-                label = summaries[place].label
-                spans.append(f"{label} spans {format_time(start)} to {format_time(end)}")
+                name = summaries[place].name
+                spans.append(f"{name} spans {format_time(start)} to {format_time(end)}")
             if len(spans) == _MAX_NAMES:
                 break
         if not spans:
@@ -294,8 +294,8 @@ class RangeResolver:
             return ""
         snapshot = self._session.snapshot()
         places = snapshot.between(snapshot.having(self._question.topics), *shared).tolist()
-        labels = [snapshot.summaries[place].label for place in places]
-        return f" Other recordings span that time: {listed(labels, _MAX_NAMES)}." if labels else ""
+        names = [snapshot.summaries[place].name for place in places]
+        return f" Other recordings span that time: {listed(names, _MAX_NAMES)}." if names else ""
 
 
 def _known_ends(stats: ChannelStats, *, is_publish: bool) -> list[int]:

@@ -274,7 +274,7 @@ class Steps:
         where: Texts = None,
         older_than: DurationLike | None = None,
     ) -> Self:
-        """Only these recordings: by label, name, id or glob, and as `Store.recordings`.
+        """Only these recordings: by name, id or glob, and as `Store.recordings`.
 
         Raises:
             TopicError: no such recording exists, or none has the topic.
@@ -302,14 +302,12 @@ class Steps:
 
         Args:
             intervals: From `intervals`, `changes` or `windows` of any query of this store,
-                or made by hand; recordings are given by id or by label.
+                or made by hand; recordings are given by id or by name.
 
         Raises:
             TopicError: an interval is of a recording that is not in the store.
         """
-        known = self.session.snapshot().summaries
-        ids = {one.label: one.id for one in known} | {one.id: one.id for one in known}
-        intervals = intervals.by_id(ids)
+        intervals = intervals.by_id(self.session.snapshot().ids_called())
         if self.question.during is not None:
             intervals = self.question.during.common(intervals)
         return self._with(during=intervals.merged())

@@ -105,7 +105,7 @@ class TableAnswers(Steps):
                 the range, the last may be shorter. None for all messages in one.
 
         Returns:
-            `begin`, `end`, `recording` (label), `topic`, `messages` and `rate`, messages a
+            `begin`, `end`, `recording` (name), `topic`, `messages` and `rate`, messages a
             second. Without windows: from the first message to the last, and the mean rate
             from one to the next, null if there is none.
 

@@ -7,33 +7,34 @@ recording, provides its writer, and completes or removes the recording.
 from __future__ import annotations
 
 import math
-import platform
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
-from pathlib import Path
 from threading import BoundedSemaphore
 from typing import TYPE_CHECKING, Any, Final
+
+from msgspec import convert
 
 from hybridlog.columns.table_writer import TableWriter
 from hybridlog.entries import (
     announce_removal,
-    new_id,
+    ended,
+    free_name_in,
+    listed,
     put_entry,
     recording_metadata,
-    sealed_event,
     text,
 )
 from hybridlog.index.index_writer import INTERVAL_S, IndexTarget, IndexWriter
 from hybridlog.maintenance.index import finish
 from hybridlog.maintenance.retention import Rules
 from hybridlog.wording import parse_size
-from hybridlog_storage import journal
 from hybridlog_storage.catalog import RecordingEntry
 from hybridlog_storage.disk.directory import LOCK_WAIT_S
 from hybridlog_storage.errors import DatabaseError, DiskFullError, HybridlogError, UsageError
-from hybridlog_storage.journal import Journal
+from hybridlog_storage.manifest import Manifest, Source, new_id
+from hybridlog_storage.manifests import change_in, write_in
 from hybridlog_storage.mongo.index_state import IndexState
 from hybridlog_storage.mongo.topic_places import TopicPlaces
 from hybridlog_storage.segments.segment_format import END_METADATA, LOSSES_METADATA, json_metadata
@@ -132,8 +133,8 @@ class Capture:
             self.entry = self._begin(name, tags, source, target.database)
             self._held = self._held.pop_all()
         self._target = target
-        recording = directory.recording(self.entry.label)
-        self._tables = TableWriter(directory.path, self.entry.id, self.entry.label)
+        recording = directory.recording(self.entry.id)
+        self._tables = TableWriter(directory.path, self.entry.id, self.entry.name)
         self.index = IndexWriter(
             recording,
             self.entry,
@@ -211,29 +212,36 @@ class Capture:
         return self._finish()
 
     def _announce(self, sealed: Sealed) -> None:
-        """Write a segment into the journal before it gets its final name."""
-        lines = [sealed_event(sealed)]
-        if self._end is not None:
-            lines.append(journal.event(journal.ENDED, end=dict(self._end)))
-        self._journal.append(*lines)
+        """List a segment in the manifest before it gets its final name."""
+        end = self._end
+        change = listed(sealed)
+        if end is not None:
+            self._change(lambda now: ended(end)(change(now)))
+        else:
+            self._change(change)
         messages = sum(channel.messages for channel in sealed.channels)
         self._tables.seal(sealed.segment, sealed.digest, messages)
         self.index.seal(sealed)
 
+    def _change(self, how: Callable[[Manifest], Manifest]) -> None:
+        change_in(self._directory.recording(self.entry.id), how, sync=self._sync)
+
     def _finish(self) -> DatabaseError | None:
         self.index.close()
         failure = self.index.failure
-        label = self.entry.label
+        recording = self.entry.id
         if self.index.damage:
-            self.catalog.put_damage(self.entry.id, self.index.damage)
+            self.catalog.put_damage(recording, self.index.damage)
         try:
             if failure is None:
                 database = self.index.database
-                self.entry = finish(self._directory, self.catalog, database, label, turn=self._turn)
+                self.entry = finish(
+                    self._directory, self.catalog, database, recording, turn=self._turn
+                )
         except DatabaseError as error:
             failure = error
         if failure is not None:
-            self.entry = put_entry(self._directory, self.catalog, label)
+            self.entry = put_entry(self._directory, self.catalog, recording)
         self._tables.close(self.entry)
         self._held.close()
         return failure
@@ -247,14 +255,14 @@ class Capture:
 
     def rollback(self) -> None:
         """Remove the whole recording; the next opening finishes a removal that fails."""
-        label, entry = self.entry.label, self.entry
+        entry = self.entry
         with suppress(HybridlogError):  # the directory's hidden name announces it, too
-            announce_removal(self._directory, label)
+            announce_removal(self._directory, entry.id)
         self.writer.abort()
         self.index.abandon()
         self._tables.discard()
         with suppress(HybridlogError):
-            self._directory.remove(label)
+            self._directory.remove(entry.id)
         with suppress(HybridlogError):
             self.catalog.remove(entry.id)
         # If MongoDB is unavailable, the next connection finds an entry without files.
@@ -274,40 +282,25 @@ class Capture:
         source: Mapping[str, Any],
         database: Database | None,
     ) -> RecordingEntry:
-        """Create and lock the recording's directory, its journal and its index entry."""
-        name = text(name)
-        label = self._directory.new_recording(name)
+        """Create and lock the recording's directory, its manifest and its index entry."""
+        manifest = Manifest(
+            new_id(name),
+            free_name_in(self.catalog, name),
+            time.time_ns(),
+            source=convert(dict(source), Source),
+            tags={text(key): text(value) for key, value in tags.items()},
+        )
+        recording = manifest.id
+        self._directory.new_recording(recording)
         try:
-            path = self._directory.recording(label)
-            lock = self._directory.writing(label, wait_s=LOCK_WAIT_S, records=True)
+            lock = self._directory.writing(recording, wait_s=LOCK_WAIT_S, records=True)
             self._held.enter_context(lock)
-            entry = RecordingEntry(
-                id=new_id(),
-                label=label,
-                name=name,
-                tags={text(key): text(value) for key, value in tags.items()},
-                source=dict(source),
-                created=time.time_ns(),
-                status="open",
-            )
-            self._journal = Journal(path, sync=self._sync)
-            self._journal.append(
-                journal.event(
-                    journal.BEGUN,
-                    id=entry.id,
-                    store=self._directory.settings.store_id,
-                    name=entry.name,
-                    tags=entry.tags,
-                    source=entry.source,
-                    created=entry.created,
-                    origin=origin(),
-                )
-            )
-            put_entry(self._directory, self.catalog, label, is_open=True)
+            write_in(self._directory.recording(recording), manifest)
+            entry = put_entry(self._directory, self.catalog, recording, is_open=True)
             if database is not None:
                 IndexState(database).put(entry, "open", turn=self._turn)
         except BaseException:
-            self._directory.remove(label)
+            self._directory.remove(recording)
             raise
         return entry
 
@@ -325,12 +318,3 @@ def remote_segment_size(table: Mapping[str, Any] | None) -> float:
     if table.keys() - {"segment-size"} or not least <= size <= most:
         raise UsageError("[remote] in hybridlog.toml has segment-size, from 64MiB to 256MiB.")
     return size
-
-
-def origin() -> dict[str, Any]:
-    """The origin of a recording: host, boot, recorder, clock."""
-    try:
-        boot = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
-    except (OSError, UnicodeDecodeError):
-        boot = ""
-    return {"host": platform.node(), "boot": boot, "recorder": "hybridlog", "clock": "realtime"}

@@ -338,16 +338,16 @@ def _refuse_known(catalog: Catalog, source: Source, fingerprint: Fingerprint) ->
     known = catalog.with_fingerprint(fingerprint.whole)
     if known is None and len(fingerprint.parts) > 1:
         parts = [catalog.with_fingerprint(part) for part in fingerprint.parts]
-        labels = dict.fromkeys(one.label for one in parts if one is not None)
+        names = dict.fromkeys(one.name for one in parts if one is not None)
         if None not in parts:
             raise AlreadyRecordedError(
-                f"{source.path} is in the store already, part by part: {listed(labels)}. "
+                f"{source.path} is in the store already, part by part: {listed(names)}. "
                 "Use --again to record it once more."
             )
     if known is not None:
         state = {"recovered": " (cut short by a crash)", "open": " (being recorded now)"}
         raise AlreadyRecordedError(
-            f"{source.path} is in the store already, as {known.label!r}"
+            f"{source.path} is in the store already, as {known.name!r}"
             f"{state.get(known.status, '')}. "
             "Use --again to record it once more."
         )

@@ -34,7 +34,7 @@ class RunningRecording:
 
     Args:
         directory: The store.
-        label: Label of the recording.
+        recording: Id of the recording.
         sealed: Returns its entry by the catalog, with what is sealed; None if it is gone.
 
     Attributes:
@@ -44,10 +44,13 @@ class RunningRecording:
     """
 
     def __init__(
-        self, directory: StoreDirectory, label: str, sealed: Callable[[], RecordingEntry | None]
+        self,
+        directory: StoreDirectory,
+        recording: str,
+        sealed: Callable[[], RecordingEntry | None],
     ) -> None:
         self._directory = directory
-        self._label = label
+        self._recording = recording
         self._read_sealed = sealed
         self._sealed: RecordingEntry | None = None
         self._state = "", False  # the look of its directory, and whether it is being written
@@ -67,8 +70,8 @@ class RunningRecording:
         Raises:
             StoreError: Its files cannot be read.
         """
-        look = self._directory.looks([self._label]).get(self._label, "")
-        state = look, self._directory.is_recorded(self._label)
+        look = self._directory.looks([self._recording]).get(self._recording, "")
+        state = look, self._directory.is_recorded(self._recording)
         is_same = state == self._state
         if not is_same:
             self._begin()
@@ -101,13 +104,13 @@ class RunningRecording:
     def _begin(self) -> None:
         """Read again what is sealed, and open the segments that are not."""
         # Listed first: what is sealed meanwhile is then in neither, or in both.
-        opened = self._directory.listing(self._label).open
+        opened = self._directory.listing(self._recording).open
         self._sealed = self._read_sealed()
         before, self._segments = self._segments, {}
         self._unreadable.clear()
         if self._sealed is None or self._sealed.status not in UNFINISHED:
             return
-        path = self._directory.recording(self._sealed.label)
+        path = self._directory.recording(self._recording)
         for number in opened:
             if str(number) in self._sealed.digests:
                 continue

@@ -102,7 +102,7 @@ class StoreContent:
         return TopicView(
             topic,
             recordings=[partial(self.topic_of, summary, topic) for summary in found],
-            labels=[summary.label for summary in found],
+            names=[summary.name for summary in found],
             spans=[self._span(summary) for summary in found],
             windows=[self.window(summary.id) for summary in found],
             kinds=kinds,

@@ -94,7 +94,7 @@ def _topics(content: StoreContent) -> Iterator[Mapping[str, Any]]:
                 "topic": topic,
                 "view": view,
                 "short": content.names.short(topic),
-                "recording": summary.label,
+                "recording": summary.name,
                 "type": ", ".join(types) or None,
                 "encoding": ", ".join(encodings) or None,
                 "messages": total.messages,
@@ -111,7 +111,7 @@ def _losses(content: StoreContent) -> Iterator[Mapping[str, Any]]:
         entry = content.session.entry_of(summary)
         for loss in entry.end.get("losses", ()):
             yield {
-                "recording": entry.label,
+                "recording": entry.name,
                 "topic": loss.get("topic"),
                 "cause": str(loss["cause"]),
                 "messages": loss["count"],
@@ -122,8 +122,8 @@ def _losses(content: StoreContent) -> Iterator[Mapping[str, Any]]:
 
 
 def _marks(content: StoreContent) -> Iterator[Mapping[str, Any]]:
-    labels = {one.id: one.label for one in content.summaries}
-    for mark in marks_in(content.session, [*labels], Counters()):
+    names = {one.id: one.name for one in content.summaries}
+    for mark in marks_in(content.session, [*names], Counters()):
         window = content.window(mark.recording)
         if window is not None and not window[0] <= mark.begin < window[1]:
             continue
@@ -132,7 +132,7 @@ def _marks(content: StoreContent) -> Iterator[Mapping[str, Any]]:
             "t": mark.begin,
             "end_time": None if mark.end is None else mark.end // 1000,
             "end_t": mark.end,
-            "recording": labels[mark.recording],
+            "recording": names[mark.recording],
             "text": mark.text,
             "tags": list(mark.tags.items()),
         }

@@ -86,7 +86,7 @@ class TopicView:
         topic: Full name.
         recordings: The topic in each recording, by the time of the recordings; made when a
             query first reads it.
-        labels: Label of each recording.
+        names: Name of each recording.
         spans: First and last log time of each recording, ns; None if unknown.
         windows: The log time `[begin, end)` of each that has rows, ns; None for all times.
         kinds: Types of the messages.
@@ -99,7 +99,7 @@ class TopicView:
         topic: str,
         *,
         recordings: Sequence[Callable[[], TopicOfRecording]],
-        labels: Sequence[str],
+        names: Sequence[str],
         spans: Sequence[tuple[int, int] | None],
         windows: Sequence[tuple[int, int] | None],
         kinds: Sequence[Any],
@@ -118,7 +118,7 @@ class TopicView:
             self._columns[POINTS] = own
         fields = [pa.field(column.name, column.type) for column in self._columns.values()]
         self.schema = pa.schema([*OWN, *fields])
-        self._chooser = _RecordingChooser(self.schema, labels, spans)
+        self._chooser = _RecordingChooser(self.schema, names, spans)
 
     def rows(
         self, columns: Sequence[str], where: Any, reading: Reading
@@ -190,17 +190,17 @@ class _RecordingChooser:
 
     Args:
         schema: Columns of the expression.
-        labels: Label of each recording.
+        names: Name of each recording.
         spans: First and last log time of each, ns; None if unknown.
     """
 
     def __init__(
-        self, schema: Any, labels: Sequence[str], spans: Sequence[tuple[int, int] | None]
+        self, schema: Any, names: Sequence[str], spans: Sequence[tuple[int, int] | None]
     ) -> None:
         self._schema = schema
-        self._labels = labels
+        self._names = names
         self._spans = spans
-        count, size = len(labels), max(isqrt(len(labels)), 1)
+        count, size = len(names), max(isqrt(len(names)), 1)
         self._groups = [range(at, min(at + size, count)) for at in range(0, count, size)]
         self._chooser = _Chooser(schema, [self._guarantee(group) for group in self._groups])
         self._inside: dict[int, _Chooser] = {}
@@ -219,12 +219,12 @@ class _RecordingChooser:
 
     def _guarantee(self, group: range) -> Any:
         """An expression that holds for all rows of some recordings."""
-        labels = self._labels[group.start : group.stop]
+        names = self._names[group.start : group.stop]
         spans = [span for span in self._spans[group.start : group.stop] if span is not None]
         within = pc.scalar(True)
         if len(spans) == len(group):
             within = _within((min(first for first, _ in spans), max(last for _, last in spans)))
-        recording, low, high = pc.field("recording"), min(labels), max(labels)
+        recording, low, high = pc.field("recording"), min(names), max(names)
         if low == high:
             return (recording == low) & within
         return (recording >= low) & (recording <= high) & within
@@ -467,7 +467,7 @@ def _type_at(kind: Any, path: Sequence[str]) -> Any:
 def _constant(name: str, entry: RecordingEntry, rows: int) -> Any:
     """A column with the same value for all rows of a recording."""
     if name == "recording":
-        return pa.repeat(pa.scalar(entry.label), rows)
+        return pa.repeat(pa.scalar(entry.name), rows)
     tags = pa.array([list(entry.tags.items())], OWN.field("tags").type)
     return tags.take(pa.array(np.zeros(rows, np.int64)))
 

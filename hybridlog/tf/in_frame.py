@@ -24,7 +24,7 @@ from hybridlog.query.planner import Planner
 from hybridlog.query.times import decoded_time
 from hybridlog.tf.reader import frame_tree
 from hybridlog.tf.transform import Transform, placed
-from hybridlog_storage.errors import DefinitionError, PayloadError, UsageError
+from hybridlog_storage.errors import DefinitionError, PayloadError, TopicError, UsageError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -207,13 +207,13 @@ def _tables_of_points(planner: Planner) -> Iterator[pa.Table]:
         raise UsageError("Points in a frame have the fields of their points: leave out fields.")
     several = question.names_recording or len(planner.session.chosen(question)) > 1
     summaries = planner.session.snapshot().summaries
-    labels = {one.id: one.label for one in summaries}
+    names = {one.id: one.name for one in summaries}
     stamp = pa.timestamp("ns", "UTC")
     given = False
     for message, time, points in points_of(planner.session, question, planner.counters):
         own = {
             "log_time": pa.array([message.log_time_ns], stamp),
-            **({"recording": pa.array([labels[message.recording]])} if several else {}),
+            **({"recording": pa.array([names[message.recording]])} if several else {}),
             "header.stamp": pa.array([time], stamp),
             "header.frame_id": pa.array([question.frame]),
         }
@@ -264,10 +264,13 @@ def _tables_of_poses(planner: Planner) -> Iterator[pa.Table]:
         added = [one for one in found.columns() if not _is_in(one, requested)]
         hidden |= {*added}
         plain = replace(plain, fields=(*requested, *added))
-    ids = {one.label: one.id for one in session.snapshot().summaries}
+    ids = session.snapshot().ids_called()
     inner = Planner(session, replace(plain, names_recording=True), planner.counters)
     for table in answer.stream(inner):
-        recordings = [ids[label] for label in table["recording"].to_pylist()]
+        names = table["recording"].to_pylist()
+        if not ids.keys() >= {*names}:
+            raise TopicError("Two of these recordings have one name: ask about one by its id.")
+        recordings = [ids[name] for name in names]
         frames = [str(name or "") for name in table[frame].to_pylist()]
         times = table[stamp].cast(pa.int64()).fill_null(0).to_numpy()
         moved = looked.transforms(recordings, frames, times)

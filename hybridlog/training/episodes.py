@@ -238,9 +238,9 @@ class _Reader:
 
     def _checked(self, topic: str, times: NDArray[np.int64]) -> NDArray[np.int64]:
         if not len(times):
-            label = self._session.entry(self._recording).label
+            name = self._session.entry(self._recording).name
             raise TopicError(
-                f"Recording {label} has no message of {topic} before "
+                f"Recording {name} has no message of {topic} before "
                 f"{format_time(self._end)}: leave the recording out, or map another topic."
             )
         return times

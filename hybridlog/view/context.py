@@ -90,7 +90,7 @@ class Context:
             self.store = self._looks.store.snapshot()
 
     def recording(self, params: RequestParams) -> RecordingEntry:
-        """The recording that the parameter `recording` names by its label or id.
+        """The recording that the parameter `recording` names by its id or name.
 
         Raises:
             TopicError: There is none.
@@ -107,7 +107,7 @@ class Context:
         known = {channel.topic for channel in recording.channels}
         for topic in topics:
             if topic not in known:
-                raise TopicError(f"{recording.label} has no topic {topic!r}.")
+                raise TopicError(f"{recording.name} has no topic {topic!r}.")
         return self.store.query(topics, [recording.id])
 
     def topic(self, params: RequestParams) -> tuple[RecordingEntry, Query]:

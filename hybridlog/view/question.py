@@ -84,7 +84,7 @@ class PageQuestion:
     def command(self) -> str:
         """The command line that writes it to a file of `file_name`."""
         words = ["hybridlog", "fetch", "--store", self.store.directory.place]
-        words += ["-r", self.recording.label]
+        words += ["-r", self.recording.name]
         for topic in self.topics or [_EVERY_TOPIC]:
             words += ["-t", topic]
         if self.span is not None:
@@ -97,7 +97,7 @@ class PageQuestion:
 
     def python(self) -> str:
         """A program that asks the same."""
-        recordings = f"store.recordings({self.recording.label!r})"
+        recordings = f"store.recordings({self.recording.name!r})"
         topics = ", ".join(map(repr, self.topics))
         steps = [f"{recordings}.topic({topics})" if topics else f"{recordings}.all_topics()"]
         if self.span is not None:
@@ -118,7 +118,7 @@ class PageQuestion:
         """The name of its file: recording and range."""
         begin, end = self._extent() if self.span is None else self.span
         times = "_".join(format_time(time).replace(":", "") for time in (begin, end))
-        return f"{_NO_NAME.sub('_', self.recording.label)}_{times}.mcap"
+        return f"{_NO_NAME.sub('_', self.recording.name)}_{times}.mcap"
 
     def _extent(self) -> Span:
         from hybridlog.record.losses import extent_of

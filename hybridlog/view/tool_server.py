@@ -92,9 +92,9 @@ class _Answers:
         self._turns = threading.BoundedSemaphore(_TURNS)
 
     def recordings(self, name: _Name | None = None) -> CallToolResult:
-        """List recordings, the latest first: label, times, messages, completeness.
+        """List recordings, the latest first: name, times, messages, completeness.
 
-        `name` is a label or a glob such as monday*.
+        `name` is a name, an id or a glob such as monday*.
         """
         return self._answer(tools.recordings, name)
 

@@ -61,7 +61,7 @@ class ToolQuestion:
 
     Attributes:
         topic: Its name, full or short.
-        recording: Label or name of a recording, or a glob; None for all.
+        recording: Name or id of a recording, or a glob; None for all.
         where: A predicate; None for all messages.
         within: Greatest distance in time of conditions on other topics.
         begin: First log time; None for the beginning.
@@ -95,7 +95,7 @@ def recordings(context: Context, name: str | None) -> Answer:
     found = chosen[-MAX_ROWS:]
     rows = [
         {
-            "recording": one.label,
+            "recording": one.name,
             "begin": None if one.span is None else format_time(one.span[0]),
             "end": None if one.span is None else format_time(one.span[1]),
             "status": one.status,
@@ -146,10 +146,10 @@ def ask(context: Context, question: ToolQuestion, at_least: str | None) -> Answe
         held = query.intervals(at_least=at_least)
         values["interval_count"] = len(held)
         is_cut = len(held) > MAX_ROWS
-        labels = {one.id: one.label for one in query.summaries()}
+        names = {one.id: one.name for one in query.summaries()}
         rows = [
             {
-                "recording": labels[one.recording],
+                "recording": names[one.recording],
                 "begin": format_time(one.begin_ns),
                 "length": format_duration(one.end_ns - one.begin_ns),
                 "messages": one.messages,

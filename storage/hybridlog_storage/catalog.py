@@ -1,6 +1,6 @@
 """The catalog: what is known of all recordings of a store, without a look at their files.
 
-It is derived from journals and segments, and may be deleted at any time. It lists recordings
+It is derived from manifests and segments, and may be deleted at any time. It lists recordings
 with summaries, and says more of those that are asked about: their channels, statistics and
 losses, and what was found out by decoding. What it says of a recording also has the state of
 the files that it was read from (sizes, times), and is used only while that is unchanged. Chunks
@@ -167,15 +167,14 @@ class RecordingEntry:
     """One recording.
 
     Attributes:
-        id: 32 random hexadecimal digits; everything refers to it.
-        label: Name of its directory; may change at any time.
-        name: Name given by the user.
+        id: Name of its directory, which never changes; everything refers to it.
+        name: What people call it; no other recording had this name when it got it.
         tags: Tags given by the user.
         source: The recorded log: path, kind, profile, bytes, fingerprint.
         created: Time of recording, ns.
         status: `open` (being recorded), `unfinished` (cut short by a crash, in a read-only
             store), `complete`, `recovered` (from a crash), `damaged` (the source or a part of
-            the recording), or `unproven` (the journal was lost).
+            the recording), or `unproven` (the manifest was lost).
         end: The state at its end: losses, damage.
         channels: Its channels.
         stored_bytes: Size of its segments and of the fields of its expired messages.
@@ -198,7 +197,6 @@ class RecordingEntry:
     """
 
     id: str
-    label: str
     name: str
     tags: dict[str, str]
     source: dict[str, Any]
@@ -222,12 +220,12 @@ class RecordingEntry:
     flushed: dict[int, Flushed] = field(default_factory=dict)
 
     def __repr__(self) -> str:
-        return f"<Recording {self.label}; {len(self.channels)} channels, {self.messages} messages>"
+        return f"<Recording {self.name}; {len(self.channels)} channels, {self.messages} messages>"
 
     @property
     def key(self) -> str:
-        """The first 64 bits of the id, 16 hexadecimal digits; index documents refer to it."""
-        return self.id[:16]
+        """The random digits of the id, 16; index documents refer to it."""
+        return self.id[-16:]
 
     @property
     def messages(self) -> int:
@@ -782,7 +780,7 @@ class Catalog:
     def _read_table(
         self, entry: RecordingEntry, number: int, digest: str
     ) -> tuple[ChunkTable, NDArray[np.void] | None]:
-        path = self._store / _RECORDINGS / entry.label / sealed_name(number)
+        path = self._store / _RECORDINGS / entry.id / sealed_name(number)
         try:
             with SegmentReader(path, number) as reader:
                 summary = reader.summary()

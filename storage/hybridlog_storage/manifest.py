@@ -10,8 +10,8 @@ from __future__ import annotations
 import re
 import secrets
 import time
-from collections.abc import Iterable
-from typing import Annotated, Final, Literal, TypeVar
+from collections.abc import Collection, Iterable, Mapping
+from typing import Annotated, Any, Final, Literal, TypeVar
 
 from blake3 import blake3
 from msgspec import UNSET, Meta, Struct, UnsetType, json, structs
@@ -34,11 +34,14 @@ Topic = Annotated[str, Meta(max_length=1 << 12)]
 Key = Annotated[str, Meta(min_length=1, max_length=255, pattern=r"\A[^\0]*\Z")]
 Name = Annotated[str, Meta(pattern=r"\A(?!\.)[^/\0]{1,255}\Z")]
 Random = Annotated[str, Meta(pattern=r"\A[0-9a-f]{16}\Z")]
-"""Of a mark or a pin; drawn before a change is made, which may be made again."""
+"""Of a mark; drawn before a change is made, which may be made again."""
+PinId = Annotated[str, Meta(pattern=r"\A[^\s/\0]{1,64}\Z")]
+"""Drawn as well; that of a copy begins with what it is known by."""
 Id = Annotated[str, Meta(pattern=r"\A[a-z0-9](-?[a-z0-9]){0,63}-[0-9a-f]{16}\Z")]
-Digest = Annotated[str, Meta(pattern=r"\A[0-9a-f]{64}\Z")]
-"""BLAKE3 of all bytes of a file."""
+Digest = Annotated[str, Meta(pattern=r"\A(sha256:)?[0-9a-f]{64}\Z")]
+"""BLAKE3 of all bytes of a file; with `sha256:`, SHA-256 of its summary or footer."""
 FileName = Annotated[str, Meta(pattern=r"\A[0-9]{6}(\.[a-z0-9_-]{1,64})?\.(mcap|parquet)\Z")]
+FieldsName = Annotated[str, Meta(pattern=r"\A(?!\.)[^/\0]{1,255}/(?!\.)[^/\0]{1,255}\Z")]
 Tags = dict[Key, Text]
 
 
@@ -58,6 +61,8 @@ class Source(Record, frozen=True):
         profile: As MCAP files state it, such as `ros2`.
         fingerprint: Of the content; two recordings of one file have the same.
         bytes: The size of the file.
+        parts: Fingerprints of its parts, if it is a log of several files.
+        flush_interval_s: Longest time until a message is flushed, seconds; None for a file.
     """
 
     kind: Text = ""
@@ -65,6 +70,8 @@ class Source(Record, frozen=True):
     profile: Text = ""
     fingerprint: Text = ""
     bytes: Count = 0
+    parts: tuple[Text, ...] = ()
+    flush_interval_s: Annotated[float, Meta(ge=0, le=1e9)] | None = None
 
 
 class Channel(Record, frozen=True):
@@ -94,10 +101,19 @@ class Channel(Record, frozen=True):
 
 
 class Part(Record, frozen=True, array_like=True):
-    """Messages of one channel in a file, and the bytes of their payloads."""
+    """Messages of one channel in a file, bytes of their payloads, first and last log time (ns)."""
 
     messages: Count
     bytes: Count
+    first: Nanoseconds | None = None
+    last: Nanoseconds | None = None
+
+
+class Stored(Record, frozen=True, array_like=True):
+    """The bytes and the digest of a log some of whose payloads have expired."""
+
+    bytes: Count
+    digest: Digest
 
 
 class File(Record, frozen=True):
@@ -116,6 +132,10 @@ class File(Record, frozen=True):
         parts: What it has of each channel.
         gone: Why the file is no longer here; absent while it is.
         copy: Address of a proven copy, if it is gone.
+        stored: What the file is since payloads of it have expired; None before. `bytes` and
+            `digest` are of the file as it was sealed.
+        expired: Topics whose payloads have expired, at least some of them.
+        retained: Topics that a rule was applied to; None for all; absent for none.
     """
 
     number: Number
@@ -130,11 +150,32 @@ class File(Record, frozen=True):
     parts: dict[ChannelNumber, Part] = {}
     gone: Literal["expired", "elsewhere"] | UnsetType = UNSET
     copy: Text = ""
+    stored: Stored | None = None
+    expired: tuple[Topic, ...] = ()
+    retained: tuple[Topic, ...] | UnsetType | None = UNSET
 
     @property
     def is_here(self) -> bool:
         """True unless it has expired, or was left elsewhere."""
         return self.gone is UNSET
+
+
+class Fields(Record, frozen=True):
+    """A file with the fields of messages whose payloads have expired.
+
+    Attributes:
+        file: Its path below the recording's `payloads`.
+        bytes: Its size.
+        digest: Of its footer.
+        topic: The topic.
+        messages: Number of messages in it.
+    """
+
+    file: FieldsName
+    bytes: Count
+    digest: Digest
+    topic: Topic
+    messages: Count
 
 
 class Note(Record, frozen=True):
@@ -153,6 +194,7 @@ class Mark(Record, frozen=True):
         text: What was said of it.
         tags: Its tags.
         end: Log time of its end; None for a moment.
+        segment: Number of the log that holds it as a message.
     """
 
     id: Random
@@ -160,20 +202,21 @@ class Mark(Record, frozen=True):
     text: Text
     tags: Tags = {}
     end: Nanoseconds | None = None
+    segment: Number | None = None
 
 
 class Pin(Record, frozen=True):
     """Messages that no rule may delete.
 
     Attributes:
-        id: Its id.
+        id: Its id, which users type.
         first: First log time, ns since the epoch; None from the beginning on.
         last: Last log time; None up to the end.
         topics: Topics whose files must stay; None for all.
         reason: Why.
     """
 
-    id: Random
+    id: PinId
     first: Nanoseconds | None = None
     last: Nanoseconds | None = None
     topics: tuple[Topic, ...] | None = None
@@ -190,6 +233,9 @@ class Loss(Record, frozen=True):
         first: Beginning of the loss, ns since the epoch; None if unknown.
         last: Its end.
         reason: An explanation for people.
+        file: The damaged file; empty for messages that were never in one.
+        offset: Where in the file, bytes.
+        length: Bytes that are damaged there.
     """
 
     cause: Text
@@ -198,6 +244,9 @@ class Loss(Record, frozen=True):
     first: Nanoseconds | None = None
     last: Nanoseconds | None = None
     reason: Text = ""
+    file: Text = ""
+    offset: Count | None = None
+    length: Count | None = None
 
 
 class Manifest(Record, frozen=True):
@@ -219,6 +268,12 @@ class Manifest(Record, frozen=True):
         channels: Its channels by number.
         files: Its files, in the order of writing.
         losses: Its loss ledger.
+        cut_bytes: Bytes that were cut off after its recorder was killed: records not yet whole.
+        damage: What else was wrong then, in words.
+        fields: Files with the fields of messages whose payloads have expired.
+        deleted: Such files that others have replaced.
+        unmarked: Numbers of the logs of marks that were removed.
+        lacks_payloads: Whether it is a copy whose payloads have not been copied yet.
     """
 
     id: Id
@@ -235,6 +290,22 @@ class Manifest(Record, frozen=True):
     channels: dict[ChannelNumber, Channel] = {}
     files: tuple[File, ...] = ()
     losses: tuple[Loss, ...] = ()
+    cut_bytes: Count = 0
+    damage: tuple[Text, ...] = ()
+    fields: tuple[Fields, ...] = ()
+    deleted: tuple[FieldsName, ...] = ()
+    unmarked: tuple[Number, ...] = ()
+    lacks_payloads: bool = False
+
+    @property
+    def logs(self) -> dict[int, File]:
+        """Its logs by number."""
+        return {file.number: file for file in self.files if file.kind == "log"}
+
+    @property
+    def is_ended(self) -> bool:
+        """True once nobody records it any more."""
+        return self.status != "open"
 
     def __post_init__(self) -> None:
         """Refuse what no writer writes.
@@ -277,13 +348,30 @@ def new_id(kind: str) -> str:
 
 
 def new_random() -> str:
-    """Draw the id of a mark or a pin."""
+    """Draw the id of a mark."""
     return secrets.token_hex(8)
 
 
 def is_id(name: str) -> bool:
     """True if a name can be the id of a recording."""
     return _ID.fullmatch(name) is not None
+
+
+def name_of(text: str) -> str:
+    """A valid name of a recording, from what a user calls it."""
+    plain = re.sub(r"[/\x00-\x1f\x7f-\x9f]", "-", text).lstrip(".")
+    return plain.encode()[:_MAX_NAME].decode(errors="ignore") or "recording"
+
+
+def free_name(text: str, taken: Collection[str]) -> str:
+    """A valid name that no other recording has: `name`, `name-2`, `name-3` and so on."""
+    name = name_of(text)
+    found, number = name, 1
+    while found in taken:
+        number += 1
+        end = f"-{number}"
+        found = name.encode()[: _MAX_NAME - len(end)].decode(errors="ignore") + end
+    return found
 
 
 def replace(part: _Part, **values: object) -> _Part:
@@ -298,6 +386,49 @@ def replace(part: _Part, **values: object) -> _Part:
 def hasher() -> blake3:
     """A hasher whose hexadecimal digest is that of a file."""
     return blake3()
+
+
+def loss_of(row: Mapping[str, Any]) -> Loss:
+    """A row of the loss ledger as a log has it."""
+    return Loss(
+        row["cause"],
+        row["topic"] or "",
+        row["count"],
+        row["from"],
+        row["to"],
+        row["reason"],
+        row["file"] or "",
+        row["offset"],
+        row["length"],
+    )
+
+
+def with_totals(manifest: Manifest) -> Manifest:
+    """The manifest with the totals of its channels as its files have them."""
+    parts: dict[int, list[Part]] = {number: [] for number in manifest.channels}
+    for file in manifest.files:
+        for number, part in file.parts.items():
+            parts[number].append(part)
+    channels = {
+        number: replace(
+            channel,
+            messages=sum(one.messages for one in parts[number]),
+            bytes=sum(one.bytes for one in parts[number]),
+            first=min((one.first for one in parts[number] if one.first is not None), default=None),
+            last=max((one.last for one in parts[number] if one.last is not None), default=None),
+        )
+        for number, channel in sorted(manifest.channels.items())
+    }
+    return replace(manifest, channels=channels)
+
+
+def with_file(manifest: Manifest, number: int, **values: object) -> Manifest:
+    """The manifest with other values of the log of a number."""
+    files = [
+        replace(one, **values) if one.kind == "log" and one.number == number else one
+        for one in manifest.files
+    ]
+    return replace(manifest, files=tuple(files))
 
 
 def encode(manifest: Manifest) -> bytes:
@@ -331,6 +462,7 @@ def decode(data: bytes) -> Manifest:
         raise ValueError("it is nested too deeply") from error
 
 
+_MAX_NAME: Final = 255  # bytes
 _DIGEST_LINE: Final = 66  # bytes, with both line feeds
 _DECODER: Final = json.Decoder(Manifest)
 _ID: Final = re.compile(r"[a-z0-9](-?[a-z0-9]){0,63}-[0-9a-f]{16}")

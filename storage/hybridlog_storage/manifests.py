@@ -21,6 +21,7 @@ import errno
 import fcntl
 import os
 import random
+import re
 import time
 from abc import ABC, abstractmethod
 from contextlib import ExitStack, contextmanager, suppress
@@ -54,8 +55,8 @@ _FOLDER: Final = "manifests"
 _RECORDINGS: Final = "recordings"
 _SUFFIX: Final = ".json"
 _ALL: Final = ".lock"
-_LOCK: Final = "manifest.lock"
-_OLD: Final = "manifest.old"
+MANIFEST_LOCK: Final = "manifest.lock"
+MANIFEST_OLD: Final = "manifest.old"
 
 
 class Manifests(ABC):
@@ -238,6 +239,8 @@ class DiskManifests(Manifests):
         """Ids of all recordings that have a manifest, sorted; also of those being removed."""
         try:
             names = files.names(self._folder)
+        except FileNotFoundError:
+            return []
         except OSError as error:
             raise unreadable(error, self._folder) from error
         return _ids(names)
@@ -245,9 +248,8 @@ class DiskManifests(Manifests):
     @contextmanager
     def creating(self) -> Iterator[Callable[[Manifest], None]]:
         """Create manifests; nobody else can create one meanwhile."""
-        for folder in (self._folder, self._recordings):
-            with suppress(FileExistsError):
-                files.make_folder(folder)
+        files.make_folders(self._folder)
+        files.sync_folder(self._folder.parent)
         _make_file(self._folder / _ALL)
         with _locked(self._folder / _ALL):
             yield self._create
@@ -259,16 +261,16 @@ class DiskManifests(Manifests):
         folder = self._recordings / manifest.id
         try:
             self._make_lock(folder)
-            with _locked(folder / _LOCK):
+            with _locked(folder / MANIFEST_LOCK):
                 self._write(path, data)
         except OSError as error:
             raise durability.explain(error, path, "writing") from error
 
     def _make_lock(self, folder: Path) -> None:
-        with suppress(FileExistsError):
-            files.make_folder(folder)
+        files.make_folders(folder)
+        files.sync_folder(self._recordings.parent)
         files.sync_folder(self._recordings)
-        _make_file(folder / _LOCK)
+        _make_file(folder / MANIFEST_LOCK)
 
     def _path(self, recording: str) -> Path:
         return self._folder / f"{recording}{_SUFFIX}"
@@ -287,23 +289,17 @@ class DiskManifests(Manifests):
         folder = self._recordings / recording
         with ExitStack() as stack:
             try:
-                stack.enter_context(_locked(folder / _LOCK))
+                stack.enter_context(_locked(folder / MANIFEST_LOCK))
             except FileNotFoundError:
                 if not _exists(self._path(recording)):
                     raise RecordingGoneError(f"There is no recording {recording!r}.") from None
                 self._make_lock(folder)  # copies of a store may leave out what is empty
-                stack.enter_context(_locked(folder / _LOCK))
+                stack.enter_context(_locked(folder / MANIFEST_LOCK))
             yield
 
     def _replace(self, recording: str, data: bytes, version: str) -> None:
-        path, old = self._path(recording), self._recordings / recording / _OLD
-        # A second name is enough: the manifest is replaced, not changed.
-        new = old.with_name(f".{_OLD}")
-        with suppress(OSError):
-            files.unlink(new)
-        with suppress(OSError):  # where there are no links, there is no older one
-            files.link(path, new)
-            files.rename(new, old)
+        path = self._path(recording)
+        _keep_old(path, self._recordings / recording)
         try:
             self._write(path, data)
         except OSError as error:
@@ -328,7 +324,7 @@ class DiskManifests(Manifests):
             raise
 
     def _old(self, recording: str) -> Manifest | None:
-        path = self._recordings / recording / _OLD
+        path = self._recordings / recording / MANIFEST_OLD
         try:
             found = decode(files.read_file(path, MAX_BYTES))
         except (OSError, ValueError):
@@ -343,7 +339,7 @@ class DiskManifests(Manifests):
         folder = self._recordings / recording
         try:
             for name in files.names(folder):
-                if name != _LOCK:
+                if name != MANIFEST_LOCK:
                     files.remove_tree(folder / name)
             files.sync_folder(folder)
         except FileNotFoundError:
@@ -421,6 +417,121 @@ class BucketManifests(Manifests):
                 self._drop(recording)
 
 
+MANIFEST: Final = "manifest.json"
+"""Name of the manifest in the folder of its recording."""
+_NEW: Final = re.compile(r"\.manifest\.old|\.manifest\.json\.[0-9a-f]{16}")
+
+
+def read_in(folder: Path) -> Manifest | None:
+    """The manifest in the folder of a recording; None if there is none.
+
+    Raises:
+        ManifestError: It is damaged.
+        StoreError: It cannot be read.
+    """
+    path = folder / MANIFEST
+    try:
+        data = files.read_file(path, MAX_BYTES)
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise unreadable(error, path) from error
+    try:
+        return decode(data)
+    except ValueError as error:
+        raise ManifestError(
+            f"{path} is damaged: {error}. `hybridlog verify --repair` makes it again."
+        ) from error
+
+
+def old_in(folder: Path) -> Manifest | None:
+    """The manifest of a recording before its last change; None if it cannot be read."""
+    try:
+        return decode(files.read_file(folder / MANIFEST_OLD, MAX_BYTES))
+    except (OSError, ValueError):
+        return None
+
+
+def write_in(folder: Path, manifest: Manifest, *, sync: bool = True) -> None:
+    """Write the manifest of a recording that nobody else changes.
+
+    Raises:
+        HybridlogError: It cannot be written; the one before is still there.
+    """
+    path = folder / MANIFEST
+    try:
+        modified = time.time_ns()
+        with suppress(FileNotFoundError):
+            # Clocks of file systems tick in milliseconds, and sizes and inodes come again: what
+            # was read of a manifest must never pass for what another one says.
+            modified = max(modified, files.status(path).st_mtime_ns + 1)
+        files.write_file(path, encode(manifest), sync=sync, modified=modified)
+    except OSError as error:
+        raise durability.explain(error, path, "writing") from error
+
+
+def change_in(folder: Path, how: Callable[[Manifest], Manifest], *, sync: bool = True) -> Manifest:
+    """Replace the manifest of a recording, if it is unchanged.
+
+    Args:
+        folder: That of the recording.
+        how: Makes the new manifest of the newest one; if it returns that one, nothing is
+            written. What it raises ends the change.
+        sync: Whether it is on the disk when this returns.
+
+    Raises:
+        RecordingGoneError: There is no such recording, or it was removed meanwhile.
+        ManifestError: The manifest is damaged.
+        HybridlogError: It cannot be written; the old one is still there.
+    """
+    try:
+        _make_file(folder / MANIFEST_LOCK)
+        with _locked(folder / MANIFEST_LOCK):
+            now = read_in(folder)
+            if now is None:
+                raise RecordingGoneError(f"{folder} has no manifest any more.")
+            made = how(_present(now))
+            if made == now:
+                return now
+            new = replace(made, id=now.id, created=now.created, changes=now.changes + 1)
+            _keep_old(folder / MANIFEST, folder)
+            write_in(folder, new, sync=sync)
+            return new
+    except FileNotFoundError as error:
+        raise RecordingGoneError(f"{folder} is gone.") from error
+
+
+def _keep_old(path: Path, folder: Path) -> None:
+    """Keep a manifest that is about to be replaced, by a second name."""
+    new = folder / f".{MANIFEST_OLD}"
+    with suppress(OSError):
+        files.unlink(new)
+    with suppress(OSError):  # where there are no links, there is no older one
+        files.link(path, new)
+        files.rename(new, folder / MANIFEST_OLD)
+        files.unlink(new)  # a change that was killed has kept this one already
+
+
+def is_being_written(name: str) -> bool:
+    """True for the file of a manifest that is being written, or was when its writer died."""
+    return _NEW.fullmatch(name) is not None
+
+
+def clear_in(folder: Path) -> None:
+    """Remove what changes that were killed have left in the folder of a recording.
+
+    Raises:
+        HybridlogError: It cannot be removed.
+    """
+    _make_file(folder / MANIFEST_LOCK)
+    with _locked(folder / MANIFEST_LOCK):
+        try:
+            for name in filter(is_being_written, files.names(folder)):
+                files.unlink(folder / name)
+        except OSError as error:
+            raise durability.explain(error, folder, "removing files of") from error
+
+
 def _object(recording: str) -> str:
     return f"{_FOLDER}/{recording}{_SUFFIX}"
 
@@ -472,7 +583,10 @@ def _lock(fd: int, path: Path, end: float) -> None:
             if time.monotonic() > end:
                 message = f"Another process has held {path} for {WAIT_S:.0f} s; end it."
                 raise HeldError(message, is_recording=False) from None
-            time.sleep(random.uniform(0, _PAUSE_S))  # noqa: S311 - no secret
+            # Who has waited for long asks more often than others, so that nobody waits for ever.
+            waited = max(0.0, WAIT_S - (end - time.monotonic()))
+            pause = _PAUSE_S / (1 + 10 * min(waited, 2.0))
+            time.sleep(random.uniform(0, pause))  # noqa: S311 - no secret
         except OSError as error:
             if error.errno not in _NO_LOCKS:
                 raise

@@ -21,7 +21,7 @@ from urllib.parse import quote
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import StoreError, UsageError, unreadable
 
-FORMAT: Final = 3
+FORMAT: Final = 4
 """Store format of this version."""
 NAME: Final = "hybridlog.toml"
 EMBEDDED: Final = "embedded"

@@ -37,7 +37,6 @@ class RecordingSummary(NamedTuple):
 
     Attributes:
         id: As of `RecordingEntry`, like all attributes without a description here.
-        label: See there.
         name: See there.
         tags: See there.
         source: See there.
@@ -56,12 +55,11 @@ class RecordingSummary(NamedTuple):
         not_copied: Number of messages whose payloads were not copied yet.
         notes: See there.
         content: Hash of the content of its segments; see `content_of`.
-        look: State of its directory and its journal when its files were read.
+        look: State of its directory and its manifest when its files were read.
         indexed_by: The id of the index that is known to be complete for it; empty if none is.
     """
 
     id: str
-    label: str
     name: str
     tags: dict[str, str]
     source: dict[str, Any]
@@ -85,8 +83,8 @@ class RecordingSummary(NamedTuple):
 
     @property
     def key(self) -> str:
-        """The first 64 bits of the id, 16 hexadecimal digits; index documents refer to it."""
-        return self.id[:16]
+        """The random digits of the id; index documents refer to it."""
+        return self.id[-16:]
 
 
 def topics_to_json(topics: Iterable[TopicType]) -> str:

@@ -19,8 +19,10 @@ import hybridlog as hl
 from hybridlog.across import topic_reader
 from hybridlog.across.match import UNKNOWN, interpolated, match
 from hybridlog_storage.errors import TimeError, TopicError, UsageError
+from hybridlog_storage.manifests import MANIFEST
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests import places
 from tests.calls import Calls
 from tests.cli.within import answer as run
 from tests.limits import Limit
@@ -436,11 +438,9 @@ def test_lost_messages_explain_empty_cells(tmp_path: Path) -> None:
                 payload = json.dumps({"n": second, "pad": "-" * 2000}).encode()
                 for channel in (a, b):
                     recording.write(channel, payload, log_time=BASE + second * 10**9)
-    for line in (path / "recordings" / "now" / "journal").read_text().splitlines():
-        event = json.loads(line[9:])
-        for channel in event.get("channels", ()) if event["event"] == "sealed" else ():
-            if channel["topic"] == "/b" and (channel["first"] - BASE) // 10**9 in {2, 3, 5}:
-                (path / "recordings" / "now" / event["file"]).unlink()
+    for segment, file in places.logs_of(path, "now", "/b"):
+        if file.first is not None and (file.first - BASE) // 10**9 in {2, 3, 5}:
+            segment.unlink()
     with hl.open(path) as store:
         for how, want in (("asof", 3), ("nearest", 3), ("interpolate", 3)):
             aligned = store.align("/a", "/b", how=how, tolerance="0.5s")
@@ -462,14 +462,15 @@ def test_losses_of_an_unknown_time_explain_no_row(tmp_path: Path) -> None:
         with store.start("now") as recording:
             for n, topic in enumerate(("/a", "/b")):
                 recording.write(Channel(topic, "json", None, {}), b"{}", log_time=BASE + n)
-    (tmp_path / "store" / "recordings" / "now" / "journal").unlink()
+    (places.folder(tmp_path / "store", "now") / MANIFEST).unlink()
     with hl.open(tmp_path / "store") as store:
+        store.verify(repair=True)
         aligned = store.align("/a", "/b")
         aligned.to_arrow()
         assert store.topic("/b").completeness().has_losses
         assert aligned.remarks() == [
             "/b: 1 of 1 row is empty: no message came before.",
-            "now has lost its journal, so this answer may not be complete.",
+            "now has lost its manifest once, so this answer may not be complete.",
         ]
 
 

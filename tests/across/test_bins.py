@@ -88,7 +88,7 @@ def test_bins_end_with_their_range(logs: Logs) -> None:
     """Also when the next range begins where the last bin would go on."""
     first = logs.said["b"][0].time
     spans = [(first + 2 * MS, first + 45 * MS), (first + 46 * MS, first + 70 * MS)]
-    (entry,) = [one for one in logs.store.recordings() if one.label == "b"]
+    (entry,) = [one for one in logs.store.recordings() if one.name == "b"]
     rows = [[begin, end, 1] for begin, end in spans]
 
     asked = logs.store.topic("left/pose").where("x > -3")

@@ -15,6 +15,7 @@ from hybridlog.query.intervals import Intervals
 from hybridlog_storage.errors import IncompleteError, UsageError
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests import places
 from tests.cli.within import answer as run
 
 BASE = 1_750_000_000 * 10**9
@@ -44,12 +45,9 @@ def damaged(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Damaged]:
             recording.write(other, payload, log_time=BASE + 12 * SECOND)
         with store.start("whole", settings=settings) as recording:
             recording.write(n, payload, log_time=BASE)
-    journal = (path / "recordings" / "part" / "journal").read_text().splitlines()
-    sealed = [json.loads(line[9:]) for line in journal]
-    for line in sealed:
-        for channel in line.get("channels", ()) if line["event"] == "sealed" else ():
-            if channel["topic"] == "/n" and (channel["first"] - BASE) // SECOND in GONE:
-                (path / "recordings" / "part" / line["file"]).unlink()
+    for segment, file in places.logs_of(path, "part", "/n"):
+        if file.first is not None and (file.first - BASE) // SECOND in GONE:
+            segment.unlink()
     with hl.open(path) as store:
         yield Damaged(store, path)
 

@@ -184,7 +184,7 @@ def test_messages_near_others(
             if inside and holds(near, message):
                 want.append((label, message.number))
     found = [
-        (logs.store.entry(m.recording).label, m.fields["header"]["seq"])  # type: ignore[index]
+        (logs.store.entry(m.recording).name, m.fields["header"]["seq"])  # type: ignore[index]
         for m in query
     ]
     assert sorted(found) == sorted(want)

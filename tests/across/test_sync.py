@@ -193,7 +193,7 @@ def test_sets_of_queries(logs: Logs) -> None:
     assert len(used) == len(set(used))
     starts = {label: said[0].time for label, said in logs.said.items()}
     for _, pose in sets:
-        start = starts[logs.store.entry(pose.recording).label]
+        start = starts[logs.store.entry(pose.recording).name]
         assert 100 * MS <= pose.log_time_ns - start < 900 * MS
 
 

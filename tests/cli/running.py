@@ -9,6 +9,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+from tests import places
 from tests.cli.fork_server import fork_server
 from tests.cli.within import Answer
 
@@ -103,14 +104,9 @@ def started(
 def open_bytes(store: Path) -> int:
     """Bytes in segments that are being written."""
     total = 0
-    for path in store.glob("recordings/*/*.mcap.open"):
+    for path in places.files(store, "*.mcap.open"):
         try:
             total += path.stat().st_size
         except FileNotFoundError:
             continue
     return total
-
-
-def recordings(store: Path) -> list[str]:
-    """What lies in a store's directory of recordings, hidden or not."""
-    return sorted(path.name for path in (store / "recordings").iterdir())

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pytest
 
 import hybridlog as hl
 from hybridlog.live.control_server import ControlServer
+from hybridlog_storage.manifests import MANIFEST, MANIFEST_OLD
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests import places
 from tests.waiting import wait_for
 
 from .running import run
@@ -35,13 +36,10 @@ def damaged(tmp_path: Path) -> Path:
                     channel = LATE if second == 3 else KEPT
                     time = BEGIN_NS + second * SECOND_NS
                     recording.write(channel, PAYLOAD, log_time=time)
-    part = path / "recordings" / "part"
-    lines = [json.loads(line[9:]) for line in (part / "journal").read_text().splitlines()]
-    sealed = [line for line in lines if line["event"] == "sealed"]
-    assert len(sealed) > 2
-    (last,) = (line for line in sealed if any(c["topic"] == "/late" for c in line["channels"]))
-    (part / last["file"]).unlink()
-    for segment in (path / "recordings" / "gone").glob("*.mcap"):
+    assert len(places.manifest(path, "part").logs) > 2
+    ((last, _),) = places.logs_of(path, "part", "/late")
+    last.unlink()
+    for segment in places.folder(path, "gone").glob("*.mcap"):
         segment.unlink()
     return path
 
@@ -81,15 +79,15 @@ def test_what_was_lost_may_have_been_current_at_a_time(damaged: Path) -> None:
 
     assert "part is not complete" in at(3.5, "/late", "part", code=2)
     assert "gone is not complete" in at(3.5, "/kept", "gone", code=2)
-    (damaged / "recordings" / "gone").rename(damaged / "gone")
+    places.folder(damaged, "gone").rename(damaged / "gone")
     assert "not complete" not in at(2, "/kept", "part")
-    min((damaged / "recordings" / "part").glob("*.mcap")).unlink()
+    min(places.folder(damaged, "part").glob("*.mcap")).unlink()
     assert "part is not complete" in at(0.5, "/kept", "part", code=2)
     assert "part is not complete" not in at(1.5, "/kept", "part")
 
 
 def test_relative_times_mean_what_they_meant(damaged: Path) -> None:
-    first = min((damaged / "recordings" / "part").glob("*.mcap"))
+    first = min(places.folder(damaged, "part").glob("*.mcap"))
     first.unlink()
     for begin, is_whole in (("+0s", False), ("+0.5s", True)):
         asked = ("fetch", "-t", "/kept", "-r", "part", "--between", begin, "+1.5s", "--count")
@@ -104,15 +102,26 @@ def test_what_was_lost_is_not_called_a_damaged_source(damaged: Path) -> None:
     assert rows["gone"].endswith("stored data lost")
 
 
-def test_a_lost_journal_is_said_with_answers(damaged: Path) -> None:
-    (damaged / "recordings" / "part" / "journal").unlink()
+@pytest.mark.parametrize("has_old", [True, False])
+def test_a_lost_manifest_is_said_with_answers(damaged: Path, has_old: bool) -> None:
+    recording = places.id_of(damaged, "part")
+    (places.folder(damaged, "part") / MANIFEST).unlink()
+    if not has_old:
+        (places.folder(damaged, "part") / MANIFEST_OLD).unlink()
+    done = run("fetch", "-t", "/kept", "--count", store=damaged, code=None)
+    assert done.out == "0\n"
+    assert f"Recording {recording} cannot be read: {recording} has no manifest" in done.err
+    assert "1 recording cannot be read and is left out" in done.err
+    run("fetch", "-t", "/kept", "--count", "--strict", store=damaged, code=11)
+    run("verify", "--repair", store=damaged, code=None)
     done = run("fetch", "-t", "/kept", "-r", "part", "--count", store=damaged)
     assert done.out == "3\n"
-    assert "part has lost its journal, so this answer may not be complete." in done.err
+    assert "part has lost its manifest once, so this answer may not be complete." in done.err
     info = run("info", "part", store=damaged).out
-    assert "not known: its journal was lost, so a segment may be missing" in info
+    why = "not known: its manifest was lost, so a segment may be missing"
+    assert ("1 message lost in 1 place" if has_old else why) in info
     done = run("fetch", "-t", "/kept", "-r", "part", "--count", store=damaged)
-    assert "part has lost its journal" in done.err
+    assert "part has lost its manifest once" in done.err
 
 
 def test_info_shows_notes_and_marks(damaged: Path) -> None:
@@ -141,7 +150,9 @@ def test_messages_that_are_not_written_yet_are_counted(tmp_path: Path) -> None:
             recording.write(KEPT, PAYLOAD, log_time=BEGIN_NS + second * SECOND_NS)
         wait_for(is_known)
         state = {"taken": {"/kept": 15, "/other": 100}}
-        recorder = ControlServer(tmp_path / "store", "now", {"state": lambda _: state})
+        recorder = ControlServer(
+            tmp_path / "store", recording.id, "now", {"state": lambda _: state}
+        )
         try:
             done = run("fetch", "-t", "/kept", "--count", store=tmp_path / "store")
         finally:

@@ -84,9 +84,7 @@ def test_times(store: Path, seen: list[Seen], scans: list[Seen], start: int) -> 
         done = run(*SCAN, "--between", *between, "--fields", "scan_time", store=store)
         assert [json.loads(line)["log_time_ns"] for line in done.lines] == wanted, between
     last = run(*SCAN, "--between", "-1s", "end", "--count", store=store)
-    end = max(
-        r["last_ns"] for r in run("ls", "--json", store=store).json if r["recording"] == "robot"
-    )
+    end = max(r["last_ns"] for r in run("ls", "--json", store=store).json if r["name"] == "robot")
     assert int(last.out) == sum(m.log_time >= end + 1 - SECOND for m in scans)
 
 
@@ -321,7 +319,7 @@ def test_the_answer_says_how_complete_it_is(store: Path) -> None:
     whole = run("fetch", "-t", "scan", "-r", "robot", "--count", store=store)
     assert "complete" not in whole.err
     # Where the time range does not meet a recording, its losses do not matter.
-    entries = {r["recording"]: r for r in run("ls", "--json", store=store).json}
+    entries = {r["name"]: r for r in run("ls", "--json", store=store).json}
     robot, other = entries["robot"], entries["torn"]
     assert other["last_ns"] < robot["start_ns"] or robot["last_ns"] < other["start_ns"]
     between = (robot["start_ns"], robot["start_ns"] + SECOND)

@@ -17,6 +17,7 @@ from hybridlog.cli.info import _channel_row
 from hybridlog.cli.output import parse_size, quoted
 from hybridlog_storage.catalog import ChannelEntry
 from hybridlog_storage.messages import REDUCED, Channel, Schema
+from tests import places
 from tests.independent import read_bag
 
 from .odd_log import HOSTILE_NAME
@@ -57,7 +58,7 @@ def test_info(logs: Path, store: Path) -> None:
     assert "latched" in text
     assert re.search(r"^index +the MongoDB that comes with hybridlog *$", text, re.MULTILINE)
     assert re.search(rf"^id +{found['id']} *$", text, re.MULTILINE)
-    assert re.fullmatch("[0-9a-f]{32}", found["id"])
+    assert re.fullmatch("[0-9]{8}-robot-[0-9a-f]{16}", found["id"])
 
 
 def test_info_without_a_name_shows_all_and_the_losses(store: Path) -> None:
@@ -79,7 +80,7 @@ def test_info_of_what_a_program_recorded_names_no_address(tmp_path: Path) -> Non
 
 
 def test_info_of_a_segment(logs: Path, store: Path) -> None:
-    path = store / "recordings/robot/000000.mcap"
+    path = places.segment(store, "robot")
     found = run("info", path, "--json").json
     assert found["recording"]["name"] == "robot"
     assert found["recording"]["id"] == run("info", "robot", "--json", store=store).json["id"]

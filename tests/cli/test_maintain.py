@@ -11,11 +11,12 @@ from pathlib import Path
 import pytest
 
 import hybridlog as hl
+from tests import places
 from tests.imports import ROOT
 from tests.independent import read_bag
 from tests.other_user import User, needs_root, open_place
 
-from .running import recordings, run
+from .running import run
 
 pytestmark = pytest.mark.mongo
 
@@ -36,7 +37,7 @@ def test_verify_and_reindex(logs: Path, fresh: Path) -> None:
 
 
 def test_verify_lists_what_is_off(fresh: Path) -> None:
-    (path,) = (fresh / "recordings/small").glob("*.mcap")
+    (path,) = places.folder(fresh, "small").glob("*.mcap")
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 1
     path.write_bytes(data)
@@ -58,9 +59,9 @@ def test_rm(logs: Path, fresh: Path) -> None:
     refused = run("rm", "odd", store=fresh, code=2)
     assert "--yes" in refused.err
     run("rm", "nothing", "--yes", store=fresh, code=2)
-    assert recordings(fresh) == ["odd", "small"]
+    assert places.names(fresh) == ["odd", "small"]
     assert run("rm", "odd", "--yes", store=fresh).out == "deleted odd\n"
-    assert recordings(fresh) == ["small"]
+    assert places.names(fresh) == ["small"]
     assert "all is well" in run("verify", store=fresh).out
     assert "/json" in run("fetch", "-t", "/json", store=fresh, code=2).err
     assert run("rm", "small", "-yq", store=fresh).out == ""
@@ -96,7 +97,7 @@ def test_a_newer_store(logs: Path, tmp_path: Path) -> None:
     store = tmp_path / "s"
     run("record", logs / "odd.mcap", "-q", store=store)
     settings = store / "hybridlog.toml"
-    settings.write_text(settings.read_text().replace("format = 3", "format = 99"))
+    settings.write_text(settings.read_text().replace("format = 4", "format = 99"))
     for command in (("ls",), ("record", logs / "small.bag"), ("fetch", "-t", "x")):
         done = run(*command, store=store, code=5)
         assert "format 99" in done.err
@@ -105,13 +106,13 @@ def test_a_newer_store(logs: Path, tmp_path: Path) -> None:
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="the next test does the same as another user")
 def test_a_store_that_cannot_be_written(logs: Path, fresh: Path) -> None:
-    places = [fresh, fresh / "recordings", fresh / "mongod"]
-    for place in places:
+    closed = [fresh, places.root(fresh), fresh / "mongod"]
+    for place in closed:
         place.chmod(0o500)
     try:
         run("record", logs / "odd.mcap", store=fresh, code=5)
     finally:
-        for place in places:
+        for place in closed:
             place.chmod(0o700)
 
 
@@ -127,7 +128,11 @@ def test_a_store_that_another_user_cannot_write(logs: Path) -> None:
         assert user.run("rm", "-y", "small", *where, code=None).code in {5, 6}
         count = ("fetch", "-t", "/imu/data", "--count", "-q", *where)
         assert user.run(*count).out == run(*count).out
-        assert recordings(store) == ["small"]
+        assert places.names(store) == ["small"]
+        (store / "catalog.sqlite").unlink()
+        for folder in (store, store / "tables", places.root(store)):
+            folder.chmod(0o777)
+        assert user.run(*count).out == run(*count).out
 
 
 def test_the_default_store_is_in_the_working_directory(
@@ -135,7 +140,7 @@ def test_the_default_store_is_in_the_working_directory(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     run("record", logs / "odd.mcap", "-q")
-    assert recordings(tmp_path / "hybridlog-store") == ["odd"]
+    assert places.names(tmp_path / "hybridlog-store") == ["odd"]
     assert "odd" in run("ls").out
 
 

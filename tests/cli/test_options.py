@@ -91,13 +91,11 @@ def test_ages_choose(tmp_path: Path) -> None:
                 for age in ages:
                     text = json.dumps({"age": age}).encode()
                     recording.write(CHANNEL, text, log_time=now - age * day)
-        labels = [one.label for one in opened.recordings(older_than="30d")]
+        labels = [one.name for one in opened.recordings(older_than="30d")]
         assert labels == ["old"]
 
     def found(*words: str) -> list[str]:
-        return [
-            one["recording"] for one in answer("ls", *words, "--json", store=tmp_path / "s").json
-        ]
+        return [one["name"] for one in answer("ls", *words, "--json", store=tmp_path / "s").json]
 
     assert found("--last", "30d") == ["both", "new"]
     assert found("--older-than", "30d") == ["old"]

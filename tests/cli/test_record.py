@@ -13,11 +13,12 @@ import pytest
 from mcap.writer import Writer
 
 import hybridlog as hl
+from tests import places
 from tests.data import DATA, needs_data
 from tests.independent import read_bag
 from tests.json_schemas import misfit, schema_of
 
-from .running import recordings, run, started
+from .running import run, started
 
 pytestmark = pytest.mark.mongo
 
@@ -47,7 +48,7 @@ def test_the_closing_table(logs: Path, tmp_path: Path) -> None:
 def test_json_is_exact(logs: Path, tmp_path: Path) -> None:
     done = run("record", logs / "small.bag", "--store", tmp_path / "s", "--json").json
     seen = read_bag(logs / "small.bag")
-    stored = sum(p.stat().st_size for p in (tmp_path / "s/recordings/small").glob("*.mcap"))
+    stored = sum(p.stat().st_size for p in places.folder(tmp_path / "s", "small").glob("*.mcap"))
     assert done["messages"] == done["messages_indexed"] == len(seen)
     assert done["bytes_in"] == (logs / "small.bag").stat().st_size
     assert done["bytes_stored"] == stored
@@ -76,15 +77,14 @@ def test_choices(logs: Path, tmp_path: Path) -> None:
     )
     wanted = [m for m in seen if m.topic == "/imu/data" and 10**9 <= m.log_time - start < 2 * 10**9]
     found = run("info", "--json", store=tmp_path / "s").json[0]
-    assert found["name"] == "my run/1"
-    assert found["recording"] == "my-run-1"
+    assert found["name"] == "my run-1"
     assert found["tags"] == {"a": "b=c", "d": ""}
     assert [(c["topic"], c["messages"]) for c in found["channels"]] == [("/imu/data", len(wanted))]
     assert found["chunks"] > 1
 
     from mcap.reader import make_reader
 
-    with (tmp_path / "s/recordings/my-run-1/000000.mcap").open("rb") as file:
+    with places.segment(tmp_path / "s", found["name"]).open("rb") as file:
         summary = make_reader(file).get_summary()
     assert summary is not None
     assert {c.compression for c in summary.chunk_indexes} <= {"lz4", ""}
@@ -105,7 +105,7 @@ def test_a_slice_has_latched_messages_in_front(logs: Path, tmp_path: Path) -> No
         first = min(m.log_time for m in inside)
         empty = ("--between", f"{first + 1}ns", f"{first + 2}ns")
         assert "has no message from" in run(*asked, *empty, store=tmp_path / "s", code=2).err
-        assert len(recordings(tmp_path / "s")) == 2
+        assert len(places.names(tmp_path / "s")) == 2
 
 
 def test_several_paths(logs: Path, tmp_path: Path) -> None:
@@ -116,7 +116,7 @@ def test_several_paths(logs: Path, tmp_path: Path) -> None:
     )
     assert [line.split()[0] for line in done.lines] == ["recording", "small", "odd", "total"]
     assert "nothing.bag: no such file" in done.err
-    assert recordings(tmp_path / "s") == ["odd", "small"]
+    assert places.names(tmp_path / "s") == ["odd", "small"]
 
     again = run(
         "record", logs / "odd.mcap", logs / "robot.bag", "--json", store=tmp_path / "s", code=8
@@ -132,9 +132,9 @@ def test_the_same_content_is_noticed(logs: Path, fresh: Path, tmp_path: Path) ->
     done = run("record", copy, store=fresh, code=8)
     assert "'small'" in done.err
     assert "--again" in done.err
-    assert recordings(fresh) == ["small"]
+    assert places.names(fresh) == ["small"]
     run("record", copy, "--again", store=fresh)
-    assert recordings(fresh) == ["other-name", "small"]
+    assert places.names(fresh) == ["other-name", "small"]
 
 
 def test_large_fields_fit_their_definition(tmp_path: Path) -> None:
@@ -191,7 +191,7 @@ def test_wrong_options(logs: Path, tmp_path: Path, options: tuple[str, ...], wor
     done = run("record", logs / "small.bag", *options, store=tmp_path / "s", code=2)
     assert words in done.err
     assert done.out == ""
-    assert not (tmp_path / "s").exists() or recordings(tmp_path / "s") == []
+    assert not (tmp_path / "s").exists() or places.names(tmp_path / "s") == []
 
 
 def test_a_log_that_gives_nothing_makes_no_store(tmp_path: Path) -> None:
@@ -264,4 +264,4 @@ def test_one_log_recorded_three_times_at_once(logs: Path, tmp_path: Path) -> Non
         ]
         codes = sorted(process.wait(120) for process in three)
     assert codes == [0, 8, 8], (tmp_path / "out").read_text()
-    assert recordings(tmp_path / "s") == ["small"]
+    assert places.names(tmp_path / "s") == ["small"]

@@ -16,6 +16,7 @@ from hybridlog.cli import watching
 from hybridlog.cli.app import app
 from hybridlog.cli.signals import Stopped
 from hybridlog_storage.errors import DatabaseError, HybridlogError
+from tests import places
 from tests.calls import Calls
 from tests.formats.test_find import METADATA, mcap
 
@@ -35,7 +36,7 @@ def opened(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
 def store(opened: hl.Store) -> Path:
     """A store without recordings, whose MongoDB runs."""
     opened.refresh()
-    for label in opened.recordings().labels:
+    for label in opened.recordings().names:
         opened.remove(label)
     return opened.directory.path
 
@@ -65,7 +66,7 @@ def record(store: Path, *words: object) -> tuple[int, str, str]:
 
 def counts(store: Path) -> dict[str, int]:
     with hl.open(store) as opened:
-        return {one.label: one.messages for one in opened.summaries()}
+        return {one.name: one.messages for one in opened.summaries()}
 
 
 def test_all_logs_below_a_directory_are_recorded_once(top: Path, store: Path) -> None:
@@ -94,7 +95,7 @@ def test_one_error_does_not_stop_the_others(top: Path, store: Path) -> None:
     inner = top / "inner"
     inner.mkdir()
     (inner / "hybridlog.toml").touch()
-    mcap(inner / "recordings" / "r" / "000000.mcap")
+    mcap(places.new_folder(inner, "r") / "000000.mcap")
     code, _, err = record(store, top, "-q")
     assert code == 3  # of the first error
     assert counts(store) == {"a": 1, "run": 5, "other": 4, "bag": 11, "torn": 3}

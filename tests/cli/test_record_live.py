@@ -34,8 +34,9 @@ from hybridlog.live.statistics import TopicState
 from hybridlog.record.recorder import RecordReport
 from hybridlog_storage.catalog import RecordingEntry
 from hybridlog_storage.errors import UsageError
+from tests import places
 from tests.cli import odd_log
-from tests.cli.running import BACKGROUND, COMMAND, complete, environment, recordings, run
+from tests.cli.running import BACKGROUND, COMMAND, complete, environment, run
 from tests.independent import read
 
 pytestmark = pytest.mark.mongo
@@ -236,14 +237,14 @@ def test_what_a_power_cut_left_is_recovered_behind_the_new_recording(
     program = (sys.executable, "-c", RECOVERS_WHEN_TOLD, str(told))
     with recorder(store, *replay, "--speed", 0.1, program=program) as process:
         assert until_it_speaks(process)["name"] == "robot-2"
-        assert [one.suffix for one in (store / "recordings/robot").glob("0*")] == [".open"]
+        assert [one.suffix for one in places.folder(store, "robot").glob("0*")] == [".open"]
         told.touch()
         assert process.stderr is not None
         kept = re.search(r"robot was cut short by a crash: (\d+) mes", process.stderr.readline())
         report, _ = end_and_hear(process)
     (recording,) = report["recordings"]
     assert recording["messages"] == report["messages_received"] > 0
-    found = {one["recording"]: one for one in run("ls", "--json", store=store).json}
+    found = {one["name"]: one for one in run("ls", "--json", store=store).json}
     assert {label: one["status"] for label, one in found.items()} == {
         "robot": "recovered",
         "robot-2": "complete",
@@ -316,7 +317,7 @@ def test_a_recorder_is_visited(logs: Path, tmp_path: Path) -> None:
         # By name, by the beginning of the id, and by nothing at all.
         run("mark", "gripper slipped", "--set-tag", "trial=7", "-r", "first drive", store=store)
         state = run(
-            "top", "first-d", "--json", "--once", "--field", "base/scan:ranges.min", store=store
+            "top", "first d", "--json", "--once", "--field", "base/scan:ranges.min", store=store
         ).json
         assert state["messages"] > 0
         (field,) = state["fields"]
@@ -329,7 +330,7 @@ def test_a_recorder_is_visited(logs: Path, tmp_path: Path) -> None:
         refused = run("trigger", "now", store=store, code=2)
         assert "--ring" in refused.err
         assert "No running recorder matches" in run("mark", "x", "-r", "b", store=store, code=2).err
-        assert complete(f"mark x --store {store} -r fi") == ["first-drive"]
+        assert complete(f"mark x --store {store} -r fi") == ["first drive"]
         assert_it_is_told_as_it_is(store)
         assert_ctrl_c_leaves_top(store)
         end(process)
@@ -345,13 +346,13 @@ def test_a_recorder_is_visited(logs: Path, tmp_path: Path) -> None:
 def assert_it_is_told_as_it_is(store: Path) -> None:
     """Commands know the topics and messages of a recording that goes on."""
     (entry,) = run("ls", "--json", store=store).json
-    assert (entry["recording"], entry["status"]) == ("first-drive", "open")
+    assert (entry["name"], entry["status"]) == ("first drive", "open")
     assert "being recorded" in run("ls", store=store).out
     info = run("info", store=store).out
-    assert "being recorded; `hybridlog top first-drive` shows it" in info
+    assert "being recorded; `hybridlog top 'first drive'` shows it" in info
     (told,) = re.findall(r"(?m)^messages +(\d+)$", info)
     assert int(told) >= entry["messages"] > 0
-    assert "first-drive is still being recorded" in run("info", "--losses", store=store).err
+    assert "first drive is still being recorded" in run("info", "--losses", store=store).err
     assert int(run("fetch", "-t", "/imu/data", "--count", store=store).out) > 0
 
 
@@ -457,7 +458,7 @@ def test_nothing_is_left_is_told_and_a_disk_without_room_is_code_7(
     done = run(*arguments, "4000TB", "-q", store=tmp_path / "store", code=7)
     assert "--reserve" in done.err
     assert done.out == ""
-    assert recordings(tmp_path / "store") == []
+    assert places.names(tmp_path / "store") == []
     done = run(*arguments, 0, "-t", "/imu/*", "-x", "/imu/*", store=tmp_path / "store")
     assert "no topic is left" in done.err
 
@@ -486,7 +487,7 @@ def test_a_robot_that_was_never_there_is_told(tmp_path: Path) -> None:
     for address in ("http://127.0.0.1:1", "ws://127.0.0.1:1"):
         assert f"hybridlog: {address} was never reached" in done.err
     assert "Nothing was stored." in done.err
-    assert recordings(tmp_path / "store") == []
+    assert places.names(tmp_path / "store") == []
     assert run("ls", "--json", store=tmp_path / "store").json == []
 
 
@@ -505,7 +506,7 @@ def test_a_number_of_losses_that_nobody_knows(
 ) -> None:
     rows = [{"topic": None, "cause": "unreadable", "count": count} for count in counts]
     source = {"path": "x", "kind": "replay", "bytes": 0}
-    entry = RecordingEntry("r", 1, "r", {}, source, 0, "complete", {"losses": rows})
+    entry = RecordingEntry("r", "r", {}, source, 0, "complete", {"losses": rows})
     state = state_with({"unreadable": known})
     found = dict(closing_rows(RecordReport(entry, [], 0, 0, None, 0, 1.0), state, []))
     assert found["lost: unreadable"] == f"{shown} (any)"

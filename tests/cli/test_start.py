@@ -367,7 +367,7 @@ UNNEEDED = {
 @pytest.mark.parametrize(
     ("wanted", "most"),
     # A slice parses definitions, to complete them.
-    [(("--count",), 114), (("-F", "raw"), 114), (("-F", "mcap"), 131)],
+    [(("--count",), 120), (("-F", "raw"), 120), (("-F", "mcap"), 137)],
 )
 def test_a_fetch_by_topic_and_time_imports_what_it_needs(
     wanted: tuple[str, ...], most: int, store: Path

@@ -17,6 +17,7 @@ import pytest
 
 from hybridlog.cli.signals import SIGNALS
 from hybridlog_storage.mongo.mongod import find_mongod
+from tests import places
 from tests.calls import Calls
 from tests.independent import read_bag
 from tests.waiting import wait_for
@@ -26,7 +27,6 @@ from .running import (
     COMMAND,
     environment,
     open_bytes,
-    recordings,
     run,
     started,
 )
@@ -55,8 +55,8 @@ def test_a_stopped_record_leaves_nothing(
     text = (tmp_path / "out").read_text()
     assert f"Nothing of {logs / 'robot.bag'} is stored. 1 recording stored before" in text
     assert "Traceback" not in text
-    assert recordings(fresh) == ["odd", "small"]
-    assert {r["recording"] for r in run("ls", "--json", store=fresh).json} == {"odd", "small"}
+    assert places.names(fresh) == ["odd", "small"]
+    assert {r["name"] for r in run("ls", "--json", store=fresh).json} == {"odd", "small"}
     assert "all is well" in run("verify", store=fresh).out
 
 
@@ -68,7 +68,7 @@ def test_the_second_ctrl_c_waits_for_the_first(logs: Path, fresh: Path, tmp_path
         process.send_signal(signal.SIGINT)
         process.send_signal(signal.SIGINT)
         assert process.wait(60) == 130
-    assert recordings(fresh) == ["small"]
+    assert places.names(fresh) == ["small"]
     assert "Traceback" not in (tmp_path / "out").read_text()
 
 
@@ -164,7 +164,7 @@ def test_a_signal_never_finds_a_lock_that_it_leaves_held(
     assert codes == [f"{moment} 143" for moment in LOCKED], ended.stdout
     assert ended.stdout.count(f"Nothing of {logs / 'robot.bag'} is stored.") == len(LOCKED)
     assert "Traceback" not in ended.stdout
-    assert recordings(fresh) == ["small"]
+    assert places.names(fresh) == ["small"]
 
 
 @pytest.mark.exhaustive
@@ -183,9 +183,9 @@ def test_a_stop_at_any_time_ends_it_and_leaves_nothing(
             code = process.wait(60)
         assert code in {0, -signals[0], *(128 + one for one in signals)}, out.read_text()
         assert code <= 0 or "Traceback" not in out.read_text()
-        if "robot" in recordings(fresh):
+        if "robot" in places.names(fresh):
             run("rm", "robot", "--yes", store=fresh)
-        assert recordings(fresh) == ["small"]
+        assert places.names(fresh) == ["small"]
 
 
 STOPS_ITSELF = """
@@ -308,8 +308,8 @@ def test_no_space(logs: Path, fresh: Path, tmp_path: Path) -> None:
     code, text = run_limited(400, "record", logs / "robot.bag", "--store", fresh)
     assert code == 7
     assert "No space left" in text
-    assert recordings(fresh) == ["small"]
-    assert [r["recording"] for r in run("ls", "--json", store=fresh).json] == ["small"]
+    assert places.names(fresh) == ["small"]
+    assert [r["name"] for r in run("ls", "--json", store=fresh).json] == ["small"]
     out = tmp_path / "out"
     out.mkdir()
     for form in ("mcap", "bag", "csv", "npz"):
@@ -419,7 +419,7 @@ def test_two_record_into_one_store(logs: Path, tmp_path: Path) -> None:
         ]
         codes = [process.wait(120) for process in both]
     assert codes == [0, 0], (tmp_path / "out").read_text()
-    assert recordings(store) == ["odd", "small"]
+    assert places.names(store) == ["odd", "small"]
     assert "all is well" in run("verify", store=store).out
 
 

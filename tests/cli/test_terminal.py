@@ -22,8 +22,9 @@ import pytest
 
 import hybridlog as hl
 from hybridlog_storage.messages import Channel
+from tests import places
 
-from .running import COMMAND, environment, open_bytes, recordings, run
+from .running import COMMAND, environment, open_bytes, run
 
 CONTROL = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]|\x1b[()][A-Z0-9]")
 
@@ -141,7 +142,7 @@ def test_no_word_is_broken_at_eighty_columns(store: Path) -> None:
 
 def test_eighty_columns_hold_a_robot_without_a_fold(store: Path) -> None:
     topics = {one["topic"] for one in run("check", "-r", "robot", "--json", store=store).json}
-    segment = store / "recordings/robot/000000.mcap"
+    segment = places.segment(store, "robot")
     for command in (("info", "robot"), ("info", segment), ("check", "-r", "robot")):
         code, shown = on_terminal(*command, "--store", store, width=80)
         assert code == 0
@@ -314,10 +315,10 @@ def test_rm_asks(fresh: Path) -> None:
     code, shown = on_terminal("rm", "small", "--store", fresh, typed=b"n\n")
     assert code == 1
     assert "Nothing is deleted." in shown
-    assert recordings(fresh) == ["small"]
+    assert places.names(fresh) == ["small"]
     code, shown = on_terminal("rm", "small", "--store", fresh, typed=b"y\n")
     assert code == 0
-    assert recordings(fresh) == []
+    assert places.names(fresh) == []
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -354,7 +355,7 @@ def test_ctrl_c(logs: Path, fresh: Path) -> None:
     assert "robot.bag is stored" in plain(shown).replace("\n", " ")
     # The cursor that the bar has hidden is back.
     assert shown.rindex("\x1b[?25h") > shown.rindex("\x1b[?25l")
-    assert recordings(fresh) == ["small"]
+    assert places.names(fresh) == ["small"]
 
 
 def test_eighty_columns_lose_no_end_and_no_late_start(store: Path) -> None:

@@ -172,7 +172,7 @@ def play(store: hl.Store, sent: list[Sent], name: str, lost: int | None = 0) -> 
         if lost != 0:
             live.ledger.note(Loss("/scan", Cause.QUEUE, lost, first=START, last=START))
             live.ledger.note(Loss("/scan", Cause.THROTTLE, 9, first=START, last=START))
-    return live.label
+    return live.name
 
 
 @pytest.fixture(scope="module")
@@ -298,7 +298,7 @@ def test_a_good_real_log_keeps_its_own_contract(name: str, tmp_path: Path) -> No
         assert not broken(store.judge(contract))
         if name != "tilt_laser.bag":  # its topics come now and then
             assert any(rules.rate for rules in contract.topics.values())
-        (label,) = store.recordings().labels
+        (label,) = store.recordings().names
         path = tmp_path / "made.yaml"
         assert run("check", "-r", label, "--make", path, store=tmp_path / "s").code == 0
         assert Contract.read(path) == contract

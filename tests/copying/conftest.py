@@ -20,6 +20,7 @@ from hybridlog.record.losses import losses_of
 from hybridlog.store import receiving
 from hybridlog_storage.errors import HybridlogError, PayloadError, StoreError
 from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests import places
 from tests.payloads.logs import robot, write_log
 
 SETTINGS = SegmentSettings(chunk_size=8 << 10, segment_size=14 << 10)
@@ -45,12 +46,12 @@ def robots(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path / "store"
 
 
-def expire(store: hl.Store, label: str, segments: Sequence[int] = ()) -> None:
+def expire(store: hl.Store, name: str, segments: Sequence[int] = ()) -> None:
     """Delete the payloads of segments of a recording; without, of all."""
-    directory = store.directory
-    with directory.writing(label):
-        numbers = segments or [*directory.listing(label).sealed]
-        expiry.expire(directory, label, numbers, min_bytes=0)
+    directory, recording = store.directory, places.id_of(store.directory.path, name)
+    with directory.writing(recording):
+        numbers = segments or [*directory.listing(recording).sealed]
+        expiry.expire(directory, recording, numbers, min_bytes=0)
     store.shared.catch_up()
 
 
@@ -186,9 +187,9 @@ def _answers(store: hl.Store, label: str) -> dict[str, Any]:
 
 
 def files_in(recording: Path) -> dict[str, str]:
-    """Digests of the files of a recording, but for its journal and its lock."""
+    """Digests of the files of a recording, but for its manifests and its locks."""
     return {
         path.relative_to(recording).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
         for path in sorted(recording.rglob("*"))
-        if path.is_file() and path.name not in {"journal", "writer.lock"}
+        if path.is_file() and path.suffix not in {".json", ".old", ".lock"}
     }

@@ -18,6 +18,7 @@ from hybridlog.schema.states import CAUSES, State, without_payload
 from hybridlog.view.context import Context
 from hybridlog.view.tools import recordings
 from hybridlog_storage.errors import PayloadError
+from tests import places
 from tests.cli.running import run, started
 from tests.cli.within import answer
 from tests.copying.conftest import answers, expire
@@ -89,7 +90,7 @@ def test_copies_to_a_directory(
         for there in ("./lab:here", "lab:data"):
             store.copy(there, ["noted"])
     for there in ("home", "lab:here", "lab:data"):
-        assert (tmp_path / there / "recordings" / "noted").is_dir()
+        assert places.folder(tmp_path / there, "noted").is_dir()
     assert run("copy", tmp_path / "x", "--store", robots, "--limit-rate", "0", code=2).err
     assert run("copy", "nosuch", tmp_path / "x", "--store", robots, code=2).err
 

@@ -10,20 +10,23 @@ import shutil
 import threading
 import time
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import pytest
+from msgspec import structs
 
 import hybridlog as hl
 from hybridlog.maintenance import copying, ssh
 from hybridlog.maintenance.copying import CopyOptions, CopyReport, run
-from hybridlog.maintenance.places import CopiedFile, Place
+from hybridlog.maintenance.places import CopiedFile, Place, RefusedError, merged
+from hybridlog_storage import manifest, manifests
 from hybridlog_storage.disk import files
 from hybridlog_storage.disk.directory import StoreDirectory
 from hybridlog_storage.errors import DiskFullError, HeldError, StoreError, UsageError
+from tests import places
 from tests.calls import Calls
 from tests.copying.conftest import (
     STATES,
@@ -59,16 +62,16 @@ def place_at(request: pytest.FixtureRequest) -> PlaceAt:
     return PLACES[request.param]
 
 
-def copied(source: Path, place: Any, *labels: str, **options: Any) -> CopyReport:
-    """Copy recordings of a store; all without labels."""
+def copied(source: Path, place: Any, *names: str, **options: Any) -> CopyReport:
+    """Copy recordings of a store; all without names."""
     with hl.open(source, mongo="none") as store:
-        chosen = [one for one in store.summaries() if not labels or one.label in labels]
+        chosen = [one for one in store.summaries() if not names or one.name in names]
         return run(store.directory, place, chosen, CopyOptions(**options))
 
 
-def labels_in(path: Path) -> list[str]:
+def names_in(path: Path) -> list[str]:
     with hl.open(path, mongo="none") as store:
-        return sorted(one.label for one in store.summaries())
+        return sorted(one.name for one in store.summaries())
 
 
 @pytest.mark.parametrize("step", [4, pytest.param(1, marks=pytest.mark.exhaustive)])
@@ -79,14 +82,14 @@ def test_a_copy_that_was_cut_goes_on(
     with place_at(tmp_path / "whole") as place:
         whole = Disturbed(place)
         total = copied(robots, whole, label).bytes_copied
-    right = files_in(robots / "recordings" / label)
+    right = files_in(places.folder(robots, label))
     for number in range(1, len(whole.asked), step):
         target = tmp_path / str(number)
         with suppress(StoreError), place_at(target) as place:
             cut = Disturbed(place, number)
             copied(robots, cut, label)
         # Nothing is believed before all of it is there.
-        assert not [*(target / "recordings").glob("[!.]*")]
+        assert not [*places.root(target).glob("[!.]*")]
         with place_at(target) as place:
             report = copied(robots, place, label)
             assert report.copied == [label]
@@ -94,8 +97,8 @@ def test_a_copy_that_was_cut_goes_on(
             counted = Disturbed(place)
             assert copied(robots, counted, label).known == [label]
         assert counted.asked == ["sees", "have"]  # of all that are there already
-        assert files_in(target / "recordings" / label) == right
-        assert [path.name for path in (target / "recordings").iterdir()] == [label]
+        assert files_in(places.folder(target, label)) == right
+        assert places.names(target) == [label]
         shutil.rmtree(target)
 
 
@@ -105,7 +108,7 @@ def test_a_connection_is_cut_at_any_byte(robots: Path, tmp_path: Path) -> None:
     for number in range(ROUNDS):
         with suppress(StoreError), server_at(tmp_path / "lab", draw.randrange(20_000)) as place:
             copied(robots, place, "noted", piece=1000)
-        hidden = [*(tmp_path / "lab" / "recordings").glob(".importing-*/*.mcap")]
+        hidden = [*places.root(tmp_path / "lab").glob(".importing-*/*.mcap")]
         before, arrived = arrived, sum(path.stat().st_size for path in hidden)
         assert arrived >= before, number
     with server_at(tmp_path / "lab") as place:
@@ -120,12 +123,12 @@ def test_a_store_is_no_copy_of_itself(
     store = tmp_path / "store"
     shutil.copytree(robots, store)
     (tmp_path / "link").symlink_to(store)
-    before = {path: path.read_bytes() for path in (store / "recordings").rglob("*.mcap")}
+    before = {path: path.read_bytes() for path in places.root(store).rglob("*.mcap")}
     for spelled in (store, tmp_path / "link", tmp_path / "link" / ".." / "store"):
         with place_at(spelled) as place, pytest.raises(UsageError, match="this very store"):
             copied(store, place, then_expire=expires)
-    assert {path: path.read_bytes() for path in (store / "recordings").rglob("*.mcap")} == before
-    assert sorted(path.name for path in (store / "recordings").iterdir()) == sorted(STATES)
+    assert {path: path.read_bytes() for path in places.root(store).rglob("*.mcap")} == before
+    assert places.names(store) == sorted(STATES)
     # A backup has the same id, and is another store.
     with place_at(robots) as place:
         assert sorted(copied(store, place, then_expire=expires).known) == sorted(STATES)
@@ -135,7 +138,7 @@ def test_a_mark_that_another_process_removes_is_made_again(robots: Path, tmp_pat
     class Swept(Disturbed):
         def sees(self, mark: str) -> bool:
             if not self.asked:
-                (robots / "recordings" / mark).unlink()
+                (places.root(robots) / mark).unlink()
             return bool(self.__getattr__("sees")(mark))
 
     for spelled, is_same in ((robots, True), (tmp_path / "lab", False)):
@@ -152,7 +155,7 @@ def test_what_is_there_is_proved_before_it_is_believed(
     """Bytes that a cut copy has left, and that changed since, are copied again."""
     with suppress(StoreError), place_at(tmp_path / "lab") as place:
         copied(robots, Disturbed(place, bytes_taken=30_000), "recorded")
-    hidden = sorted((tmp_path / "lab" / "recordings").glob(".importing-*/*.mcap"))
+    hidden = sorted(places.root(tmp_path / "lab").glob(".importing-*/*.mcap"))
     assert len(hidden) == 2
     for path in hidden:
         data = bytearray(path.read_bytes())
@@ -160,7 +163,7 @@ def test_what_is_there_is_proved_before_it_is_believed(
         path.write_bytes(data)
     with place_at(tmp_path / "lab") as place:
         assert copied(robots, place, "recorded").copied == ["recorded"]
-    there, here = (at / "recordings" / "recorded" for at in (tmp_path / "lab", robots))
+    there, here = (places.folder(at, "recorded") for at in (tmp_path / "lab", robots))
     assert files_in(there) == files_in(here)
 
 
@@ -169,36 +172,54 @@ def test_damaged_recordings_are_refused_and_others_are_copied(
 ) -> None:
     source = tmp_path / "damaged"
     shutil.copytree(robots, source)
-    path = source / "recordings" / "recorded" / "000001.mcap"
+    path = places.segment(source, "recorded", 1)
     data = bytearray(path.read_bytes())
     data[len(data) // 3] ^= 1
     path.write_bytes(data)
-    (source / "recordings" / "noted" / "000000.mcap").unlink()
+    places.segment(source, "noted").unlink()
     with place_at(tmp_path / "lab") as place:
         report = copied(source, place)
     assert sorted(report.copied) == ["calm", "damaged", "driven", "expired"]
     assert "does not match its checksums" in report.refused["recorded"]
     assert "is incomplete" in report.refused["noted"]
-    assert labels_in(tmp_path / "lab") == ["calm", "damaged", "driven", "expired"]
+    assert names_in(tmp_path / "lab") == ["calm", "damaged", "driven", "expired"]
+
+
+DIGEST = "sha256:" + "0" * 64
+NONE = "other-" + "0" * 16
+"""Id of no recording."""
 
 
 def test_a_place_believes_nothing(robots: Path, tmp_path: Path, place_at: PlaceAt) -> None:
-    with hl.open(robots, mongo="none") as store:
-        recording = store.entry("recorded").id
-    lines = (robots / "recordings" / "recorded" / "journal").read_bytes()
-    other = lines.replace(recording.encode(), b"0" * 32)
-    file = CopiedFile("000000.mcap", 4, "sha256:0")
+    found = manifests.read_in(places.folder(robots, "recorded"))
+    assert found is not None
+    recording, whole = found.id, manifest.encode(found)
+    other = manifest.encode(manifest.replace(found, id=NONE))
+    open_ = manifest.encode(manifest.replace(found, status="open"))
+    rows = manifest.replace(
+        found, files=tuple(structs.replace(one, kind="rows") for one in found.files)
+    )
+    refused = "damaged, or of another"
+    file = CopiedFile("000000.mcap", 4, DIGEST)
     with place_at(tmp_path / "lab") as place:
         place.begin(recording, wants_payloads=True)
-        for journal, why in ((lines, "was not copied"), (other, "damaged, or of another")):
+        for data, why in (
+            (whole, "was not copied"),
+            (manifest.encode(rows), "was not copied"),
+            (other, refused),
+            (open_, refused),
+            (whole[:-100], refused),
+            (whole.replace(b'"complete"', b'"recovered"'), refused),
+            (b"", refused),
+        ):
             with pytest.raises(StoreError, match=why):
-                place.publish("x", journal, lacks_payloads=False)
+                place.publish(data)
         place.append(file, 0, b"abcd")
         assert not place.prove(file)
         for at, data, why in ((9, b"abcd", "does not have 9 bytes"), (0, b"abcde", "more came")):
             with pytest.raises(StoreError, match=why):
                 _append(place, file, at, data)
-    assert labels_in(tmp_path / "lab") == []
+    assert names_in(tmp_path / "lab") == []
 
 
 def _append(place: Place, file: CopiedFile, at: int, data: bytes) -> None:
@@ -207,16 +228,17 @@ def _append(place: Place, file: CopiedFile, at: int, data: bytes) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["../../x", "../000000.mcap", "journal", "/etc/x", "a/../b", "a/..", "..", "a/b/c"]
+    "name",
+    ["../../x", "../000000.mcap", "manifest.json", "/etc/x", "a/../b", "a/..", "..", "a/b/c"],
 )
 def test_a_server_writes_only_its_store(robots: Path, tmp_path: Path, name: str) -> None:
     with server_at(tmp_path / "lab") as place:
-        place.begin("0" * 32, wants_payloads=True)
+        place.begin(NONE, wants_payloads=True)
         with pytest.raises(StoreError, match="has ended"):
-            _append(place, CopiedFile(name, 4, "sha256:0"), 0, b"abcd")
+            _append(place, CopiedFile(name, 4, DIGEST), 0, b"abcd")
     assert {path.name for path in tmp_path.iterdir()} == {"lab"}
-    assert [*(tmp_path / "lab" / "recordings").glob("*/*")] == [
-        tmp_path / "lab" / "recordings" / f".importing-{'0' * 32}" / "writer.lock"
+    assert [*places.root(tmp_path / "lab").glob("*/*")] == [
+        places.root(tmp_path / "lab") / f".importing-{NONE}" / "writer.lock"
     ]
 
 
@@ -266,7 +288,7 @@ def test_payloads_expire_here_when_they_are_proved_there(robots: Path, tmp_path:
     right = {label: answers(robot, label) for label in STATES}
     with hl.open(robot, mongo="none") as store:
         store.copy(lab, ["calm"])
-        _flip_a_bit(lab / "recordings" / "calm" / "000000.mcap")
+        _flip_a_bit(places.segment(lab, "calm"))
         report = store.copy(lab, None, CopyOptions(then_expire=True))
         assert len(report.problems) == 1
         assert "calm stay" in report.problems[0]
@@ -301,14 +323,17 @@ def test_only_what_has_a_copy_expires(robots: Path, tmp_path: Path, place_at: Pl
         store.copy(lab, ["recorded", "noted"])
         store.mark("recorded", "end", "later")
         marked = store.entry("recorded")
-        sealed = {label: {*store.directory.listing(label).sealed} for label in STATES}
+        sealed = {
+            label: {*store.directory.listing(store.entry(label).id).sealed} for label in STATES
+        }
     # One of the copies was made by hand before the end of the recording.
     cut = tmp_path / "cut"
     shutil.copytree(lab, cut)
-    lines = (cut / "recordings/noted/journal").read_bytes().splitlines(keepends=True)
-    number = next(n for n, line in enumerate(lines) if b'"segment":1' in line)
-    (cut / "recordings/noted/journal").write_bytes(b"".join(lines[:number] + lines[number + 1 :]))
-    (cut / "recordings/noted/000001.mcap").unlink()
+    found = manifests.read_in(places.folder(cut, "noted"))
+    assert found is not None
+    left = tuple(one for one in found.files if one.number != 1)
+    manifests.write_in(places.folder(cut, "noted"), manifest.replace(found, files=left))
+    places.segment(cut, "noted", 1).unlink()
 
     def run_to(path: Path, change: Any = None) -> CopyReport:
         class Changed(Disturbed):
@@ -319,7 +344,7 @@ def test_only_what_has_a_copy_expires(robots: Path, tmp_path: Path, place_at: Pl
 
         told.clear()
         with hl.open(robot, mongo="none") as store, place_at(path) as place:
-            chosen = [one for one in store.summaries() if one.label in {"recorded", "noted"}]
+            chosen = [one for one in store.summaries() if one.name in {"recorded", "noted"}]
             options = CopyOptions(then_expire=True)
             return run(store.directory, Changed(place), chosen, options, proved=told.__setitem__)
 
@@ -368,6 +393,77 @@ def test_marks_of_both_sides(robots: Path, tmp_path: Path, place_at: PlaceAt) ->
         assert not store.verify(["recorded"]).findings
 
 
+def test_an_edit_at_the_moment_of_a_copy_stays(robots: Path, tmp_path: Path, calls: Calls) -> None:
+    """It waits until the copy has taken its place, and changes that one."""
+    lab = tmp_path / "lab"
+    with directory_at(lab) as place:
+        copied(robots, place, "recorded", only_fields=True)
+    with hl.open(lab, mongo="none") as store, ThreadPoolExecutor(1) as pool:
+        edits: list[Future[Any]] = []
+
+        def meanwhile(*_: object) -> None:
+            edits.append(pool.submit(store.edit, "recorded", tag={"who": "me"}))
+            with pytest.raises(TimeoutError):
+                edits[0].result(1)
+
+        calls(StoreDirectory, "put_in_place", meanwhile)
+        with directory_at(lab) as place:
+            assert copied(robots, place, "recorded").copied == ["recorded"]
+        assert edits[0].result().tags == {"who": "me"}
+    with hl.open(lab, mongo="none") as store:
+        assert store.entry("recorded").tags == {"who": "me"}
+        assert not store.verify().findings
+    found, right = answers(lab, "recorded"), answers(robots, "recorded")
+    assert {**found, "entry": None} == {**right, "entry": None}
+
+
+def test_what_was_said_of_a_copy_stays() -> None:
+    def log(number: int, digit: str) -> manifest.File:
+        name, part = f"{number:06d}.mcap", manifest.Part(1, 8)
+        return manifest.File(
+            number, number, name, "log", 9, f"sha256:{digit * 64}", 0, parts={number: part}
+        )
+
+    mark = manifest.Mark("0" * 16, 5, "came along", segment=1)
+    sent = manifest.Manifest(
+        NONE,
+        "sent",
+        1,
+        changes=7,
+        status="complete",
+        tags={"place": "field"},
+        marks=(mark,),
+        channels={0: manifest.Channel("/scan"), 1: manifest.Channel("/marks")},
+        files=(log(0, "a"), log(1, "b")),
+        unmarked=(2,),
+    )
+    there = manifest.replace(
+        sent,
+        name="there",
+        tags={},
+        notes=(manifest.Note(3, "seen"),),
+        pins=(manifest.Pin("a", topics=("/scan",)),),
+        marks=(mark, manifest.Mark("1" * 16, 6, "of there", segment=2)),
+        channels={**sent.channels, 2: manifest.Channel("/marks")},
+        files=(*sent.files, log(2, "c")),
+        changes=20,
+        unmarked=(),
+        lacks_payloads=True,
+    )
+    made = merged(there, sent)
+    assert made == manifest.replace(there, changes=21, lacks_payloads=False)
+    assert merged(made, sent).files == made.files
+    other = manifest.replace(
+        sent,
+        marks=(mark, manifest.Mark("2" * 16, 6, "of here", segment=2)),
+        channels=there.channels,
+        files=(*sent.files, log(2, "d")),
+        unmarked=(),
+    )
+    with pytest.raises(RefusedError, match="marked here and in its copy"):
+        merged(there, other)
+
+
 def test_recordings_that_are_held_or_gone_keep_no_others_waiting(
     robots: Path, tmp_path: Path, place_at: PlaceAt
 ) -> None:
@@ -384,7 +480,7 @@ def test_recordings_that_are_held_or_gone_keep_no_others_waiting(
             assert any(path.name.startswith(".copying-") for path in robot.iterdir())
             begun = self.__getattr__("begin")(recording, **options)
             if recording == gone:
-                shutil.rmtree(robot / "recordings" / "driven")
+                shutil.rmtree(places.folder(robot, "driven"))
                 raise StoreError("a file is gone")
             return begun
 
@@ -396,7 +492,7 @@ def test_recordings_that_are_held_or_gone_keep_no_others_waiting(
         "noted": "Recording 'noted' is not copied: another process copies it",
         "driven": "Recording 'driven' is no longer in the store.",
     }
-    assert [path.name for path in (lab / "recordings").iterdir()] == ["recorded"]
+    assert places.names(lab) == ["recorded"]
 
 
 def test_a_full_disk_there_keeps_what_arrived(
@@ -418,7 +514,7 @@ def test_a_full_disk_there_keeps_what_arrived(
     monkeypatch.undo()
     arrived, size = (
         sum(path.stat().st_size for path in store.glob("*.mcap"))
-        for store in (*(tmp_path / "lab" / "recordings").iterdir(), robots / "recordings/recorded")
+        for store in (*places.folders(tmp_path / "lab"), places.folder(robots, "recorded"))
     )
     with place_at(tmp_path / "lab") as place:
         report = copied(robots, place, "recorded")
@@ -441,7 +537,7 @@ def test_two_copies_at_once_end_with_one(robots: Path, tmp_path: Path, place_at:
         with ThreadPoolExecutor(2) as pool:
             found = [*pool.map(copy, range(2))]
         assert sorted([*one.copied, *one.known] for one in found) == [["driven"]] * 2
-        assert [one.label for one in reader.summaries()] == ["driven"]
+        assert [one.name for one in reader.summaries()] == ["driven"]
         assert reader.topic("/number").count() > 20
     assert answers(lab, "driven") == answers(robots, "driven")
 
@@ -489,26 +585,36 @@ def test_a_silent_side_holds_nothing(tmp_path: Path, limit: Limit, said: bytes) 
         assert is_free
 
 
-def test_labels_are_read_once(robots: Path, tmp_path: Path, calls: Calls) -> None:
-    """The cost of a copy does not grow with those before it; labels that others change are seen."""
+def test_names_that_others_change_are_seen(robots: Path, tmp_path: Path) -> None:
     lab = tmp_path / "lab"
-    read = calls(StoreDirectory, "id_of")
     with directory_at(lab) as place:
-        counts = []
-        for label in STATES:
-            read.clear()
-            copied(robots, place, label)
-            counts.append(sum(directory.path == lab for directory, _ in read))
-        assert counts[-1] <= counts[1]
+        copied(robots, place, "recorded", "noted")
         with hl.open(lab, mongo="none") as store:
             ids = {name: store.entry(name).id for name in ("recorded", "noted")}
             store.edit("recorded", name="other")
             store.edit("noted", name="recorded")
         found = place.have([*ids.values()])
-    assert {name: found[one].label for name, one in ids.items()} == {
+    assert {name: found[one].name for name, one in ids.items()} == {
         "recorded": "other",
         "noted": "recorded",
     }
+
+
+def test_a_name_that_another_recording_has_there_gets_a_number(
+    robots: Path, tmp_path: Path, place_at: PlaceAt
+) -> None:
+    robot, lab = tmp_path / "robot", tmp_path / "lab"
+    shutil.copytree(robots, robot)
+    with place_at(lab) as place:
+        assert copied(robot, place, "calm", "noted").copied == ["calm", "noted"]
+    with hl.open(robot, mongo="none") as store:
+        store.edit("recorded", name="driven by hand")
+        store.edit("calm", name="hall")
+        store.edit("driven", name="calm")
+    with place_at(lab) as place:
+        report = copied(robot, place, "driven by hand", "calm", "hall")
+        assert (report.copied, report.known) == (["driven by hand", "calm-2"], ["calm"])
+    assert names_in(lab) == ["calm", "calm-2", "driven by hand", "noted"]
 
 
 def test_a_cure_deletes_nothing_that_is_not_here(robots: Path, tmp_path: Path) -> None:
@@ -516,7 +622,7 @@ def test_a_cure_deletes_nothing_that_is_not_here(robots: Path, tmp_path: Path) -
     shutil.copytree(robots, robot)
     with hl.open(robot, mongo="none") as store:
         store.copy(lab, ["recorded"])
-        _flip_a_bit(lab / "recordings" / "recorded" / "000001.mcap")
+        _flip_a_bit(places.segment(lab, "recorded", 1))
         (said,) = store.copy(lab, ["recorded"], CopyOptions(check=True)).problems
         assert "`hybridlog rm recorded`" in said
         expire(store, "recorded", [0])
@@ -525,25 +631,37 @@ def test_a_cure_deletes_nothing_that_is_not_here(robots: Path, tmp_path: Path) -
         assert "from another copy" in said
 
 
+@pytest.mark.parametrize("step", [0, 1])
 def test_a_crash_before_the_copy_of_fields_goes(
-    robots: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    step: int, robots: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The whole copy answers, and what the store advises to remove is the other one."""
+    """The next opening puts the whole copy in its place, with what was said of the other one."""
     lab = tmp_path / "lab"
     with directory_at(lab) as place:
         copied(robots, place, "recorded", only_fields=True)
+    with hl.open(lab, mongo="none") as store:
+        store.edit("recorded", name="renamed", tag={"who": "me"})
+    rename, left = files.rename, [step]
+
+    def interrupted(old: Path, new: Path) -> None:
+        if old.parent == places.root(lab):
+            left[0] -= 1
+            if left[0] < 0:
+                raise KeyboardInterrupt
+        rename(old, new)
+
     with monkeypatch.context() as patch:
-        Calls(patch).fail(StoreDirectory, "hide", KeyboardInterrupt)
+        patch.setattr(files, "rename", interrupted)
         with suppress(KeyboardInterrupt), directory_at(lab) as place:
             copied(robots, place, "recorded")
-    assert labels_in(lab) == ["recorded-2"]
-    assert answers(lab, "recorded-2") == answers(robots, "recorded")
-    with directory_at(lab) as place:
-        assert copied(robots, place, "recorded").known == ["recorded-2"]
     with hl.open(lab, mongo="none") as store:
-        assert store.repairs.copies == {"recorded": "recorded-2"}
-        store.remove("recorded")
-    assert labels_in(lab) == ["recorded-2"]
+        assert store.entry("renamed").tags["who"] == "me"
+    assert places.names(lab) == ["renamed"]
+    with directory_at(lab) as place:
+        assert copied(robots, place, "recorded").known == ["renamed"]
+    with hl.open(lab, mongo="none") as store:
+        assert store.entry("renamed").status == "complete"
+        assert [store.topic(one).count() for one in store.topics()]
 
 
 def test_what_a_stopped_copy_left_goes_when_the_store_is_opened(

@@ -29,6 +29,7 @@ from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.open_segment import Flushed
 from hybridlog_storage.segments.segment_reader import SegmentReader
 from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests import places
 from tests.calls import Calls
 
 MS = 10**6
@@ -238,7 +239,7 @@ def test_damaged_message_indexes(store: hl.Store, tmp_path: Path) -> None:
         segment = entry.spans[1][0]
         table = damaged.session.chunk_table(entry, segment)
         chunk = table.chunks[len(table.chunks) // 2]
-        path = damaged.directory.recording("a") / f"{segment:06d}.mcap"
+        path = places.segment(damaged.directory.path, "a", segment)
         content = bytearray(path.read_bytes())
         # Both the messages and their indexes: nothing tells the times any more.
         for place in (int(chunk["offset"]) + 60, int(chunk["offset"] + chunk["length"]) + 20):

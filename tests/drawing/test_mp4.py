@@ -257,8 +257,8 @@ def test_a_lost_frame_of_av1(tmp_path: Path) -> None:
 def test_frames_whose_payloads_have_expired(tmp_path: Path) -> None:
     write(tmp_path / "log.mcap", {"/cam": ("json", [*encoded("h264")])}, "h264")
     with hl.open(tmp_path / "store", create=True, mongo="none") as store:
-        store.record(tmp_path / "log.mcap", name="cam")
-        expire(store.directory, "cam", [0])
+        recording = store.record(tmp_path / "log.mcap", name="cam").entry.id
+        expire(store.directory, recording, [0])
     with (
         hl.open(tmp_path / "store", mongo="none") as store,
         pytest.raises(PayloadError, match=r"12 messages have no payload.*there is no picture"),

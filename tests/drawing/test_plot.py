@@ -217,7 +217,7 @@ def test_sparklines(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_parts_with_losses(drive: Drive) -> None:
-    (summary,) = (one for one in drive.store.summaries() if one.label == "drive")
+    (summary,) = (one for one in drive.store.summaries() if one.name == "drive")
     entry: RecordingEntry = drive.store.entry(summary.id)
 
     def lost(*rows: tuple[int | None, int | None, int | None, Cause]) -> list[int]:

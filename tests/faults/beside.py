@@ -68,7 +68,7 @@ def watch(bench: Bench, scenario: Scenario, *, anew: bool) -> Watched:
 
 def _ask(store: hl.Store, scenario: Scenario, step: str, watched: Watched) -> None:
     known = [scenario.before.recordings, scenario.after.recordings]
-    entries = {entry.label: entry for entry in store.recordings()}
+    entries = {entry.name: entry for entry in store.recordings()}
     ended = {label for label, entry in entries.items() if entry.status != "open"}
     if not any(ended <= state.keys() for state in known) or store.repairs.unreadable:
         watched.wrong.append(f"{step}: {ended}, unreadable {store.repairs.unreadable}")

@@ -95,6 +95,7 @@ class Bench:
             with prepared.copy(self.server, self.path / "whole") as case:
                 before = look(case)
         assert not (is_clean and after.findings), after.findings
+        assert not after.unreadable
         for label, said in (truth or {}).items():
             assert after.recordings[label].holds(said), label
         return Scenario(
@@ -193,6 +194,8 @@ def difference(state: State, wanted: State) -> str:
         found.append(f"files too many {sorted(extra)}, too few {sorted(missing)}")
     if state.findings != wanted.findings:
         found.append(f"findings {state.findings} instead of {wanted.findings}")
+    if state.unreadable != wanted.unreadable:
+        found.append(f"unreadable {state.unreadable}")
     if state.recordings.keys() != wanted.recordings.keys():
         found.append(f"recordings {sorted(state.recordings)}")
     for label, seen in state.recordings.items():

@@ -36,7 +36,7 @@ INDEX: Final = {
 OPENINGS: Final = {
     "open after a crash": 170,
     "open after a crash in the index": 125,
-    "open without a journal": 40,
+    "open with an unlisted segment": 40,
     "open while removing": 65,
     "open after removing": 55,
     "open after a mark": 110,

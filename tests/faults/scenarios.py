@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from hybridlog_storage import journal
-from hybridlog_storage.journal import Journal
+from hybridlog_storage.manifest import Manifest, replace
+from hybridlog_storage.manifests import MANIFEST, change_in
+from tests import places
 from tests.faults import logs
 from tests.faults.cases import (
     Bench,
@@ -52,7 +53,7 @@ def _changed(bench: Bench, name: str, change: Callable[[Path], None]) -> Prepare
     two = _two(bench)
     path = bench.path / name
     two.duplicate(path)
-    change(path / "recordings")
+    change(path)
     return Prepared(path, two.documents)
 
 
@@ -83,24 +84,20 @@ def _import(bench: Bench) -> Scenario:
 
 
 def _repair(bench: Bench) -> Scenario:
-    def damage(recordings: Path) -> None:
-        a = recordings / "a"
+    def damage(store: Path) -> None:
+        a = places.folder(store, "a")
         (a / "000000.mcap").rename(a / "kept")
         (a / "000001.mcap").rename(a / "000000.mcap")
         (a / "kept").rename(a / "000001.mcap")
         summary = bytearray((a / "000002.mcap").read_bytes())
         summary[-60] ^= 1
         (a / "000002.mcap").write_bytes(summary)
-        b = recordings / "b"
-        with (b / journal.JOURNAL).open("r+b") as file:
-            text = file.read()
-            file.seek(text.index(b'"sealed"') + 1)
-            file.write(b"S")
+        (places.folder(store, "b") / MANIFEST).write_bytes(b"damaged")
 
     def allowed(state: State, _before: State, _outcome: str) -> bool:
-        return state.recordings.keys() == {"a", "b"} and all(
-            says_what_is_missing(state.recordings[name], _LOGS[name]) for name in ("a", "b")
-        )
+        """The one without a manifest answers nothing until it is made again."""
+        assert state.recordings.keys() | ({"b"} if state.unreadable else set()) == {"a", "b"}
+        return all(says_what_is_missing(one, _LOGS[n]) for n, one in state.recordings.items())
 
     return bench.scenario(
         "repair",
@@ -187,20 +184,23 @@ def _opening(prepare: Callable[[Bench], Prepared], **truth: Content) -> Callable
     return make
 
 
-def _lose_journal(recordings: Path) -> None:
-    (recordings / "a" / journal.JOURNAL).unlink()
+def _forget_segment(store: Path) -> None:
+    def how(now: Manifest) -> Manifest:
+        return replace(now, files=tuple(one for one in now.files if one.number != 1))
+
+    change_in(places.folder(store, "a"), how)
 
 
-def _announce(recordings: Path) -> None:
-    Journal(recordings / "a").append(journal.event(journal.REMOVING, by=1))
+def _announce(store: Path) -> None:
+    change_in(places.folder(store, "a"), lambda now: replace(now, status="removed"))
 
 
-def _hide(recordings: Path) -> None:
-    (recordings / "a").rename(recordings / ".removed-a-00000000")
+def _hide(store: Path) -> None:
+    places.folder(store, "a").rename(places.root(store) / ".removed-a-00000000")
 
 
-def _lose_segment(recordings: Path) -> None:
-    (recordings / "a" / "000001.mcap").unlink()
+def _lose_segment(store: Path) -> None:
+    places.segment(store, "a", 1).unlink()
 
 
 SCENARIOS: Mapping[str, Callable[[Bench], Scenario]] = {
@@ -219,8 +219,8 @@ SCENARIOS: Mapping[str, Callable[[Bench], Scenario]] = {
     "open after a crash in the index": _opening(
         lambda bench: _crashed(bench, "crashed in index", "insert", 2), a=FIRST, c=THIRD
     ),
-    "open without a journal": _opening(
-        lambda bench: _changed(bench, "unproven", _lose_journal), a=FIRST, b=SECOND
+    "open with an unlisted segment": _opening(
+        lambda bench: _changed(bench, "unlisted", _forget_segment), a=FIRST, b=SECOND
     ),
     "open while removing": _opening(lambda bench: _changed(bench, "removing", _announce), b=SECOND),
     "open after removing": _opening(lambda bench: _changed(bench, "hidden", _hide), b=SECOND),

@@ -287,6 +287,12 @@ class SteppedSystem(files.System):
             lambda: os.rename(old, new, src_dir_fd=folder, dst_dir_fd=new_folder),
         )
 
+    def link(self, old: str, new: str, *, folder: int, new_folder: int) -> None:
+        def do() -> None:
+            super(SteppedSystem, self).link(old, new, folder=folder, new_folder=new_folder)
+
+        self._seam.step("link", f"{old} {new}", do)
+
     def unlink(self, name: str, *, folder: int) -> None:
         self._seam.step("unlink", name, lambda: os.unlink(name, dir_fd=folder))
 

@@ -24,19 +24,21 @@ from hybridlog.maintenance.lease import place_of
 from hybridlog.record.losses import losses_of
 from hybridlog_storage.catalog import CATALOG, RecordingEntry
 from hybridlog_storage.cells import put
-from hybridlog_storage.disk.directory import StoreDirectory
+from hybridlog_storage.disk.directory import LOCK, StoreDirectory
+from hybridlog_storage.manifests import MANIFEST_LOCK, MANIFEST_OLD
 from hybridlog_storage.mongo.collection_names import CATALOG_PREFIX
 from hybridlog_storage.mongo.database import Database
 from hybridlog_storage.mongo.index_state import RECORDINGS, STORE, IndexState
 from hybridlog_storage.mongo.mongod import EmbeddedMongod
 from hybridlog_storage.mongo.topic_places import SHARED, TOPICS, TopicPlaces
+from tests import places
 from tests.faults.logs import Content
 from tests.indexed import EVERYTHING
 
 WHERE = 20
 """Messages with `n` of at least this are asked for."""
-_ANY_FILE = {"writer.lock", "journal.old"}
-_MADE_UP = re.compile(r"\b[0-9a-f]{32}\b|\d{19}")
+_ANY_FILE = {LOCK, MANIFEST_LOCK, MANIFEST_OLD}
+_MADE_UP = re.compile(r"\b([0-9]{8}-[a-z0-9-]+-)?[0-9a-f]{16}\b|\b[0-9a-f]{32}\b|\d{19}")
 
 
 class Server:
@@ -105,8 +107,8 @@ class Prepared:
             rows = catalog.execute("SELECT key, body FROM cells WHERE kind = 'entry'").fetchall()
             for recording, body in rows:
                 looks, entry = json.loads(body)
-                if looks == old.listing(entry["label"]).print:
-                    now = json.dumps([new.listing(entry["label"]).print, entry])
+                if looks == old.listing(recording).print:
+                    now = json.dumps([new.listing(recording).print, entry])
                     catalog.execute(*put("entry", recording, now.encode()))
 
     @contextmanager
@@ -179,14 +181,16 @@ class State:
     """All that a store answers.
 
     Attributes:
-        recordings: By label.
+        recordings: By name.
         files: Names of all files, but for those that may be there or not.
         findings: What `verify` says.
+        unreadable: What an opening says of recordings that answer nothing.
     """
 
     recordings: Mapping[str, Seen]
     files: frozenset[str]
     findings: tuple[str, ...] = field(default=())
+    unreadable: tuple[str, ...] = field(default=())
 
     def without(self, label: str) -> State:
         """The same without a recording."""
@@ -208,10 +212,10 @@ def look(case: Case) -> State:
         WrongError: An answer contradicts another one, or something was left over.
     """
     with case.open() as store:
-        without_server = {entry.label: _messages(store, entry) for entry in store.recordings()}
+        without_server = {entry.name: _messages(store, entry) for entry in store.recordings()}
         database = store.connect()
         # What connecting has mended is what counts.
-        seen = {entry.label: _look_at(store, entry) for entry in store.recordings()}
+        seen = {entry.name: _look_at(store, entry) for entry in store.recordings()}
         for label, messages in without_server.items():
             _check(seen[label].messages == messages, f"{label} changed while it was asked")
         verification = store.verify()
@@ -222,8 +226,8 @@ def look(case: Case) -> State:
         _check_database(store, database)
         _check_catalog(store)
         _check_tables(store)
-        _check(not store.repairs.unreadable, f"unreadable: {store.repairs.unreadable}")
-    return State(seen, _files(case.path), tuple(_plain(f) for f in findings))
+        unreadable = tuple(sorted(map(_plain, store.repairs.unreadable.values())))
+    return State(seen, _files(case.path), tuple(_plain(f) for f in findings), unreadable)
 
 
 def _check(holds: object, otherwise: str) -> None:
@@ -262,7 +266,7 @@ def _look_at(store: hl.Store, entry: RecordingEntry) -> Seen:
         expected = sum(time < middle for time, _ in part)
         _check(half.count() == expected, f"half of {topic}: {half.count()} instead of {expected}")
     told = sum(channel.stats.messages for channel in entry.channels)
-    _check(told == sum(map(len, messages.values())), f"{entry.label} says {told} messages")
+    _check(told == sum(map(len, messages.values())), f"{entry.name} says {told} messages")
     return Seen(_comparable(entry), messages, tuple(map(_without_made_up, losses_of(entry))))
 
 
@@ -302,9 +306,11 @@ def _plain(text: str) -> str:
 
 
 def _files(path: Path) -> frozenset[str]:
-    """Names of files in recordings, and whatever else should not be in the store."""
-    recordings = path / "recordings"
-    found = {str(p.relative_to(recordings)) for p in recordings.rglob("*")}
+    """Names of files in recordings by name, and whatever else should not be in the store."""
+    found = set()
+    for folder in places.folders(path):
+        name = places.name_of(folder)
+        found |= {name, *(f"{name}/{p.relative_to(folder)}" for p in folder.rglob("*"))}
     found |= {f"../{p.name}" for p in path.iterdir()}
     return frozenset(name for name in found if Path(name).name not in _ANY_FILE) - {
         "../catalog.sqlite",
@@ -317,7 +323,7 @@ def _files(path: Path) -> frozenset[str]:
 
 def _check_tables(store: hl.Store) -> None:
     """None is of a recording that is gone, and nothing is unfinished."""
-    ids = {entry.id for entry in store.recordings()}
+    ids = {entry.id for entry in store.recordings()} | store.repairs.unreadable.keys()
     path = store.directory.path
     there = recordings_of(path)
     _check(there <= ids, f"there are tables of {there - ids}")
@@ -327,17 +333,20 @@ def _check_tables(store: hl.Store) -> None:
 
 def _check_database(store: hl.Store, database: Database) -> None:
     """Nothing is in it that is of no recording, and of each recording there is all."""
-    entries = {entry.key: entry for entry in store.recordings() if entry.label}
+    entries = {entry.key: entry for entry in store.recordings() if entry.name}
+    hidden = {recording[-16:] for recording in store.repairs.unreadable}  # kept until they answer
     mirror = {document["_id"]: document for document in database.find(RECORDINGS)}
+    for key in hidden:
+        mirror.pop(key, None)
     _check(mirror.keys() == entries.keys(), f"mirrored are {mirror.keys()}")
     for key, entry in entries.items():
         document = dict(mirror[key])
         index = document.pop("index")
         del document["_id"]
-        _check(index["state"] == "complete", f"{entry.label} is {index['state']}")
-        _check(index["segments"] == entry.digests, f"of {entry.label} other segments are indexed")
+        _check(index["state"] == "complete", f"{entry.name} is {index['state']}")
+        _check(index["segments"] == entry.digests, f"of {entry.name} other segments are indexed")
         wanted = bson.decode(bson.encode(entry.to_document()))
-        _check(document == wanted, f"the mirror of {entry.label}: {document} not {wanted}")
+        _check(document == wanted, f"the mirror of {entry.name}: {document} not {wanted}")
     expected: dict[str, Counter[str]] = defaultdict(Counter)
     for key, entry in entries.items():
         for place in TopicPlaces(database).of({c.topic for c in entry.channels}).values():
@@ -345,23 +354,30 @@ def _check_database(store: hl.Store, database: Database) -> None:
                 expected[place.collection][key] += messages
     for collection in IndexState(database).document_collections():
         pipeline = [{"$group": {"_id": "$_meta.rec", "n": {"$sum": 1}}}]
-        found = {d["_id"]: d["n"] for d in database.aggregate(collection, pipeline)}
+        documents = {d["_id"]: d["n"] for d in database.aggregate(collection, pipeline)}
+        found = {key: number for key, number in documents.items() if key not in hidden}
         _check(found == expected[collection], f"{collection} has {found}")
 
 
 def _check_catalog(store: hl.Store) -> None:
     """The catalog is what the files say."""
     rows = {one.id: store.catalog.recording(one.id) for one in store.catalog.summaries()}
-    labels = store.directory.labels()
-    _check(len(rows) == len(labels), f"{labels} are there, {len(rows)} in the catalog")
-    for label in labels:
-        described = describe_now(store.directory, store.catalog, label)
+    hidden = store.repairs.unreadable.keys()
+    rows = {recording: row for recording, row in rows.items() if recording not in hidden}
+    ids = [recording for recording in store.directory.ids() if recording not in hidden]
+    _check(len(rows) == len(ids), f"{ids} are there, {len(rows)} in the catalog")
+    for recording in ids:
+        described = describe_now(store.directory, store.catalog, recording)
         row = rows.get(described.entry.id)
-        _check(row is not None, f"{label} is not in the catalog")
-        _check(row == (described.files, described.entry), f"the catalog's row of {label} differs")
+        _check(row is not None, f"{recording} is not in the catalog")
+        _check(
+            row == (described.files, described.entry), f"the catalog's row of {recording} differs"
+        )
         known = next(one for one in store.catalog.summaries() if one.id == described.entry.id)
         same = known._replace(indexed_by="") == described.summary
-        _check(same, f"the catalog's summary of {label} differs")
-        for number, summary in take_inventory(store.directory, label).summaries.items():
+        _check(same, f"the catalog's summary of {recording} differs")
+        for number, summary in take_inventory(store.directory, recording).summaries.items():
             found, wanted = store.catalog.table(described.entry, number), summary.table
-            _check(found.to_bytes() == wanted.to_bytes(), f"the chunks of {label} {number} differ")
+            _check(
+                found.to_bytes() == wanted.to_bytes(), f"the chunks of {recording} {number} differ"
+            )

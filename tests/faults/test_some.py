@@ -16,14 +16,14 @@ SOME: list[tuple[str, Fault, str, int, bool]] = [
     ("reindex", "INT", "insert number", 0, True),
     ("reindex one", "database", "replace hybridlog.recordings", 1, False),
     ("rename", "die", "rename", 0, False),
-    ("tag", "torn", "write journal", 0, False),
-    ("mark", "die", "write journal", 0, False),
-    ("mark", "ENOSPC", "sync journal", 0, False),
+    ("tag", "torn", "write .manifest.json", 0, False),
+    ("mark", "die", "rename .manifest.json", 0, False),
+    ("mark", "ENOSPC", "sync .manifest.json", 0, False),
     ("import", "torn", "write 000000", 0, False),
     ("repair", "die", "rename 000000.mcap", 0, True),
     ("record", "die", "rename 000000.mcap.open", 0, True),
-    ("open after a crash", "EIO", "sync journal", 0, True),
-    ("open without a journal", "torn", "write .journal", 0, False),
+    ("open after a crash", "EIO", "sync .manifest.json", 0, True),
+    ("open with an unlisted segment", "torn", "write .manifest.json", 0, False),
 ]
 
 

@@ -12,6 +12,7 @@ from hybridlog.formats import find
 from hybridlog.formats.detect import grouped_parts, open_parts
 from hybridlog.formats.find import Found, Watch, find_logs
 from hybridlog_storage.errors import SourceError
+from tests import places
 from tests.calls import Calls
 
 METADATA = """rosbag2_bagfile_information:
@@ -75,7 +76,7 @@ def test_all_logs_below_a_directory(tmp_path: Path) -> None:
     (top / "empty.db3").touch()
     database(top / "history.sqlite")
     database(top / "rosbag.db3")
-    mcap(top / "inner" / "recordings" / "r" / "000000.mcap")
+    mcap(places.new_folder(top / "inner", "r") / "000000.mcap")
     (top / "inner" / "hybridlog.toml").touch()
     found = find_logs(top)
     assert sorted(paths(found, top)) == sorted([

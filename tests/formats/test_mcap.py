@@ -23,6 +23,7 @@ from hybridlog.formats.mcap.reader import McapSource
 from hybridlog.formats.reading import BATCH_BYTES, BATCH_MESSAGES, Damage
 from hybridlog_storage.errors import SourceError
 from hybridlog_storage.mcap.mcap_scan import MAGIC, ScannedChunk, scan
+from tests import places
 from tests.data import DATA, needs_data
 
 if TYPE_CHECKING:
@@ -566,8 +567,7 @@ def test_what_stands_behind_the_last_message_is_recorded(
         writer.finish()
     with hl.open(tmp_path / "store", create=True) as store:
         entry = store.record(path).entry
-        folder = store.directory.path / "recordings" / entry.label
-        with (folder / "000000.mcap").open("rb") as stream:
+        with places.segment(store.directory.path, entry.name).open("rb") as stream:
             reader = make_reader(stream)
             found = {a.name: a.data for a in reader.iter_attachments()}
             metadata = {record.name: record.metadata for record in reader.iter_metadata()}

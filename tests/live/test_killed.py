@@ -95,13 +95,13 @@ def test_a_killed_recording_is_not_said_to_go_on(tmp_path: Path) -> None:
             time.sleep(0.02)
         assert [entry.status for entry in before.recordings()] == ["open"]
         with pytest.raises(HeldError, match=f"is being written by process {process.pid} "):
-            before.edit("load", tag={"a": "1"})
+            before.remove("load")
     finally:
         process.kill()
         process.communicate()
     with before:
         # Another process is about to recover it, so nobody else can.
-        with before.directory.writing("load"), hl.open(path) as after:
+        with before.directory.writing(before.entry("load").id), hl.open(path) as after:
             for store in (before, after):
                 assert [one.status for one in store.summaries()] == ["unfinished"]
                 assert [entry.status for entry in store.recordings()] == ["unfinished"]

@@ -130,7 +130,7 @@ def test_a_clock_that_is_set_mid_recording(store: hl.Store) -> None:
     robot.play(chatter, "back")
     (report,) = robot.recorder.stop()
     assert len(robot.said) == 4  # the clock is no silence
-    label = report.entry.label
+    label = report.entry.name
     query = store.query(["/chatter"], [label])
     assert [m.decode().data for m in query if m.log_time_ns < NOW][:20] == words(20, 40)
     assert query.count() == 4 * 21 + 1
@@ -158,7 +158,7 @@ def test_a_clock_that_is_set_between_recordings(store: hl.Store) -> None:
         robot.play(text_channel(), *words(0, 3))
         robot.recorder.look()
         (report,) = robot.recorder.stop()
-        told.append((report.entry.label, report.entry.messages - 3, len(robot.said)))
+        told.append((report.entry.name, report.entry.messages - 3, len(robot.said)))
         assert store.query(["/chatter"], [report.entry.id]).between("-0.1s", "end").count() == 1
     # Those whose clock is behind say so, and have a mark.
     assert told == [("drive", 0, 0), ("drive-2", 1, 1), ("drive-3", 0, 0), ("drive-4", 1, 1)]

@@ -44,6 +44,7 @@ from hybridlog_storage.errors import (
 from hybridlog_storage.messages import SUPPLIED, Channel, Schema
 from hybridlog_storage.mongo.collection_names import collection_of
 from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests import places
 from tests.calls import Calls
 from tests.indexed import documents_of
 from tests.limits import Limit
@@ -84,7 +85,7 @@ def block_writing(calls: Calls) -> threading.Event:
 def in_segments(store: hl.Store, recording: str) -> Counter[tuple[str, str]]:
     """Messages by topic and encoding, as the official reader finds them."""
     found: Counter[tuple[str, str]] = Counter()
-    for path in sorted(store.directory.recording(recording).glob("*.mcap")):
+    for path in sorted(places.folder(store.directory.path, recording).glob("*.mcap")):
         with path.open("rb") as stream:
             for _, channel, _ in make_reader(stream, validate_crcs=True).iter_messages():
                 found[channel.topic, channel.message_encoding] += 1
@@ -380,9 +381,7 @@ def test_a_number_of_more_than_32_bits_is_kept_by_its_lower_ones(store: hl.Store
     (report,) = running.recorder.stop()
     assert report.entry.messages == 4
     assert not report.entry.end["losses"]
-    with (store.directory.path / "recordings" / report.entry.label / "000000.mcap").open(
-        "rb"
-    ) as file:
+    with places.segment(store.directory.path, report.entry.name).open("rb") as file:
         found = [m.sequence for _, _, m in make_reader(file).iter_messages()]
     assert found == [7, 8, 0xFFFFFFFF, 0]
 
@@ -444,7 +443,7 @@ def test_a_source_that_cannot_work_leaves_nothing(store: hl.Store) -> None:
     assert speaker.stopped == 1
     store.refresh()
     assert store.recordings() == []
-    assert running(store.directory.path) == []
+    assert running(store.directory.path) == {}
 
 
 @pytest.mark.parametrize(
@@ -461,7 +460,7 @@ def test_a_try_that_reached_nobody_leaves_nothing(
     assert len(running.recorder.stop()) == recordings
     store.refresh()
     assert len(store.recordings()) == recordings
-    assert len(list((store.directory.path / "recordings").iterdir())) == recordings
+    assert len(places.folders(store.directory.path)) == recordings
 
 
 def test_sources_that_end_end_it(store: hl.Store) -> None:
@@ -489,11 +488,10 @@ def test_marks_are_messages_that_questions_use(store: hl.Store) -> None:
 def test_visitors(store: hl.Store) -> None:
     one, other = Running(store), Running(store)
     here = store.directory.path
-    name = one.recorder.name
-    assert set(running(here)) == {
-        one.recorder.name,
-        other.recorder.name,
-    }
+    ids = {name: recorder for recorder, name in running(here).items()}
+    assert ids.keys() == {one.recorder.name, other.recorder.name}
+    name = ids[one.recorder.name]
+    assert choose(here, [one.recorder.name]) == choose(here, [name]) == [name]
     with pytest.raises(UsageError, match="Several recorders"):
         choose(here, [])
     with pytest.raises(UsageError, match="No running recorder matches"):
@@ -525,7 +523,7 @@ def test_visitors(store: hl.Store) -> None:
     with pytest.raises(StoreError, match="does not answer"):
         request(here, name, "state")
     assert not Path(path).parent.exists()
-    assert running(here) == [other.recorder.name]
+    assert [*running(here).values()] == [other.recorder.name]
     other.recorder.stop()
 
 
@@ -560,7 +558,7 @@ def test_a_killed_recorder_loses_no_more_rows_than_messages(tmp_path: Path) -> N
         # 0.2 s are ten messages and ten rows; the machine may be slow.
         assert recording.messages >= 40
         assert sum(row["count"] for row in recording.end["losses"]) >= 40
-        assert running(path) == []
+        assert running(path) == {}
 
 
 def test_fields_land_when_no_payload_finds_room(store: hl.Store, calls: Calls) -> None:

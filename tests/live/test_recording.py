@@ -37,6 +37,7 @@ from hybridlog_storage.mongo.index_state import NOTHING, IndexState
 from hybridlog_storage.segments import segment_writer
 from hybridlog_storage.segments.segment_file import SegmentFile
 from hybridlog_storage.segments.segment_writer import AT_WORK, RecordingWriter, SegmentSettings
+from tests import places
 from tests.calls import Calls
 from tests.limits import Limit
 from tests.live.sources.heard import must_return
@@ -60,7 +61,7 @@ def text(content: bytes) -> bytes:
 def in_segments(store: hl.Store, recording: str) -> list[Seen]:
     """What the official reader finds, in file order."""
     found = []
-    for path in sorted(store.directory.recording(recording).glob("*.mcap")):
+    for path in sorted(places.folder(store.directory.path, recording).glob("*.mcap")):
         with path.open("rb") as stream:
             for _, about, message in make_reader(stream, validate_crcs=True).iter_messages(
                 log_time_order=False
@@ -91,9 +92,7 @@ def test_many_threads_one_recording(store: hl.Store) -> None:
     assert (report.indexed, report.missed, report.failure) == (180, 0, None)
     assert report.entry.status == "complete"
     assert report.entry.tags == {"who": "six"}
-    assert Counter(in_segments(store, recording.label)) == Counter(
-        m for one in written for m in one
-    )
+    assert Counter(in_segments(store, recording.name)) == Counter(m for one in written for m in one)
     for number in range(6):
         fetched = store.topic(f"/topic{number}")
         assert [(m.log_time_ns, m.raw) for m in fetched] == [
@@ -164,7 +163,7 @@ def test_large_and_small_messages_of_a_topic_stay_in_order(store: hl.Store) -> N
         thread.join()
     for topic in ("/talk", "/other"):
         assert [m.raw for m in store.topic(topic)] == payloads
-        found = [m for m in in_segments(store, recording.label) if m[0] == topic]
+        found = [m for m in in_segments(store, recording.name) if m[0] == topic]
         assert [data for *_, data in found] == payloads
     assert store.verify().findings == []
 
@@ -471,7 +470,7 @@ def test_what_is_no_message_is_refused_at_once_and_costs_nothing(store: hl.Store
             recording.write("/talk", b"")
         for number, memory in enumerate((bytearray, memoryview, bytes)):
             recording.write(own, memory(text(b"after")), log_time=np.int64(3 + number))
-    assert [s[1] for s in in_segments(store, recording.label)] == [1, 3, 4, 5]
+    assert [s[1] for s in in_segments(store, recording.name)] == [1, 3, 4, 5]
     assert store.topic("/talk").where("data == 'after'").count() == 3
     assert not store.verify().findings
 
@@ -557,7 +556,7 @@ def test_abort_leaves_nothing(store: hl.Store) -> None:
     recording = store.start("talk")
     recording.write(channel("/talk"), text(b"gone"))
     recording.abort()
-    assert store.directory.labels() == []
+    assert store.directory.ids() == []
     store.refresh()
     assert store.recordings() == []
 
@@ -607,7 +606,7 @@ def test_what_a_mongod_had_lost_when_it_died_is_indexed_again_and_counted_once(
     with store.start("talk", flush_interval_s=0.2) as recording:
         recording.write(speech, text(b"lost"), log_time=1)
         wait_for(lambda: recording.lag == 0 and recording.stored[0] == 1)
-        database, key = store.shared.index.database_for("This"), recording.id[:16]
+        database, key = store.shared.index.database_for("This"), recording.id[-16:]
         IndexState(database).put_through(key, NOTHING)
         assert database.delete(collection_of("/speech"), {"_meta.rec": key}) == 1
         kill_mongod(store.directory.path)

@@ -12,16 +12,18 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from msgspec import UNSET
 
 import hybridlog as hl
 from hybridlog.live.recorder import Recorder, RecorderOptions
 from hybridlog.maintenance.retention import MIN_SEGMENT
 from hybridlog.maintenance.sizes import disk_bytes
-from hybridlog_storage import journal
 from hybridlog_storage.errors import PayloadError
+from hybridlog_storage.manifests import read_in
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.mongo.index_state import NOTHING, IndexState
 from hybridlog_storage.settings import write_settings
+from tests import places
 from tests.indexed import documents_of
 from tests.live.speaker import Speaker
 from tests.some import each
@@ -116,8 +118,14 @@ def test_the_quota_holds_while_recording_and_nothing_is_lost(
     assert sent * SIZE > 1.5 * quota  # or nothing had to go
     assert most <= quota + 2 * segment
     assert check(tmp_path / "store", sent) > 0
-    sizes = [p.stat().st_size for p in (tmp_path / "store").glob("recordings/*/*.mcap")]
+    sizes = [p.stat().st_size for p in places.files(tmp_path / "store")]
     assert max(sizes) < 2 * segment
+
+
+def has_expired(folder: Path) -> bool:
+    """True once a rule was applied to a segment of a recording."""
+    manifest = read_in(folder)
+    return manifest is not None and any(log.retained is not UNSET for log in manifest.logs.values())
 
 
 PLAY = """
@@ -137,9 +145,9 @@ def test_a_kill_costs_no_pinned_byte_and_no_count(tmp_path: Path, seed: int) -> 
     assert process.stdout is not None
     try:
         assert [process.stdout.readline() for _ in range(2)] == ["running\n", "pinned\n"]
-        (folder,) = (path / "recordings").iterdir()
+        (folder,) = places.folders(path)
         # From the first expiry on, at any time.
-        while not (state := journal.read(folder)) or not state.retained:
+        while not has_expired(folder):
             assert process.poll() is None
             time.sleep(0.01)
         time.sleep(random.Random(seed).uniform(0, 1))
@@ -182,9 +190,9 @@ def test_documents_that_mongodb_loses_after_their_messages_expired_are_made_agai
         speaker = Speaker()
         recorder = Recorder(store, [speaker], RecorderOptions(reserve_bytes=0), lambda _: None)
         recorder.start()
-        (folder,) = (path / "recordings").iterdir()
+        (folder,) = places.folders(path)
         sent, until = 0, time.monotonic() + 60
-        while not (state := journal.read(folder)) or not state.retained:
+        while not has_expired(folder):
             assert time.monotonic() < until
             for _ in range(10):
                 speaker.say(CAMERA, image(sent), sent * 10**9)
@@ -194,7 +202,7 @@ def test_documents_that_mongodb_loses_after_their_messages_expired_are_made_agai
         while recorder.look().lag:  # or what is sent now would say anew what is there
             assert time.monotonic() < until
             time.sleep(0.1)
-        IndexState(database).put_through(state.id[:16], NOTHING)
+        IndexState(database).put_through(folder.name[-16:], NOTHING)
         database.checkpoint()
         kill_mongod(path)
         failures: set[str] = set()

@@ -65,7 +65,7 @@ def played(
             assert (tags["cause"], tags["rule"]) == ("contract", "longest_gap")
             marked[tags["topic"]].append((mark.log_time_ns, mark.fields["end"]))
     assert not report.entry.end["losses"]
-    return report.entry.label, said, marked
+    return report.entry.name, said, marked
 
 
 def stored(store: hl.Store, label: str, limit: str) -> dict[str, list[tuple[int, int]]]:

@@ -133,7 +133,7 @@ def test_an_import_copies_what_has_ended(tmp_path: Path) -> None:
         assert "'live' of" in done.err
         assert "is being written. Copy it when it has ended." in done.err
     with hl.open(other, mongo=NOWHERE) as store:
-        assert [one.label for one in store.recordings()] == ["before", "zulu"]
+        assert [one.name for one in store.recordings()] == ["before", "zulu"]
 
 
 def test_without_a_socket_it_is_told_in_words(tmp_path: Path) -> None:

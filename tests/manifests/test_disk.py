@@ -26,7 +26,7 @@ from hybridlog_storage.errors import (
     StoreError,
 )
 from hybridlog_storage.manifest import Manifest, Note, encode, new_id, replace
-from hybridlog_storage.manifests import DiskManifests
+from hybridlog_storage.manifests import DiskManifests, change_in, clear_in, read_in, write_in
 from tests.calls import Calls
 from tests.limits import Limit
 from tests.power import PowerCut
@@ -273,6 +273,25 @@ def test_without_hard_links_there_is_no_older_one(store: Path, calls: Calls) -> 
     assert manifests.read(ONE.id).tags == {"a": "b"}
 
 
+def test_after_a_killed_change_no_second_name_stays(store: Path) -> None:
+    """It had kept the older one, and had not replaced it yet: both are one file."""
+    folder = store / "recordings" / ONE.id
+    (folder / "manifest.old").unlink(missing_ok=True)
+    os.link(store / "manifests" / f"{ONE.id}.json", folder / "manifest.old")
+    DiskManifests(store).change(ONE.id, tagged)
+    assert not [name for name in names(store) if Path(name).name.startswith(".manifest")]
+
+
+def test_what_killed_changes_left_is_removed_under_the_lock(store: Path) -> None:
+    folder = store / "recordings" / ONE.id
+    left = [folder / ".manifest.old", folder / f".manifest.json.{'0' * 16}"]
+    for path in left:
+        path.write_bytes(b"x")
+    clear_in(folder)
+    assert not any(path.exists() for path in left)
+    assert (folder / "000000.mcap").exists()
+
+
 def test_who_stands_still_is_not_waited_for_without_end(store: Path, limit: Limit) -> None:
     limit(manifest_wait_s=0.2)
     holds = (
@@ -365,3 +384,24 @@ def test_notes_are_kept_in_order(store: Path) -> None:
     for at in (3, 1, 2):
         manifests.change(ONE.id, lambda now, at=at: replace(now, notes=(*now.notes, Note(at, ""))))
     assert [note.at for note in manifests.read(ONE.id).notes] == [3, 1, 2]
+
+
+def test_no_two_manifests_look_alike(tmp_path: Path) -> None:
+    """However fast they follow each other; sizes and inodes come again."""
+    folder = tmp_path / "recordings" / ONE.id
+    folder.mkdir(parents=True)
+    write_in(folder, ONE)
+    seen = set()
+    for number in range(100):
+        change_in(folder, lambda now, n=number: replace(now, tags={"a": f"{n:03d}"}), sync=False)
+        seen.add((folder / "manifest.json").stat().st_mtime_ns)
+    assert len(seen) == 100
+
+
+def test_a_removed_recording_is_not_changed(tmp_path: Path) -> None:
+    folder = tmp_path / "recordings" / ONE.id
+    folder.mkdir(parents=True)
+    write_in(folder, replace(ONE, status="removed"))
+    with pytest.raises(RecordingGoneError):
+        change_in(folder, tagged)
+    assert read_in(folder) == replace(ONE, status="removed")

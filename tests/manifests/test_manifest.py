@@ -23,7 +23,9 @@ from hybridlog_storage.manifest import (
     Source,
     decode,
     encode,
+    free_name,
     is_id,
+    name_of,
     new_id,
     new_random,
     replace,
@@ -186,3 +188,29 @@ def test_ids_are_readable_and_safe() -> None:
     assert "-robot-7-bag-" in new_id("Robot 7.bag")
     assert new_random() != new_random()
     assert not any(map(is_id, ("", "robot", "A-3f9a12bc04d7e615", f"{ID}\n", f"../{ID}")))
+
+
+@pytest.mark.parametrize(
+    ("text", "name"),
+    [
+        ("robot", "robot"),
+        ("my run/1", "my run-1"),
+        ("../../etc", "-..-etc"),
+        (".hidden", "hidden"),
+        ("--all", "--all"),
+        ("", "recording"),
+        ("...", "recording"),
+        ("äöü", "äöü"),
+        ("x" * 300, "x" * 255),
+        ("ä" * 200, "ä" * 127),
+        ("a\0b\nc\x1b[1m\x85", "a-b-c-[1m-"),
+    ],
+)
+def test_what_users_call_a_recording_becomes_a_name(text: str, name: str) -> None:
+    assert name_of(text) == name_of(name) == name
+    assert decode(encode(Manifest(new_id(text), name, 1))).name == name
+    assert free_name(text, {"other"}) == name
+    second = free_name(text, {name})
+    assert second.endswith("-2")
+    assert name_of(second) == second
+    assert free_name(text, {name, second}).endswith("-3")

@@ -15,6 +15,7 @@ from rosbags.typesys.store import Typestore
 import hybridlog as hl
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests import places
 
 COUNT = 120
 SETTINGS = SegmentSettings(chunk_size=32 << 10, segment_size=60 << 10)
@@ -155,4 +156,4 @@ def messages(store: hl.Store) -> list[tuple[Any, ...]]:
 
 
 def recording_of(store: Path) -> Path:
-    return store / "recordings" / "log"
+    return places.folder(store, "log")

@@ -27,6 +27,7 @@ from hybridlog.query.planner import Planner
 from hybridlog.schema.codecs import codec_for
 from hybridlog_storage.errors import PayloadError, StoreError, TopicError, UsageError
 from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests import places
 from tests.cli.within import answer
 from tests.payloads.logs import (
     BASE,
@@ -233,7 +234,7 @@ def test_shared_files_have_no_holes_and_cost_what_it_says(copy: Path, tmp_path: 
 def test_a_damaged_chunk_costs_no_table(copy: Path, *, off: bool) -> None:
     with hl.open(copy, mongo="none") as store:
         store.index.arrays("scan", off=not off)
-        segment = min(store.directory.recording("log").glob("*.mcap"))
+        segment = min(places.folder(store.directory.path, "log").glob("*.mcap"))
         data = bytearray(segment.read_bytes())
         data[2000] ^= 1
         segment.write_bytes(data)

@@ -18,9 +18,10 @@ import hybridlog as hl
 from hybridlog.entries import put_entry
 from hybridlog.maintenance import expiry
 from hybridlog.maintenance.expiry import Expired
-from hybridlog_storage import journal
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import IncompleteError, PayloadError, StoreError
+from hybridlog_storage.manifests import MANIFEST, read_in
+from tests import places
 from tests.cli.within import answer
 from tests.copies import bring
 from tests.format_reader import FormatReader
@@ -40,12 +41,12 @@ def expire(
     """Delete payloads of the only recording of a store."""
     with hl.open(store) as opened:
         (entry,) = opened.recordings()
-        with opened.directory.writing(entry.label, entry.id) as label:
+        with opened.directory.writing(entry.id, entry.name):
             least = expiry.MIN_BYTES if is_worth else 0
             found = expiry.expire(
-                opened.directory, label, segments, topics, min_bytes=least, max_files=max_files
+                opened.directory, entry.id, segments, topics, min_bytes=least, max_files=max_files
             )
-            put_entry(opened.directory, opened.catalog, label)
+            put_entry(opened.directory, opened.catalog, entry.id)
     return found
 
 
@@ -73,7 +74,7 @@ def answers(path: Path) -> dict[str, Any]:
 
 
 def recording_of(store: Path) -> Path:
-    return store / "recordings" / "log"
+    return places.folder(store, "log")
 
 
 def field_files(store: Path) -> list[Path]:
@@ -190,16 +191,16 @@ def test_what_is_left_is_copied_checked_and_never_made_again(copy: Path, tmp_pat
         store.edit("log", name="new")
         store.edit("new", name="log")
     assert answers(other) == right
-    (copy / "recordings" / "log" / journal.JOURNAL).unlink()
+    (recording_of(copy) / MANIFEST).unlink()
     with hl.open(copy, mongo="none") as store:
-        assert [f.place for f in store.verify().findings] == ["journal"]
+        store.verify(repair=True)
     assert answers(copy) | {"status": 0} == right | {"status": 0}
     with hl.open(other, mongo="none") as store:
-        path = next((other / "recordings" / "log" / "payloads").glob("fields=scan/*"))
+        path = next((places.folder(other, "log") / "payloads").glob("fields=scan/*"))
         whole = path.read_bytes()
         path.write_bytes(whole[:900] + bytes([whole[900] ^ 1]) + whole[901:])
-        places = [one.place for one in store.verify().findings]
-        assert f"payloads/fields=scan/{path.name}" in places
+        found = [one.place for one in store.verify().findings]
+        assert f"payloads/fields=scan/{path.name}" in found
         shutil.rmtree(other / "tables")
     with hl.open(other, mongo="none") as store:
         with pytest.raises(StoreError, match="Restore the file from a copy"):
@@ -219,26 +220,27 @@ def test_files_of_fields_are_joined(copy: Path, tmp_path: Path) -> None:
     before = answers(copy)
     for segment in (0, 1):
         expire(copy, [segment], max_files=0)
-    listed = journal.read(recording_of(copy))
+    listed = read_in(recording_of(copy))
     assert listed is not None
-    assert sorted(file.topic for file in listed.payloads.values()) == TOPICS
+    assert sorted(file.topic for file in listed.fields) == TOPICS
     assert len(listed.deleted) > len(TOPICS)
     there = {str(p.relative_to(recording_of(copy) / "payloads")) for p in field_files(copy)}
-    assert there == {*listed.payloads}
+    assert there == {file.file for file in listed.fields}
     assert answers(copy) == before
     with hl.open(copy, mongo="none") as store, hl.open(tmp_path / "o", create=True) as other:
         assert store.verify().findings == []
         bring(other, copy)
         assert other.verify().findings == []
-    # Without its journal a recording knows which files the others were joined to.
-    (recording_of(copy) / "journal").unlink()
+    # One that has lost its manifest knows from the one before which files were joined.
+    with hl.open(copy, mongo="none") as store:
+        store.edit("log", note="looked at")
+    (recording_of(copy) / MANIFEST).unlink()
     with hl.open(copy, mongo="none") as store:
         store.verify(repair=True)
-        found = [one.place for one in store.verify().findings]
-        assert found in ([], ["journal"])
-    rebuilt = journal.read(recording_of(copy))
-    assert rebuilt is not None
-    assert rebuilt.payloads.keys() == listed.payloads.keys()
+        assert [one.place for one in store.verify().findings] == ["manifest"]
+    made = read_in(recording_of(copy))
+    assert made is not None
+    assert (made.fields, made.deleted) == (listed.fields, listed.deleted)
     after = answers(copy)
     assert {key: after[key] for key in before if key != "status"} == {
         key: before[key] for key in before if key != "status"

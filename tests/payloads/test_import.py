@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 import hybridlog as hl
+from tests import places
 from tests.copies import bring
 from tests.payloads.logs import recording_of
 from tests.payloads.test_expiry import expire
@@ -101,21 +102,27 @@ def test_only_what_is_listed_is_copied(source: Path, mine: hl.Store, thin: Path)
     assert files_of(mine.directory.path) == files_of(thin)
     names = {path.name for path in recording_of(mine.directory.path).iterdir()}
     segments = {name for name in files_of(thin) if name.endswith(".mcap")}
-    assert names == {"journal", "payloads", "writer.lock", *segments}
+    assert names - {"manifest.lock", "manifest.old"} == {
+        "manifest.json",
+        "payloads",
+        "writer.lock",
+        *segments,
+    }
     assert mine.recordings()[0].status == "complete"
     assert not mine.verify().findings
 
 
 def test_what_an_earlier_import_left_is_checked(source: Path, mine: hl.Store, thin: Path) -> None:
     with hl.open(source, mongo=NOWHERE) as store:
-        hidden = mine.directory.recording(f".importing-{store.recordings()[0].id}")
+        hidden = places.root(mine.directory.path) / f".importing-{store.recordings()[0].id}"
     shutil.copytree(recording_of(source), hidden)
+    (hidden / "manifest.json").unlink()  # it is written when all else is whole
     shutil.copy(hidden / "000000.mcap", hidden / "000077.mcap")
     (hidden / "payloads" / "fields=scan" / "stale.parquet").write_bytes(b"stale")
     for path in hidden.glob("payloads/fields=cloud/*"):
         flip(path)
     cut(hidden / "000001.mcap")
-    bring(mine, source)
+    assert bring(mine, source).copied == ["log"]
     assert files_of(mine.directory.path) == files_of(thin)
     assert mine.recordings()[0].status == "complete"
     assert not mine.verify().findings

@@ -59,7 +59,7 @@ def test_the_same_answers_with_and_without(store: hl.Store, calls: Calls, condit
         "table": lambda s: s.topic("/t").where(condition).to_arrow().to_pylist(),
         "times": lambda s: [*s.topic("/t").where(condition).windows(0, "1ns")],
         "some": lambda s: s.topic("/t").where(condition).between("+1s", "+4s").count(),
-        "recordings": lambda s: s.choose(Choice.of(where=f"/t: {condition}")).labels,
+        "recordings": lambda s: s.choose(Choice.of(where=f"/t: {condition}")).names,
         "states": lambda s: [*s.topic("/t").where(condition).intervals()],
     }
     with hl.open(store.directory.path) as other:

@@ -81,7 +81,7 @@ def test_null_and_missing_are_different(store: hl.Store, tmp_path: Path) -> None
 def test_mixed_kinds_and_definitions(
     store: hl.Store, file: str, topic: str, field: str, wanted: list[int]
 ) -> None:
-    if file not in {entry.label for entry in store.recordings()}:
+    if file not in {entry.name for entry in store.recordings()}:
         store.record(CASES / f"{file}.mcap", name=file)
     found = store.topic(topic).in_recording(file).changes(field, pause="1us")
     assert [(change.begin_ns - BASE) // 10**8 for change in found] == wanted

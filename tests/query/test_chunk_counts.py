@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 import hybridlog as hl
 from hybridlog.query.intervals import Intervals
 from hybridlog_storage.errors import SegmentError
+from tests import places
 from tests.limits import Limit
 from tests.query.test_intervals import BASE, SECOND, Model, intervals, recorded, several
 
@@ -99,7 +100,7 @@ def without_tables(limit: Limit) -> None:
 
 
 def segment_of(store: hl.Store) -> Path:
-    return store.directory.recording("a") / "000000.mcap"
+    return places.segment(store.directory.path, "a")
 
 
 def test_a_count_by_time_reads_indexes_at_its_ends_only(many: hl.Store) -> None:

@@ -217,7 +217,7 @@ def _world(place: Path, mongo: str) -> Iterator[World]:
                     )
                 )  # fmt: skip
             assert len(everything) == 400 * (seed + 1)
-        everything.sort(key=lambda m: (m.log_time, m.recording[:16], m.seq))
+        everything.sort(key=lambda m: (m.log_time, m.recording[-16:], m.seq))
         assert (store.database is None) == (mongo == NONE)
         if store.database is not None:
             assert store.database.count(topic_places.SHARED, {"_meta.seq": {"$gte": 0}}) > 400

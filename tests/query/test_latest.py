@@ -16,6 +16,7 @@ from hybridlog.record.recorder import RecordOptions
 from hybridlog_storage.errors import SegmentError, TopicError
 from hybridlog_storage.segments.segment_reader import SegmentReader
 from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests import places
 from tests.calls import Calls
 from tests.query.test_intervals import BASE, SECOND, Model, recorded, several
 
@@ -133,7 +134,7 @@ def test_what_was_read_is_forgotten_with_its_recording(many: hl.Store) -> None:
 
 def test_a_damaged_chunk_is_named(many: hl.Store) -> None:
     entry = many.recordings()[0]
-    path = many.directory.recording(entry.label) / "000000.mcap"
+    path = places.segment(many.directory.path, entry.name)
     whole = path.read_bytes()
     last = many.session.chunks(entry, [entry.channels[0].id], None, "log")[-1]
     place = last.place.offset + last.place.length - 1

@@ -12,6 +12,7 @@ import foxglove
 import pytest
 from foxglove.channels import EventChannel, LogChannel
 from foxglove.messages import Event, KeyValuePair, Log, Timestamp
+from msgspec import structs
 from starlette.testclient import TestClient
 
 import hybridlog as hl
@@ -19,8 +20,9 @@ from hybridlog.query.answers.marks import marks_in
 from hybridlog.query.counters import Counters
 from hybridlog.view.loopback import Admission
 from hybridlog.view.server import make_app
-from hybridlog_storage import journal
 from hybridlog_storage.errors import TimeError, UsageError
+from hybridlog_storage.manifest import replace
+from tests import places
 from tests.cli.within import answer
 
 S = 10**9
@@ -91,7 +93,7 @@ def test_a_mark_is_removed(store: hl.Store, tmp_path: Path) -> None:
     answer("mark", "carpet", "-r", "drive", "--at", "+70s", "--remove", store=path)
     answer("mark", "carpet", "-r", "drive", "--until", "+70s", "--remove", store=path, code=2)
     marks = "/hybridlog/marks"
-    folder = path / "recordings" / "drive"
+    folder = places.folder(path, "drive")
     with hl.open(path, mongo="none") as opened:
         assert [m["text"] for m in opened.entry("drive").marks] == ["carpet", "stairs"]
         assert times(opened.topic(marks)) == [60, 80]
@@ -138,11 +140,10 @@ def test_a_mark_ends_after_it_begins(store: hl.Store) -> None:
         store.mark("drive", "+5s", "x", until="+4s")
     (mark,) = store.entry("drive").marks
     assert mark["end"] - mark["time"] == 4 * S
-    lines = (store.directory.recording("drive") / journal.JOURNAL).read_bytes().splitlines()
-    wrong = journal.event(journal.MARKED, **{**mark, "end": mark["time"] - 1})
-    state = journal.parse(b"\n".join([*lines, journal.encode(wrong).strip()]) + b"\n")
-    assert state.damaged == [len(lines) + 1]
-    assert state.marks == [mark]
+    manifest = places.manifest(store.directory.path, "drive")
+    wrong = [structs.replace(one, end=one.time - 1) for one in manifest.marks]
+    with pytest.raises(ValueError, match="ends before it begins"):
+        replace(manifest, marks=tuple(wrong))
 
 
 def test_an_odd_event_is_a_mark_where_its_message_is(tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from hybridlog_storage.disk import files
 from hybridlog_storage.errors import BucketError, StoreError, UsageError
 from hybridlog_storage.remote.bucket import Bucket
 from hybridlog_storage.remote.store import RemoteDirectory
+from tests import places
 from tests.copies import bring
 from tests.copying.conftest import (
     STATES,
@@ -56,7 +57,7 @@ def test_from_the_robot_to_the_bucket(
     """Each hop is cut at ten bytes, and goes on; all places answer like the robot."""
     draw = random.Random(SEED)
     right = all_answers(robots)
-    total = sum(path.stat().st_size for path in (robots / "recordings").glob("*/**/*.*"))
+    total = sum(path.stat().st_size for path in places.root(robots).glob("*/**/*.*"))
     here = robots
     for there in (tmp_path / "disk", tmp_path / "server", Path(address)):
         with hl.open(here, mongo="none") as store:
@@ -71,8 +72,8 @@ def test_from_the_robot_to_the_bucket(
         assert (again.copied, sorted(again.known)) == ([], sorted(STATES))
         assert len(proxy.requests) <= len(STATES) + 1
         for label in () if there == Path(address) else STATES:
-            known = files_in(robots / "recordings" / label)
-            assert files_in(there / "recordings" / label) == known
+            known = files_in(places.folder(robots, label))
+            assert files_in(places.folder(there, label)) == known
         files.mounted.clear()
         assert all_answers(there) == right
         here = there
@@ -85,7 +86,7 @@ def test_from_the_robot_to_the_bucket(
     objects = {one.name for one in Bucket(address).objects("recordings")}
     with hl.open(here) as store:
         assert isinstance(store.directory, RemoteDirectory)
-        listed = [store.directory.files_of(label).values() for label in STATES]
+        listed = [store.directory.files_of(store.entry(name).id).values() for name in STATES]
     assert objects == {one.name for files_ in listed for one in files_}  # none was sent twice
 
 
@@ -108,7 +109,7 @@ def test_a_copy_is_cut_after_each_request(
                 proxy.reset()
                 files.mounted.clear()
                 with suppress(StoreError), hl.open(address) as there:
-                    assert there.directory.labels() == []
+                    assert there.directory.ids() == []
         else:
             pytest.fail("it never ends")
         assert allowed > 8
@@ -144,7 +145,7 @@ def test_fields_come_first_and_payloads_go_here(
             there.edit("recorded", tag={"seen": "yes"})
             there.edit("noted", name="known")
             assert not there.verify().findings
-        size = sum(path.stat().st_size for path in (here / "recordings").glob("*/**/*.*"))
+        size = sum(path.stat().st_size for path in places.root(here).glob("*/**/*.*"))
         report = store.copy(address, options=CopyOptions(then_expire=True, limit_rate=2 * size))
         assert (sorted(report.copied), report.problems) == (["driven", "known", "recorded"], [])
         assert report.freed_bytes > 0
@@ -171,7 +172,7 @@ def test_damaged_recordings_are_refused(
     here = tmp_path / "here"
     with hl.open(robots, mongo="none") as robot:
         robot.copy(here, ["recorded", "noted"])
-    path = here / "recordings" / "noted" / "000001.mcap"
+    path = places.segment(here, "noted", 1)
     data = bytearray(path.read_bytes())
     data[len(data) // 3] ^= 1
     path.write_bytes(data)

@@ -17,7 +17,7 @@ from hybridlog.maintenance.copying import CopyOptions, run
 from hybridlog.maintenance.places import CopiedSegment
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import UsageError
-from hybridlog_storage.remote.bucket import Bucket
+from hybridlog_storage.remote.bucket import Bucket, path_of
 from hybridlog_storage.remote.store import RemoteDirectory
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.calls import Calls
@@ -58,7 +58,11 @@ def test_messages_have_addresses(address: str) -> None:
 
 def lose(address: str, *names: str) -> None:
     bucket = Bucket(address)
-    found = [o.name for o in bucket.objects("recordings") if o.name.rpartition("/")[2] in names]
+    found = [
+        one.name
+        for one in bucket.objects("recordings")
+        if path_of(one.name.rpartition("/")[2]) in names
+    ]
     bucket.delete(found)
     files.mounted.clear()
 
@@ -111,24 +115,26 @@ def test_what_neither_has_is_told(robot: hl.Store, address: str) -> None:
         assert report.copied == []
         assert "has lost 000001.mcap, which this store does not have" in report.refused["run"]
         assert states(address) == there
-    lose(address, "journal")
+    lose(address, "manifest.json")
     report = robot.copy(address, options=THEN)
     assert "has payloads that are not here, in 000000.mcap, 0000" in report.refused["run"]
 
 
-def test_a_lost_journal_is_brought_back(robot: hl.Store, address: str) -> None:
+def test_a_lost_manifest_is_brought_back(robot: hl.Store, address: str) -> None:
     """With what was added there since."""
     robot.copy(address)
     with hl.open(address) as there:
         there.edit("run", tag={"seen": "yes"})
         there.mark("run", "+1s", "lab")
-    lose(address, "journal")
+        there.pin("run", "+1s", "+2s", topics=["scan"], reason="mine")
+        before = there.entry("run")
+    lose(address, "manifest.json")
     assert robot.copy(address).copied == ["run"]
     files.mounted.clear()
     with hl.open(address) as there:
         assert not there.verify().findings
-        assert there.entry("run").tags == {"seen": "yes"}
-        assert [mark["text"] for mark in there.entry("run").marks] == ["lab"]
+        assert before.pins
+        assert there.entry("run") == before
 
 
 @pytest.mark.parametrize("has_digests", [True, False])

@@ -26,6 +26,7 @@ from hybridlog_storage.errors import (
     StoreError,
     UsageError,
 )
+from hybridlog_storage.manifests import MANIFEST
 from hybridlog_storage.remote import address_of
 from hybridlog_storage.remote.blocks import BLOCK, BlockCache
 from hybridlog_storage.remote.bucket import Bucket
@@ -43,7 +44,7 @@ def everything(store: hl.Store) -> dict[str, Any]:
     """Answers of all kinds."""
     return {
         "recordings": [
-            (one.id, one.label, one.status, one.tags, one.notes, one.marks, one.span, one.messages)
+            (one.id, one.name, one.status, one.tags, one.notes, one.marks, one.span, one.messages)
             for one in store.recordings()
         ],
         "topics": store.topics(),
@@ -107,9 +108,9 @@ def test_edits(here: Path, address: str, proxy: Proxy) -> None:
     with hl.open(address) as store:
         store.edit("run", tag={"who": "me"})
         store.edit("run", note="good")
-        assert store.edit("run", name="A new run").label == "A-new-run"
+        assert store.edit("run", name="A new run").name == "A new run"
         store.remove("short-0")
-        assert [one.label for one in store.recordings()] == ["A-new-run"]
+        assert [one.name for one in store.recordings()] == ["A new run"]
     files.mounted.clear()
     with hl.open(address) as store:
         (entry,) = store.recordings()
@@ -117,22 +118,30 @@ def test_edits(here: Path, address: str, proxy: Proxy) -> None:
         assert [note["text"] for note in entry.notes] == ["good"]
         assert store.topic("/arm").count() == 400
         assert not store.verify().findings
-    answer("tag", "A-new-run", "why=test", store=Path(address))
+    answer("tag", "A new run", "why=test", store=Path(address))
     assert "why=test" in answer("ls", store=Path(address)).out
 
 
-def test_changes_keep_their_order(here: Path, address: str, proxy: Proxy) -> None:
-    """Also where the name of one that did not come to its end is free again."""
+def test_a_change_is_one_manifest_and_one_list(here: Path, address: str, proxy: Proxy) -> None:
+    """The manifest before it is listed no more; readers of an older list still have it."""
     publish_all(here, address, ("run",))
     with hl.open(address) as store:
-        bucket, name = Bucket(address), f"recordings/{store.entry('run').id}/journal.1"
-        bucket.create(name, b"?")
+        directory = store.directory
+        assert isinstance(directory, RemoteDirectory)
+        recording = store.entry("run").id
+        old = directory.files_of(recording)[MANIFEST]
+        proxy.requests.clear()
         store.edit("run", tag={"x": "1"})
-        bucket.delete([name])
-        store.edit("run", tag={"x": "2"})
+        made = [path for method, path, _ in proxy.requests if method == "PUT"]
+        assert ["/lists/" in path for path in made] == [False, True]
+        new = directory.files_of(recording)[MANIFEST]
+        assert new.name in made[0]
+        assert {one.name for one in Bucket(address).objects("recordings")} > {old.name, new.name}
+        with pytest.raises(UsageError, match="has no tag"):
+            store.edit("run", untag=["y"])
     files.mounted.clear()
     with hl.open(address) as store:
-        assert store.entry("run").tags["x"] == "2"
+        assert store.entry("run").tags["x"] == "1"
 
 
 def test_the_command_copies(here: Path, address: str, proxy: Proxy) -> None:
@@ -184,7 +193,8 @@ def test_marks_pins_and_rules(here: Path, address: str, proxy: Proxy) -> None:
     with hl.open(address) as store:
         directory = store.directory
         assert isinstance(directory, RemoteDirectory)
-        whole = {label: {*directory.files_of(label).values()} for label in ("run", "more")}
+        ids = [store.entry(name).id for name in ("run", "more")]
+        whole = {one: {*directory.files_of(one).values()} for one in ids}
         raw = [message.raw for message in store.topic("/scan").in_recording("run")]
         kept = store.mark("run", "+2s", "seen", {"by": "lab"}, until="+3s").marks
         assert [mark["text"] for mark in kept] == ["slipped", "seen"]
@@ -238,7 +248,7 @@ def test_tidying_leaves_what_may_be_needed(here: Path, address: str, proxy: Prox
     with hl.open(address) as store:
         directory = store.directory
         assert isinstance(directory, RemoteDirectory)
-        gone = store.entry("short-0").id
+        gone, run = store.entry("short-0").id, store.entry("run").id
         store.remove("short-0")
         store.edit("run", tag={"a": "b"})
         directory.source.bucket.create("recordings/x/000000.mcap", b"of a copy")
@@ -250,6 +260,7 @@ def test_tidying_leaves_what_may_be_needed(here: Path, address: str, proxy: Prox
         assert {name for name in names if gone not in name} == {
             *later,
             "recordings/x/000000.mcap",
+            f"recordings/{run}/manifest.json",
         }
         assert len(names) > 6
         directory.source.bucket.delete([*names])
@@ -281,7 +292,7 @@ def test_two_who_send_large_files_at_once(
     limit(bucket_whole_bytes=10_000, bucket_part_bytes=5_000)
     publish = BucketPlace.publish
 
-    def overtaken(place: BucketPlace, label: str, lines: bytes, **options: Any) -> str:
+    def overtaken(place: BucketPlace, data: bytes) -> str:
         monkeypatch.setattr(BucketPlace, "publish", publish)
         with hl.open(here, mongo="none") as other:
             assert other.copy(address, ["short-0"]).copied == ["short-0"]
@@ -291,7 +302,7 @@ def test_two_who_send_large_files_at_once(
             version = bucket._put(one.name, content, "overwrite")
             assert version != one.version
             place._there[path] = replace(one, version=version)
-        return publish(place, label, lines, **options)
+        return publish(place, data)
 
     monkeypatch.setattr(BucketPlace, "publish", overtaken)
     with hl.open(here, mongo="none") as store:
@@ -372,20 +383,23 @@ def test_lost_objects(here: Path, address: str, tmp_path: Path, changes: bool) -
         assert not store.verify().findings
 
 
-def test_lost_fields_and_journals(here: Path, address: str, proxy: Proxy) -> None:
+def test_lost_fields_and_manifests(here: Path, address: str, proxy: Proxy) -> None:
     publish_all(here, address, ("run", "short-0"))
     table = lose(address, ".parquet")
     files.mounted.clear()
     with hl.open(address) as store:
         assert store.topic("/arm").where("n < 10").count() == 20
         assert [one.place for one in store.verify().findings] == [table]
-    lose(address, "/journal", table.split("/")[-1][:32])
+    lose(address, "/manifest.json", table.split("/")[-1].rpartition("-")[0])
     files.mounted.clear()
     with hl.open(address) as store:
         findings = store.verify().findings
-        assert [one.place for one in findings] == ["journal", table]
+        assert [one.place for one in findings] == ["manifest", table]
+        assert "hybridlog copy" in findings[0].cure
         label = findings[0].recording
-        assert store.topic("/arm").where("n < 10").count() == 20
+    files.mounted.clear()
+    with hl.open(address) as store, pytest.raises(StoreError, match="has no manifest"):
+        store.topic("/arm").where("n < 10").count()
     with hl.open(here, mongo="none") as source:
         proxy.requests.clear()
         assert source.copy(address, ["run", "short-0"]).copied == [label]
@@ -432,8 +446,8 @@ def test_hostile_lists(published: str, proxy: Proxy) -> None:
     store, number = head["store"], len(RECORDINGS)
     assert newest.name == list_name(number)
     assert StoreList.from_bytes(store, number, data, "it").to_bytes() == data
-    (label, one), *_ = head["recordings"].items()
-    (path, row), *_ = one["files"].items()
+    (recording, one), *_ = head["recordings"].items()
+    (path, row), *_ = one.items()
 
     def refused(changed: dict[str, Any] | None, packed: bytes | None = None) -> None:
         text = json.dumps(changed).encode() + b"\n" + rest
@@ -442,13 +456,12 @@ def test_hostile_lists(published: str, proxy: Proxy) -> None:
 
     refused({**head, "store": "other"})
     refused({**head, "format": 2})
-    for wrong in ("../run", ".hidden", "a/b", "", "x" * 200):
+    for wrong in ("../run", ".hidden", "a/b", "", "x" * 200, "run"):
         refused({**head, "recordings": {wrong: one}})
-    refused({**head, "recordings": {label: one, "twice": one}})
     for wrong in ("../../etc/passwd", "/etc/passwd", "a//b", "a/b/c/d"):
-        refused({**head, "recordings": {label: {**one, "files": {wrong: row}}}})
+        refused({**head, "recordings": {recording: {**one, wrong: row}}})
     for bad in (["other/file", *row[1:]], [row[0] + "/../x", *row[1:]], [row[0], -1, ""], [1, 2]):
-        refused({**head, "recordings": {label: {**one, "files": {path: bad}}}})
+        refused({**head, "recordings": {recording: {**one, path: bad}}})
     refused(None, data[:-3])
     refused(None, zlib.compress(b"[]\n"))
 
@@ -528,32 +541,31 @@ def test_all_commands_tell_of_lost_objects(here: Path, address: str) -> None:
         files.mounted.clear()
         return answer(*words, store=Path(address))
 
-    for lost, (listed, missing) in {
-        "000001.mcap": ("stored data lost", "20 lost"),
-        "/journal": ("journal lost", "an unknown number lost"),
-    }.items():
-        lose(address, lost, run)
-        files.mounted.clear()
-        assert hl.open(address).topic("arm").completeness().has_losses
-        assert listed in told("ls").out
-        assert told("ls", "--json").json[0]["status"] != "complete"
-        for count in ("n < 10", "n > 10000"):
-            assert missing in told("fetch", "arm", "--where", count, "--count").err
-        places = [one["place"] for one in told("verify", "--json").json["findings"]]
-        assert lost.strip("/") in places
-        assert "000001.mcap" in places
-        assert (
-            f"run: {lost.strip('/')}: " in commands.run("verify", store=Path(address), code=1).out
-        )
-    for name in ("000000.mcap", "000002.mcap"):
-        lose(address, name, run)
-    assert "neither a journal nor a segment" in told("ls").err
-    assert {"000000.mcap", "journal"} < {
-        f["place"] for f in told("verify", "--json").json["findings"]
-    }
+    lose(address, "000001.mcap", run)
     files.mounted.clear()
-    with pytest.raises(StoreError, match="neither a journal nor a segment"):
-        hl.open(address).topic("arm").where("n < 10").count()
+    assert hl.open(address).topic("arm").completeness().has_losses
+    assert "stored data lost" in told("ls").out
+    assert told("ls", "--json").json[0]["status"] != "complete"
+    for count in ("n < 10", "n > 10000"):
+        assert "20 lost" in told("fetch", "arm", "--where", count, "--count").err
+    assert [one["place"] for one in told("verify", "--json").json["findings"]] == ["000001.mcap"]
+    assert "run: 000001.mcap: " in commands.run("verify", store=Path(address), code=1).out
+    lose(address, "/manifest.json", run)
+    for _ in range(2):  # also if nothing else is left of it
+        assert "has no manifest" in told("ls").err
+        places = {one["place"] for one in told("verify", "--json").json["findings"]}
+        assert {"000001.mcap", "manifest"} <= places
+        for count in ("n < 10", "n > 10000"):
+            found = commands.run(
+                *("fetch", "arm", "--where", count, "--count"), store=Path(address), code=5
+            )
+            assert "has no manifest" in found.err
+        files.mounted.clear()
+        with pytest.raises(StoreError, match="has no manifest"):
+            hl.open(address).topic("arm").where("n < 10").count()
+        for name in ("000000.mcap", "000002.mcap"):
+            if "000000.mcap" not in places:
+                lose(address, name, run)
     with hl.open(here, mongo="none") as source:
         assert source.copy(address, ["run", "short-0"]).copied == ["run"]
     assert not told("verify", "--json").json["findings"]

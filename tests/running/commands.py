@@ -174,12 +174,12 @@ COMMANDS: dict[str, list[Asked]] = {
     "ls": [
         asked(
             "ls --json",
-            listed("recording", "status", "messages", "start_ns", "last_ns", "topics"),
+            listed("name", "status", "messages", "start_ns", "last_ns", "topics"),
             lambda k: [(LABEL, "open", len(k.of()), *k.span, len(_there(k)))],
         ),
         asked(
             "ls --json --with said:~n~==~4 --has arm",
-            listed("recording"),
+            listed("name"),
             lambda _: [(LABEL,)],
         ),
     ],
@@ -374,12 +374,14 @@ COMMANDS: dict[str, list[Asked]] = {
         asked("keep --pins --json", lambda a, _: a.json, lambda _: []),
     ],
     "edit": [
-        refused(f"edit {LABEL} --name other", 5),
-        refused(f"edit {LABEL} --note quiet", 5),
+        asked(
+            f"edit {LABEL} --name {LABEL}", lambda a, _: a.out, lambda _: f"renamed to {LABEL}\n"
+        ),
+        asked(f"edit {LABEL} --note quiet", lambda a, _: a.out, lambda _: ""),
     ],
     "tag": [
-        refused(f"tag {LABEL} a=b", 5),
-        refused(f"tag {LABEL} --remove robot", 5),
+        asked(f"tag {LABEL} robot=7", lambda a, _: a.lines, lambda _: ["robot=7"]),
+        refused(f"tag {LABEL} --remove nothing", 2),
         asked(f"tag {LABEL}", lambda a, _: a.lines, lambda _: ["robot=7"]),
     ],
     "mark": [refused(f"mark here -r {LABEL} --at +1s", 5)],

@@ -480,7 +480,7 @@ METHODS: dict[str, Rule] = {
         lambda k: (rates(k, "/said", "/arm", "/opaque"), by_window(k, "/arm", SECOND // 2)),
     ),
     "recordings": Rule(
-        lambda s: [s.entry(one).label for one in s.topic("arm").recordings], lambda _: [LABEL]
+        lambda s: [s.entry(one).name for one in s.topic("arm").recordings], lambda _: [LABEL]
     ),
     "remarks": Rule(
         lambda s: any("3 messages" in remark for remark in s.topic("said").remarks()),
@@ -501,7 +501,7 @@ METHODS: dict[str, Rule] = {
         lambda k: numbers(k, "/said", "x"),
     ),
     "summaries": Rule(
-        lambda s: [(r.label, r.messages, r.span) for r in s.topic("arm").summaries()],
+        lambda s: [(r.name, r.messages, r.span) for r in s.topic("arm").summaries()],
         lambda k: [(LABEL, len(k.of()), k.span)],
     ),
     "tags": Rule(
@@ -638,16 +638,16 @@ STORE: dict[str, Rule] = {
     "query": Rule(lambda s: s.query(["/arm"], [LABEL]).count(), lambda k: len(k.of("/arm"))),
     "recordings": Rule(
         lambda s: (
-            s.recordings(has="arm").labels,
-            s.recordings(where="said: n == 4").labels,
-            s.recordings(where="said: n < 0").labels,
-            s.recordings(during=(FIRST_S, LAST_S)).labels,
+            s.recordings(has="arm").names,
+            s.recordings(where="said: n == 4").names,
+            s.recordings(where="said: n < 0").names,
+            s.recordings(during=(FIRST_S, LAST_S)).names,
             s.recordings(tag="robot=7").topic("arm").count(),
         ),
         lambda k: ((LABEL,), (LABEL,), (), (LABEL,), len(k.of("/arm"))),
     ),
     "select": Rule(
-        lambda s: [(e.label, e.status, e.messages, e.span) for e in s.select(None)],
+        lambda s: [(e.name, e.status, e.messages, e.span) for e in s.select(None)],
         lambda k: [(LABEL, "open", len(k.of()), k.span)],
     ),
     "sizes": Rule(
@@ -661,7 +661,7 @@ STORE: dict[str, Rule] = {
             _sql(s, "select count(*), min(n), max(n), sum(x) from said"),
             _sql(s, "select n, ranges[3], name from arm where n > 40 order by t"),
             _sql(s, "select topic, messages from topics order by topic"),
-            _sql(s, "select name, status, messages from recordings"),
+            _sql(s, "select recording, status, messages from recordings"),
             _sql(s, "select text from marks order by log_time"),
             _sql(s, "select cause, messages from losses"),
             _sql(s, "select seq from said order by t, seq", recordings=[LABEL], between=EDGES),
@@ -687,7 +687,7 @@ STORE: dict[str, Rule] = {
         ),
     ),
     "summaries": Rule(
-        lambda s: [(r.label, r.status, r.messages, r.span) for r in s.summaries()],
+        lambda s: [(r.name, r.status, r.messages, r.span) for r in s.summaries()],
         lambda k: [(LABEL, "open", len(k.of()), k.span)],
     ),
     "sync": Rule(

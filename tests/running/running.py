@@ -87,7 +87,7 @@ class Running:
         """Wait until a store sees everything, and the losses."""
         until = time.monotonic() + limit_s
         while True:
-            entry = next((e for e in store.recordings() if e.label == LABEL), None)
+            entry = next((e for e in store.recordings() if e.name == LABEL), None)
             if entry is not None and entry.messages >= len(self.sent) and entry.end.get("losses"):
                 assert entry.messages == len(self.sent)
                 return
@@ -119,7 +119,7 @@ def begun(path: Path, kind: str, steps: int = 200) -> Iterator[Running]:
     """A recording with the first steps of the sequence."""
     options = LiveOptions(settings=SETTINGS[kind], flush_interval_s=FLUSH_S, tags=TAGS)
     with hl.open(path, create=True) as store, hl.open(path) as before:
-        assert LABEL not in before.recordings().labels
+        assert LABEL not in before.recordings().names
         with store.start(LABEL, options) as recording:
             running = Running(recording, store, before)
             running.lose()

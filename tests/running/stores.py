@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import hybridlog as hl
+from tests import places
 from tests.running.methods import LABEL
 from tests.running.running import NO_MONGODB, Running
 
@@ -22,7 +23,7 @@ def copy_of(running: Running, path: Path) -> Path:
 
 def folder(store: Path) -> Path:
     """The directory of the recording."""
-    return store / "recordings" / LABEL
+    return places.folder(store, LABEL)
 
 
 def open_segment(store: Path) -> Path:

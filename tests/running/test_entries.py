@@ -12,7 +12,6 @@ import pytest
 
 import hybridlog as hl
 from hybridlog.entries import put_entry
-from hybridlog.maintenance.report import RepairReport
 from hybridlog.maintenance.verify import verify
 from hybridlog.record.losses import Cause
 from hybridlog.record.running import RunningRecording
@@ -20,6 +19,7 @@ from hybridlog_storage.catalog import RecordingEntry
 from hybridlog_storage.disk.directory import StoreDirectory
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests import places
 from tests.running.running import NO_MONGODB
 
 CHANNELS = [Channel("/a", "json", None), Channel("/b", "json", None)]
@@ -47,7 +47,7 @@ class Running:
     entry: RecordingEntry
 
     def follow(self, directory: StoreDirectory) -> RecordingEntry:
-        running = RunningRecording(directory, "live", lambda: self.sealed)
+        running = RunningRecording(directory, self.sealed.id, lambda: self.sealed)
         running.follow()
         assert running.entry is not None
         return running.entry
@@ -100,7 +100,7 @@ def test_what_is_sealed_while_it_is_listed_counts_once(
 ) -> None:
     """A segment may be listed as open, and be sealed when the catalog is read."""
     directory = StoreDirectory(running.path)
-    listing = directory.listing("live")
+    listing = directory.listing(running.sealed.id)
     late = replace(listing, open={**listing.sealed, **listing.open})
     monkeypatch.setattr(directory, "listing", lambda _: late)
     check(running.follow(directory))
@@ -112,12 +112,12 @@ def test_a_segment_that_begins_in_the_tick_of_a_look_is_found(
 ) -> None:
     """The directory looks the same then; after a while it does not."""
     directory = StoreDirectory(running.path)
-    listing = directory.listing("live")
+    listing = directory.listing(running.sealed.id)
     changed = time.time_ns() - age_s * 10**9
     look = f"1 {changed} {changed} 2 3 {changed} {changed}"
-    monkeypatch.setattr(directory, "looks", lambda _: {"live": look})
+    monkeypatch.setattr(directory, "looks", lambda _: {running.sealed.id: look})
     monkeypatch.setattr(directory, "listing", lambda _: replace(listing, open={}))
-    follower = RunningRecording(directory, "live", lambda: running.sealed)
+    follower = RunningRecording(directory, running.sealed.id, lambda: running.sealed)
     follower.follow()
     monkeypatch.setattr(directory, "listing", lambda _: listing)
     assert follower.follow() == (age_s == 0)
@@ -130,8 +130,8 @@ def test_a_segment_that_is_about_to_be_noted_is_no_problem(running: Running) -> 
     with hl.open(running.path.parent / "store", mongo=NO_MONGODB) as reader:
         catalog, directory = reader.catalog, reader.directory
         catalog.remove(running.entry.id)
-        assert not verify(directory, catalog, None, RepairReport(), labels=["live"]).findings
-        put_entry(directory, catalog, "live", is_open=True)
+        assert not verify(directory, catalog, None, recordings=[running.entry.id]).findings
+        put_entry(directory, catalog, running.entry.id, is_open=True)
 
 
 def test_each_segment_has_the_span_of_its_messages(running: Running) -> None:
@@ -145,7 +145,7 @@ def test_each_segment_has_the_span_of_its_messages(running: Running) -> None:
 @pytest.mark.parametrize("is_file", [True, False])
 def test_what_cannot_be_read_is_a_loss(running: Running, tmp_path: Path, *, is_file: bool) -> None:
     shutil.copytree(running.path, tmp_path / "store")
-    (path,) = (tmp_path / "store").glob("recordings/live/*.mcap.open")
+    (path,) = places.folder(tmp_path / "store", "live").glob("*.mcap.open")
     place = running.entry.flushed[int(path.name[:6])].table.chunks[0]
     data = bytearray(path.read_bytes())
     data[int(place["offset"]) + 60] ^= 1

@@ -19,6 +19,7 @@ from hybridlog.record.marks import MARKS, mark_channel, mark_payload
 from hybridlog_storage.disk.directory import StoreDirectory
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests import places
 from tests.cli.within import answer
 from tests.drawing.test_mp4 import read as read_mp4
 from tests.drawing.test_video import JSON, encoded, payload
@@ -214,7 +215,7 @@ def running(jobs: Jobs, path: Path, _: pytest.MonkeyPatch) -> Iterator[None]:
     import fcntl
 
     shutil.copytree(jobs.copy, path)
-    with (path / "recordings/run/writer.lock").open("r+b") as lock:
+    with (places.folder(path, "run") / "writer.lock").open("r+b") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         yield
 
@@ -244,7 +245,7 @@ def read_only(jobs: Jobs, path: Path, patch: pytest.MonkeyPatch) -> Iterator[Non
 def damaged(jobs: Jobs, path: Path, _: pytest.MonkeyPatch) -> Iterator[None]:
     """Chunks of a topic that no job asks for are damaged, and the index of none."""
     shutil.copytree(jobs.path, path)
-    (segment,) = (path / "recordings/run").glob("*.mcap")
+    (segment,) = places.folder(path, "run").glob("*.mcap")
     data = segment.read_bytes()
     for _ in range(3):
         data = data.replace(NOISE, b"DAMAGE" * (len(NOISE) // 6) + b"D" * (len(NOISE) % 6), 1)

@@ -18,6 +18,7 @@ from hybridlog.maintenance.expiry import expire
 from hybridlog_storage.disk.directory import StoreDirectory
 from hybridlog_storage.segments.attachments import Attachment
 from hybridlog_storage.segments.compression import FilePart
+from tests import places
 from tests.cli.running import complete
 from tests.cli.within import answer
 from tests.imports import ROOT
@@ -60,7 +61,7 @@ def test_a_copy_that_cannot_be_written(running: Running, tmp_path: Path, limit: 
         check(store, known)
         found = store.topic("arm").completeness()
         assert (found.has_losses, found.is_exact) == (True, False)
-        assert list(copied.glob("recordings/live/*.open"))
+        assert list(places.folder(copied, "live").glob("*.open"))
 
 
 def test_a_copy_is_recovered(running: Running, tmp_path: Path) -> None:
@@ -106,8 +107,8 @@ def test_all_payloads_of_a_copy_have_expired(running: Running, tmp_path: Path) -
     copied = copy_of(running, tmp_path / "copy")
     with hl.open(copied, mongo=NO_MONGODB) as store:
         entry = store.entry(LABEL)
-        with store.directory.writing(entry.label, entry.id) as label:
-            expire(store.directory, label, [*map(int, entry.digests)], min_bytes=0)
+        with store.directory.writing(entry.id):
+            expire(store.directory, entry.id, [*map(int, entry.digests)], min_bytes=0)
         store.refresh()
         check_expired(store, known)
     shutil.rmtree(copied / "tables")
@@ -119,14 +120,15 @@ def test_all_payloads_of_a_copy_have_expired(running: Running, tmp_path: Path) -
 def test_payloads_expire_while_it_is_recorded(tmp_path: Path) -> None:
     with begun(tmp_path / "store", "many", 130) as running:
         known = running.flushed()
-        sealed = sorted(map(int, running.before.entry(LABEL).digests))
-        expire(running.store.directory, LABEL, sealed[:1], min_bytes=0)
+        entry = running.before.entry(LABEL)
+        sealed = sorted(map(int, entry.digests))
+        expire(running.store.directory, entry.id, sealed[:1], min_bytes=0)
         check_expired(running.before, known)
-        expire(running.store.directory, LABEL, sealed[:3], ["/cam", "/arm"], min_bytes=0)
+        expire(running.store.directory, entry.id, sealed[:3], ["/cam", "/arm"], min_bytes=0)
         running.write(30)
         known = running.flushed()
         check_expired(running.before, known)
-        expire(running.store.directory, LABEL, sealed, min_bytes=0)
+        expire(running.store.directory, entry.id, sealed, min_bytes=0)
         known = running.flushed()
         check_expired(running.before, known)
     with hl.open(tmp_path / "store") as store:
@@ -242,8 +244,9 @@ def test_renamed_meanwhile(ended: tuple[hl.Store, Known]) -> None:
     with hl.open(store.directory.path, mongo=NO_MONGODB) as other:
         other.edit(LABEL, name="other")
     assert rows([first, *steps]) == sent(known.of())
+    store.refresh()
     assert store.topic("arm").in_recording("other").count() == len(known.of("/arm"))
-    assert [r.label for r in store.summaries()] == ["other"]
+    assert [r.name for r in store.summaries()] == ["other"]
 
 
 def test_removed_meanwhile(ended: tuple[hl.Store, Known]) -> None:
@@ -277,10 +280,10 @@ def test_what_questions_read(tmp_path: Path) -> None:
         again = cost_of(store, running.count)
         assert not [name for name in again.opened if name.endswith(".open")]
         assert again.bytes_read <= 2 * 4096  # the room behind the last block
-        grown = next(path.glob("recordings/*/*.open")).stat().st_size
+        grown = places.files(path, "*.open")[0].stat().st_size
         found.write(20)
         found.flushed()
-        grown = next(path.glob("recordings/*/*.open")).stat().st_size - grown
+        grown = places.files(path, "*.open")[0].stat().st_size - grown
         more = cost_of(store, running.count)
         assert running.count() == found.step
         assert more.bytes_read < grown + 3 * 4096

@@ -62,7 +62,7 @@ sys.addaudithook(_hear)
 
 @contextmanager
 def _counting_reads(cost: Cost) -> Iterator[None]:
-    """Count what the calls return that segments, tables and journals are read with."""
+    """Count what the calls return that segments, tables and manifests are read with."""
     status = os.stat
 
     def looked(*arguments: Any, **options: Any) -> Any:

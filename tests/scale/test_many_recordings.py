@@ -56,7 +56,7 @@ def fill(path: Path, count: int) -> None:
 def stores(tmp_path_factory: pytest.TempPathFactory) -> dict[int, Path]:
     """A store of few recordings, and one of many."""
     top = tmp_path_factory.mktemp("scale")
-    # Names of one length, since journals hold paths.
+    # Names of one length, since manifests hold paths.
     paths = {count: top / f"{count:05d}" / "store" for count in (FEW, MANY)}
     for count, path in paths.items():
         path.parent.mkdir()
@@ -293,7 +293,7 @@ def test_a_small_recording_takes_little_room(stores: dict[int, Path]) -> None:
     kept = [CATALOG, "recordings", "tables"]
     found = [f for name in kept for f in [path / name, *(path / name).rglob("*")] if f.is_file()]
     assert sum(f.stat().st_size for f in found) <= MANY * 30_000
-    assert len(found) <= MANY * 4
+    assert len(found) <= MANY * 5 + 10  # segment, manifest, the one before, two locks
 
 
 def test_one_more_recording_costs_the_same(stores: dict[int, Path], tmp_path: Path) -> None:
@@ -350,22 +350,3 @@ def test_all_of_it_works_with_fewer_files_than_recordings(stores: dict[int, Path
 def test_all_of_it_works_with_1024_files(tmp_path: Path) -> None:
     fill(tmp_path / "store", 1_100)
     check_with_few_files(tmp_path / "store", 1_100, 1024)
-
-
-def test_a_name_is_found_among_many_of_the_same(tmp_path: Path) -> None:
-    """Recordings of one name get numbers, and finding a free one does not try them all."""
-    with hl.open(tmp_path / "store", create=True) as store:
-        for number in range(2, 300):
-            (store.directory.recordings / f"talk-{number}").mkdir()
-        (store.directory.recordings / "talk").mkdir()
-        tried = []
-        has = type(store.directory).has
-
-        def counted(self: object, label: str) -> bool:
-            tried.append(label)
-            return has(store.directory, label)
-
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(type(store.directory), "has", counted)
-            assert store.directory.new_recording("talk") == "talk-300"
-        assert len(tried) < 20

@@ -13,6 +13,7 @@ from mcap.writer import Writer
 import hybridlog as hl
 from hybridlog.query.answers import field_statistics
 from hybridlog.query.engines.tables import TablesEngine
+from tests import places
 from tests.calls import Calls
 from tests.scale.cost import cost_of
 
@@ -55,7 +56,7 @@ def test_a_condition_on_another_topic_reads_each_chunk_once(stores: dict[int, Pa
         with hl.open(path) as store:
             query = store.all_topics().where("s1: data > 3", within="3ms")
             assert query.count() == near(count)
-            size = sum(one.stat().st_size for one in (path / "recordings").glob("*/*.mcap"))
+            size = sum(one.stat().st_size for one in places.files(path))
             costs[count] = cost_of(store, store.all_topics().during(query.question.during).count)
             assert costs[count].bytes_read <= size
     assert costs[MANY].counts == costs[FEW].counts

@@ -16,6 +16,7 @@ from pymongo import MongoClient
 import hybridlog as hl
 from hybridlog.session import Session
 from hybridlog_storage.mongo.index_state import IndexState
+from tests import places
 from tests.cli.running import COMMAND, environment
 from tests.faults import logs
 from tests.servers.mongods import Mongod, eventually
@@ -27,8 +28,9 @@ WATCH = ("index", "watch", "--every", "100ms")
 
 def arrive(robot: Path, lab: Path, label: str) -> None:
     """A recording comes whole into the lab's store, as a copy lets it."""
-    shutil.copytree(robot / "recordings" / label, lab / "recordings" / ".coming")
-    (lab / "recordings" / ".coming").rename(lab / "recordings" / label)
+    folder = places.folder(robot, label)
+    shutil.copytree(folder, places.root(lab) / ".coming")
+    (places.root(lab) / ".coming").rename(places.new_folder(lab, folder.name))
 
 
 def test_what_comes_into_a_store_is_indexed_once_by_several_that_watch(
@@ -56,7 +58,7 @@ def test_what_comes_into_a_store_is_indexed_once_by_several_that_watch(
                 def overtaken(session: Session, summary: Any) -> Any:
                     entry = read(session, summary)
                     is_ours = session.shared is store.shared
-                    if is_ours and summary.label == "drive-4" and not other.shared.repairs.indexed:
+                    if is_ours and summary.name == "drive-4" and not other.shared.repairs.indexed:
                         other.refresh()
                         other.connect()
                     return entry
@@ -78,11 +80,13 @@ def test_what_comes_into_a_store_is_indexed_once_by_several_that_watch(
             for out in outs:
                 errs.append(out.with_suffix(".err"))
                 watching.append(
-                    subprocess.Popen(
-                        [*COMMAND, *WATCH, "--store", str(lab), "--json"],
-                        env=environment(),
-                        stdout=stack.enter_context(out.open("w")),
-                        stderr=stack.enter_context(errs[-1].open("w")),
+                    stack.enter_context(
+                        subprocess.Popen(
+                            [*COMMAND, *WATCH, "--store", str(lab), "--json"],
+                            env=environment(),
+                            stdout=stack.enter_context(out.open("w")),
+                            stderr=stack.enter_context(errs[-1].open("w")),
+                        )
                     )
                 )
                 stack.callback(watching[-1].kill)

@@ -28,6 +28,7 @@ from hybridlog_storage.errors import (
     ResourceError,
     UsageError,
 )
+from tests import places
 from tests.cli.running import COMMAND, environment
 from tests.sql.conftest import LARGE
 from tests.sql.test_engine import ENDLESS
@@ -158,7 +159,7 @@ def test_unreadable_messages_are_told(tmp_path: Path) -> None:
 
 def test_losses_are_told(root: Path, tmp_path: Path) -> None:
     shutil.copytree(root, tmp_path / "store", ignore=shutil.ignore_patterns("mongod*"))
-    (tmp_path / "store" / "recordings" / "second" / "000000.mcap").unlink()
+    places.segment(tmp_path / "store", "second").unlink()
     done = run(tmp_path / "store", "select count(*) from large", "-F", "csv")
     assert done.stdout.splitlines()[1] == str(LARGE)
     lost = run(

@@ -29,6 +29,7 @@ from hybridlog_storage.errors import (
     TopicError,
     UsageError,
 )
+from tests import places
 from tests.limits import Limit
 from tests.sql.conftest import LARGE, SCANS, scan
 from tests.tables.logs import BASE, SECOND
@@ -273,7 +274,7 @@ def test_a_damaged_chunk_is_an_error(own: hl.Store) -> None:
     (entry,) = own.select(["first"])
     channels = [c.id for c in entry.channels if c.topic == "/base/scan"]
     chunk = own.session.chunks(entry, channels, None, "log")[3]
-    path = own.directory.recording("first") / "000000.mcap"
+    path = places.segment(own.directory.path, "first")
     with path.open("r+b") as file:
         file.seek(chunk.place.offset + 100)
         file.write(b"\xff\x00\xff")
@@ -340,8 +341,8 @@ def test_refreshing_sees_new_recordings(own: hl.Store) -> None:
     query = "select count(*) from large where recording = 'first'"
     before = own.sql(query)
     assert before.rows() == [(LARGE,)]
-    folder = own.directory.recording("first")
-    folder.rename(folder.with_name("renamed"))
+    with hl.open(own.directory.path) as other:
+        other.edit("first", name="renamed")
     own.refresh()
     assert own.sql(query).rows() == [(0,)]
     assert own.sql("select distinct recording from large order by 1").rows() == [

@@ -17,6 +17,7 @@ from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.open_segment import OpenSegment
 from hybridlog_storage.segments.segment_reader import SegmentReader, places_of
 from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests import places
 from tests.limits import Limit
 from tests.sql.conftest import SCAN, scan
 from tests.tables.logs import BASE, STATE, payload
@@ -131,10 +132,10 @@ def test_a_segment_is_read_up_to_its_last_whole_chunk(
     recording, store = reader
     for n in range(300):
         recording.write(LARGE, payload(n), log_time=BASE + n)
-    while not (found := list(store.directory.path.glob("recordings/*/*.mcap.open"))):
+    while not (found := places.files(store.directory.path, "*.mcap.open")):
         time.sleep(0.02)
     recording.close()
-    (sealed,) = store.directory.path.glob("recordings/live/*.mcap")
+    (sealed,) = places.folder(store.directory.path, "live").glob("*.mcap")
     with SegmentReader(sealed, 0) as whole:
         summary = whole.summary()
     data = sealed.read_bytes()

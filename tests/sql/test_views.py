@@ -288,7 +288,7 @@ def test_tables_about_the_store(store: hl.Store) -> None:
     ).rows()
     entries = store.recordings()
     assert found == [
-        (e.label, e.tags.get("site"), e.status, e.messages, e.span[0] if e.span else None)
+        (e.name, e.tags.get("site"), e.status, e.messages, e.span[0] if e.span else None)
         for e in entries
     ]
     assert store.sql("select * from losses").rows() == []

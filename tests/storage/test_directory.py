@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import fcntl
 import os
-import shutil
 import subprocess
 import sys
 import threading
@@ -17,11 +16,10 @@ from typing import Any
 
 import pytest
 
-from hybridlog_storage import journal
 from hybridlog_storage.disk import files
 from hybridlog_storage.disk.directory import LOCK, REMOVED, Holder, StoreDirectory
 from hybridlog_storage.errors import HeldError, StoreError, TopicError
-from hybridlog_storage.journal import Journal
+from hybridlog_storage.manifests import MANIFEST
 from tests.other_user import User, needs_root, open_place
 
 
@@ -33,9 +31,9 @@ def store(tmp_path: Path) -> StoreDirectory:
 def test_a_new_store(tmp_path: Path) -> None:
     made = StoreDirectory.create(tmp_path / "deep/er/store")
     values = tomllib.loads((made.path / "hybridlog.toml").read_text())
-    assert values == {"format": 3, "store_id": made.settings.store_id}
+    assert values == {"format": 4, "store_id": made.settings.store_id}
     assert made.settings.mongo is None
-    assert made.labels() == []
+    assert made.ids() == []
     again = StoreDirectory.create(made.path)
     assert again.settings == made.settings == StoreDirectory(made.path).settings
     other = StoreDirectory.create(tmp_path / "other")
@@ -50,7 +48,7 @@ def test_a_uri_is_kept_without_its_password(tmp_path: Path, uri: str) -> None:
 
 def test_an_empty_directory_becomes_a_store(tmp_path: Path) -> None:
     (tmp_path / "store").mkdir()
-    assert StoreDirectory.create(tmp_path / "store").labels() == []
+    assert StoreDirectory.create(tmp_path / "store").ids() == []
 
 
 def test_what_is_no_place_for_a_store(tmp_path: Path) -> None:
@@ -107,31 +105,13 @@ def test_many_make_the_same_store_at_once(tmp_path: Path) -> None:
         assert sorted(p.name for p in path.iterdir()) == ["hybridlog.toml", "recordings"]
 
 
-@pytest.mark.parametrize(
-    ("name", "label"),
-    [
-        ("robot", "robot"),
-        ("my run/1", "my-run-1"),
-        ("../../etc", "etc"),
-        (".hidden", "hidden"),
-        ("--all", "all"),
-        ("", "recording"),
-        ("...", "recording"),
-        ("äöü", "recording"),
-        ("x" * 300, "x" * 80),
-        ("a\0b\nc", "a-b-c"),
-    ],
-)
-def test_names_become_directories(store: StoreDirectory, name: str, label: str) -> None:
-    first, second = store.new_recording(name), store.new_recording(name)
-    assert (first, second) == (label, f"{label}-2")
-    for made in (first, second):
-        assert store.recording(made).parent == store.path / "recordings"
-    assert store.labels() == sorted([first, second])
+def made(store: StoreDirectory, name: str = "r") -> Path:
+    store.new_recording(name)
+    return store.recording(name)
 
 
 def test_segments_are_told_by_their_numbers(store: StoreDirectory) -> None:
-    recording = store.recording(store.new_recording("r"))
+    recording = made(store)
     names = ["000010.mcap", "000002.mcap", "000003.mcap.open", "x.mcap", "-1.mcap", "٣.mcap",
              "000001.mcap.tmp", "1.bag", "writer.lock"]  # fmt: skip
     for name in names:
@@ -146,17 +126,17 @@ def test_other_things_among_the_recordings(store: StoreDirectory, tmp_path: Path
     (base / "file").write_text("")
     (base / ".removed-x-1").mkdir()
     (base / "link").symlink_to(tmp_path)
-    store.new_recording("r")
-    assert store.labels() == ["r"]
+    made(store)
+    assert store.ids() == ["r"]
     base.rename(base.with_name("elsewhere"))
-    assert store.labels() == []
+    assert store.ids() == []
 
 
 def test_removing(store: StoreDirectory) -> None:
-    recording = store.recording(store.new_recording("r"))
+    recording = made(store)
     (recording / "000000.mcap").write_bytes(b"x")
     hidden = store.hide("r")
-    assert store.labels() == []
+    assert store.ids() == []
     assert hidden.startswith(REMOVED)
     assert store.names() == [hidden]
     assert (store.recording(hidden) / "000000.mcap").read_bytes() == b"x"
@@ -168,18 +148,18 @@ def test_removing(store: StoreDirectory) -> None:
 
 
 def test_what_a_recording_looks_like_changes_with_its_files(store: StoreDirectory) -> None:
-    recording = store.recording(store.new_recording("r"))
+    recording = made(store)
     seen = [store.listing("r").print]
 
     def changed() -> bool:
         seen.append(store.listing("r").print)
         return seen[-1] not in seen[:-1]
 
-    (recording / "journal").write_bytes(b"one\n")
+    (recording / MANIFEST).write_bytes(b"one\n")
     assert changed()
     (recording / "000000.mcap").write_bytes(b"segment")
     assert changed()
-    (recording / "journal").write_bytes(b"two\n")
+    (recording / MANIFEST).write_bytes(b"two\n")
     assert changed()
     (recording / "000000.mcap").rename(recording / "000001.mcap")
     assert changed()
@@ -191,16 +171,14 @@ def test_what_a_recording_looks_like_changes_with_its_files(store: StoreDirector
     assert store.listing("s").print == seen[-1]
 
 
-def test_a_label_that_is_free(store: StoreDirectory) -> None:
-    store.new_recording("a")
-    store.new_recording("b")
-    assert store.free_label("a") == "a-2"
-    assert store.free_label("a", but="a") == "a"
-    assert store.free_label("c d", but="b") == "c-d"
-    store.move("b", "c-d")
-    assert store.labels() == ["a", "c-d"]
-    assert store.has("c-d")
-    assert not store.has("b")
+def test_a_folder_takes_the_place_of_another_one(store: StoreDirectory) -> None:
+    for name, content in (("r", b"old"), (".new", b"new")):
+        (made(store, name) / "000000.mcap").write_bytes(content)
+    for _ in range(2):
+        store.put_in_place(".new", "r")
+        assert store.names() == ["r"]
+        assert (store.recording("r") / "000000.mcap").read_bytes() == b"new"
+        store.recording("r").rename(store.recording(".new"))
 
 
 HOLD = """
@@ -232,18 +210,8 @@ def holding(store: StoreDirectory, *command: str, as_: str = "changes") -> Itera
         other.communicate()
 
 
-def begun(store: StoreDirectory, label: str, recording: str) -> str:
-    """Make a recording that has only begun; return its id of 32 digits."""
-    recording = (recording * 32)[:32]
-    line = {"id": recording, "store": "", "name": label, "tags": {}, "source": {}, "created": 0}
-    Journal(store.recording(store.new_recording(label))).append(
-        journal.event(journal.BEGUN, **line)
-    )
-    return recording
-
-
 def test_one_process_writes_a_recording(store: StoreDirectory) -> None:
-    store.new_recording("r")
+    made(store)
     with (
         holding(store) as pid,
         pytest.raises(HeldError, match=rf"'r' is being changed by process {pid} \("),
@@ -251,8 +219,7 @@ def test_one_process_writes_a_recording(store: StoreDirectory) -> None:
     ):
         pass
     # What is killed lets go.
-    with store.writing("r") as label:
-        assert label == "r"
+    with store.writing("r"):
         with pytest.raises(HeldError, match=f"process {os.getpid()} "), store.writing("r"):
             pass
         assert store.holder("r") is not None
@@ -261,7 +228,7 @@ def test_one_process_writes_a_recording(store: StoreDirectory) -> None:
 
 
 def test_a_lock_says_the_words_of_a_command_and_no_options(store: StoreDirectory) -> None:
-    store.new_recording("r")
+    made(store)
     command = ("/usr/bin/hybridlog", "tag", "a", "x=\x1b[1mé", "--mongo", "mongodb://me:pass@h")
     with holding(store, *command) as pid:
         assert store.holder("r") == Holder("another process", is_recording=False)
@@ -279,13 +246,13 @@ def test_a_lock_says_the_words_of_a_command_and_no_options(store: StoreDirectory
 
 
 def test_a_command_waits_for_another_one_and_not_for_a_recorder(store: StoreDirectory) -> None:
-    store.new_recording("r")
+    made(store)
     with ExitStack() as held, ThreadPoolExecutor(1) as pool:
         held.enter_context(store.writing("r"))
 
         def wait() -> str:
-            with store.writing("r", wait_s=60) as label:
-                return label
+            with store.writing("r", wait_s=60):
+                return "r"
 
         waiting = pool.submit(wait)
         with pytest.raises(TimeoutError):
@@ -311,49 +278,26 @@ def test_a_command_waits_for_another_one_and_not_for_a_recorder(store: StoreDire
         assert waiting.result(60) == "r"
 
 
-def test_a_lock_follows_the_recording_and_not_its_label(store: StoreDirectory) -> None:
-    one, two = begun(store, "r", "1"), begun(store, "s", "2")
-    with store.writing("r", one) as label:
-        assert label == "r"
-    with store.writing("r", two) as label:
-        assert label == "s"
-        with store.writing("gone", one) as other:
-            assert other == "r"
-        # Another recording gets the label that it had.
-        store.move("r", "t")
-        with pytest.raises(HeldError, match="'s' is being changed"), store.writing("r", two):
-            pass
-    for chosen in (("t", "3" * 32), ("gone", "3" * 32), ("gone", "")):
-        with pytest.raises(TopicError, match="no longer in the store"), store.writing(*chosen):
-            pass
-    # Of several copies none is meant more than the others.
-    shutil.copytree(store.recording("t"), store.recording("u"))
-    with store.writing("u", one) as label:
-        assert label == "u"
-    with pytest.raises(TopicError, match="no longer"), store.writing("r", one):
-        pass
-
-
-def test_a_lock_is_that_of_the_label_when_it_is_got(
+def test_a_recording_that_was_removed_is_not_locked(
     store: StoreDirectory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    one, _ = begun(store, "r", "1"), begun(store, "s", "2")
-    for recording in (one, ""):
-        open_file = files.open_file
+    for name in ("", "run"):
+        with (
+            pytest.raises(TopicError, match=f"'{name or 'gone'}' is no longer in the store"),
+            store.writing("gone", name),
+        ):
+            pass
+    made(store)
+    open_file = files.open_file
 
-        def opened(path: Path, *args: Any, again: Any = open_file, **options: Any) -> int:
-            found: int = again(path, *args, **options)
-            if path.name == LOCK and path.parent.name == "r":
-                monkeypatch.undo()
-                for old, new in (("r", "x"), ("s", "r"), ("x", "s")):
-                    store.move(old, new)
-            return found
+    def opened(path: Path, *args: Any, **options: Any) -> int:
+        found: int = open_file(path, *args, **options)
+        store.hide("r")
+        return found
 
-        monkeypatch.setattr(files, "open_file", opened)
-        with store.writing("r", recording) as label:
-            assert label == ("s" if recording else "r")
-            assert store.holder("r" if recording else "s") is None
-            assert store.id_of(label) == one
+    monkeypatch.setattr(files, "open_file", opened)
+    with pytest.raises(TopicError, match="no longer in the store"), store.writing("r"):
+        pass
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="the next test does the same as another user")
@@ -391,8 +335,8 @@ def test_a_store_that_another_user_cannot_write() -> None:
         done = User(place).python("-c", AS_A_READER, store.path)
         assert "read-only" in done.lines[0]
         assert "Not allowed" in done.lines[1]
-        assert store.labels() == []
+        assert store.ids() == []
         for path in (store.path, store.path / "recordings"):
             path.chmod(0o777)
         assert User(place).python("-c", AS_A_READER, store.path).lines == []
-        assert store.labels() == ["r"]
+        assert store.ids() == ["r"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
@@ -48,7 +47,6 @@ def recording(of: str = ONE, topics: tuple[str, ...] = ("/ä b", "/b")) -> Recor
     channels[0].stats = ChannelStats(messages=2, first=5, last=9, skew_sum=0.5, stamped=1)
     return RecordingEntry(
         id=of,
-        label="run",
         name="run näme",
         tags={"a.b": "c", "$x": "y", "": "z"},
         source={"path": "/x", "bytes": 2**40},
@@ -86,15 +84,15 @@ def chunk(segment: int, number: int, of: str = ONE) -> ChunkEntry:
 
 
 def document(of: str, at: int, segment: int, number: int) -> dict[str, object]:
-    key = bytes.fromhex(of[:16])
+    key = bytes.fromhex(of[-16:])
     _id = key_bound(at)[:8] + key + number.to_bytes(8, "big")
-    return {"_id": _id, "_meta": {"rec": of[:16], "ref": {"seg": segment, "chunk": 0}}}
+    return {"_id": _id, "_meta": {"rec": of[-16:], "ref": {"seg": segment, "chunk": 0}}}
 
 
 def indexed(state: IndexState, of: str = ONE) -> Indexed | None:
-    found = state.of([of[:16]])
-    assert found.keys() <= {of[:16]}
-    return found.get(of[:16])
+    found = state.of([of[-16:]])
+    assert found.keys() <= {of[-16:]}
+    return found.get(of[-16:])
 
 
 # How far a recording is.
@@ -134,7 +132,7 @@ def test_a_recording_is_whole_only_when_state_and_all_digests_fit(state: IndexSt
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        ("label", "other"), ("name", "other"), ("tags", {"a": "b"}), ("status", "damaged"),
+        ("name", "other"), ("tags", {"a": "b"}), ("status", "damaged"),
         ("notes", []), ("marks", []),
     ],
 )  # fmt: skip
@@ -161,7 +159,7 @@ def test_the_mirror_is_what_other_programs_read(state: IndexState, database: Dat
     entry = recording()
     state.put(entry, "complete", turn=1, segments=DIGESTS)
     (found,) = database.find(RECORDINGS, {})
-    assert found["_id"] == ONE[:16]
+    assert found["_id"] == ONE[-16:]
     assert found.pop("index") == {"state": "complete", "turn": 1, "segments": DIGESTS}
     del found["_id"]
     assert found == entry.to_document()
@@ -177,24 +175,8 @@ def test_what_the_mirror_says_otherwise_is_seen(state: IndexState, database: Dat
     ):  # fmt: skip
         state.put(entry, "complete", turn=1, segments=DIGESTS, damage={(0, 1): "x"})
         assert state.is_mirrored(entry)
-        database.update(RECORDINGS, {"_id": ONE[:16]}, change)
+        database.update(RECORDINGS, {"_id": ONE[-16:]}, change)
         assert not state.is_mirrored(entry), change
-    other = replace(entry, label=os.fsdecode(b"r\xff"))
-    state.put(other, "complete", turn=1)
-    assert state.is_mirrored(other)
-
-
-def test_a_directory_may_have_any_name(state: IndexState) -> None:
-    entry = replace(recording(), label=os.fsdecode(b"r\xff"))
-    state.put(entry, "complete", turn=1, segments=DIGESTS)
-    found = indexed(state)
-    assert found is not None
-    assert found.shown["label"] == "r\\xff"
-    assert found.mirrors(entry)
-    state.show(replace(entry, label=os.fsdecode(b"r\xfe")))
-    found = indexed(state)
-    assert found is not None
-    assert not found.mirrors(entry)
 
 
 def test_chunks_without_documents_are_known(state: IndexState) -> None:
@@ -212,22 +194,22 @@ def test_chunks_without_documents_are_known(state: IndexState) -> None:
 def test_only_the_recordings_that_are_asked_for(state: IndexState) -> None:
     state.put(recording(), "complete", turn=1, segments=DIGESTS)
     state.put(recording(OTHER), "open", turn=2)
-    assert state.of().keys() == {ONE[:16], OTHER[:16]}
-    assert state.of([OTHER[:16], "0" * 16]).keys() == {OTHER[:16]}
+    assert state.of().keys() == {ONE[-16:], OTHER[-16:]}
+    assert state.of([OTHER[-16:], "0" * 16]).keys() == {OTHER[-16:]}
     assert state.of([]) == {}
-    both = [ONE[:16], OTHER[:16]]
-    assert state.segments(both) == {ONE[:16]: DIGESTS, OTHER[:16]: {}}
-    assert state.segments([OTHER[:16], "0" * 16]) == {OTHER[:16]: {}}
+    both = [ONE[-16:], OTHER[-16:]]
+    assert state.segments(both) == {ONE[-16:]: DIGESTS, OTHER[-16:]: {}}
+    assert state.segments([OTHER[-16:], "0" * 16]) == {OTHER[-16:]: {}}
 
 
 def test_what_another_program_has_put_there_is_not_whole(
     state: IndexState, database: Database
 ) -> None:
-    database.replace(RECORDINGS, {"_id": ONE[:16]}, {"_id": ONE[:16]})
+    database.replace(RECORDINGS, {"_id": ONE[-16:]}, {"_id": ONE[-16:]})
     found = indexed(state)
     assert found is not None
     assert (found.state, found.turn) == ("indexing", 0)
-    assert state.segments([ONE[:16]]) == {ONE[:16]: {}}
+    assert state.segments([ONE[-16:]]) == {ONE[-16:]: {}}
     assert not found.is_whole(recording())
     assert not found.mirrors(recording())
 
@@ -251,7 +233,7 @@ def test_an_index_says_through_which_chunk_it_is(state: IndexState) -> None:
     assert before is not None
     assert before.through == NOTHING
     for through in (Through(0, 5, 2**40, 7), Through(300, 0, 8, 2**40)):
-        state.put_through(ONE[:16], through)
+        state.put_through(ONE[-16:], through)
         assert indexed(state) == replace(before, through=through)
     state.put(recording(), "complete", turn=1, segments=DIGESTS)
     after = indexed(state)
@@ -275,14 +257,14 @@ def filled(state: IndexState, database: Database) -> IndexState:
 
 
 def left(database: Database, of: str, name: str = "one") -> list[int]:
-    found = database.find(name, {"_meta.rec": of[:16]}, sort=[("_id", 1)])
+    found = database.find(name, {"_meta.rec": of[-16:]}, sort=[("_id", 1)])
     return [d["_meta"]["ref"]["seg"] for d in found]
 
 
 def test_clearing_removes_the_documents_of_one_recording(
     filled: IndexState, database: Database
 ) -> None:
-    filled.clear(ONE[:16], [TopicPlace("/one"), TopicPlace("/not_there")])
+    filled.clear(ONE[-16:], [TopicPlace("/one"), TopicPlace("/not_there")])
     assert left(database, ONE) == []
     assert left(database, ONE, "two") == list(range(5))
     assert left(database, OTHER) == list(range(5))
@@ -291,15 +273,15 @@ def test_clearing_removes_the_documents_of_one_recording(
 def test_clearing_leaves_the_segments_that_are_to_stay(
     filled: IndexState, database: Database
 ) -> None:
-    filled.clear(ONE[:16], [TopicPlace("/one")], but=[1, 3])
+    filled.clear(ONE[-16:], [TopicPlace("/one")], but=[1, 3])
     assert left(database, ONE) == [1, 3]
     assert left(database, OTHER) == list(range(5))
 
 
 def test_clearing_looks_at_some_times_only(filled: IndexState, database: Database) -> None:
-    filled.clear(ONE[:16], [TopicPlace("/one")], (1, 3))
+    filled.clear(ONE[-16:], [TopicPlace("/one")], (1, 3))
     assert left(database, ONE) == [0, 4]
-    filled.clear(ONE[:16], [TopicPlace("/one")], (4, 2**63 - 1))
+    filled.clear(ONE[-16:], [TopicPlace("/one")], (4, 2**63 - 1))
     assert left(database, ONE) == [0]
     assert left(database, OTHER) == list(range(5))
 
@@ -320,8 +302,8 @@ def test_a_recording_leaves_the_mirror_last_and_alone(
 ) -> None:
     filled.put(recording(), "removing", turn=1)
     filled.put(recording(OTHER), "complete", turn=1)
-    filled.remove(ONE[:16])
-    assert filled.of().keys() == {OTHER[:16]}
+    filled.remove(ONE[-16:])
+    assert filled.of().keys() == {OTHER[-16:]}
     assert left(database, ONE) == list(range(5))
 
 

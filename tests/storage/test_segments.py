@@ -53,12 +53,13 @@ from hybridlog_storage.segments.segment_format import (
 from hybridlog_storage.segments.segment_reader import ChunkPlace, SegmentReader
 from hybridlog_storage.segments.segment_writer import AT_WORK, RecordingWriter, SegmentSettings
 from hybridlog_storage.stopping import at_safe_points, postpone
+from tests import places
 from tests.calls import Calls
 from tests.limits import Limit
 from tests.storage.steps import Steps, through
 
 RECORDING = {
-    "id": "0123456789abcdef0123456789abcdef",
+    "id": "20261128-run-0123456789abcdef",
     "name": "r",
     "tags": {"a": "b"},
     "source": {},
@@ -793,7 +794,7 @@ def small_writer(
         RECORDING,
         lambda chunk, _: steps.log.append(("told", f"chunk {chunk.number}")),
         SegmentSettings(sync=sync),
-        on_sealing=lambda sealed: steps.log.append(("journal", sealed.file)),
+        on_sealing=lambda sealed: steps.log.append(("list", sealed.file)),
     )
 
 
@@ -809,7 +810,7 @@ def small_writer(
                 ("sync", "000000.mcap.open"),
                 ("told", "chunk 1"),
                 ("sync", "000000.mcap.open"),
-                ("journal", "000000.mcap"),
+                ("list", "000000.mcap"),
                 ("rename", "000000.mcap"),
                 ("sync", "rec"),
             ],
@@ -820,7 +821,7 @@ def small_writer(
                 ("told", "chunk 0"),
                 ("told", "chunk 1"),
                 ("sync", "000000.mcap.open"),
-                ("journal", "000000.mcap"),
+                ("list", "000000.mcap"),
                 ("rename", "000000.mcap"),
                 ("sync", "rec"),
             ],
@@ -830,7 +831,7 @@ def small_writer(
             [
                 ("told", "chunk 0"),
                 ("told", "chunk 1"),
-                ("journal", "000000.mcap"),
+                ("list", "000000.mcap"),
                 ("rename", "000000.mcap"),
                 ("sync", "rec"),
             ],
@@ -847,7 +848,7 @@ def test_what_is_forced_to_the_disk_and_when(
             writer.append(batch_of([(0, b"abc", n, n, n)]), CHANNELS)
             writer.flush()
         writer.close()
-    seen = {"sync", "told", "journal", "rename"}
+    seen = {"sync", "told", "list", "rename"}
     assert [step for step in steps.log if step[0] in seen] == want
     # Nothing is written behind the last sync of the file.
     if sync != "never":
@@ -864,12 +865,12 @@ def test_a_recovered_segment_is_on_the_disk_before_it_gets_its_name(tmp_path: Pa
         log = steps.log
         with through(steps):
             recovered = recover_segment(
-                opened, lambda sealed, log=log: log.append(("journal", sealed.file))
+                opened, lambda sealed, log=log: log.append(("list", sealed.file))
             )
         assert recovered.path == tmp_path / "000000.mcap"
         assert steps.log[-4:] == [
             ("sync", "000000.mcap.open"),
-            ("journal", "000000.mcap"),
+            ("list", "000000.mcap"),
             ("rename", "000000.mcap"),
             ("sync", tmp_path.name),
         ]
@@ -1086,12 +1087,12 @@ def test_a_table_that_does_not_end_at_the_summary_is_refused(tmp_path: Path) -> 
         reader.summary()
 
 
-@pytest.mark.parametrize("version", [4, "x", 2])
+@pytest.mark.parametrize("version", [5, "x", 3])
 @pytest.mark.parametrize("with_table", [True, False])
 def test_a_segment_of_another_format_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, version: object, with_table: bool
 ) -> None:
-    message = f"format {version}, and this hybridlog knows format 3"
+    message = f"format {version}, and this hybridlog knows format 4"
     monkeypatch.setattr("hybridlog_storage.segments.segment_file.FORMAT_VERSION", version)
     if not with_table:
         monkeypatch.setattr("hybridlog_storage.segments.segment_file.CHUNK_TABLE_OPCODE", 0xF0)
@@ -1136,22 +1137,22 @@ def test_no_symlink_is_followed_to_a_segment(tmp_path: Path) -> None:
     (outside / "000000.mcap").write_bytes(whole)
     (outside / "000001.mcap.open").write_bytes(whole[:-9])
     (tmp_path / "hybridlog.toml").touch()
-    recordings = tmp_path / "recordings"
-    (recordings / "r").mkdir(parents=True)
-    (recordings / "r" / "000000.mcap").symlink_to(outside / "000000.mcap")
-    (recordings / "r" / "000001.mcap.open").symlink_to(outside / "000001.mcap.open")
-    (recordings / "s").symlink_to(outside)
-    for label in "rs":
+    own, linked = (places.new_folder(tmp_path, name) for name in "rs")
+    own.mkdir(parents=True)
+    (own / "000000.mcap").symlink_to(outside / "000000.mcap")
+    (own / "000001.mcap.open").symlink_to(outside / "000001.mcap.open")
+    linked.symlink_to(outside)
+    for folder in (own, linked):
         with pytest.raises(SegmentError, match="cannot be opened"):
-            SegmentReader(recordings / label / "000000.mcap", 0)
+            SegmentReader(folder / "000000.mcap", 0)
         with pytest.raises(SegmentError, match="cannot be opened"):
-            SegmentReader(recordings / label / "000000.mcap", 0, direct=True)
+            SegmentReader(folder / "000000.mcap", 0, direct=True)
         with pytest.raises(StoreError):
-            recover_segment(recordings / label / "000001.mcap.open")
+            recover_segment(folder / "000001.mcap.open")
         with pytest.raises(SegmentError, match="cannot be opened"):
-            SegmentCheck(recordings / label / "000000.mcap")
+            SegmentCheck(folder / "000000.mcap")
     with pytest.raises(StoreError):
-        SegmentFile.create(recordings / "s", 7, RECORDING)
+        SegmentFile.create(linked, 7, RECORDING)
     assert (outside / "000001.mcap.open").read_bytes() == whole[:-9]
 
 
@@ -1188,7 +1189,7 @@ def test_a_segment_is_told_of_as_it_is(tmp_path: Path) -> None:
     every = [channel for sealed in told for channel in sealed.channels]
     assert sum(c.payload_bytes for c in every) == 3 * 4009
     assert [c for c in every if c.topic == "/large"] == [
-        SealedChannel(2, "/large", 1, 4000, 5, 5)
+        SealedChannel(2, "/large", 1, 4000, 5, 5, "cdr", "a/msg/B")
     ] * 3
     small = [c for c in every if c.topic == "/small"]
     assert [(c.first, c.last, c.messages, c.payload_bytes) for c in small] == [
@@ -1201,7 +1202,7 @@ def test_a_segment_is_told_of_as_it_is(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("zeros", [0, 1, BLOCK - 1])
 def test_a_complete_segment_only_gets_its_name(tmp_path: Path, zeros: int) -> None:
-    """Killed between its sync and its rename: what the journal says of it still holds."""
+    """Killed between its sync and its rename: what the manifest says of it still holds."""
     told: list[Sealed] = []
     directory = tmp_path / "a"
     directory.mkdir()
@@ -1249,25 +1250,25 @@ def test_when_a_recovery_fails_nothing_is_lost(tmp_path: Path) -> None:
         final.unlink()
 
 
-def test_when_the_journal_fails_the_segment_is_sealed_later(tmp_path: Path) -> None:
+def test_when_the_manifest_fails_the_segment_is_sealed_later(tmp_path: Path) -> None:
     told: list[Sealed] = []
     fails = True
 
-    def journal(sealed: Sealed) -> None:
+    def listing(sealed: Sealed) -> None:
         if fails:
             raise DiskFullError("no room for a line")
         told.append(sealed)
 
     directory = tmp_path / "a"
     directory.mkdir()
-    writer = RecordingWriter(directory, RECORDING, lambda *_: None, on_sealing=journal)
+    writer = RecordingWriter(directory, RECORDING, lambda *_: None, on_sealing=listing)
     writer.append(batch_of(many(50)), CHANNELS)
     with pytest.raises(DiskFullError, match="line"):
         writer.close()
     opened = directory / "000000.mcap.open"
     assert [path.name for path in directory.iterdir()] == [opened.name]
     with pytest.raises(DiskFullError, match="line"):
-        recover_segment(opened, journal)
+        recover_segment(opened, listing)
     before = opened.read_bytes()
     # Who gives up tries it once more, and says the rest in another segment.
     fails = False

@@ -45,7 +45,7 @@ def test_what_is_written_is_read(tmp_path: Path, settings: StoreSettings) -> Non
     write_settings(tmp_path, settings)
     assert read_settings(tmp_path) == settings
     values = tomllib.loads((tmp_path / "hybridlog.toml").read_text("utf-8"))
-    assert values["format"] == FORMAT == 3
+    assert values["format"] == FORMAT == 4
     assert [p.name for p in tmp_path.iterdir()] == ["hybridlog.toml"]
 
 
@@ -67,18 +67,18 @@ def test_the_umask_says_who_may_read_it(tmp_path: Path, umask: int, mode: int) -
         (b"format = true\nstore_id = 'x'", "format"),
         (b"format = 0", "format"),
         (b"format = 2\nstore_id = 'x'", "format 2, and"),
-        (b"format = 4\nstore_id = 'x'", "format 4.*that wrote it"),
-        (b"format = 3", "store_id"),
-        (b"format = 3\nstore_id = ''", "store_id"),
-        (b"format = 3\nstore_id = 5", "store_id"),
-        (b"format = 3\nstore_id = 'x'\nmongo = 1", "mongo"),
-        (b"format = 3\nstore_id = 'x'\nmongo = 'nowhere'", "mongo"),
-        (b"format = 3\nstore_id = 'x'\nrequires = 'a'", "requires"),
-        (b"format = 3\nstore_id = 'x'\noptional = [1]", "optional"),
-        (b"format = 3\nstore_id = 'x'\narrays = '/scan'", "arrays"),
-        (b"format = 3\nstore_id = 'x'\nrequires = ['payload tables']", "'payload tables'.*newer"),
-        (b"format = 3\nstore_id = 'x'\nretention = 5", "retention"),
-        (b"format = 3\nstore_id = 'x'\nremote = 'yes'", "remote"),
+        (b"format = 5\nstore_id = 'x'", "format 5.*that wrote it"),
+        (b"format = 4", "store_id"),
+        (b"format = 4\nstore_id = ''", "store_id"),
+        (b"format = 4\nstore_id = 5", "store_id"),
+        (b"format = 4\nstore_id = 'x'\nmongo = 1", "mongo"),
+        (b"format = 4\nstore_id = 'x'\nmongo = 'nowhere'", "mongo"),
+        (b"format = 4\nstore_id = 'x'\nrequires = 'a'", "requires"),
+        (b"format = 4\nstore_id = 'x'\noptional = [1]", "optional"),
+        (b"format = 4\nstore_id = 'x'\narrays = '/scan'", "arrays"),
+        (b"format = 4\nstore_id = 'x'\nrequires = ['payload tables']", "'payload tables'.*newer"),
+        (b"format = 4\nstore_id = 'x'\nretention = 5", "retention"),
+        (b"format = 4\nstore_id = 'x'\nremote = 'yes'", "remote"),
         (b"format = [", "damaged"),
         (b"\xff\xfe", "damaged"),
         (b"format = " + b"[" * 100_000, "damaged"),

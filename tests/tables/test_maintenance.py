@@ -19,6 +19,7 @@ from hybridlog.maintenance import tables as making
 from hybridlog_storage.disk import files
 from hybridlog_storage.mongo.index_state import IndexState
 from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests import places
 from tests.copies import bring
 from tests.faults import logs
 from tests.limits import Limit
@@ -116,7 +117,7 @@ def test_what_is_left_of_recordings_that_are_gone(few: hl.Store, tmp_path: Path)
     few.record(write_log(tmp_path / "more.mcap", FEW), name="more", again=True)
     gone = few.entry("more").id
     assert contents(few) != before
-    shutil.rmtree(root / "recordings/more")
+    shutil.rmtree(places.folder(root, "more"))
     few.refresh()
     few.connect()
     assert contents(few) == before
@@ -134,7 +135,7 @@ def test_what_is_gone_has_no_tables_without_mongodb(few: hl.Store, tmp_path: Pat
     few.record(write_log(tmp_path / "more.mcap", FEW), name="more", again=True)
     gone = few.entry("more").id
     few.close()
-    shutil.rmtree(root / "recordings/more")
+    shutil.rmtree(places.folder(root, "more"))
     (root / PARTS / f"r{gone}").mkdir(parents=True)
     (root / PARTS / ("r" + "b" * 32)).mkdir(parents=True)
     with hl.open(root, mongo="none") as again:
@@ -195,7 +196,7 @@ def test_a_damaged_chunk_costs_no_table(few: hl.Store) -> None:
     """It may be the only copy of these fields, and documents of its messages are no surplus."""
     before = contents(few)
     (entry,) = few.recordings()
-    (path,) = few.directory.recording("few").glob("*.mcap")
+    (path,) = places.folder(few.directory.path, "few").glob("*.mcap")
     data = bytearray(path.read_bytes())
     data[2000] ^= 1
     path.write_bytes(data)
@@ -244,7 +245,7 @@ def test_rows_of_a_lost_segment_are_made_again_once(store: hl.Store, tmp_path: P
     said = [(BASE + n, "/a" if n % 3 else "/b", varied(n)) for n in range(90)]
     log = write_log(tmp_path / "long.mcap", said)
     store.record(log, name="long", settings=logs.SETTINGS)
-    _, path = store.directory.segments("long")[1]
+    _, path = store.directory.segments(places.id_of(store.directory.path, "long"))[1]
     before = contents(store)
     content = path.read_bytes()
     path.unlink()
@@ -278,7 +279,7 @@ def test_a_store_that_cannot_be_written_makes_none(few: hl.Store, limit: Limit) 
 def test_a_recording_that_is_held_is_left_alone(few: hl.Store) -> None:
     (entry,) = few.recordings()
     shutil.rmtree(few.directory.path / TABLES)
-    with few.directory.writing("few"):
+    with few.directory.writing(few.entry("few").id):
         assert not making.make(few.directory, entry)
     assert not folders(few)
 

@@ -417,9 +417,9 @@ def test_a_store_in_a_folder_with_an_odd_name(many: hl.Store, tmp_path: Path) ->
 
 
 def listed(store: Path) -> dict[str, Row]:
-    """The rows of `recordings.parquet` as DuckDB reads them, by label."""
+    """The rows of `recordings.parquet` as DuckDB reads them, by name."""
     query = (
-        "select label, recording, name, tags, status, epoch_us(created), first_t, last_t, "
+        "select name, recording, tags, status, epoch_us(created), first_t, last_t, "
         "messages, topics, segments, bytes from read_parquet(?)"
     )
     rows = duckdb.connect().execute(query, [str(store / "tables/recordings.parquet")]).fetchall()
@@ -428,12 +428,10 @@ def listed(store: Path) -> dict[str, Row]:
 
 def listed_by_command(store: Path) -> dict[str, Row]:
     """The same of ended recordings, as `hybridlog ls --json` prints them."""
-    keys = ("id", "name", "tags", "status", "created_ns", "start_ns", "last_ns", "messages")
+    keys = ("id", "tags", "status", "created_ns", "start_ns", "last_ns", "messages")
     keys += ("topics", "segments", "stored_bytes")
     return {
-        one["recording"]: tuple(
-            one[key] // 1000 if key == "created_ns" else one[key] for key in keys
-        )
+        one["name"]: tuple(one[key] // 1000 if key == "created_ns" else one[key] for key in keys)
         for one in answer("ls", "--json", "--mongo", NONE, store=store).json
         if one["status"] != "open"
     }
@@ -472,7 +470,7 @@ def test_recordings_are_listed_beside_their_tables(recorded: hl.Store, tmp_path:
         assert listed(place).keys() == {"first", "live"}
     tags = (
         f"select distinct topic, tags['robot'] from '{place}/tables/test_State~*/*.parquet' "
-        f"join '{path}' using (recording) where label = 'first' order by topic"
+        f"join '{path}' using (recording) where recordings.name = 'first' order by topic"
     )
     topics = ("/large", "/small/one", "/small/two")
     assert duckdb.sql(tags).fetchall() == [(topic, "7") for topic in topics]

@@ -184,7 +184,7 @@ def test_lists_of_shared_files_that_are_lost_or_damaged(
 def test_lists_go_with_their_folders(several: hl.Store) -> None:
     assert lists_of(several)
     for one in list(several.recordings()):
-        several.remove(one.label)
+        several.remove(one.name)
     assert not list((several.directory.path / "tables").iterdir())
 
 

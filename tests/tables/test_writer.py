@@ -321,7 +321,7 @@ def test_a_topic_of_two_types_has_two_files_and_no_answer(
 
 def chunks_of(store: hl.Store, entry: RecordingEntry) -> list[Any]:
     found = []
-    for number, path in store.directory.segments(entry.label):
+    for number, path in store.directory.segments(entry.id):
         with SegmentReader(path, number) as reader:
             summary = reader.summary()
             found += [(reader.read_chunk(place), summary.channels) for place in summary.chunks]
@@ -337,7 +337,7 @@ def test_memory_does_not_grow_with_the_recording(
         said = [(BASE + n, f"/{n % 3}", payload(n)) for n in range(count)]
         path = write_log(tmp_path / f"{count}.mcap", said)
         entry = store.record(path, name=str(count), settings=SMALL_CHUNKS).entry
-        writer = TableWriter(store.directory.path, entry.id, entry.label, is_new=False)
+        writer = TableWriter(store.directory.path, entry.id, entry.name, is_new=False)
         held = []
         for chunk, channels in chunks_of(store, entry):
             writer.add(chunk, channels)
@@ -361,7 +361,7 @@ def test_chunks_that_come_late_are_put_in_their_place(
     assert entry.segments > 1
     chunks = chunks_of(store, entry)
     making.remove(store.directory, entry.id)
-    writer = TableWriter(store.directory.path, entry.id, entry.label)
+    writer = TableWriter(store.directory.path, entry.id, entry.name)
     late = chunks[3::5]
     counts = Counter(number for c, _ in chunks for number in [c.segment] * len(c.batch))
     for chunk, channels in [c for c in chunks if not any(c is other for other in late)]:

@@ -20,6 +20,7 @@ from hybridlog.training.feature_map import FeatureMap
 from hybridlog_storage.errors import UsageError
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests import places
 from tests.cli.within import answer
 from tests.data import DATA, needs_data
 from tests.training.test_lerobot import about, episodes_of
@@ -101,7 +102,7 @@ def test_a_set_of_the_demo(demo: Path, tmp_path: Path) -> None:
 
 def test_a_damaged_recording(demo: Path, tmp_path: Path) -> None:
     """What is lost is in the set's description; a gap is refused unless it is asked for."""
-    (segment,) = demo.glob("recordings/*/*.mcap")
+    (segment,) = places.files(demo)
     data = bytearray(segment.read_bytes())
     with hl.open(demo, mongo="none") as store:
         (entry,) = store.recordings()

@@ -26,6 +26,7 @@ from hybridlog.view.routes import ask, export
 from hybridlog.view.server import make_app
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests import places
 from tests.limits import Limit
 
 from .conftest import PORT, TOKEN
@@ -251,12 +252,12 @@ def test_sql_stops_when_the_client_goes(demo_store: hl.Store) -> None:
     assert json.loads(said[1]["body"])["rows"] == [["1"]]
 
 
-DAMAGED = "x-1-3"
+DAMAGED = "x-1"
 
 
 @pytest.fixture(scope="module")
 def odd(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
-    """A store of odd names; the label of one recording is the name of another, which lost some."""
+    """A store of odd names, one of which lost some."""
     place = tmp_path_factory.mktemp("odd")
     with (place / "odd.mcap").open("wb") as file:
         writer = Writer(file)
@@ -273,7 +274,7 @@ def odd(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
         for name in ("x [1]", "x [1]", "x-1"):
             settings = SegmentSettings(segment_size=1)  # a chunk each
             store.record(place / "odd.mcap", name=name, again=True, settings=settings)
-    (place / "store" / "recordings" / DAMAGED / "000001.mcap").unlink()
+    places.segment(place / "store", DAMAGED, 1).unlink()
     with hl.open(place / "store") as store:
         yield store
 
@@ -295,7 +296,7 @@ def test_odd_names(
 ) -> None:
     client = asking(odd)
     monkeypatch.chdir(tmp_path)
-    for label in ("x-1", "x-1-2"):
+    for label in ("x [1]", "x [1]-2"):
         params = {"recording": label, **asked}
         told = client.get("export-command", params=params).json()
         done = CliRunner().invoke(
@@ -310,7 +311,7 @@ def test_odd_names(
 def test_a_name_that_no_predicate_has_is_refused(
     odd: hl.Store, asking: Callable[[hl.Store], TestClient]
 ) -> None:
-    asked = {"recording": "x-1", "topic": "/a b", "where": "n > 1", "around": "1s"}
+    asked = {"recording": "x [1]", "topic": "/a b", "where": "n > 1", "around": "1s"}
     assert "'/a b' cannot stand" in asking(odd).get("export-command", params=asked).json()["error"]
 
 
@@ -356,7 +357,7 @@ def test_a_running_recording(odd: hl.Store, asking: Callable[[hl.Store], TestCli
 def test_observed_fields_are_offered(
     odd: hl.Store, asking: Callable[[hl.Store], TestClient]
 ) -> None:
-    asked = {"recording": "x-1", "topic": "/a b", "text": "na", "place": 2}
+    asked = {"recording": "x [1]", "topic": "/a b", "text": "na", "place": 2}
     answer = asking(odd).get("complete", params=asked).json()
     assert answer["candidates"][0] == ["`odd.name`", "field", "integer"]
 
@@ -379,7 +380,7 @@ def test_a_file_is_made_while_it_is_sent(
 
     monkeypatch.setattr(export, "pieces_of", counted)
     app = make_app(odd, Admission(token=TOKEN, port=PORT))
-    asked = {"recording": "x-1"}
+    asked = {"recording": "x [1]"}
     said = asked_for(app, "export", asked, leaves_after=9.0)
     whole = len(made)
     assert sum(made) == sum(len(message.get("body", b"")) for message in said)

@@ -23,7 +23,7 @@ def test_a_row_says_what_the_store_says(client: TestClient, demo_store: hl.Store
     (summary,) = demo_store.summaries()
     assert (answer["all"], answer["found"], answer["messages"]) == (1, 1, summary.messages)
     (row,) = answer["rows"]
-    assert (row["label"], row["tags"], row["topics"]) == ("robot", {"place": "lab"}, 18)
+    assert (row["name"], row["tags"], row["topics"]) == ("robot", {"place": "lab"}, 18)
     assert row["start"] == str(summary.extent[0])
     assert row["duration"] == summary.extent[1] - summary.extent[0]
     assert (row["lost"], row["incomplete"]) == ([], False)

@@ -19,6 +19,7 @@ from hybridlog.view.context import Context
 from hybridlog_storage.errors import TimeError
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests import places
 from tests.view.conftest import Asking, served
 
 if TYPE_CHECKING:
@@ -385,7 +386,7 @@ def test_what_is_lost_is_said(
     (entry,) = demo_store.recordings()
     table = demo_store.session.chunk_table(entry, 0)
     chunk = table.chunks[len(table.chunks) // 2]
-    path = tmp_path / "store" / "recordings" / "robot" / "000000.mcap"
+    path = places.segment(tmp_path / "store", "robot")
     content = bytearray(path.read_bytes())
     content[int(chunk["offset"]) + int(chunk["length"]) // 2] ^= 0xFF
     path.write_bytes(content)

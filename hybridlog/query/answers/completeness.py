@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 from hybridlog.record.losses import Cause
@@ -21,8 +22,8 @@ if TYPE_CHECKING:
     from hybridlog.schema.states import State
     from hybridlog_storage.catalog import RecordingEntry
 
-JOURNAL_LOST = "journal lost"
-"""Cause of a row for what may have been lost with a journal."""
+MANIFEST_LOST = "manifest lost"
+"""Cause of a row for what may have been lost with a manifest."""
 NOT_LOST = {Cause.THROTTLE: "left out by a throttle", Cause.DEGRADE: "without their payload"}
 """Causes of rows about messages that are no loss: not wanted, or with their fields kept."""
 _MAX_NAMES = 5
@@ -39,7 +40,7 @@ class Completeness:
         reduced: Messages of which only the fields are stored.
         expired: Those of them whose payloads were deleted to make room.
         not_copied: Those of them whose payloads were not copied yet.
-        rows: Rows of the loss ledger, with the label of their `recording`.
+        rows: Rows of the loss ledger, with the name of their `recording`.
         unwritten: Messages that a running recorder has taken and not written yet, which are not
             lost; None for an unknown number.
         unindexed: Messages that the index lacks, where MongoDB must answer.
@@ -138,17 +139,17 @@ class Completeness:
             )
 
 
-def not_written(label: str, messages: int | None, interval_ns: int) -> str:
+def not_written(name: str, messages: int | None, interval_ns: int) -> str:
     """Sentence about messages not yet written; None for an unknown number of them."""
     what = f"up to {interval_ns / 1e9:g} s" if messages is None else counted(messages, "message")
-    return f"{label} is being recorded: {what} not written yet, nor in this answer."
+    return f"{name} is being recorded: {what} not written yet, nor in this answer."
 
 
 def not_indexed(lacks: Iterable[tuple[str, int]]) -> Iterator[str]:
-    """Messages that the index lacks, by the label of their recording."""
+    """Messages that the index lacks, by the name of their recording."""
     total: Counter[str] = Counter()
-    for label, number in lacks:
-        total[label] += number
+    for name, number in lacks:
+        total[name] += number
     if total:
         are = "is" if total.total() == 1 else "are"
         yield (
@@ -210,19 +211,19 @@ def _unreadable(messages: int, question: Question) -> str:
     return f"{counted(messages, 'message')} could not be tested: {why}."
 
 
-def about_losses(label: str, rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+def about_losses(name: str, rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
     """Rows of the ledger of a recording."""
-    if any(row["cause"] == JOURNAL_LOST for row in rows):
-        yield f"{label} has lost its journal, so this answer may not be complete."
+    if any(row["cause"] == MANIFEST_LOST for row in rows):
+        yield f"{name} has lost its manifest once, so this answer may not be complete."
     for row in rows:
         if row["cause"] == Cause.THROTTLE:
-            yield f"{label}: {line_of(row)} while it was recorded."
-    lost = [row for row in rows if row["cause"] not in {JOURNAL_LOST, *NOT_LOST}]
+            yield f"{name}: {line_of(row)} while it was recorded."
+    lost = [row for row in rows if row["cause"] not in {MANIFEST_LOST, *NOT_LOST}]
     if lost:
         causes = listed(dict.fromkeys(row["cause"] for row in lost), _MAX_NAMES)
         yield (
-            f"{label} is not complete, so this answer may not be: {in_words(lost)} ({causes}); "
-            f"`hybridlog info {label}` says where."
+            f"{name} is not complete, so this answer may not be: {in_words(lost)} ({causes}); "
+            f"`hybridlog info {quote(name)}` says where."
         )
 
 
@@ -265,7 +266,7 @@ def _coverage(entry: RecordingEntry, losses: Collection[Mapping[str, Any]]) -> s
         if entry.status == "open":
             return "being recorded"
         if entry.status == "unproven":
-            return "not known: its journal was lost, so a segment may be missing"
+            return "not known: its manifest was lost, so a segment may be missing"
         # An empty log is complete; a robot that sent nothing may not have been reached.
         is_live = not entry.source["bytes"]
         return "nothing was received" if is_live and not entry.messages else "complete"

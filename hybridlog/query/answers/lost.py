@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hybridlog.query.answers.completeness import (
-    JOURNAL_LOST,
+    MANIFEST_LOST,
     NOT_LOST,
     Completeness,
     about_losses,
@@ -24,6 +24,7 @@ from hybridlog.query.planner import Planner
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.record.losses import CRASH, Cause, losses_of
 from hybridlog.schema.states import CAUSES, GONE, State
+from hybridlog.wording import counted
 from hybridlog_storage.errors import HybridlogError, TimeError
 from hybridlog_storage.settings import EXPIRED
 from hybridlog_storage.times import BEGIN, END, span_of
@@ -70,6 +71,7 @@ def completeness_of(
         if cost is not None:
             is_short = cost.lacking or cost.without_arrays
             sentences += left_out(one, cost, _why_expired(session, one) if is_short else "")
+    unreadable = _unreadable(session, question)
     by_recording: dict[str, list[Mapping[str, Any]]] = defaultdict(list)
     known: set[tuple[Any, ...]] = set()
     for rows in ledgers:  # a loss of unknown topics is in several
@@ -78,13 +80,14 @@ def completeness_of(
             if key not in known:
                 by_recording[row["recording"]].append(row)
         known.update(keys)
-    sentences += late
-    for label, rows in by_recording.items():
-        sentences += about_losses(label, rows)
+    sentences += [*late, *unreadable]
+    for name, rows in by_recording.items():
+        sentences += about_losses(name, rows)
     expired = _expired(session, question)
     return Completeness(
         sum(row["count"] or 0 for row in lost),
-        is_exact=not any(row["count"] is None for row in lost)
+        is_exact=not unreadable
+        and not any(row["count"] is None for row in lost)
         and all(row["cause"] in NOT_LOST for rows in ledgers[1:] for row in rows),
         reduced=sum(row["count"] or 0 for row in ledgers[0] if row["cause"] == Cause.DEGRADE)
         + expired.total(),
@@ -98,6 +101,19 @@ def completeness_of(
         late=tuple(dict.fromkeys(late)),
         sentences=tuple(dict.fromkeys(sentences)),
     )
+
+
+def _unreadable(session: Session, question: Question) -> list[str]:
+    """A sentence about recordings that cannot be read, if a question is about all."""
+    known = session.snapshot().by_id
+    number = sum(one not in known for one in [*session.shared.repairs.unreadable])
+    if not number or question.recordings is not None:
+        return []
+    are = "is" if number == 1 else "are"
+    return [
+        f"{counted(number, 'recording')} cannot be read and {are} left out; `hybridlog verify` "
+        "says why."
+    ]
 
 
 def _why_expired(session: Session, question: Question) -> str:
@@ -116,9 +132,9 @@ def _expired(session: Session, question: Question) -> Counter[State]:
 
 
 def _rows_of(session: Session, question: Question) -> list[Mapping[str, Any]]:
-    """Rows of the ledger about a question, with the label of their recording."""
+    """Rows of the ledger about a question, with the name of their recording."""
     with suppress(TimeError):  # nothing is in the range
-        return [{"recording": e.label, **row} for e, row in _losses_in(session, question)]
+        return [{"recording": e.name, **row} for e, row in _losses_in(session, question)]
     return []
 
 
@@ -167,9 +183,9 @@ def _chosen_windows(bounds: Span | None, windows: NDArray[np.int64] | None) -> N
 
 
 def _ledger(entry: RecordingEntry) -> list[dict[str, Any]]:
-    """The loss ledger of a recording, with a row for what a lost journal leaves open."""
-    unproven = {"cause": JOURNAL_LOST, "count": None, "topic": None}
-    return losses_of(entry) + [unproven] * (entry.status == "unproven")
+    """The loss ledger of a recording, with a row for what a lost manifest leaves open."""
+    unproven = {"cause": MANIFEST_LOST, "count": None, "topic": None}
+    return losses_of(entry) + [unproven] * ("unproven" in {entry.status, entry.end.get("status")})
 
 
 def _span_of(entry: RecordingEntry, row: Mapping[str, Any]) -> Span | None:
@@ -205,13 +221,13 @@ def _unwritten(session: Session, questions: Sequence[Question]) -> tuple[int | N
         late = _taken(session, one)
         if late is None:
             missing = None
-            sentences.append(not_written(one.label, None, flush_interval_ns(one)))
+            sentences.append(not_written(one.name, None, flush_interval_ns(one)))
             continue
         if missing is not None:
             missing += sum(late.get(topic, 0) for topic, is_own in owners.items() if is_own)
         messages = sum(late.get(topic, 0) for topic in owners)
         if messages:
-            sentences.append(not_written(one.label, messages, flush_interval_ns(one)))
+            sentences.append(not_written(one.name, messages, flush_interval_ns(one)))
     return missing, sentences
 
 
@@ -220,7 +236,7 @@ def _taken(session: Session, recording: RecordingSummary) -> dict[str, int] | No
     from hybridlog.live.control_server import request
 
     with suppress(HybridlogError, KeyError):  # no socket, or it has just begun or ended
-        taken = request(session.directory.path, recording.label, "state")["taken"]
+        taken = request(session.directory.path, recording.id, "state")["taken"]
         written = session.entry_of(recording).messages_by_topic()
         return {topic: max(count - written[topic], 0) for topic, count in taken.items()}
     return None

@@ -72,7 +72,7 @@ class Rates:
         size = None if window is None else parse_duration(window)
         if size == 0:
             raise UsageError("A window of 0 holds nothing: name a duration, such as 1s.")
-        labels: list[tuple[str, str, int]] = []
+        named: list[tuple[str, str, int]] = []
         columns: _Columns = defaultdict(list)
         rows = 0
         for stretch in self._stretches():
@@ -82,7 +82,7 @@ class Rates:
             rows += len(begin)
             if rows > MAX_PIECES:
                 raise UsageError(f"There are {rows} windows; use a longer one or a time range.")
-            labels.append((stretch.summary.label, stretch.topic, len(begin)))
+            named.append((stretch.summary.name, stretch.topic, len(begin)))
             for name, values in (
                 ("begin", begin),
                 ("end", end),
@@ -90,7 +90,7 @@ class Rates:
                 ("rate", rate),
             ):
                 columns[name].append(values)
-        return _table(labels, columns)
+        return _table(named, columns)
 
     def gaps(self, longer_than: DurationLike | None, periods: float | None) -> Intervals:
         """Times without messages; see `Query.gaps`."""
@@ -233,7 +233,7 @@ def _usual_periods(stretches: Iterable[tuple[Stretch, _Times]]) -> dict[str, flo
     return {name: found.usual_period() for name, found in steps.items()}
 
 
-def _table(labels: list[tuple[str, str, int]], columns: _Columns) -> pa.Table:
+def _table(named: list[tuple[str, str, int]], columns: _Columns) -> pa.Table:
     import pyarrow as pa
 
     from hybridlog.schema.arrow_columns import numbers
@@ -242,8 +242,8 @@ def _table(labels: list[tuple[str, str, int]], columns: _Columns) -> pa.Table:
         return np.concatenate([np.empty(0, kind), *columns[name]])
 
     def texts(place: int) -> pa.Array[Any]:
-        codes = np.repeat(np.arange(len(labels)), [row[2] for row in labels])
-        names = [str(row[place]).encode("utf-8", "replace").decode() for row in labels]
+        codes = np.repeat(np.arange(len(named)), [row[2] for row in named])
+        names = [str(row[place]).encode("utf-8", "replace").decode() for row in named]
         return pa.array(names, pa.string()).take(numbers(codes.astype(np.int64)))
 
     rate = joined("rate", np.float64)

@@ -27,7 +27,7 @@ class TopicCheck:
     """Regularity of a topic in a recording, or in a range of it.
 
     Attributes:
-        recording: Label of the recording.
+        recording: Name of the recording.
         topic: Full name.
         type: Type of the messages; several have commas between them.
         begin_ns: Beginning of the recording or the range.
@@ -84,7 +84,7 @@ def check(session: Session, question: Question, counters: Counters) -> list[Topi
             if topic in stretches:
                 for times in rates.times(stretches[topic]):
                     measured.add(times)
-            counts = lost[summary.label, topic]
+            counts = lost[summary.name, topic]
             found.append(_check(session, summary, span, topic, measured=measured, lost=counts))
     return sorted(
         found, key=lambda one: (one.silent_periods, one.lost is None, one.lost or 0), reverse=True
@@ -115,7 +115,7 @@ def _check(
         end = max(begin, end - flush_interval_ns(summary))
     some = measured.messages > 0
     return TopicCheck(
-        summary.label,
+        summary.name,
         topic,
         ", ".join(sorted({one.schema.name for one in channels if one.schema is not None})),
         begin,

@@ -207,10 +207,10 @@ def _others(session: Session, question: Question) -> Iterator[str]:
         ranges = RangeResolver(session, everywhere).resolve()
     except TimeError:
         return
-    labels = [
-        each.summary.label
+    names = [
+        each.summary.name
         for each in islice(ranges, _MAX_RECORDINGS)
         if each.summary.id not in (question.recordings or ())
     ]
-    if labels:
-        yield f"Other recordings span that time: {listed(labels, _MAX_NAMES)}."
+    if names:
+        yield f"Other recordings span that time: {listed(names, _MAX_NAMES)}."

@@ -180,28 +180,28 @@ def sql_answer(context: Context, text: str, seconds: float) -> dict[str, Any]:
 def _moments(
     context: Context,
     times: Sequence[range | None],
-    labels: Sequence[str | None],
+    names: Sequence[str | None],
     remarks: Remarks,
 ) -> tuple[list[str | None], list[str | None]]:
-    """The message of each row: time since the start of its recording, ns, as text, and label.
+    """The message of each row: time since the start of its recording, ns, as text, and its name.
 
     It is the only one of the topics that were read at a time that the row may be of. Without a
     column `recording`, the recording is known if a single one was read.
     """
     if not times:
         return [], []
-    read = [entry.label for entry in remarks.recordings.values()]
-    named = labels or [read[0] if len(read) == 1 else None] * len(times)
+    read = [entry.name for entry in remarks.recordings.values()]
+    named = names or [read[0] if len(read) == 1 else None] * len(times)
     found: list[str | None] = [None] * len(times)
-    for label in {*named} - {None}:
-        rows = [n for n, one in enumerate(named) if one == label and times[n]]
+    for name in {*named} - {None}:
+        rows = [n for n, one in enumerate(named) if one == name and times[n]]
         spans = [cast("range", times[n]) for n in rows]
         with suppress(HybridlogError):  # there is no such recording, or it is damaged
-            entry = context.store.entry(str(label))
+            entry = context.store.entry(str(name))
             known = _messages_in(context, entry, remarks.topics, spans)
             for n, time in zip(rows, known, strict=True):
                 found[n] = None if time is None else str(time - start_of(entry))
-    return found, [label if at else None for label, at in zip(named, found, strict=False)]
+    return found, [name if at else None for name, at in zip(named, found, strict=False)]
 
 
 def _messages_in(

@@ -103,9 +103,9 @@ def _parameters(params: RequestParams) -> list[tuple[str, str]]:
 
 
 def _name(context: Context, query: Query) -> str:
-    """The label of the recording, if it is one."""
+    """The name of the recording, if it is one."""
     ids = query.recordings
-    return context.store.entry(ids[0]).label if len(ids) == 1 else f"{len(ids)} recordings"
+    return context.store.entry(ids[0]).name if len(ids) == 1 else f"{len(ids)} recordings"
 
 
 def _topic(recorded: RecordedChannel, schemas: dict[Schema, int]) -> tuple[tuple[str, Any], ...]:

@@ -31,7 +31,7 @@ def _start(summary: RecordingSummary) -> int:
 
 _KEYS: Final[Mapping[str, Callable[[RecordingSummary], Any]]] = {
     "start": _start,
-    "name": lambda one: one.label,
+    "name": lambda one: one.name,
     "duration": lambda one: one.extent[1] - one.extent[0],
     "topics": lambda one: one.topic_count,
     "messages": lambda one: one.messages,
@@ -69,7 +69,6 @@ def recording(context: Context, params: RequestParams) -> dict[str, Any]:
     begin, end = extent(entry)
     return {
         "id": entry.id,
-        "label": entry.label,
         "store": context.store.directory.place,
         "name": entry.name,
         "status": entry.status,
@@ -109,7 +108,6 @@ def _row(context: Context, summary: RecordingSummary) -> dict[str, Any]:
     losses = context.store.entry(summary.id) if summary.has_losses else None
     return {
         "id": summary.id,
-        "label": summary.label,
         "name": summary.name,
         "tags": summary.tags,
         "status": summary.status,

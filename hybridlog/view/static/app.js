@@ -11,10 +11,10 @@ function show() {
   unmount();
   const main = document.getElementById("main");
   fill(main);
-  const label = state.get("recording");
-  document.title = label ? `${label} – hybridlog` : "hybridlog";
-  document.getElementById("where").textContent = label;
-  unmount = label ? mountRecording(main, label) : mountList(main);
+  const name = state.get("recording");
+  document.title = name ? `${name} – hybridlog` : "hybridlog";
+  document.getElementById("where").textContent = name;
+  unmount = name ? mountRecording(main, name) : mountList(main);
 }
 
 document.getElementById("home").addEventListener("click", (event) => {

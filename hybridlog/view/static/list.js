@@ -169,10 +169,9 @@ function row(one) {
   const open = (event) => {
     if (event.metaKey || event.ctrlKey) return;
     event.preventDefault();
-    state.show(one.label);
+    state.show(one.name);
   };
-  const link = element("a", { href: state.link({ recording: one.label }), onclick: open }, one.label);
-  const name = one.name === one.label ? null : element("small", {}, ` ${one.name}`);
+  const link = element("a", { href: state.link({ recording: one.name }), onclick: open }, one.name);
   const status = STATUS[one.status];
   const badge = status ? element("span", { class: "badge" }, status) : null;
   const tags = Object.entries(one.tags).map(([key, value]) =>
@@ -197,7 +196,7 @@ const STATUS = {
   damaged: "damaged",
   recovered: "cut short",
   unfinished: "cut short",
-  unproven: "journal lost",
+  unproven: "manifest lost",
 };
 
 /** A bar over the time of a recording; parts with losses are striped. */

@@ -11,7 +11,7 @@ import { count, counted, duration, moment, size } from "./words.js";
 
 /**
  * @typedef {Object} Recording
- * @property {string} label
+ * @property {string} name
  * @property {Object} info the answer of the server: topics, marks, losses; begin, end as BigInt
  * @property {BigInt} start the time that all other times count from, ns since 1970
  * @property {function(number|BigInt): BigInt} toTime ns since 1970 of a time since the start
@@ -23,7 +23,7 @@ import { count, counted, duration, moment, size } from "./words.js";
  */
 
 /** Shows a recording in an element. Returns a function that takes it away. */
-export function mountRecording(main, label) {
+export function mountRecording(main, name) {
   const ends = [];
   let isGone = false;
   const head = element("p", { class: "summary" }, "…");
@@ -36,7 +36,7 @@ export function mountRecording(main, label) {
 
   async function load() {
     try {
-      const info = timed(await get("recording", { recording: label }));
+      const info = timed(await get("recording", { recording: name }));
       if (isGone) return;
       const recording = made(info);
       // Nothing was said of the cursor: at the very start most topics have no message yet.
@@ -61,7 +61,7 @@ export function mountRecording(main, label) {
 function made(info) {
   const listeners = new Set();
   const recording = {
-    label: info.label,
+    name: info.name,
     info,
     start: BigInt(info.start),
     toTime: (offset) => recording.start + state.instant(offset),

@@ -40,9 +40,9 @@ export function sqlTable(recording, answer) {
 
   /** Shows the message of a row, in its recording. */
   function go(row) {
-    const label = recordings[row];
-    if (label === recording.label) state.set({ at: state.instant(at[row]) });
-    else state.show(label, { at: state.instant(at[row]), ask: state.get("ask") });
+    const name = recordings[row];
+    if (name === recording.name) state.set({ at: state.instant(at[row]) });
+    else state.show(name, { at: state.instant(at[row]), ask: state.get("ask") });
   }
 }
 

@@ -2,7 +2,7 @@
  * What the page shows, mirrored in the part of its address behind `#`, so that a link shows
  * the same.
  *
- * - recording: label or id; "" for the list of recordings
+ * - recording: name or id; "" for the list of recordings
  * - begin, end: the visible range, ns since the start of the recording, as BigInt; null for all
  * - at: the cursor, ns since the start of the recording, as BigInt
  * - seq: of the messages at the cursor's time, the arrival number of the one that is meant, if it

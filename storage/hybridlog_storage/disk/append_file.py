@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
+from blake3 import blake3
 
 from hybridlog_storage.buffers import buffers
 from hybridlog_storage.disk import files
@@ -52,6 +53,7 @@ class AppendFile:
         self.position = position
         """Bytes in the file."""
         self._fd = fd
+        self._hasher = None if position else blake3()  # of all that was appended
         self._stage = buffers.take(_STAGE) if direct else None
         self._filled = 0  # bytes in the stage
         self._begun = 0  # staged bytes before this are being written
@@ -105,6 +107,21 @@ class AppendFile:
         except OSError:
             self._step_back(before)
             raise
+        if self._hasher is not None:
+            for part in parts:
+                self._hasher.update(part)
+
+    def digest(self) -> str:
+        """BLAKE3 of all bytes of the file, in hexadecimal digits.
+
+        Raises:
+            OSError: It has to be read, and the system refuses.
+        """
+        if self._hasher is None:
+            self._hasher = blake3()
+            for at in range(0, self.position, _STAGE):
+                self._hasher.update(files.pread(self._fd, min(_STAGE, self.position - at), at))
+        return self._hasher.hexdigest()
 
     def _append(self, parts: Sequence[Buffer]) -> None:
         if self._stage is None:
@@ -149,7 +166,7 @@ class AppendFile:
         assert self._stage is None
         files.system.truncate(self._fd, position)
         os.lseek(self._fd, position, os.SEEK_SET)
-        self.position = position
+        self.position, self._hasher = position, None
 
     def rewrite(self, position: int, data: Buffer) -> None:
         """Overwrite bytes of the file; not for direct writes.
@@ -159,6 +176,7 @@ class AppendFile:
         """
         assert self._stage is None
         assert position + len(data) <= self.position
+        self._hasher = None
         pieces = [memoryview(data)]
         while pieces:
             done = files.system.pwritev(self._fd, pieces, position)

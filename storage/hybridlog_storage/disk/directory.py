@@ -3,12 +3,12 @@
 ```
 <store>/
   hybridlog.toml        format version, id of the store, settings
-  recordings/<label>/   one recording: journal, segments, columns; writer.lock while it is written
+  recordings/<id>/      one recording: manifest, segments, columns; writer.lock while it is written
   catalog.sqlite        derived: recordings and channels
   mongod/               derived: data of the embedded MongoDB
 ```
 
-The label of a recording is for people. The journal identifies the recording.
+The id of a recording never changes. What people call it lies in its manifest.
 """
 
 from __future__ import annotations
@@ -21,19 +21,18 @@ import secrets
 import stat
 import sys
 import time
-from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from itertools import takewhile
 from pathlib import Path
 from typing import Any, ClassVar, Final
 
-from hybridlog_storage import journal
 from hybridlog_storage.cells import Cells
 from hybridlog_storage.disk import durability, files
-from hybridlog_storage.errors import HeldError, SegmentError, StoreError, TopicError, unreadable
-from hybridlog_storage.journal import JOURNAL
+from hybridlog_storage.errors import HeldError, StoreError, TopicError, unreadable
+from hybridlog_storage.manifest import Manifest
+from hybridlog_storage.manifests import MANIFEST, MANIFEST_LOCK, MANIFEST_OLD, change_in
 from hybridlog_storage.segments.segment_file import OPEN_SUFFIX, SEALED_SUFFIX
 from hybridlog_storage.settings import NAME as SETTINGS
 from hybridlog_storage.settings import StoreSettings, read_settings, write_settings
@@ -55,7 +54,6 @@ _TICK_NS: Final = 50_000_000
 _POLL_S = 0.02
 _RECORDER_WAIT_S = 0.5  # a reader's look at a lock must not pass for a recorder
 _MAX_HOLDER = 256  # bytes of the line in a lock
-_TRIES = 10
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +74,7 @@ class Listing:
     """Content of a recording's directory.
 
     Attributes:
-        journal: Whether it has a journal.
+        manifest: Whether it has a manifest.
         sealed: Names of sealed segments, by number.
         open: Names of segments that were never sealed, by number.
         others: All other names.
@@ -85,7 +83,7 @@ class Listing:
         print: A value that changes whenever a relevant file changes.
     """
 
-    journal: bool
+    manifest: bool
     sealed: Mapping[int, str]
     open: Mapping[int, str]
     others: tuple[str, ...]
@@ -220,12 +218,12 @@ class StoreDirectory:
         """Directory of all recordings."""
         return self.path / _RECORDINGS
 
-    def recording(self, label: str) -> Path:
-        """Directory of a recording."""
-        return self.recordings / label
+    def recording(self, recording: str) -> Path:
+        """Directory of a recording, by its id."""
+        return self.recordings / recording
 
-    def labels(self) -> list[str]:
-        """Labels of all recordings that have a directory, sorted."""
+    def ids(self) -> list[str]:
+        """Ids of all recordings that have a directory, sorted."""
         return [name for name in self._folders() if not name.startswith(".")]
 
     def names(self) -> list[str]:
@@ -243,7 +241,7 @@ class StoreDirectory:
             raise unreadable(error, self.path, f"The store {self.path}") from error
 
     def changed(self) -> tuple[int, bool]:
-        """Time at which a recording got or lost its name last, ns, and if that is a while ago.
+        """Time at which a recording came or went last, ns, and if that is a while ago.
 
         Within a tick of the file system's clock another change would show the same time.
         """
@@ -254,9 +252,9 @@ class StoreDirectory:
         return changed, _is_a_tick_ago(changed)
 
     def looks(self, names: Sequence[str]) -> dict[str, str]:
-        """The look of each recording's directory, by label.
+        """The look of each recording's directory, by id.
 
-        It changes whenever a file gets or loses its name, and when the journal grows. A
+        It changes whenever a file gets or loses its name, and when the manifest changes. A
         change inside a segment shows only in `Listing.print`.
 
         Args:
@@ -273,17 +271,17 @@ class StoreDirectory:
                         with suppress(OSError):
                             about = os.stat(name, dir_fd=fd, follow_symlinks=False)
                             if stat.S_ISDIR(about.st_mode):
-                                found[name] = _look(about, f"{name}/{JOURNAL}", fd)
+                                found[name] = _look(about, f"{name}/{MANIFEST}", fd)
         except FileNotFoundError:
             return {}
         except OSError as error:
             raise unreadable(error, self.path, f"The store {self.path}") from error
         return found
 
-    def _look_of(self, label: str) -> str:
+    def _look_of(self, recording: str) -> str:
         """The look of one recording."""
-        with files.folder(self.recording(label)) as fd:
-            return _look(os.fstat(fd), JOURNAL, fd)
+        with files.folder(self.recording(recording)) as fd:
+            return _look(os.fstat(fd), MANIFEST, fd)
 
     @property
     def address(self) -> str:
@@ -304,23 +302,29 @@ class StoreDirectory:
         """The cells of the catalog; None for those in its file here."""
         return None
 
-    def append(self, label: str, *lines: journal.Event) -> None:
-        """Append lines to the journal of a recording that this process has locked.
+    def change(self, recording: str, how: Callable[[Manifest], Manifest]) -> Manifest:
+        """Replace the manifest of a recording, if it is unchanged; see `manifests.change_in`.
 
         Raises:
+            RecordingGoneError: The recording is gone.
             StoreError: It cannot be written.
         """
-        journal.Journal(self.recording(label)).append(*lines)
+        return change_in(self.recording(recording), how)
 
     @contextmanager
-    def at_hand(self, label: str, segments: Collection[int] = ()) -> Iterator[StoreDirectory]:
+    def changing(self) -> Iterator[None]:
+        """Change a manifest and its row of the catalog at once; here nobody needs that."""
+        yield
+
+    @contextmanager
+    def at_hand(self, recording: str, segments: Collection[int] = ()) -> Iterator[StoreDirectory]:
         """A directory where files of a recording can be changed, within `writing`: this one."""
         yield self
 
-    def has(self, label: str) -> bool:
+    def has(self, recording: str) -> bool:
         """True if this name exists below `recordings`."""
         try:
-            files.status(self.recording(label))
+            files.status(self.recording(recording))
         except FileNotFoundError:
             return False
         except OSError:
@@ -340,20 +344,20 @@ class StoreDirectory:
         """Compare a list of files with the files; True if some are missing. Here is no list."""
         return False
 
-    def lost_of(self, label: str) -> Collection[str]:
+    def lost_of(self, recording: str) -> Collection[str]:
         """Files that a list says to be there, and are not; here nothing says so."""
         return ()
 
-    def listing(self, label: str) -> Listing:
+    def listing(self, recording: str) -> Listing:
         """Read the content of a recording's directory.
 
         Raises:
             StoreError: It cannot be read.
         """
-        path = self.recording(label)
+        path = self.recording(recording)
         look, found, payloads = "", {}, {}
         try:
-            look = self._look_of(label)
+            look = self._look_of(recording)
             found = files.names(path)
             if PAYLOADS in found:
                 payloads = payload_names(path)
@@ -372,7 +376,9 @@ class StoreDirectory:
                 looks.update(f"{name}\n".encode())
             elif kind == SEALED_SUFFIX:
                 sealed[number] = name
-            elif name != JOURNAL:
+            elif name in {MANIFEST_LOCK, MANIFEST_OLD}:
+                continue
+            elif name != MANIFEST:
                 others.append(name)
                 continue
             if kind != OPEN_SUFFIX:
@@ -386,7 +392,7 @@ class StoreDirectory:
                 f"{about.st_ino}\n".encode()
             )
         return Listing(
-            JOURNAL in found,
+            MANIFEST in found,
             dict(sorted(sealed.items())),
             dict(sorted(opened.items())),
             tuple(others),
@@ -395,46 +401,25 @@ class StoreDirectory:
             looks.hexdigest(),
         )
 
-    def segments(self, label: str) -> list[tuple[int, Path]]:
+    def segments(self, recording: str) -> list[tuple[int, Path]]:
         """Number and path of each sealed segment of a recording, in order."""
-        path = self.recording(label)
-        return [(number, path / name) for number, name in self.listing(label).sealed.items()]
+        path = self.recording(recording)
+        return [(number, path / name) for number, name in self.listing(recording).sealed.items()]
 
     @property
     def mongod(self) -> Path:
         """Directory of the embedded MongoDB."""
         return self.path / "mongod"
 
-    def new_recording(self, name: str) -> str:
-        """Create a directory for a new recording; return its label, made from the name."""
-        base = label_of(name)
-        number = 1
-        while True:
-            label = _numbered_label(base, number)
-            try:
-                files.make_folder(self.recording(label))
-            except FileExistsError:
-                number = self._free_number(base, number)
-            except OSError as error:
-                raise durability.explain(error, self.path, "starting a recording in") from error
-            else:
-                self._sync()
-                return label
+    def new_recording(self, recording: str) -> None:
+        """Create the directory of a new recording."""
+        try:
+            files.make_folder(self.recording(recording))
+        except OSError as error:
+            raise durability.explain(error, self.path, "starting a recording in") from error
+        self._sync()
 
-    def _free_number(self, base: str, taken: int) -> int:
-        """A free number after a taken one; a thousand recordings of one name cost ten looks."""
-        free = taken + 1
-        while self.has(_numbered_label(base, free)):
-            taken, free = free, free * 2
-        while free - taken > 1:
-            middle = (taken + free) // 2
-            if self.has(_numbered_label(base, middle)):
-                taken = middle
-            else:
-                free = middle
-        return free
-
-    def is_beginning(self, label: str) -> bool:
+    def is_beginning(self, recording: str) -> bool:
         """True if a process may be about to lock this empty recording.
 
         A process that begins a recording locks `recordings` until the recording itself is
@@ -446,32 +431,35 @@ class StoreDirectory:
         except OSError:
             return True
 
-    def free_label(self, name: str, *, but: str = "") -> str:
-        """A free label made from a name; the label of one recording may count as free."""
-        base = label_of(name)
-        taken = set(self._folders()) - {but}
-        number = 1
-        while (label := _numbered_label(base, number)) in taken:
-            number += 1
-        return label
+    def put_in_place(self, hidden: str, recording: str) -> None:
+        """Durably give a hidden directory the name of a recording; one that had it goes.
 
-    def move(self, old: str, new: str) -> None:
-        """Durably rename a directory below `recordings`."""
+        Within `alone`. A crash in between leaves `hidden`, and this can be called again.
+        """
+        removed = f"{REMOVED}{recording}-{secrets.token_hex(4)}" if self.has(recording) else ""
         try:
-            files.rename(self.recording(old), self.recording(new))
+            if removed:
+                files.rename(self.recording(recording), self.recording(removed))
+            files.rename(self.recording(hidden), self.recording(recording))
             self._sync()
         except OSError as error:
-            raise durability.explain(error, self.recording(old), "renaming") from error
+            raise durability.explain(error, self.recording(hidden), "renaming") from error
+        if removed:
+            self.sweep(removed)
 
-    def hide(self, label: str) -> str:
+    def hide(self, recording: str) -> str:
         """Durably give a recording a hidden name, and return that name."""
-        hidden = f"{REMOVED}{label}-{secrets.token_hex(4)}"
-        self.move(label, hidden)
+        hidden = f"{REMOVED}{recording}-{secrets.token_hex(4)}"
+        try:
+            files.rename(self.recording(recording), self.recording(hidden))
+            self._sync()
+        except OSError as error:
+            raise durability.explain(error, self.recording(recording), "renaming") from error
         return hidden
 
-    def remove(self, label: str) -> None:
+    def remove(self, recording: str) -> None:
         """Hide a recording's directory, then delete its files."""
-        self.sweep(self.hide(label))
+        self.sweep(self.hide(recording))
 
     def sweep(self, name: str) -> None:
         """Delete a hidden directory below `recordings`."""
@@ -507,104 +495,42 @@ class StoreDirectory:
                 raise unreadable(error, self.path) from error
             yield True
 
-    def id_of(self, label: str) -> str:
-        """The id of a recording: by its journal, else by most of its segments.
-
-        Returns:
-            Empty if it has no segments yet that could say it.
-
-        Raises:
-            StoreError: Nothing says it, or it cannot be read.
-        """
-        from hybridlog_storage.segments.segment_reader import SegmentReader
-
-        path, listing = self.recording(label), self.listing(label)
-        state = journal.read(path) if listing.journal else None
-        if state is not None and state.id:
-            return state.id
-        found: Counter[str] = Counter()
-        for number, name in listing.sealed.items():
-            with suppress(SegmentError), SegmentReader(path / name, number) as reader:
-                found[str(reader.summary().recording.get("id", ""))] += 1
-        if not found and (listing.sealed or listing.open):
-            raise StoreError(f"Nothing readable says which recording {label!r} is.")
-        return found.most_common(1)[0][0] if found else ""
-
-    def labels_of(self, recording: str) -> list[str]:
-        """Labels of a recording, by its id; several are copies of one."""
-        found: list[str] = []
-        for _ in range(_TRIES):
-            looks = self.looks(self.labels())
-            found = [label for label in looks if self.has_label(label, recording)]
-            # One that is renamed meanwhile must not be missed.
-            if found or self.looks(self.labels()) == looks:
-                break
-        return found
-
-    def label_now(self, label: str, recording: str) -> str:
-        """The present label of a recording that had a label.
-
-        Raises:
-            TopicError: It is gone, or several copies of it are left.
-        """
-        if self.has(label) and self.has_label(label, recording):
-            return label
-        found = self.labels_of(recording) if recording else []
-        if len(found) == 1:
-            return found[0]
-        raise TopicError(f"Recording {label!r} is no longer in the store.")
-
-    def has_label(self, label: str, recording: str) -> bool:
-        """True if a recording, by its id, has a label; empty for any recording."""
-        try:
-            return not recording or self.id_of(label) == recording
-        except StoreError:
-            return False
-
     @contextmanager
     def writing(
-        self, label: str, recording: str = "", *, wait_s: float = 0.0, records: bool = False
-    ) -> Iterator[str]:
+        self, recording: str, name: str = "", *, wait_s: float = 0.0, records: bool = False
+    ) -> Iterator[None]:
         """Lock a recording for writing.
 
-        Nobody gives a locked recording another label, so the label is right until the end.
-
         Args:
-            label: Its label when it was chosen.
-            recording: Its id. If the label belongs to another recording by now, it is looked
-                for. Empty for any recording that has the label.
+            recording: Its id.
+            name: What people call it, for messages.
             wait_s: Seconds to wait for another command that holds it. A recorder may hold it
                 for hours, so it is not waited for.
             records: Whether this process records it.
-
-        Yields:
-            Its present label.
 
         Raises:
             HeldError: Another process holds it.
             TopicError: It is gone.
         """
-        begun = time.monotonic()
+        begun, path = time.monotonic(), self.recording(recording) / LOCK
         while True:
             try:
-                fd = files.open_file(self.recording(label) / LOCK, os.O_RDWR | os.O_CREAT)
-            except FileNotFoundError:
-                label = self.label_now(label, recording)
-                continue
+                fd = files.open_file(path, os.O_RDWR | os.O_CREAT)
+            except FileNotFoundError as error:
+                raise gone(name or recording) from error
             except OSError as error:
-                raise durability.explain(error, self.recording(label) / LOCK, "locking") from error
+                raise durability.explain(error, path, "locking") from error
             is_mine = False
             try:
                 with suppress(BlockingIOError):
                     fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
                     is_mine = True
-                if not self._is_lock_of(fd, label, recording):
-                    label = self.label_now(label, recording)
-                    continue
+                if not _is_at(fd, path):
+                    raise gone(name or recording)
                 if is_mine:
                     _say_holder(fd, records=records)
                     try:
-                        yield label
+                        yield
                     finally:
                         with suppress(OSError):
                             files.system.truncate(fd, 0)
@@ -616,27 +542,16 @@ class StoreDirectory:
             if time.monotonic() - begun >= most:
                 what = "being written" if holder.is_recording else "being changed"
                 raise HeldError(
-                    f"Recording {label!r} is {what} by {holder.name}. Wait until it is done, or "
-                    "stop it.",
+                    f"Recording {name or recording!r} is {what} by {holder.name}. Wait until it "
+                    "is done, or stop it.",
                     is_recording=holder.is_recording,
                 )
             pause(_POLL_S)
 
-    def _is_lock_of(self, fd: int, label: str, recording: str) -> bool:
-        """True if an open lock is that of a label, and the label that of a recording."""
-        path = self.recording(label) / LOCK
-        try:
-            there = files.status(path)
-        except FileNotFoundError:
-            return False
-        except OSError as error:
-            raise durability.explain(error, path, "locking") from error
-        return os.path.samestat(os.fstat(fd), there) and self.has_label(label, recording)
-
-    def holder(self, label: str) -> Holder | None:
+    def holder(self, recording: str) -> Holder | None:
         """The process that holds a recording's lock at this moment."""
         try:
-            fd = files.open_file(self.recording(label) / LOCK, os.O_RDONLY | os.O_NONBLOCK)
+            fd = files.open_file(self.recording(recording) / LOCK, os.O_RDONLY | os.O_NONBLOCK)
         except OSError:
             return None
         try:
@@ -647,9 +562,9 @@ class StoreDirectory:
             os.close(fd)
         return None
 
-    def is_recorded(self, label: str) -> bool:
+    def is_recorded(self, recording: str) -> bool:
         """True if a process records into a directory at this moment."""
-        holder = self.holder(label)
+        holder = self.holder(recording)
         return holder is not None and holder.is_recording
 
 
@@ -674,21 +589,32 @@ def _read_holder(fd: int) -> Holder:
     return Holder(f"process {found[1]} ({found[3]})", is_recording=found[2] == "1")
 
 
-def _numbered_label(base: str, number: int) -> str:
-    return base if number == 1 else f"{base}-{number}"
+def gone(name: str) -> TopicError:
+    """The error for a recording that was removed meanwhile."""
+    return TopicError(f"Recording {name!r} is no longer in the store.")
 
 
-def _look(about: os.stat_result, journal: str, fd: int) -> str:
+def _is_at(fd: int, path: Path) -> bool:
+    """True if an open file has a path."""
+    try:
+        return os.path.samestat(os.fstat(fd), files.status(path))
+    except FileNotFoundError:
+        return False
+    except OSError as error:
+        raise durability.explain(error, path, "locking") from error
+
+
+def _look(about: os.stat_result, manifest: str, fd: int) -> str:
     """The look of a recording.
 
     Args:
         about: The status of its directory.
-        journal: Path of its journal.
+        manifest: Path of its manifest.
         fd: Handle of the folder that the path begins in.
     """
     look = f"{about.st_ino} {about.st_mtime_ns} {about.st_ctime_ns}"
     try:
-        lines = os.stat(journal, dir_fd=fd, follow_symlinks=False)
+        lines = os.stat(manifest, dir_fd=fd, follow_symlinks=False)
     except OSError:
         return look
     return f"{look} {lines.st_ino} {lines.st_size} {lines.st_mtime_ns} {lines.st_ctime_ns}"
@@ -696,7 +622,7 @@ def _look(about: os.stat_result, journal: str, fd: int) -> str:
 
 def is_stable(look: str) -> bool:
     """False if the look is so new that it would be the same after another change."""
-    times = look.split()[2::4]  # of the directory, and of the journal if there is one
+    times = look.split()[2::4]  # of the directory, and of the manifest if there is one
     return all(_is_a_tick_ago(int(one)) for one in times)
 
 
@@ -720,11 +646,6 @@ def payload_names(recording: Path, folder: str = PAYLOADS) -> dict[str, os.stat_
             inside = files.names(recording / folder / topic)
             found.update({f"{topic}/{name}": status for name, status in inside.items()})
     return found
-
-
-def label_of(name: str) -> str:
-    """Turn a name into a valid label."""
-    return re.sub(r"[^A-Za-z0-9._-]+", "-", name).strip("-.")[:80] or "recording"
 
 
 def _numbered(name: str) -> tuple[int, str]:

@@ -183,8 +183,22 @@ def read_file(path: Path, most: int) -> bytes:
         os.close(fd)
 
 
-def write_file(path: Path, content: bytes, mode: int = 0o666, *, sync: bool = True) -> None:
+def write_file(
+    path: Path,
+    content: bytes,
+    mode: int = 0o666,
+    *,
+    sync: bool = True,
+    modified: int | None = None,
+) -> None:
     """Write a small file atomically. It replaces a file or symlink of its name.
+
+    Args:
+        path: The file.
+        content: Its bytes.
+        mode: Its permissions, before the umask.
+        sync: Whether it is on the disk when this returns.
+        modified: Time of its modification, ns; None for the one that the system gives.
 
     Raises:
         OSError: It cannot be written; no part of it remains.
@@ -196,6 +210,8 @@ def write_file(path: Path, content: bytes, mode: int = 0o666, *, sync: bool = Tr
             left = memoryview(content)
             while left:
                 left = left[system.writev(fd, [left]) :]
+            if modified is not None:
+                os.utime(fd, ns=(modified, modified))
             if sync:
                 system.sync(fd)
         finally:

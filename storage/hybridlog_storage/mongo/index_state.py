@@ -10,7 +10,6 @@ not lost documents up to there.
 
 from __future__ import annotations
 
-import os
 import secrets
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
@@ -39,7 +38,6 @@ _CHANNEL_BYTES: Final = 600  # of a channel in the mirror, without its texts
 _MAX_CHANNEL_BYTES: Final = 8 << 20  # of all: a document of MongoDB has at most 16 MiB
 _OF_CHANNELS: Final = ("channels.topic", "channels.stats.first", "channels.stats.last")
 _MAX_NAMES: Final = (
-    "label",
     "name",
     "tags",
     "status",
@@ -272,8 +270,8 @@ class IndexState:
 
 
 def _mirrored(entry: RecordingEntry) -> dict[str, Any]:
-    """An entry as MongoDB accepts it: a directory's name may not be UTF-8."""
-    document = {**entry.to_document(), "label": _label(entry)}
+    """An entry as MongoDB accepts it."""
+    document = entry.to_document()
     text = (
         len(part)
         for channel in entry.channels
@@ -282,7 +280,3 @@ def _mirrored(entry: RecordingEntry) -> dict[str, Any]:
     if len(entry.channels) * _CHANNEL_BYTES + sum(text) > _MAX_CHANNEL_BYTES:
         document["channels"] = [{"topic": channel.topic} for channel in entry.channels]
     return document
-
-
-def _label(entry: RecordingEntry) -> str:
-    return os.fsencode(entry.label).decode("utf-8", "backslashreplace")

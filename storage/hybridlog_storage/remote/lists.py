@@ -21,6 +21,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from hybridlog_storage.errors import StoreError
+from hybridlog_storage.manifest import is_id
 from hybridlog_storage.remote.bucket import Object
 
 LISTS: Final = "lists"
@@ -30,23 +31,8 @@ MAX_LIST: Final = 1 << 30
 """Largest list that is read, bytes, packed and unpacked."""
 _FORMAT: Final = 1
 _LAST: Final = (1 << 64) - 1
-_LABEL: Final = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9._-]{0,99}", re.ASCII)
-_ID: Final = re.compile(r"[0-9a-f]{32}", re.ASCII)
 _PART: Final = re.compile(r"[^/\x00]{1,255}")
 _MAX_DEPTH: Final = 3
-
-
-@dataclass(frozen=True, slots=True)
-class ListedRecording:
-    """A recording in a list.
-
-    Attributes:
-        id: Its id.
-        files: The object of each file, by path below the recording.
-    """
-
-    id: str
-    files: Mapping[str, Object]
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,14 +42,14 @@ class StoreList:
     Attributes:
         store: Id of the store.
         number: Counts states, from 1; 0 before the first.
-        recordings: By label.
+        recordings: The object of each file of each recording, by its id and the path below it.
         tables: The object of each file of fields, by path below `tables`.
         catalog: The catalog, as an SQLite database.
     """
 
     store: str
     number: int = 0
-    recordings: Mapping[str, ListedRecording] = field(default_factory=dict)
+    recordings: Mapping[str, Mapping[str, Object]] = field(default_factory=dict)
     tables: Mapping[str, Object] = field(default_factory=dict)
     catalog: bytes = b""
 
@@ -72,10 +58,7 @@ class StoreList:
         head = {
             "format": _FORMAT,
             "store": self.store,
-            "recordings": {
-                label: {"id": one.id, "files": _rows(one.files)}
-                for label, one in self.recordings.items()
-            },
+            "recordings": {one: _rows(objects) for one, objects in self.recordings.items()},
             "tables": _rows(self.tables),
         }
         line = json.dumps(head, separators=(",", ":")).encode() + b"\n"
@@ -100,14 +83,11 @@ class StoreList:
             if head["store"] != store:
                 raise ValueError("it is of another store")
             found = {
-                _checked(_LABEL, label): ListedRecording(
-                    _checked(_ID, one["id"]), _objects(one["files"], f"{RECORDINGS}/{one['id']}/")
-                )
-                for label, one in head["recordings"].items()
+                one: _objects(rows, f"{RECORDINGS}/{one}/")
+                for one, rows in head["recordings"].items()
             }
-            ids = {one.id for one in found.values()}
-            if len(ids) < len(found):
-                raise ValueError("a recording is listed twice")
+            if not all(map(is_id, found)):
+                raise ValueError("it names no recording")
             tables = _objects(head["tables"], f"{TABLES}/")
             return cls(store, number, found, tables, rest)
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError, zlib.error) as e:

@@ -20,26 +20,37 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
-from itertools import count
 from pathlib import Path
 from typing import Any, ClassVar, Final
 
-from hybridlog_storage import journal
+from hybridlog_storage import manifest as truth
 from hybridlog_storage.cells import Cells
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk import files
-from hybridlog_storage.disk.directory import LOCK, PAYLOADS, Listing, StoreDirectory
-from hybridlog_storage.errors import ObjectChangedError, ObjectExistsError, StoreError
-from hybridlog_storage.journal import JOURNAL
+from hybridlog_storage.disk.directory import LOCK, PAYLOADS, Listing, StoreDirectory, gone
+from hybridlog_storage.errors import (
+    ManifestError,
+    ObjectChangedError,
+    ObjectExistsError,
+    RecordingGoneError,
+    StoreError,
+)
+from hybridlog_storage.manifest import Manifest, encode
+from hybridlog_storage.manifests import (
+    MANIFEST,
+    MANIFEST_LOCK,
+    MANIFEST_OLD,
+    read_in,
+    write_in,
+)
 from hybridlog_storage.remote import TRIES
 from hybridlog_storage.remote.blocks import BlockCache, inode_of
-from hybridlog_storage.remote.bucket import UNLISTED_DAYS, Bucket, Object
+from hybridlog_storage.remote.bucket import UNLISTED_DAYS, Bucket, Object, other_name
 from hybridlog_storage.remote.lists import (
     LISTS,
     MAX_LIST,
     RECORDINGS,
     TABLES,
-    ListedRecording,
     StoreList,
     list_name,
     number_of,
@@ -55,10 +66,11 @@ _DAY_NS: Final = 86_400 * 10**9
 _ALONE: Final = 4  # recordings that are compared with the bucket one by one; then all at once
 _MAX_SETTINGS: Final = 1 << 20
 _PIECE: Final = 1 << 20  # bytes of a file that are sent at once
+_NOT_LISTED: Final = frozenset({LOCK, MANIFEST, MANIFEST_LOCK, MANIFEST_OLD})
 _FOLDER: Final = stat.S_IFDIR | 0o555
 _FILE: Final = stat.S_IFREG | 0o444
 _Node = Mapping[str, Any]
-"""A folder: an `Object`, a list of them, bytes, or another folder, by name."""
+"""A folder: an `Object`, bytes, or another folder, by name."""
 
 
 class BucketFiles:
@@ -117,7 +129,7 @@ class BucketFiles:
         number = number_of(about.name)
         if number is None:
             raise StoreError(f"{place} is no list.")
-        return StoreList.from_bytes(store, number, self.read([about]), place)
+        return StoreList.from_bytes(store, number, self.read(about), place)
 
     def commit(self, before: StoreList, after: StoreList) -> None:
         """Create the next list.
@@ -150,7 +162,7 @@ class BucketFiles:
             if recording in self._compared or (recording and "" in self._compared):
                 return
             listed = self.list
-            everything = [one for r in listed.recordings.values() for one in r.files.values()]
+            everything = [one for files_ in listed.recordings.values() for one in files_.values()]
             place = f"{RECORDINGS}/{recording}" if recording else ""
             if len(self._compared) >= _ALONE:  # 1,000 objects are listed at once
                 recording, place = "", RECORDINGS
@@ -164,10 +176,10 @@ class BucketFiles:
             )
             self._compared.add(recording)
 
-    def files_of(self, label: str) -> dict[str, Object]:
+    def files_of(self, recording: str) -> dict[str, Object]:
         """The object of each file of a recording, without those that are lost."""
         lost = self.bucket.lost
-        return {p: o for p, o in self.list.recordings[label].files.items() if o not in lost}
+        return {p: o for p, o in self.list.recordings[recording].items() if o not in lost}
 
     # Files.
 
@@ -190,22 +202,19 @@ class BucketFiles:
         if isinstance(node, Mapping):
             raise IsADirectoryError(errno.EISDIR, "it is a folder", self._place(inner))
         with tempfile.TemporaryFile() as file:
-            file.write(node if isinstance(node, bytes) else self.read(node))
+            file.write(node)
             file.seek(0)
             return os.dup(file.fileno())
 
-    def read(self, objects: Sequence[Object]) -> bytes:
-        """Small objects, one behind the other."""
-        if sum(one.size for one in objects) > MAX_LIST:
-            raise StoreError(f"{self.bucket.address}/{objects[0].name} is too large.")
-        parts = []
-        for one in objects:
-            handle = self._cache.open(self.bucket, one)
-            try:
-                parts.append(files.pread(handle, one.size, 0))
-            finally:
-                os.close(handle)
-        return b"".join(parts)
+    def read(self, about: Object) -> bytes:
+        """A small object."""
+        if about.size > MAX_LIST:
+            raise StoreError(f"{self.bucket.address}/{about.name} is too large.")
+        handle = self._cache.open(self.bucket, about)
+        try:
+            return files.pread(handle, about.size, 0)
+        finally:
+            os.close(handle)
 
     def _status(self, node: Any, inner: tuple[str, ...]) -> os.stat_result:
         if isinstance(node, Mapping):
@@ -213,16 +222,25 @@ class BucketFiles:
             return _stat(_FOLDER, listed, 0, listed)
         if isinstance(node, bytes):
             return _stat(_FILE, crc32(node), len(node))
-        objects = [node] if isinstance(node, Object) else node
-        return _stat(_FILE, inode_of(objects[-1]), sum(one.size for one in objects))
+        return _stat(_FILE, inode_of(node), node.size)
 
     def _node(self, inner: tuple[str, ...]) -> Any:
         found: Any = self._root(inner)
         for name in inner:
             if not isinstance(found, Mapping) or name not in found:
-                raise FileNotFoundError(errno.ENOENT, "there is no such object", self._place(inner))
+                problem = "there is no such object"
+                if self._is_lost(inner):
+                    problem = "its object in the bucket is missing or was changed"
+                raise FileNotFoundError(errno.ENOENT, problem, self._place(inner))
             found = found[name]
         return found
+
+    def _is_lost(self, inner: tuple[str, ...]) -> bool:
+        """True if the list names a file of a recording whose object is not there."""
+        if len(inner) < 3 or inner[0] != RECORDINGS:
+            return False
+        listed = self.list.recordings.get(inner[1], {})
+        return listed.get("/".join(inner[2:])) in self.bucket.lost
 
     def _root(self, inner: tuple[str, ...]) -> _Node:
         """The folders on the way to a file; others are left out."""
@@ -230,7 +248,7 @@ class BucketFiles:
         top = inner[0] if inner else ""
         recordings: dict[str, _Node] = {}
         if top == RECORDINGS and len(inner) == 1:
-            recordings = {label: {} for label in listed.recordings}
+            recordings = {recording: {} for recording in listed.recordings}
         elif top == RECORDINGS and inner[1] in listed.recordings:
             recordings = {inner[1]: _folder(self.files_of(inner[1]))}
         return {
@@ -414,10 +432,10 @@ class RemoteDirectory(StoreDirectory):
         self.check_changes()
         self.source.change_settings(changed)
 
-    def new_recording(self, name: str) -> str:
+    def new_recording(self, recording: str) -> None:
         """Raise: nothing is recorded into a bucket."""
         self.check_writable()
-        raise AssertionError(name)
+        raise AssertionError(recording)
 
     def catalog_cells(self) -> Cells | None:
         """The cells of the catalog, from the newest list."""
@@ -428,7 +446,7 @@ class RemoteDirectory(StoreDirectory):
         return self.source.list
 
     def names(self) -> list[str]:
-        """All labels, sorted."""
+        """All ids, sorted."""
         return sorted(self._now.recordings)
 
     def _folders(self) -> list[str]:
@@ -440,27 +458,22 @@ class RemoteDirectory(StoreDirectory):
         return self._now.number, True
 
     def looks(self, names: Sequence[str]) -> dict[str, str]:
-        """The look of each recording, by label: it changes whenever any file does."""
+        """The look of each recording, by id: it changes whenever any file does."""
         listed = self._now.recordings
         return {name: _look(self.files_of(name)) for name in names if name in listed}
 
-    def _look_of(self, label: str) -> str:
-        return self.looks([label]).get(label, "")
+    def _look_of(self, recording: str) -> str:
+        return self.looks([recording]).get(recording, "")
 
     def look_closely(self) -> bool:
         """Compare all files with their objects; True if some were lost."""
         self.source.compare()
         return bool(self.source.bucket.lost)
 
-    def listing(self, label: str) -> Listing:
+    def listing(self, recording: str) -> Listing:
         """As of a directory; files count whose objects are there."""
-        self.source.compare(self.id_of(label))
-        return super().listing(label)
-
-    def id_of(self, label: str) -> str:
-        """The id of a recording; empty if there is none of this label."""
-        found = self._now.recordings.get(label)
-        return "" if found is None else found.id
+        self.source.compare(recording)
+        return super().listing(recording)
 
     @contextmanager
     def alone(self) -> Iterator[None]:
@@ -475,13 +488,13 @@ class RemoteDirectory(StoreDirectory):
     @property
     def listed_bytes(self) -> int:
         """Bytes of all files that the newest list names."""
-        recordings = [one.files for one in self._now.recordings.values()]
-        return sum(o.size for files_ in (*recordings, self._now.tables) for o in files_.values())
+        everything = (*self._now.recordings.values(), self._now.tables)
+        return sum(o.size for files_ in everything for o in files_.values())
 
     @contextmanager
     def writing(
-        self, label: str, recording: str = "", *, wait_s: float = 0.0, records: bool = False
-    ) -> Iterator[str]:
+        self, recording: str, name: str = "", *, wait_s: float = 0.0, records: bool = False
+    ) -> Iterator[None]:
         """A change of a recording, which counts at the end of the block.
 
         Raises:
@@ -492,17 +505,22 @@ class RemoteDirectory(StoreDirectory):
         if records:
             self.check_writable()
         with self.changing():
-            yield self.label_now(label, recording)
+            if recording not in self._now.recordings:
+                raise gone(name or recording)
+            yield
 
     @contextmanager
     def changing(self) -> Iterator[None]:
-        """A change of the store, which counts at the end of the block.
+        """A change of the store, which counts at the end of the block, or of the outer one.
 
         Raises:
             ObjectExistsError: Another process was faster: begin again.
         """
         self.check_changes()
         with self.source.lock:
+            if self.source.is_changing:
+                yield
+                return
             self.source.look(self.settings.store_id, now=True)
             before = self._now
             self._cells.begin()
@@ -524,60 +542,78 @@ class RemoteDirectory(StoreDirectory):
         if self.read_only:
             raise StoreError(f"The store {self.place} was opened for reading only.")
 
-    def append(self, label: str, *lines: journal.Event) -> None:
-        """Append lines to the journal of a recording, within `writing`: one more object."""
-        self._append(label, b"".join(map(journal.encode, lines)))
+    def change(self, recording: str, how: Callable[[Manifest], Manifest]) -> Manifest:
+        """As of a directory: the list names a new object in the place of the one before.
 
-    def _append(self, label: str, content: bytes) -> None:
-        listed = self._now.recordings[label]
-        # Behind all others: one in a gap would be read before those behind it.
-        for number in count(max(map(_part, listed.files), default=0) + 1):
-            path = f"{JOURNAL}.{number}"
-            name = f"{RECORDINGS}/{listed.id}/{path}"
-            # One that is there is of a change that did not come to its end.
-            with suppress(ObjectExistsError):
-                version = self.source.bucket.create(name, content)
-                break
-        about = Object(name, len(content), version, 0)
-        self._relist(label, replace(listed, files={**listed.files, path: about}))
+        Raises:
+            RecordingGoneError: The recording is gone.
+            ManifestError: The manifest is damaged or lost.
+            ObjectExistsError: Another process was faster: begin again.
+        """
+        with self.changing():
+            if recording not in self._now.recordings:
+                raise RecordingGoneError(f"There is no recording {recording!r}.")
+            now = self._manifest(recording)
+            made = how(now)
+            if made == now:
+                return now
+            made = truth.replace(made, id=now.id, created=now.created, changes=now.changes + 1)
+            self._list_manifest(recording, made)
+            return made
+
+    def _manifest(self, recording: str) -> Manifest:
+        found = read_in(self.recording(recording))
+        if found is None:
+            raise ManifestError(
+                f"{self.recording(recording)} has lost its manifest: `hybridlog copy` brings it "
+                "back."
+            )
+        return found
+
+    def _list_manifest(self, recording: str, manifest: Manifest) -> None:
+        data = encode(manifest)
+        name = other_name(f"{RECORDINGS}/{recording}/{MANIFEST}")
+        about = Object(name, len(data), self.source.bucket.create(name, data), 0)
+        self._relist(recording, {**self._now.recordings[recording], MANIFEST: about})
 
     @contextmanager
-    def at_hand(self, label: str, segments: Collection[int] = ()) -> Iterator[StoreDirectory]:
+    def at_hand(self, recording: str, segments: Collection[int] = ()) -> Iterator[StoreDirectory]:
         """As of a directory; what the block leaves on the disk becomes objects.
 
         Raises:
             StoreError: An object that is needed is lost.
         """
-        objects, bucket = self.files_of(label), self.source.bucket
+        objects, bucket = self.files_of(recording), self.source.bucket
         wanted = {sealed_name(number) for number in segments}
         if wanted:  # fields of expired messages belong to all segments
             wanted |= {path for path in objects if path.startswith(f"{PAYLOADS}/")}
         with tempfile.TemporaryDirectory(prefix="hybridlog-") as place:
             there = StoreDirectory.create(Path(place) / "store")
-            folder = there.recording(label)
-            lines = files.read_file(self.recording(label) / JOURNAL, journal.MAX_JOURNAL)
+            folder = there.recording(recording)
+            manifest = self._manifest(recording)
             folder.mkdir()
-            (folder / JOURNAL).write_bytes(lines)
+            write_in(folder, manifest, sync=False)
             for path in wanted:
                 try:
                     self.fetch(objects[path], folder / path)
                 except (KeyError, FileNotFoundError, ObjectChangedError) as error:
-                    raise StoreError(f"{self.recording(label) / path} is lost.") from error
+                    raise StoreError(f"{self.recording(recording) / path} is lost.") from error
             before = _files_below(folder)
             yield there
             after = _files_below(folder)
-            listed = dict(self._now.recordings[label].files)
+            listed = dict(self._now.recordings[recording])
             for path, about in after.items():
                 if before.get(path) != about:
-                    name = f"{RECORDINGS}/{self._now.recordings[label].id}/{path}"
+                    name = f"{RECORDINGS}/{recording}/{path}"
                     with (folder / path).open("rb") as file:
                         pieces = iter(partial(file.read, _PIECE), b"")
                         listed[path] = bucket.send(name, about[0], pieces)
             for path in before.keys() - after.keys():
                 del listed[path]
-            self._relist(label, replace(self._now.recordings[label], files=listed))
-            if added := (folder / JOURNAL).read_bytes()[len(lines) :]:
-                self._append(label, added)
+            self._relist(recording, listed)
+            changed = read_in(folder)
+            if changed is not None and changed != manifest:
+                self._list_manifest(recording, changed)
 
     def fetch(self, about: Object, path: Path) -> None:
         """Write an object to a file, past the cache.
@@ -596,61 +632,50 @@ class RemoteDirectory(StoreDirectory):
         """See what the newest list has."""
         self.source.look(self.settings.store_id, now=True)
 
-    def labels_by_id(self) -> dict[str, str]:
-        """The labels of all recordings, by id."""
-        return {one.id: label for label, one in self._now.recordings.items()}
-
-    def files_of(self, label: str) -> Mapping[str, Object]:
+    def files_of(self, recording: str) -> Mapping[str, Object]:
         """The object of each file of a recording, without those that are lost."""
-        return self.source.files_of(label)
+        return self.source.files_of(recording)
 
-    def lost_of(self, label: str) -> dict[str, Object]:
+    def lost_of(self, recording: str) -> dict[str, Object]:
         """The files of a recording, which is compared with its objects, that were lost.
 
         After `look_closely` its fields are among them, with `tables/` before their paths.
         """
-        recording, lost = self._now.recordings[label], self.source.bucket.lost
-        self.source.compare(recording.id)
-        mine = _tables_of(recording.id)
+        lost = self.source.bucket.lost
+        self.source.compare(recording)
+        mine = _tables_of(recording)
         tables = {f"{TABLES}/{p}": o for p, o in self._now.tables.items() if mine.fullmatch(p)}
-        return {p: o for p, o in {**recording.files, **tables}.items() if o in lost}
+        return {p: o for p, o in {**self._now.recordings[recording], **tables}.items() if o in lost}
 
     def add_recording(
-        self, label: str, recording: ListedRecording, tables: Mapping[str, Object]
+        self, recording: str, found: Mapping[str, Object], tables: Mapping[str, Object]
     ) -> None:
         """List a recording whose objects are there, within `changing`."""
-        self.source.bucket.lost.difference_update(recording.files.values(), tables.values())
-        self._relist(label, recording)
-        self._replace_tables(recording.id, tables)
+        self.source.bucket.lost.difference_update(found.values(), tables.values())
+        self._relist(recording, found)
+        self._replace_tables(recording, tables)
 
     def mend(
-        self, label: str, found: Mapping[str, Object], tables: Mapping[str, Object] | None
+        self, recording: str, found: Mapping[str, Object], tables: Mapping[str, Object] | None
     ) -> None:
         """List objects of a recording in the place of lost ones, within `changing`.
 
         Args:
-            label: The recording.
+            recording: Its id.
             found: Its files that were lost.
             tables: All files of its fields; None to leave them as they are.
         """
         self.source.bucket.lost.difference_update(found.values(), (tables or {}).values())
-        listed = self._now.recordings[label]
-        self._relist(label, replace(listed, files={**listed.files, **found}))
+        self._relist(recording, {**self._now.recordings[recording], **found})
         if tables is not None:
-            self._replace_tables(listed.id, tables)
+            self._replace_tables(recording, tables)
 
-    def move(self, old: str, new: str) -> None:
-        """Give a recording another label, within `writing`."""
-        others = dict(self._now.recordings)
-        others[new] = others.pop(old)
-        self.source.list = replace(self._now, recordings=others)
-
-    def drop(self, label: str) -> None:
+    def drop(self, recording: str) -> None:
         """List a recording no more, within `writing`; its objects stay."""
         others = dict(self._now.recordings)
-        gone = others.pop(label)
+        del others[recording]
         self.source.list = replace(self._now, recordings=others)
-        self._replace_tables(gone.id, {})
+        self._replace_tables(recording, {})
 
     def unneeded(self, now: int | None = None) -> list[Object]:
         """Objects that may be deleted: what neither a list of the last hour nor a copy needs.
@@ -679,7 +704,7 @@ class RemoteDirectory(StoreDirectory):
         named = {one.name for one in kept}
         for one in kept:
             listed = self.source.read_list(self.settings.store_id, one)
-            named.update(o.name for r in listed.recordings.values() for o in r.files.values())
+            named.update(o.name for r in listed.recordings.values() for o in r.values())
             named.update(o.name for o in listed.tables.values())
         old = {one.name for one in lists}
         return [
@@ -698,8 +723,9 @@ class RemoteDirectory(StoreDirectory):
         others = {path: o for path, o in self._now.tables.items() if not mine.fullmatch(path)}
         self.source.list = replace(self._now, tables={**others, **tables})
 
-    def _relist(self, label: str, recording: ListedRecording) -> None:
-        self.source.list = replace(self._now, recordings={**self._now.recordings, label: recording})
+    def _relist(self, recording: str, found: Mapping[str, Object]) -> None:
+        recordings = {**self._now.recordings, recording: found}
+        self.source.list = replace(self._now, recordings=recordings)
 
 
 def _tables_of(recording: str) -> re.Pattern[str]:
@@ -708,23 +734,19 @@ def _tables_of(recording: str) -> re.Pattern[str]:
 
 
 def _files_below(folder: Path) -> dict[str, tuple[int, int]]:
-    """Size and inode of the files of a recording, by path; without its journal and lock."""
+    """Size and inode of the files of a recording, by path; without its manifest and locks."""
     found = {}
     for path in folder.rglob("[!.]*"):
-        if path.is_file() and path.name not in {JOURNAL, LOCK}:
+        if path.is_file() and path.name not in _NOT_LISTED:
             about = path.stat()
             found[path.relative_to(folder).as_posix()] = about.st_size, about.st_ino
     return found
 
 
 def _folder(objects: Mapping[str, Object]) -> dict[str, Any]:
-    """Files below a folder, with all lines of a journal as one file."""
+    """Files below a folder."""
     found: dict[str, Any] = {}
-    more: dict[int, Object] = {}
     for path, about in objects.items():
-        if number := _part(path):
-            more[number] = about
-            continue
         *folders, name = path.split("/")
         place = found
         for part in folders:
@@ -732,16 +754,7 @@ def _folder(objects: Mapping[str, Object]) -> dict[str, Any]:
             if not isinstance(place, dict):
                 raise StoreError(f"The list names {path!r} both as a file and as a folder.")
         place[name] = about
-    if more and JOURNAL in found:
-        found[JOURNAL] = [found[JOURNAL], *(one for _, one in sorted(more.items()))]
     return found
-
-
-def _part(path: str) -> int:
-    """Number of an object with later lines of a journal; 0 for all others."""
-    stem, _, number = path.partition(".")
-    is_part = stem == JOURNAL and number.isascii() and number.isdigit() and len(number) < 10
-    return int(number) if is_part else 0
 
 
 def _look(objects: Mapping[str, Object]) -> str:

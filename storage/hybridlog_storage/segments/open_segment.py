@@ -55,9 +55,9 @@ from hybridlog_storage.segments.segment_format import (
 from hybridlog_storage.segments.segment_reader import (
     ChunkPlace,
     SegmentReader,
-    loss_rows,
     open_chunk,
 )
+from hybridlog_storage.segments.statements import loss_rows
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -68,9 +68,9 @@ from hybridlog_storage.segments.segment_reader import (
     check_arrivals,
     check_format,
     indexes_of,
-    loss_rows,
     right_head,
 )
+from hybridlog_storage.segments.statements import loss_rows
 
 if TYPE_CHECKING:
     from hybridlog_storage.segments.segment_reader import SegmentSummary
@@ -484,10 +484,11 @@ def _complete(path: Path, number: int) -> Sealed | None:
         if summary.size < file.position:
             file.cut(summary.size)
         file.sync()
+        blake3 = file.digest()
     finally:
         file.close()
     channels = sealed_channels(summary.table, summary.channels)
-    return Sealed(number, sealed_name(number), summary.size, summary.digest, channels)
+    return Sealed(number, sealed_name(number), summary.size, summary.digest, channels, blake3)
 
 
 def _proven_summary(path: Path, number: int) -> SegmentSummary | None:

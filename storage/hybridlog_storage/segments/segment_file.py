@@ -79,6 +79,8 @@ class SealedChannel:
         payload_bytes: Bytes of their payloads.
         first: Smallest log time, ns.
         last: Largest log time, ns.
+        encoding: Of the messages, such as `cdr`.
+        type: Name of the message type; empty without a definition.
     """
 
     id: int
@@ -87,11 +89,13 @@ class SealedChannel:
     payload_bytes: int
     first: int
     last: int
+    encoding: str
+    type: str
 
 
 @dataclass(frozen=True, slots=True)
 class Sealed:
-    """A complete segment, for the journal of its recording.
+    """A complete segment, for the manifest of its recording.
 
     Attributes:
         segment: Its number.
@@ -100,6 +104,7 @@ class Sealed:
         digest: `sha256:` and the hex digest of its bytes from the start of the summary on.
             The summary has checksums of all bytes before, so this proves the whole file.
         channels: Channels with messages, by channel id.
+        blake3: BLAKE3 of all its bytes; empty if that was not worked out.
     """
 
     segment: int
@@ -107,6 +112,7 @@ class Sealed:
     bytes: int
     digest: str
     channels: tuple[SealedChannel, ...]
+    blake3: str = ""
 
 
 OnSealing = Callable[[Sealed], None]
@@ -130,10 +136,15 @@ def sealed_channels(
     rows = table.by_channel()
     names = ("channel", "messages", "payload_bytes", "first", "last")
     columns = (rows[name].tolist() for name in names)
-    return tuple(
-        SealedChannel(number, channels[number].topic, messages, payload_bytes, first, last)
-        for number, messages, payload_bytes, first, last in zip(*columns, strict=True)
-    )
+    found = []
+    for number, messages, payload_bytes, first, last in zip(*columns, strict=True):
+        channel = channels[number]
+        kind = "" if channel.schema is None else channel.schema.name
+        of = channel.message_encoding, kind
+        found.append(
+            SealedChannel(number, channel.topic, messages, payload_bytes, first, last, *of)
+        )
+    return tuple(found)
 
 
 class SegmentFile:
@@ -492,7 +503,7 @@ class SegmentFile:
                     f"{final} is there already, so {self.path} cannot be sealed. "
                     "Move one of them out of the store."
                 )
-            sealed = self._sealed or self.complete()
+            sealed = self.complete()
             if not self._finished:
                 self._file.finish(sync=sync)
                 self._finished = True
@@ -507,6 +518,8 @@ class SegmentFile:
 
     def complete(self) -> Sealed:
         """Write the summary, without renaming the file or forcing it to the disk."""
+        if self._sealed is not None:
+            return self._sealed
         self._prove()
         # In one write: without room the file is unchanged, and can be sealed again.
         end = record_bytes(DataEnd(data_section_crc=0))
@@ -521,6 +534,7 @@ class SegmentFile:
             self.position,
             digest_of(tail),
             sealed_channels(table, channels),
+            self._digest(),
         )
         return self._sealed
 
@@ -559,6 +573,12 @@ class SegmentFile:
             self._file.append(parts)
         except OSError as error:
             raise durability.explain(error, self.path, "writing") from error
+
+    def _digest(self) -> str:
+        try:
+            return self._file.digest()
+        except OSError as error:
+            raise durability.explain(error, self.path, "reading") from error
 
     def _sync_folder(self) -> None:
         try:

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 MAGIC: Final = b"\x89MCAP0\r\n"
 PROFILE: Final = "hybridlog"
 LIBRARY: Final = "hybridlog"
-FORMAT_VERSION: Final = 3
+FORMAT_VERSION: Final = 4
 
 OUR_NAMES: Final = "hybridlog."
 """Beginning of the names of the store's own metadata records and channel metadata."""

@@ -21,7 +21,6 @@ from mcap.records import AttachmentIndex, Metadata, MetadataIndex, Statistics
 from mcap.records import Channel as ChannelRecord
 from mcap.records import Schema as SchemaRecord
 
-from hybridlog_storage import journal
 from hybridlog_storage.buffers import buffers
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk import files
@@ -68,6 +67,7 @@ from hybridlog_storage.segments.segment_format import (
     messages_at,
     split_trailer,
 )
+from hybridlog_storage.segments.statements import compacted_of, end_of, loss_rows
 from hybridlog_storage.stopping import check_wanted
 
 if TYPE_CHECKING:
@@ -351,10 +351,10 @@ class SegmentReader:
                 if index.name == RECORDING_METADATA:
                     check_format(found[index.name], self.path)
                 else:
-                    found[index.name] = _said(journal.end_of, found[index.name])
+                    found[index.name] = dict(end_of(found[index.name]))
             elif index.name == COMPACTED_METADATA:
                 value = json_of(self.metadata(table, index))
-                found[index.name] = _said(journal.compacted_of, value)
+                found[index.name] = dict(compacted_of(value))
             elif index.name == LOSSES_METADATA:
                 losses += loss_rows(json_of(self.metadata(table, index)))
         if RECORDING_METADATA not in found:
@@ -718,22 +718,6 @@ def place_of(table: ChunkTable, number: int, bounds: NDArray[np.int64] | None = 
         crc=crc,
         trailer_crc=trailer_crc,
     )
-
-
-def loss_rows(value: Mapping[str, object]) -> list[dict[str, Any]]:
-    """Rows of the loss ledger, from the value of its metadata record.
-
-    Raises:
-        SegmentError: The value is damaged.
-    """
-    return _said(journal.loss_rows, value.get("rows"))
-
-
-def _said(check: Callable[[Any], _T], value: object) -> _T:
-    try:
-        return check(value)
-    except (KeyError, TypeError, ValueError) as error:
-        raise SegmentError(f"a metadata record is damaged: {error!r}") from error
 
 
 def check_format(recording: Mapping[str, object], path: Path) -> None:

@@ -135,6 +135,7 @@ class RecordingWriter:
         on_sealing: Called when a segment is complete and, unless `sync` is never, on the
             disk, before it gets its final name. Called on a writer thread or by `give_up`.
             An exception stops the writer like a failed write.
+        on_sealed: The same, once it has its final name.
     """
 
     def __init__(
@@ -150,6 +151,7 @@ class RecordingWriter:
         on_written: Callable[[], None] | None = None,
         no_index: Callable[[str], bool] | None = None,
         on_sealing: OnSealing | None = None,
+        on_sealed: OnSealing | None = None,
     ) -> None:
         self.settings = settings or SegmentSettings()
         self.totals = RecordingTotals()
@@ -173,6 +175,7 @@ class RecordingWriter:
         self._on_written = on_written
         self._no_index = no_index or (lambda _: False)
         self._on_sealing: OnSealing = on_sealing or (lambda _: None)
+        self._on_sealed: OnSealing = on_sealed or (lambda _: None)
         self._closed_bytes = 0
         self._stored_bytes = 0
         self._packed: deque[Future[PackedChunk]] = deque()  # in file order
@@ -586,6 +589,7 @@ class RecordingWriter:
         self._synced = 0
         sync = self.settings.sync != "never"
         self._closed.append(segment.seal(sync=sync, on_sealing=self._on_sealing))
+        self._on_sealed(segment.complete())
         self.totals.stored_bytes += segment.position
         self.totals.segments += 1
         self._segment = None

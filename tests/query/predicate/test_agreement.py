@@ -530,7 +530,7 @@ def test_reduced_json_has_summaries(where: str, holds: bool) -> None:
     payload = reduce(codec_for(channel), json.dumps({"r": [*range(1000)]}).encode())
     zero = np.zeros(1, np.int64)
     batch = Batch(payload, zero, zero + len(payload), zero, zero, zero, zero)
-    entry = RecordingEntry("0", "a", "a", {}, {}, 0, "complete")
+    entry = RecordingEntry("0", "a", {}, {}, 0, "complete")
     recorded = RecordedChannel(entry, 0, reduced_channel(channel), ChannelStats(), None)
     found = MessageFilter(parse(where), None).matches(recorded, batch, zero)
     assert found.holds.tolist() == [holds]

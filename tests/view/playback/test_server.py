@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests import places
+
 pytest.importorskip("websockets", reason="websockets is not installed: no playback is tested")
 
 from mcap.writer import Writer
@@ -458,7 +460,7 @@ def test_requests_that_are_none_are_answered(request_: str | bytes, one: PlayedL
 def test_a_damaged_log_is_said(store: hl.Store, tmp_path: Path) -> None:
     copied = tmp_path / "store"
     shutil.copytree(store.directory.path, copied, ignore=shutil.ignore_patterns("mongod*"))
-    (segment,) = copied.glob("recordings/one/*.mcap")
+    (segment,) = places.folder(copied, "one").glob("*.mcap")
     said: list[str] = []
     with hl.open(copied) as opened:
         log = PlayedLog(opened.topic("/n").in_recording("one"))

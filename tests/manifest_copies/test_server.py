@@ -12,10 +12,10 @@ from hybridlog_storage.copy_places import Directory
 from hybridlog_storage.errors import HeldError, StoreError, UsageError
 from hybridlog_storage.manifest import Manifest, Note, replace
 from hybridlog_storage.sftp import Server
-from tests.copies.conftest import RECORDING, Makes, recording
-from tests.copies.server import Sshd
-from tests.copies.test_copy import as_of
 from tests.limits import Limit
+from tests.manifest_copies.conftest import RECORDING, Makes, recording
+from tests.manifest_copies.server import Sshd
+from tests.manifest_copies.test_copy import as_of
 
 
 def test_urls(sshd: dict[str, Sshd], tmp_path: Path) -> None:

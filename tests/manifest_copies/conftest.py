@@ -15,7 +15,7 @@ from hybridlog_storage.copy_places import BucketStore, Directory, Place, Source
 from hybridlog_storage.manifest import Channel, File, Loss, Manifest, Part, Pin, new_id, replace
 from hybridlog_storage.remote.bucket import Bucket
 from hybridlog_storage.sftp import Server
-from tests.copies.server import Sshd
+from tests.manifest_copies.server import Sshd
 from tests.remote.conftest import address, moto, new_address, proxy, running_proxy
 from tests.remote.server import Proxy
 

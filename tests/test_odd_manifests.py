@@ -1,32 +1,30 @@
-"""A journal line with an odd value, whose checksum is right, concerns its recording only."""
+"""A manifest with an odd value, whose digest is right, concerns its recording only."""
 
 from __future__ import annotations
 
 import json
 import shutil
-import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
+from blake3 import blake3
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import hybridlog as hl
-from hybridlog_storage import journal
 from hybridlog_storage.catalog import CATALOG
-from tests import odd_values
+from hybridlog_storage.manifest import Loss, encode, replace
+from hybridlog_storage.manifests import MANIFEST, MANIFEST_OLD
+from tests import odd_values, places
 from tests.cli.within import answer
 from tests.copying.conftest import expire
 from tests.payloads.logs import BASE, SETTINGS, STEP, robot, write_log
 
 NOWHERE = "mongodb://127.0.0.1:9/x?serverSelectionTimeoutMS=20&connectTimeoutMS=20"
 COUNT = 20
-LOSS = {
-    "cause": "segment", "file": "000000.mcap", "offset": 5, "length": 6, "reason": "r",
-    "count": 3, "topic": "/number", "from": BASE, "to": BASE + STEP,
-}  # fmt: skip
+LOSS = Loss("segment", "/number", 3, BASE, BASE + STEP, "r", "000000.mcap", 5, 6)
 READING: Sequence[Sequence[str]] = (
     ("ls", "--json"),
     ("ls",),
@@ -62,7 +60,7 @@ CHANGING: Sequence[Sequence[str]] = (
 
 @pytest.fixture(scope="module")
 def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two recordings; the journal of one has every event."""
+    """Two recordings; the manifest of one has a value of every kind."""
     place = tmp_path_factory.mktemp("odd")
     path = place / "store"
     with hl.open(path, create=True) as store:
@@ -72,34 +70,32 @@ def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
         expire(store, "odd", [0])
         store.edit("odd", note="wind")
         store.edit("odd", tag={"place": "lab"})
-        store.edit("odd", untag=["place"])
-        store.mark("odd", BASE + STEP, "here")
+        store.mark("odd", BASE + STEP, "here", {"kind": "odd"}, until=BASE + 2 * STEP)
+        store.pin("odd", topics=["/number"], reason="wanted")
     shutil.rmtree(path / "mongod", ignore_errors=True)
     (path / CATALOG).unlink()
     return path
 
 
 @pytest.fixture(scope="module")
-def lines(template: Path) -> list[dict[str, Any]]:
-    data = (template / "recordings" / "odd" / "journal").read_bytes()
-    found = [dict(line) for _, line in journal.read_lines(data) if line is not None]
-    for line in found:
-        if line["event"] == journal.ENDED:
-            line["end"] = {"status": "damaged", "losses": [LOSS], "damage": ["x"], "cut_bytes": 4}
-    moving = {"from": "before", "to": "odd"}
-    found += [journal.event(journal.RENAMED, name="odd", **moving)]
-    return [*found, journal.event(journal.ADOPTED, store="6" * 32)]
+def manifest(template: Path) -> dict[str, Any]:
+    found = replace(
+        places.manifest(template, "odd"),
+        status="damaged", losses=(LOSS,), damage=("x",), cut_bytes=4,
+        deleted=("gone/part.parquet",), unmarked=(90,), uncounted_marks=2,
+    )  # fmt: skip
+    made: dict[str, Any] = json.loads(encode(found).split(b"\n")[0])
+    return made
 
 
-def hold(
-    template: Path, path: Path, lines: Sequence[Any], commands: Sequence[Sequence[str]]
-) -> None:
-    """Run commands on a store with this journal: no traceback, and the other recording answers."""
+def hold(template: Path, path: Path, manifest: Any, commands: Sequence[Sequence[str]]) -> None:
+    """Run commands on a store with this manifest: no traceback, and the other recording answers."""
     shutil.rmtree(path, ignore_errors=True)
     shutil.copytree(template, path)
-    texts = [json.dumps(line, separators=(",", ":")).encode() for line in lines]
-    content = b"".join(b"%08x %b\n" % (zlib.crc32(text), text) for text in texts)
-    (path / "recordings" / "odd" / "journal").write_bytes(content)
+    text = json.dumps(manifest, separators=(",", ":")).encode()
+    folder = places.folder(path, "odd")
+    (folder / MANIFEST).write_bytes(b"%b\n%b\n" % (text, blake3(text).hexdigest().encode()))
+    (folder / MANIFEST_OLD).write_bytes((folder / MANIFEST).read_bytes())
     other = ("fetch", "-t", "/number", "-r", "other", "--count")
     for command in (other, *commands, other):
         found = answer(*command, "--mongo", NOWHERE, store=path, code=None)
@@ -113,23 +109,24 @@ def hold(
 @settings(max_examples=8)
 @given(data=st.data())
 def test_an_odd_value_concerns_its_recording_only(
-    template: Path, lines: list[dict[str, Any]], tmp_path_factory: pytest.TempPathFactory, data: Any
+    template: Path,
+    manifest: dict[str, Any],
+    tmp_path_factory: pytest.TempPathFactory,
+    data: Any,
 ) -> None:
-    number, path = data.draw(st.sampled_from(odd_values.places(lines)))
-    odd = odd_values.with_value(lines[number], path, data.draw(odd_values.VALUES))
+    _, path = data.draw(st.sampled_from(odd_values.places([manifest])))
+    odd = odd_values.with_value(manifest, path, data.draw(odd_values.VALUES))
     commands = [*(data.draw(st.sampled_from(READING)) for _ in range(3))]
     commands.append(data.draw(st.sampled_from(CHANGING)))
-    changed = [*lines[:number], odd, *lines[number + 1 :]]
-    hold(template, tmp_path_factory.getbasetemp() / "odd-store", changed, commands)
+    hold(template, tmp_path_factory.getbasetemp() / "odd-store", odd, commands)
 
 
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("which", range(8))
 def test_every_odd_value_and_every_command(
-    template: Path, lines: list[dict[str, Any]], tmp_path: Path, which: int
+    template: Path, manifest: dict[str, Any], tmp_path: Path, which: int
 ) -> None:
-    for number, path in odd_values.places(lines)[which::8]:
+    for _, path in odd_values.places([manifest])[which::8]:
         for value in odd_values.ODD:
-            odd = odd_values.with_value(lines[number], path, value)
-            changed = [*lines[:number], odd, *lines[number + 1 :]]
-            hold(template, tmp_path / "store", changed, [*READING, *CHANGING])
+            odd = odd_values.with_value(manifest, path, value)
+            hold(template, tmp_path / "store", odd, [*READING, *CHANGING])

@@ -17,7 +17,7 @@ from hybridlog_storage.manifest import Channel, Manifest, Mark, Note, Pin, repla
 from hybridlog_storage.remote.bucket import Bucket
 from hybridlog_storage.sftp import Server
 from hybridlog_storage.stopping import at_safe_points, postpone
-from tests.copies.conftest import (
+from tests.manifest_copies.conftest import (
     FIRST,
     MORE_PAIRS,
     RECORDING,
@@ -29,7 +29,7 @@ from tests.copies.conftest import (
     listed,
     recording,
 )
-from tests.copies.server import Sshd
+from tests.manifest_copies.server import Sshd
 
 Pair = tuple[Store, Store]
 FILE = listed("000000.mcap")

@@ -25,8 +25,8 @@ from hybridlog_storage.errors import (
 )
 from hybridlog_storage.manifest import encode, replace
 from tests.calls import Calls
-from tests.copies.conftest import RECORDING, Makes, Store, recording
-from tests.copies.test_copy import as_of, edited
+from tests.manifest_copies.conftest import RECORDING, Makes, Store, recording
+from tests.manifest_copies.test_copy import as_of, edited
 from tests.manifests.test_disk import Dying
 from tests.power import PowerCut
 

@@ -12,10 +12,10 @@ from hybridlog_storage.copy_places import BucketStore
 from hybridlog_storage.errors import HybridlogError
 from hybridlog_storage.manifests import BucketManifests
 from hybridlog_storage.remote.bucket import Bucket
-from tests.copies.conftest import RECORDING, SIZES, Makes, Store, recording
-from tests.copies.server import Sshd
-from tests.copies.test_copy import edited
 from tests.limits import Limit
+from tests.manifest_copies.conftest import RECORDING, SIZES, Makes, Store, recording
+from tests.manifest_copies.server import Sshd
+from tests.manifest_copies.test_copy import edited
 from tests.remote.server import Proxy
 
 

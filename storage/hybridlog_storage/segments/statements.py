@@ -1,0 +1,101 @@
+"""What segments say of their recording in metadata records, checked, since all may be hostile."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Any, Literal, TypedDict
+
+from msgspec import convert
+
+from hybridlog_storage.errors import SegmentError
+from hybridlog_storage.manifest import Count, Digest, FieldsName, Nanoseconds, Text, Topic
+
+LossRow = TypedDict(
+    "LossRow",
+    {
+        "cause": Text,
+        "reason": Text,
+        "file": Text | None,
+        "topic": Topic | None,
+        "count": Count | None,
+        "offset": Count | None,
+        "length": Count | None,
+        "from": Nanoseconds | None,
+        "to": Nanoseconds | None,
+    },
+)
+"""A row of the loss ledger: `from` and `to` are log times, ns; None for what is unknown."""
+
+
+class End(TypedDict, total=False):
+    """The end of a recording."""
+
+    status: Literal["complete", "damaged", "recovered"]
+    losses: list[LossRow]
+    cut_bytes: Count
+    damage: list[Text]
+
+
+class FieldsRow(TypedDict):
+    """A file with fields of expired messages."""
+
+    file: FieldsName
+    bytes: Count
+    digest: Digest
+    topic: Topic
+    messages: Count
+
+
+class Compacted(TypedDict):
+    """A segment with expired chunks: its digest and size before, and files that it needs."""
+
+    digest: Digest
+    bytes: Count
+    files: list[FieldsRow]
+
+
+def end_of(value: object) -> dict[str, Any]:
+    """The end of a recording, see `End`.
+
+    Raises:
+        SegmentError: It is damaged.
+    """
+    found: dict[str, Any] = _checked(value, End)
+    _check_spans(found.get("losses", []))
+    return found
+
+
+def compacted_of(value: object) -> dict[str, Any]:
+    """The statement of a segment with expired chunks, see `Compacted`.
+
+    Raises:
+        SegmentError: It is damaged.
+    """
+    return _checked(value, Compacted)  # type: ignore[no-any-return]
+
+
+def loss_rows(value: Mapping[str, object]) -> list[dict[str, Any]]:
+    """Rows of the loss ledger, from the value of its metadata record, see `LossRow`.
+
+    Raises:
+        SegmentError: The value is damaged.
+    """
+    rows: list[dict[str, Any]] = _checked(value.get("rows"), list[LossRow])
+    _check_spans(rows)
+    return rows
+
+
+def _checked(value: object, kind: Any) -> Any:
+    try:
+        json.dumps(value, ensure_ascii=False).encode()  # fails for halves of surrogate pairs
+        return convert(value, kind)
+    except (ValueError, RecursionError) as error:
+        raise SegmentError(f"a metadata record is damaged: {error!r}") from error
+
+
+def _check_spans(rows: list[dict[str, Any]]) -> None:
+    for row in rows:
+        begin, end = row["from"], row["to"]
+        if (begin is None) != (end is None) or (begin is not None and begin > end):
+            raise SegmentError("a metadata record is damaged: a loss ends before it begins")

@@ -1,0 +1,80 @@
+"""Where the files of a store's recordings lie."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+from hybridlog_storage.manifest import File, Manifest
+from hybridlog_storage.manifests import MANIFEST, read_in
+
+
+def root(store: Path) -> Path:
+    """The directory that has the directories of all recordings."""
+    return store / "recordings"
+
+
+def folder(store: Path, name: str) -> Path:
+    """The directory of the recording of a name; one of this name if there is none."""
+    if (root(store) / name).exists() or not root(store).is_dir():
+        return root(store) / name
+    found = [path for path in folders(store) if name_of(path) == name and path.name[0] != "."]
+    return found[0] if found else root(store) / name
+
+
+def id_of(store: Path, name: str) -> str:
+    """The id of the recording of a name."""
+    return folder(store, name).name
+
+
+def segment(store: Path, name: str, number: int = 0) -> Path:
+    """A sealed segment of the recording of a name."""
+    return folder(store, name) / f"{number:06d}.mcap"
+
+
+def manifest(store: Path, name: str) -> Manifest:
+    """The manifest of the recording of a name."""
+    found = read_in(folder(store, name))
+    assert found is not None
+    return found
+
+
+def logs_of(store: Path, name: str, topic: str) -> list[tuple[Path, File]]:
+    """The listed segments of a recording that have messages of a topic."""
+    found = manifest(store, name)
+    numbers = {number for number, one in found.channels.items() if one.topic == topic}
+    files = [file for file in found.logs.values() if numbers & file.parts.keys()]
+    return [(folder(store, name) / file.name, file) for file in files]
+
+
+def new_folder(store: Path, name: str) -> Path:
+    """Where a test puts the directory of a recording that the store does not have yet."""
+    return root(store) / name
+
+
+def folders(store: Path) -> list[Path]:
+    """All that lies in the directory of recordings, hidden or not."""
+    return sorted(root(store).iterdir())
+
+
+def names(store: Path) -> list[str]:
+    """The names of the recordings whose directories are there; hidden ones as they are."""
+    return sorted(map(name_of, folders(store)))
+
+
+def files(store: Path, pattern: str = "*.mcap") -> list[Path]:
+    """Files of all recordings, by a pattern inside their directories."""
+    return sorted(root(store).glob(f"*/{pattern}"))
+
+
+def name_of(path: Path) -> str:
+    """The name of the recording in a directory: by its manifest, else by the word of its id."""
+    if path.name.startswith("."):
+        return path.name
+    try:
+        found = json.loads((path / MANIFEST).read_bytes().split(b"\n")[0])["name"]
+    except (OSError, ValueError, KeyError, TypeError):
+        found = ""
+    known = re.fullmatch(r"[0-9]{8}-(.+)-[0-9a-f]{16}", path.name)
+    return str(found) or (known[1] if known else path.name)
