@@ -13,6 +13,9 @@ On a disk:
     recordings/<id>/manifest.old     the manifest before the last change
 
 In a bucket, the first one only. All that is in `recordings/<id>` goes with a removal.
+
+Recordings are not written so yet: their manifest is `recordings/<id>/manifest.json`, for the
+functions that end in `_in`.
 """
 
 from __future__ import annotations
@@ -324,12 +327,8 @@ class DiskManifests(Manifests):
             raise
 
     def _old(self, recording: str) -> Manifest | None:
-        path = self._recordings / recording / MANIFEST_OLD
-        try:
-            found = decode(files.read_file(path, MAX_BYTES))
-        except (OSError, ValueError):
-            return None
-        return found if found.id == recording else None
+        found = old_in(self._recordings / recording)
+        return found if found is not None and found.id == recording else None
 
     def _drop(self, recording: str) -> None:
         with suppress(FileNotFoundError):
