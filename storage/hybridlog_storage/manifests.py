@@ -53,6 +53,9 @@ if TYPE_CHECKING:
 WAIT_S: Final = 30.0
 """Longest wait of a change for others, which take milliseconds."""
 _PAUSE_S: Final = 0.002
+_YIELD_S: Final = 0.05
+_last: Final[dict[Path, tuple[float, float]]] = {}
+"""Of the lock that this process had last: when it was left, and how long it was held."""
 _NO_LOCKS: Final = frozenset({errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS})
 _FOLDER: Final = "manifests"
 _RECORDINGS: Final = "recordings"
@@ -548,14 +551,27 @@ def _present(manifest: Manifest) -> Manifest:
 
 @contextmanager
 def _locked(path: Path) -> Iterator[None]:
-    """Hold a file's lock. If the file was deleted meanwhile, the one of its name is locked."""
+    """Hold a file's lock. If the file was deleted meanwhile, the one of its name is locked.
+
+    A process that changes a recording again and again would find the lock free before others
+    look for it: it waits for as long as it has just held it.
+    """
+    left, held = _last.get(path, (0.0, 0.0))
+    if (pause := left + held - time.monotonic()) > 0:
+        time.sleep(min(pause, _YIELD_S))
     end = time.monotonic() + WAIT_S
     while True:
         fd = _opened(path, os.O_RDWR)
         try:
             _lock(fd, path, end)
             if _is_at(path, fd):
-                yield
+                locked = time.monotonic()
+                try:
+                    yield
+                finally:
+                    left = time.monotonic()
+                    _last.clear()
+                    _last[path] = (left, left - locked)
                 return
         finally:
             os.close(fd)
@@ -582,10 +598,7 @@ def _lock(fd: int, path: Path, end: float) -> None:
             if time.monotonic() > end:
                 message = f"Another process has held {path} for {WAIT_S:.0f} s; end it."
                 raise HeldError(message, is_recording=False) from None
-            # Who has waited for long asks more often than others, so that nobody waits for ever.
-            waited = max(0.0, WAIT_S - (end - time.monotonic()))
-            pause = _PAUSE_S / (1 + 10 * min(waited, 2.0))
-            time.sleep(random.uniform(0, pause))  # noqa: S311 - no secret
+            time.sleep(random.uniform(0, _PAUSE_S))  # noqa: S311 - no secret
         except OSError as error:
             if error.errno not in _NO_LOCKS:
                 raise
