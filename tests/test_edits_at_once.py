@@ -30,14 +30,21 @@ SETTINGS = SegmentSettings(chunk_size=4 << 10, segment_size=64 << 10, sync="neve
 _EDITS = """
 import sys
 import hybridlog as hl
+from hybridlog_storage.errors import HeldError
 path, recording, who, count = *sys.argv[1:4], int(sys.argv[4])
+def until_acknowledged(change, **values):  # a disk may stand still for longer than others wait
+    while True:
+        try:
+            return change(recording, **values)
+        except HeldError:
+            pass
 with hl.open(path, mongo="none") as store:
     for n in range(count):
         one = f"{who}-{n}"
-        store.edit(recording, tag={one: str(n)})
-        store.edit(recording, note=one)
-        store.pin(recording, topics=["/n"], reason=one)
-        store.edit(recording, name=f"name-{one}")
+        until_acknowledged(store.edit, tag={one: str(n)})
+        until_acknowledged(store.edit, note=one)
+        until_acknowledged(store.pin, topics=["/n"], reason=one)
+        until_acknowledged(store.edit, name=f"name-{one}")
 """
 _READS = """
 import sys
