@@ -118,7 +118,8 @@ def test_conformance(folder: str) -> None:
         wanted = json.loads(path.with_suffix(".json").read_text())["records"]
         data = path.read_bytes()
         items = items_of(data)
-        assert [as_json(r) for r in records_of(items)] == wanted, path.name
+        end = next(i for i, r in enumerate(wanted) if r["type"] == "DataEnd")
+        assert [as_json(r) for r in records_of(items)] == wanted[: end + 1], path.name
         assert items[-1] == (len(data), End(len(data), clean=True)), path.name
         check_summary(data, wanted, path)
 
@@ -305,10 +306,12 @@ def test_an_index_of_a_chunk_is_read_as_the_mcap_package_writes_it(
 
 
 @pytest.mark.parametrize("claim", [4, 1 << 31, (1 << 63) - 1, (1 << 64) - 1])
-def test_a_field_that_claims_more_than_its_record_holds_is_an_error(claim: int) -> None:
-    attachment = struct.pack("<QQIIQ", 0, 0, 0, 0, claim) + b"abc"
-    with pytest.raises(SegmentError, match="attachment record is damaged"):
-        read_record(Opcode.ATTACHMENT, attachment)
+def test_an_attachment_that_claims_more_than_its_record_holds_is_damage(claim: int) -> None:
+    fields = struct.pack("<QQIIQ", 0, 0, 0, 0, claim) + b"abc"
+    record = struct.pack("<BQ", Opcode.ATTACHMENT, len(fields)) + fields
+    body = content_of(Header("p", "l")) + record + content_of(DataEnd(0), Footer(0, 0, 0))
+    (damage,) = damages(items_of(MAGIC + body + MAGIC))
+    assert damage.reason.startswith("an attachment record is damaged")
 
 
 def test_messages_are_not_looked_at_one_by_one() -> None:

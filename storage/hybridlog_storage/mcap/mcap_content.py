@@ -18,7 +18,6 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 
-from hybridlog_storage.checksum import crc32
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.lazy import RowType
 from hybridlog_storage.messages import MAX_PAYLOAD, Batch
@@ -61,8 +60,7 @@ MIN_RECORDS = 1 << 16
 """Records that a chunk may hold in addition to one a compressed byte."""
 
 Record: TypeAlias = (
-    records.Attachment
-    | records.AttachmentIndex
+    records.AttachmentIndex
     | records.Channel
     | records.ChunkIndex
     | records.DataEnd
@@ -496,7 +494,6 @@ _FREQUENT: dict[int, Callable[[Buffer], tuple[Record, int]]] = {
 _READERS: dict[int, Callable[[ReadDataStream], Record]] = {
     Opcode.HEADER: records.Header.read,
     Opcode.FOOTER: records.Footer.read,
-    Opcode.ATTACHMENT: records.Attachment.read,
     Opcode.ATTACHMENT_INDEX: records.AttachmentIndex.read,
     Opcode.STATISTICS: records.Statistics.read,
     Opcode.METADATA: records.Metadata.read,
@@ -507,7 +504,7 @@ _READERS: dict[int, Callable[[ReadDataStream], Record]] = {
 
 
 def read_record(opcode: int, content: Buffer) -> tuple[Record | None, int]:
-    """Parse one record that is neither a message nor a chunk.
+    """Parse one record that is neither a message nor a chunk nor an attachment.
 
     Args:
         opcode: Its kind.
@@ -518,7 +515,7 @@ def read_record(opcode: int, content: Buffer) -> tuple[Record | None, int]:
         None).
 
     Raises:
-        SegmentError: Its fields exceed it, are not UTF-8, or its checksum differs.
+        SegmentError: Its fields exceed it, or are not UTF-8.
     """
     try:
         frequent = _FREQUENT.get(opcode)
@@ -532,15 +529,4 @@ def read_record(opcode: int, content: Buffer) -> tuple[Record | None, int]:
     except (SegmentError, McapError, struct.error, UnicodeDecodeError) as error:
         name = Opcode(opcode).name.replace("_", " ").lower()  # every parsed kind has a name
         raise SegmentError(f"a {name} record is damaged ({error or 'too short'})") from error
-    if isinstance(record, records.Attachment):
-        # The mcap package skips the checksum, the last field.
-        _check_attachment(content, stream.count)
     return record, stream.count
-
-
-def _check_attachment(content: Buffer, used: int) -> None:
-
-    view = memoryview(content)
-    (crc,) = struct.unpack_from("<I", view, used - 4)
-    if crc not in {0, crc32(view[: used - 4])}:
-        raise SegmentError("the checksum of an attachment differs")

@@ -66,33 +66,34 @@ MAGIC = b"\x89MCAP0\r\n"
 
 _HEAD = RECORD_HEAD.size
 _FOOTER_SIZE = _HEAD + 20
+_DATA_END = RECORD_HEAD.pack(Opcode.DATA_END, 4)
 _DATA_END_SIZE = _HEAD + 4
 _CHUNK_FIELDS = struct.Struct("<QQQII")  # start, end, size, checksum, length of codec name
 _CODECS = frozenset({"", "zstd", "lz4"})
 _LAST_KNOWN = max(Opcode)
 _FIRST_PRIVATE = 0x80
-_DEFINITIONS = frozenset({Opcode.SCHEMA, Opcode.CHANNEL})
 _WINDOW = 1 << 20
 _MAX_PLAIN = 1 << 26  # largest record that is neither chunk, message nor attachment
 _MAX_SUMMARY = 1 << 28
 _ANOTHER = MAGIC + bytes([Opcode.HEADER])  # the beginning of another file
 _MAX_WHOLE_BYTES = 64 << 20  # content of a chunk that is decompressed at once
 
-_DATA_OPCODES = frozenset(
+# Records of the data, but for chunks.
+_PLAIN = frozenset(
     {
+        Opcode.HEADER,
         Opcode.SCHEMA,
         Opcode.CHANNEL,
         Opcode.MESSAGE,
-        Opcode.CHUNK,
         Opcode.MESSAGE_INDEX,
         Opcode.ATTACHMENT,
         Opcode.METADATA,
         Opcode.DATA_END,
     }
 )
-# Records between chunks. None of them occurs inside an uncompressed chunk, so a search
-# for them cannot end inside one.
-_CHUNKED_OPCODES = _DATA_OPCODES - {Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE}
+_BETWEEN_CHUNKS = frozenset(
+    {Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode.ATTACHMENT, Opcode.METADATA, Opcode.DATA_END}
+)
 _SUMMARY_OPCODES = frozenset(
     {
         Opcode.SCHEMA,
@@ -400,53 +401,45 @@ def _chunk_head(window: _Window, offset: int) -> _ChunkHead | None:
 
 
 class _Places:
-    """Positions of chunks by the summary, and whether they are reliable.
+    """Chunks by the summary.
 
-    A wrong summary must not spoil an intact file. So at the first contradiction its entries
-    are checked: the summary counts if at least half of them point at chunk records of the
-    stated length.
+    A wrong summary must not spoil an intact file. So at the first contradiction its entries are
+    looked at: they count if at least half of them point at chunk records of the stated length.
     """
 
     def __init__(self, window: _Window, summary: Summary | None) -> None:
         indexes = summary.chunk_indexes if summary is not None else []
-        self._lengths = {index.chunk_start_offset: index.chunk_length for index in indexes}
-        self._starts = sorted(self._lengths)
+        self._ends = {
+            one.chunk_start_offset: one.chunk_start_offset + one.chunk_length for one in indexes
+        }
+        self._starts = sorted(self._ends)
         self._window = window
-        self._believed: bool | None = None
+        self._is_checked = False
 
-    def length(self, offset: int) -> int | None:
-        """Length of the chunk record at `offset`, None without one."""
-        return self._lengths.get(offset)
+    def end(self, offset: int) -> int | None:
+        """End of the chunk record at `offset`, None without one."""
+        return self._ends.get(offset)
 
     def next(self, offset: int) -> int | None:
         """Start of the first chunk behind `offset`."""
         i = bisect.bisect_right(self._starts, offset)
         return self._starts[i] if i < len(self._starts) else None
 
-    def denies(self, offset: int) -> bool:
-        """True if the summary rules out a chunk at `offset`."""
-        return bool(self._starts) and offset not in self._lengths and self.believed()
-
-    def believed(self) -> bool:
-        """True if enough entries are correct."""
-        if self._believed is None:
-            right = sum(self._is_right(offset) for offset in self._starts)
-            self._believed = self._single() if right == 0 else right * 2 >= len(self._starts)
-        return self._believed
+    def count(self) -> bool:
+        """True if there are any to go by; those that are wrong are forgotten."""
+        if not self._is_checked:
+            self._is_checked = True
+            if 2 * sum(map(self._is_right, self._starts)) < len(self._starts):
+                self._ends, self._starts = {}, []
+        return bool(self._starts)
 
     def _is_right(self, offset: int) -> bool:
+        end = self._ends[offset]
         head = self._window.peek(offset, _HEAD)
-        if len(head) < _HEAD:
-            return False
-        return RECORD_HEAD.unpack(head) == (Opcode.CHUNK, self._lengths[offset] - _HEAD)
-
-    def _single(self) -> bool:
-        """Check the only chunk of a file by its own fields: it has no others to agree with."""
-        if len(self._starts) != 1:
-            return False
-        (offset,) = self._starts
+        if head == RECORD_HEAD.pack(Opcode.CHUNK, max(end - offset - _HEAD, 0)):
+            return True
         fields = _chunk_head(self._window, offset)
-        return fields is not None and fields.end == offset + self._lengths[offset]
+        return fields is not None and fields.end == end
 
 
 def _is_other_record(content: memoryview) -> bool:
@@ -455,7 +448,7 @@ def _is_other_record(content: memoryview) -> bool:
     In files with chunks, messages outside of them are rare. But one wrong byte can turn
     any record between two chunks into a message, and no checksum covers those.
     """
-    for opcode in (Opcode.MESSAGE_INDEX, Opcode.METADATA, Opcode.ATTACHMENT):
+    for opcode in (Opcode.MESSAGE_INDEX, Opcode.METADATA):
         try:
             record, used = read_record(opcode, content)
         except SegmentError:
@@ -474,301 +467,243 @@ class _Scanner:
     ) -> None:
         self._window = _Window(file, size)
         self._limit = limit
-        self._at = start
-        self._places = _Places(self._window, summary)
-        self._footer = _read_footer(file, size)
+        self._start = self._at = start
         # End of the fields of the last record. If the length of that record was wrong, the
         # search for the next one starts here, not where the length points.
         self._behind = start
-        self._summary_start = self._footer.summary_start if self._footer and summary else None
+        self._places = _Places(self._window, summary)
         self._chunked = bool(summary and summary.chunk_indexes)
-        self._in_data = True
-        self._crc: int | None = None
-        if start == len(MAGIC) and self._data_crc() not in {None, 0}:
-            self._crc = crc32(MAGIC)
+        self._stop = self._end_by_footer(summary)
+        self._is_ended = False
+        self._needs_crc = False  # messages have no checksum of their own
 
-    def _data_crc(self) -> int | None:
-        """The checksum of the data section, if the file has one."""
-        footer = self._footer
+    def _end_by_footer(self, summary: Summary | None) -> int | None:
+        """Byte where the data ends, if the file says so."""
+        footer = _read_footer(self._window.file, self._window.size)
         if footer is None:
             return None
         end = footer.summary_start or self._window.size - len(MAGIC) - _FOOTER_SIZE
-        raw = self._window.peek(max(end - _DATA_END_SIZE, 0), _DATA_END_SIZE)
-        if len(raw) < _DATA_END_SIZE or RECORD_HEAD.unpack_from(raw) != (Opcode.DATA_END, 4):
-            return None
-        return int.from_bytes(raw[_HEAD:], "little")
+        at = max(end - _DATA_END_SIZE, 0)
+        if self._window.peek(at, _HEAD) == _DATA_END:
+            return at
+        return end if summary is not None else None
+
+    @property
+    def _end(self) -> int:
+        """End of the data, or of the file."""
+        return self._window.size if self._stop is None else self._stop
 
     def items(self) -> Iterator[tuple[int, Item]]:
         """All items from the start to the end of the file."""
-        footer = False
-        while self._at < self._window.size:
-            if footer and self._window.at(self._at, len(MAGIC)) == MAGIC:
-                if self._window.peek(self._at + len(MAGIC), len(_ANOTHER)) != _ANOTHER:
-                    break
-                self._begin_another(self._at + len(MAGIC))
-            before = self._at
-            for offset, item in self._step():
-                footer = isinstance(item, records.Footer)
-                yield offset, item
-            self._add_crc(before)
-        clean = footer and self._at + len(MAGIC) == self._window.size
-        if not clean and self._at < self._window.size:
-            rest = self._window.size - self._at
-            yield self._at, ScanDamage(self._at, rest, "bytes follow the end of the log", 0)
-        yield self._window.size, End(self._window.size, clean)
+        size, is_clean = self._window.size, False
+        while self._at < size:
+            yield from self._step()
+            size = self._window.size  # the file may be cut meanwhile
+            if not self._is_ended:
+                continue
+            is_clean = self._pass_summary()
+            if is_clean and self._window.peek(self._at, len(_ANOTHER)) == _ANOTHER:
+                self._begin_another()
+            elif self._at < size:
+                reason = "bytes follow the end of the log" if is_clean else "the summary is damaged"
+                yield self._at, ScanDamage(self._at, size - self._at, reason, 0)
+                is_clean = False
+                break
+        yield size, End(size, is_clean)
 
-    def _begin_another(self, at: int) -> None:
-        """Go on with another file whose bytes follow those of this one.
+    def _pass_summary(self) -> bool:
+        """Go behind the footer; False if the summary is damaged, or the end is missing."""
+        while True:
+            head = self._window.at(self._at, _HEAD)
+            if len(head) < _HEAD:
+                return False
+            opcode, length = RECORD_HEAD.unpack(head)
+            end = self._at + _HEAD + length
+            if opcode == Opcode.FOOTER and self._window.peek(end, len(MAGIC)) == MAGIC:
+                self._at = end + len(MAGIC)
+                return True
+            if not _is_in_summary(opcode) or end > self._window.size:
+                return False
+            self._at = end
+
+    def _begin_another(self) -> None:
+        """Go on with another log whose bytes follow those of this one.
 
         Its summary counts from its own beginning, so positions are not known from it.
         """
-        self._at = self._behind = at + len(MAGIC)
+        self._at = self._behind = self._at + len(MAGIC)
         self._places = _Places(self._window, None)
-        self._summary_start = self._crc = None
-        self._chunked = False
-        self._in_data = True
+        self._stop, self._start = None, -1
+        self._chunked = self._is_ended = False
 
     def _step(self) -> Iterator[tuple[int, Item]]:
         """Read one record, one run of messages, or one place of damage."""
         at = self._at
         head = self._window.peek(at, _HEAD)
-        if len(head) < _HEAD:
-            yield from self._torn(at, "the file ends in the middle of a record")
-            return
-        if head == _ANOTHER:
-            reason = "another log begins before the end of this one"
-            yield at, ScanDamage(at, 0, reason, 0)
-            self._begin_another(at)
-            return
-        opcode, length = RECORD_HEAD.unpack(head)
-        if opcode in _DEFINITIONS and self._in_data:
-            yield from self._definitions(at)
-            if self._at > at:
-                return
-        if self._in_data and self._summary_start is not None and at >= self._summary_start:
-            self._in_data = False
-            yield at, ScanDamage(at, 0, "the record that ends the data is damaged", 0)
-        if self._contradicts_index(at, opcode, length):
-            indexed = self._places.length(at)
+        if at == self._stop:
+            yield from self._finish(at, head)
+        elif len(head) < _HEAD:
+            yield self._torn(at, "the file ends in the middle of a record")
+        elif head == _ANOTHER:
+            yield at, ScanDamage(at, 0, "another log begins before the end of this one", 0)
+            self._begin_another()
+        else:
+            opcode, length = RECORD_HEAD.unpack(head)
+            yield from self._record(at, opcode, at + _HEAD + length)
+
+    def _record(self, at: int, opcode: int, end: int) -> Iterator[tuple[int, Item]]:
+        listed = self._places.end(at)
+        fields = _chunk_head(self._window, at)
+        is_chunk = (opcode, end) == (Opcode.CHUNK, listed)
+        if listed is not None and not is_chunk and listed <= self._end and self._places.count():
             reason = "the head of a chunk is damaged; the chunk is read by the summary"
             yield at, ScanDamage(at, _HEAD, reason, 0)
-            self._crc = None
-            yield from self._chunk(at, at + (indexed or 0))
-        elif self._hides_chunk(at, opcode, length):
-            yield at, ScanDamage(at, _HEAD, f"a chunk record is marked as of kind {opcode}", 0)
-            self._crc = None
-            yield from self._chunk(at, at + _HEAD + length)
-        elif not self._in_data:
-            yield from self._summary_record(at, opcode, length)
+            yield self._chunk(at, listed)
         elif opcode == Opcode.CHUNK:
-            yield from self._chunk_or_damage(at, length)
+            yield from self._chunk_or_damage(at, end, fields)
+        elif fields is not None and fields.end == end <= self._end and opcode in _PLAIN:
+            yield at, ScanDamage(at, _HEAD, f"a chunk record is marked as of kind {opcode}", 0)
+            yield self._chunk(at, end)
+        elif not self._fits(at, end) or not (opcode in _PLAIN or opcode > _LAST_KNOWN):
+            size = end - at - _HEAD
+            reason = f"a record of kind {opcode} claims {size} bytes"
+            yield self._lost(at, reason if opcode else "no record starts here")
         elif opcode == Opcode.MESSAGE:
-            yield from self._loose(at, length)
+            yield self._loose(at, end)
+        elif opcode in _PLAIN or opcode >= _FIRST_PRIVATE:
+            yield from self._plain(at, opcode, end)
+        elif self._goes_on(end):
+            self._at = end  # a reserved kind
         else:
-            yield from self._plain(at, opcode, length)
+            yield self._lost(at, f"a record of kind {opcode}")
 
-    def _contradicts_index(self, at: int, opcode: int, length: int) -> bool:
-        """True if the summary lists a chunk here, but the record's head is not that of a chunk."""
-        indexed = self._places.length(at) if self._in_data else None
-        if indexed is None or (opcode, length + _HEAD) == (Opcode.CHUNK, indexed):
-            return False
-        return _HEAD < indexed <= self._window.size - at and self._places.believed()
-
-    def _hides_chunk(self, at: int, opcode: int, length: int) -> bool:
-        """True if only a wrong opcode keeps a record from being a chunk.
-
-        Message indexes are not checked, since they are too many; private records have any
-        content.
-        """
-        if not self._in_data or opcode in {Opcode.CHUNK, Opcode.MESSAGE_INDEX}:
-            return False
-        if opcode >= _FIRST_PRIVATE or length < _LEAST[Opcode.CHUNK]:
-            return False
-        fields = _chunk_head(self._window, at)
-        return fields is not None and fields.end == at + _HEAD + length <= self._window.size
+    def _fits(self, at: int, end: int) -> bool:
+        """True if a record reaches neither into a chunk of the summary nor over the end."""
+        known = self._places.next(at)
+        is_free = known is None or known >= end or not self._places.count()
+        return is_free and end <= self._end
 
     # Chunks
 
-    def _chunk_or_damage(self, at: int, length: int) -> Iterator[tuple[int, Item]]:
-        end = at + _HEAD + length
-        fields = _chunk_head(self._window, at)
-        fits = end <= self._window.size and not self._swallows(at, end)
-        if (
-            fields is not None
-            and fits
-            and fields.end <= end
-            and (fields.end == end or self._goes_on(end) or not self._goes_on(fields.end))
-        ):
-            yield from self._chunk(at, end)
-        elif fields is not None and fields.end <= self._window.size and self._goes_on(fields.end):
-            yield at, ScanDamage(at, _HEAD, "the length of a chunk record is wrong", 0)
-            self._crc = None
-            yield from self._chunk(at, fields.end)
-        elif fields is not None and fields.end == end > self._window.size:
+    def _chunk_or_damage(
+        self, at: int, end: int, fields: _ChunkHead | None
+    ) -> Iterator[tuple[int, Item]]:
+        """The chunk at a byte, with the length in its head, or by its own fields."""
+        if fields is not None and fields.end == end > self._window.size:
             data = self._window.part(fields.data, self._window.size - fields.data)
             torn = TornChunk(fields.compression, fields.size, data)
-            yield from self._torn(at, "the file ends in the middle of a chunk", torn)
-        elif fits and self._goes_on(end):
-            yield from self._chunk(at, end)
+            yield self._torn(at, "the file ends in the middle of a chunk", torn)
+            return
+        is_sure = fields is not None and fields.end == end
+        if self._fits(at, end) and (is_sure or self._goes_on(end)):
+            yield self._chunk(at, end)
+        elif fields is not None and self._fits(at, fields.end) and self._goes_on(fields.end):
+            yield at, ScanDamage(at, _HEAD, "the length of a chunk record is wrong", 0)
+            yield self._chunk(at, fields.end)
         else:
-            yield from self._lost(at, f"a chunk record claims {length} bytes", Opcode.CHUNK)
+            yield self._lost(at, f"a chunk record claims {end - at - _HEAD} bytes", Opcode.CHUNK)
 
-    def _chunk(self, at: int, end: int) -> Iterator[tuple[int, Item]]:
+    def _chunk(self, at: int, end: int) -> tuple[int, Item]:
         """The chunk in `[at, end)`; its own fields may still be wrong."""
         self._chunked = True
         self._at = self._behind = end
         fields = _chunk_head(self._window, at)
         if fields is None or fields.data > end:
+            is_other = self._places.count() and self._places.end(at) is None
+            kind = None if is_other else Opcode.CHUNK
             reason = "the fields of a chunk are damaged"
-            # Too short, or unknown to the summary: the opcode is wrong.
-            real = end - at >= _HEAD + _LEAST[Opcode.CHUNK] and not self._places.denies(at)
-            yield at, ScanDamage(at, end - at, reason, opcode=Opcode.CHUNK if real else None)
-        elif end - at > self._limit:
-            yield at, self._too_large(at, end, Opcode.CHUNK)
-        else:
-            data_end = min(fields.end, end)
-            data = self._window.part(fields.data, data_end - fields.data)
-            self._behind = data_end
-            yield (
-                at,
-                ScannedChunk(
-                    at,
-                    end - at,
-                    fields.compression,
-                    fields.size,
-                    fields.crc,
-                    data,
-                    self._limit,
-                ),
-            )
+            return at, ScanDamage(at, end - at, reason, opcode=kind)
+        if end - at > self._limit:
+            return at, self._too_large(at, end, Opcode.CHUNK)
+        self._behind = min(fields.end, end)
+        self._needs_crc |= not fields.crc
+        data = self._window.part(fields.data, self._behind - fields.data)
+        return at, ScannedChunk(
+            at, end - at, fields.compression, fields.size, fields.crc, data, self._limit
+        )
 
-    # Messages outside chunks
+    # Other records
 
-    def _loose(self, at: int, length: int) -> Iterator[tuple[int, Item]]:
-        end = at + _HEAD + length
-        if end > self._window.size or length < _LEAST[Opcode.MESSAGE] or self._swallows(at, end):
-            yield from self._lost(at, f"a message record claims {length} bytes")
-            return
-        if length > MAX_PAYLOAD:
+    def _loose(self, at: int, end: int) -> tuple[int, Item]:
+        """A run of messages outside of chunks."""
+        size = end - at - _HEAD
+        if size > MAX_PAYLOAD:
             self._at = self._behind = end
-            yield at, self._too_large(at, end, Opcode.MESSAGE)
-            return
-        content = self._window.at(at, end - at)[_HEAD:]
-        if self._chunked and _is_other_record(content):
+            return at, self._too_large(at, end, Opcode.MESSAGE)
+        if size < _LEAST[Opcode.MESSAGE]:
+            return self._lost(at, f"a message record claims {size} bytes")
+        if self._chunked and _is_other_record(self._window.at(at, end - at)[_HEAD:]):
             self._at = self._behind = end
-            self._crc = None
-            yield at, ScanDamage(at, end - at, "a record is marked as a message but is none", 0)
-            return
-        until = self._places.next(at) if self._places.believed() else None
-        run = self._window.rest(at)[: None if until is None else until - at]
+            reason = "a record is marked as a message but is none"
+            return at, ScanDamage(at, end - at, reason, 0)
+        self._needs_crc = True
+        self._window.at(at, end - at)
+        until = min(self._end, self._places.next(at) or self._end)
+        run = self._window.rest(at)[: until - at]
         found = parse_content(run, loose=not self._chunked, messages_only=self._chunked)
         if found.damage:
             found = parse_content(run, messages_only=True)
         self._at = self._behind = at + found.end
-        yield at, Loose(found, at)
+        return at, Loose(found, at)
 
-    # Everything else
-
-    def _definitions(self, at: int) -> Iterator[tuple[int, Item]]:
-        """Schemas and channels that fill their records exactly, up to the next chunk."""
-        run = self._window.rest(at)
-        stops = (len(run), (self._summary_start or self._window.size) - at)
-        known = self._places.next(at - 1)
-        stop = min(*stops, len(run) if known is None else known - at)
-        start = 0
-        while start + _HEAD <= stop:
-            opcode, length = RECORD_HEAD.unpack_from(run, start)
-            end = start + _HEAD + length
-            if opcode not in _DEFINITIONS or end > stop:
-                return
-            try:
-                record, used = read_record(opcode, run[start + _HEAD : end])
-            except SegmentError:
-                return
-            if used != length or record is None:
-                return
-            self._at = self._behind = at + end
-            yield at + start, record
-            start = end
-
-    def _plain(self, at: int, opcode: int, length: int) -> Iterator[tuple[int, Item]]:
-        end = at + _HEAD + length
-        if not self._is_plausible(opcode, end) or self._swallows(at, end):
-            reason = f"a record of kind {opcode} claims {length} bytes"
-            yield from self._lost(at, "no record starts here" if opcode == 0 else reason)
-            return
-        self._at = end
-        known = opcode <= _LAST_KNOWN
-        if opcode == Opcode.ATTACHMENT:
-            yield from self._attachment(at, end)
-            return
-        if length > _MAX_PLAIN:
-            if known:
-                yield at, self._too_large(at, end, opcode)
-            return
-        if opcode >= _FIRST_PRIVATE:
-            content = self._window.at(at + _HEAD, length)
-            yield at, PrivateRecord(opcode, at, content)
-        elif known:
-            yield from self._known(at, opcode, end)
-
-    def _attachment(self, at: int, end: int) -> Iterator[tuple[int, Item]]:
+    def _plain(self, at: int, opcode: int, end: int) -> Iterator[tuple[int, Item]]:
         start = at + _HEAD
-        part = FilePart(self._window.file, start, end - start)
-        try:
-            found, used = parse_attachment(self._window.at(start, min(end - start, MAX_HEAD)), part)
-        except SegmentError as error:
-            yield at, ScanDamage(at, end - at, str(error), 0)
-            return
-        self._behind = start + used
-        yield at, found
+        self._at = end
+        if opcode == Opcode.DATA_END:
+            if self._stop is None and self._ends_data(end):
+                yield from self._finish(at, _DATA_END)
+            else:
+                reason = "an end of data stands in the middle of the data"
+                yield at, ScanDamage(at, end - at, reason)
+        elif opcode != Opcode.ATTACHMENT and end - start > _MAX_PLAIN:
+            if opcode <= _LAST_KNOWN:
+                yield at, self._too_large(at, end, opcode)
+        elif opcode >= _FIRST_PRIVATE:
+            yield at, PrivateRecord(opcode, at, self._window.at(start, end - start))
+        else:
+            try:
+                item, used = self._parsed(opcode, start, end - start)
+            except SegmentError as error:
+                yield at, ScanDamage(at, end - at, str(error), 0)
+                return
+            self._behind = start + used
+            if item is not None:
+                yield at, item
 
-    def _known(self, at: int, opcode: int, end: int) -> Iterator[tuple[int, Item]]:
-        try:
-            record, used = read_record(opcode, self._window.at(at + _HEAD, end - at - _HEAD))
-        except SegmentError as error:
-            yield at, ScanDamage(at, end - at, str(error), 0)
-            return
-        self._behind = at + _HEAD + used
-        if isinstance(record, records.DataEnd):
-            yield from self._data_end(at, end, record)
-        elif record is not None:
-            self._in_data = self._in_data and not isinstance(record, records.Footer)
-            yield at, record
+    def _parsed(self, opcode: int, start: int, size: int) -> tuple[Record | Attachment | None, int]:
+        if opcode != Opcode.ATTACHMENT:
+            return read_record(opcode, self._window.at(start, size))
+        part = FilePart(self._window.file, start, size)
+        return parse_attachment(self._window.at(start, min(size, MAX_HEAD)), part)
 
-    def _data_end(self, at: int, end: int, record: records.DataEnd) -> Iterator[tuple[int, Item]]:
-        if not self._ends_data(end):
-            yield at, ScanDamage(at, end - at, "an end of data stands in the middle of the data")
-            self._crc = None
+    # The end of the data
+
+    def _finish(self, at: int, head: bytes) -> Iterator[tuple[int, Item]]:
+        self._is_ended = True
+        if head != _DATA_END:
+            yield at, ScanDamage(at, 0, "the record that ends the data is damaged", 0)
             return
-        self._in_data = False
-        if self._crc is not None and record.data_section_crc not in {0, self._crc}:
+        self._at = at + _DATA_END_SIZE
+        crc = int.from_bytes(self._window.at(at + _HEAD, 4), "little")
+        if crc and self._needs_crc and self._start == len(MAGIC) and self._crc_up_to(at) != crc:
             reason = "the checksum of all data differs: some bytes before this one have changed"
             yield at, ScanDamage(0, at, reason, opcode=Opcode.DATA_END)
-        self._crc = None
-        yield at, record
+        yield at, records.DataEnd(crc)
+
+    def _crc_up_to(self, end: int) -> int:
+        crc = 0
+        for at in range(0, end, _WINDOW):
+            crc = crc32(self._window.peek(at, min(_WINDOW, end - at)), crc)
+        return crc
 
     def _ends_data(self, end: int) -> bool:
         """True if the summary, or the end of the file, follows."""
-        if self._summary_start is not None:
-            return end == self._summary_start
         raw = self._window.peek(end, _HEAD)
         if len(raw) < _HEAD:
             return True
         opcode, length = RECORD_HEAD.unpack(raw)
-        known = opcode == Opcode.FOOTER or _is_in_summary(opcode)
-        return known and length <= self._window.size - end - _HEAD
-
-    def _summary_record(self, at: int, opcode: int, length: int) -> Iterator[tuple[int, Item]]:
-        end = at + _HEAD + length
-        wrong = opcode != Opcode.FOOTER and not _is_in_summary(opcode)
-        if wrong or end > self._window.size or length > _MAX_PLAIN:
-            # The data has already given everything that the summary holds.
-            yield at, ScanDamage(at, self._window.size - at, "the summary is damaged", 0)
-            self._at = self._window.size
-            return
-        self._at = end
-        yield from self._known(at, opcode, end)
+        is_known = opcode == Opcode.FOOTER or _is_in_summary(opcode)
+        return is_known and length <= self._window.size - end - _HEAD
 
     # Damage
 
@@ -779,135 +714,74 @@ class _Scanner:
         reason = f"a record of {end - at} bytes is above the limit of {limit}"
         return ScanDamage(at, end - at, reason, messages, opcode=opcode)
 
-    def _torn(
-        self, at: int, reason: str, torn: TornChunk | None = None
-    ) -> Iterator[tuple[int, Item]]:
+    def _torn(self, at: int, reason: str, torn: TornChunk | None = None) -> tuple[int, Item]:
         self._at = self._window.size
-        messages = None if self._in_data else 0
-        yield at, ScanDamage(at, self._window.size - at, reason, messages, torn)
+        return at, ScanDamage(at, self._window.size - at, reason, None, torn)
 
-    def _lost(self, at: int, reason: str, opcode: int | None = None) -> Iterator[tuple[int, Item]]:
-        """Skip to the next plausible records."""
-        self._crc = None
-        found = self._resume(at)
+    def _lost(self, at: int, reason: str, opcode: int | None = None) -> tuple[int, Item]:
+        """Skip to the next chunk of the summary, or to the next records that are whole."""
+        found = self._places.next(at) if self._places.count() else None
+        found = found or self._search(min(self._behind, at) + 1) or self._stop
         if found is None:
-            end = self._end_of_data()
-            if end is None:
-                yield from self._torn(at, f"the file ends in the middle of a record: {reason}")
-                return
-            found = end
+            return self._torn(at, f"the file ends in the middle of a record: {reason}")
         where = min(at, self._behind, found)
         self._at = self._behind = found
         reason += f"; reading goes on at byte {found}"
-        yield where, ScanDamage(where, found - where, reason, opcode=opcode)
+        return where, ScanDamage(where, found - where, reason, opcode=opcode)
 
-    def _resume(self, at: int) -> int | None:
-        known = self._places.next(at)
-        if known is not None and self._places.believed():
-            return known
-        end = self._end_of_data()
-        stop = self._window.size if end is None else end
-        return self._search(self._behind if self._behind < at else at + 1, stop)
+    def _search(self, start: int) -> int | None:
+        """The first byte, from one on, where records that are whole follow one another.
 
-    def _end_of_data(self) -> int | None:
-        """Position of the DataEnd record, if the file has a footer."""
-        if self._footer is None:
-            return None
-        size = self._window.size
-        end = self._footer.summary_start or size - len(MAGIC) - _FOOTER_SIZE
-        at = end - _DATA_END_SIZE
-        raw = self._window.peek(max(at, 0), _HEAD)
-        if len(raw) < _HEAD or RECORD_HEAD.unpack(raw) != (Opcode.DATA_END, 4) or at <= self._at:
-            return None
-        return at
-
-    def _search(self, start: int, stop: int) -> int | None:
-        """The first byte in `[start, stop)` at which a chain of records starts."""
+        Between chunks, no message and no definition counts: a chunk that is not compressed is
+        full of them.
+        """
         wanted = np.zeros(256, np.bool_)
-        wanted[list(_CHUNKED_OPCODES if self._chunked else _DATA_OPCODES)] = True
-        least = np.zeros(256, np.int64)
-        least[list(_LEAST)] = list(_LEAST.values())
-        for block in range(start, stop, _WINDOW):
-            raw = self._window.peek(block, min(_WINDOW, stop - block) + _HEAD - 1)
+        wanted[list(_BETWEEN_CHUNKS if self._chunked else _PLAIN | {Opcode.CHUNK})] = True
+        for block in range(start, self._end, _WINDOW):
+            raw = self._window.peek(block, min(_WINDOW, self._end - block) + _HEAD - 1)
             if len(raw) < _HEAD:
                 return None
             data = np.frombuffer(raw, np.uint8)
-            opcodes = data[: 1 - _HEAD]
-            # No length reaches 2^40, so a test for three zero bytes excludes nearly all positions.
-            sieve = wanted[opcodes] & (data[6:-2] == 0) & (data[7:-1] == 0) & (data[8:] == 0)
-            places = np.flatnonzero(sieve)
-            lengths = np.ndarray((len(opcodes),), "<u8", raw, 1, (1,))[places].astype(np.int64)
-            fit = (lengths >= least[opcodes[places]]) & (
-                places + lengths <= self._window.size - block - _HEAD
-            )
-            for place in places[fit].tolist():
-                if self._is_chain(block + place):
+            # No length reaches 2^40, which excludes nearly all positions.
+            sieve = wanted[data[: 1 - _HEAD]]
+            sieve &= (data[6:-2] == 0) & (data[7:-1] == 0) & (data[8:] == 0)
+            for place in np.flatnonzero(sieve).tolist():
+                if self._is_start(block + place):
                     return block + int(place)
         return None
 
-    def _is_chain(self, at: int) -> bool:
-        """True if a chain of records starts here, up to an end or long enough."""
-        weight = 0
-        while weight < 3:
-            if at == self._window.size:
-                return weight > 0
-            found = self._weight(at)
-            if found is None:
-                return False
-            weight += found[0]
-            at = found[1]
+    def _is_start(self, at: int) -> bool:
+        """True for a record that nothing else looks like, or for three in a row."""
+        for _ in range(3):
+            fields = _chunk_head(self._window, at)
+            end = self._end_of(at)
+            if end is None or end == self._window.size:
+                return end is not None
+            if (fields is not None and fields.end == end) or self._window.peek(
+                at, _HEAD
+            ) == _DATA_END:
+                return True
+            at = end
         return True
 
-    def _weight(self, at: int) -> tuple[int, int] | None:
-        """A plausibility score of a record at `at`, and its end."""
+    def _end_of(self, at: int) -> int | None:
+        """The end of a plausible record."""
         raw = self._window.peek(at, _HEAD + 6)
         if len(raw) < _HEAD:
             return None
         opcode, length = RECORD_HEAD.unpack_from(raw)
         end = at + _HEAD + length
-        weight = 1 if opcode >= _FIRST_PRIVATE or length >= _LEAST.get(opcode, 1 << 64) else 0
-        if opcode == Opcode.CHUNK and weight:
-            # The only record that may run over the end of the file, since it is recognizable.
+        if opcode == Opcode.CHUNK:  # it alone may run over the end: nothing else looks like it
             fields = _chunk_head(self._window, at)
-            if fields is None or fields.end > end:
-                return None
-            return (3 if fields.end == end else 1), end
-        if end > self._window.size:
+            return None if fields is None or fields.end > end else end
+        is_known = opcode in _PLAIN and length >= _LEAST.get(opcode, 0)
+        if end > self._window.size or not (is_known or opcode >= _FIRST_PRIVATE):
             return None
-        if opcode == Opcode.MESSAGE_INDEX and weight:
+        if opcode == Opcode.MESSAGE_INDEX:
             (entries,) = struct.unpack_from("<I", raw, _HEAD + 2)
-            weight = 0 if entries + 6 > length or entries % 16 else 2
-        elif opcode == Opcode.DATA_END and length == 4:
-            weight = 3
-        return (weight, end) if weight else None
-
-    def _is_plausible(self, opcode: int, end: int) -> bool:
-        if opcode == 0 or end > self._window.size:
-            return False
-        if opcode == Opcode.FOOTER:
-            return end + len(MAGIC) >= self._window.size
-        if opcode <= _LAST_KNOWN:
-            return opcode in _DATA_OPCODES or opcode == Opcode.HEADER
-        return opcode >= _FIRST_PRIVATE or self._goes_on(end)
+            return None if entries + 6 > length or entries % 16 else end
+        return None if opcode == Opcode.DATA_END and length != 4 else end
 
     def _goes_on(self, at: int) -> bool:
-        """True if `at` is the start of a record or the end of the file."""
-        return at == self._window.size or self._weight(at) is not None
-
-    def _swallows(self, at: int, end: int) -> bool:
-        """True if a record would overlap the start of a chunk or of the summary."""
-        if self._summary_start is not None and at < self._summary_start < end:
-            return True
-        known = self._places.next(at)
-        return known is not None and known < end and self._places.believed()
-
-    def _add_crc(self, before: int) -> None:
-        if self._crc is None:
-            return
-        at = before
-        while at < self._at:
-            piece = self._window.at(at, min(self._at - at, _WINDOW))
-            if not len(piece):
-                break
-            self._crc = crc32(piece, self._crc)
-            at += len(piece)
+        """True if `at` is the start of a record or the end of the data."""
+        return at in {self._end, self._window.size} or self._end_of(at) is not None
