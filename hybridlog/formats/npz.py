@@ -11,18 +11,15 @@
 | structures | `name.field` |
 
 If a column has nulls, `name.valid` marks the rows with a value; the others are NaN, NaT,
-zero or empty. Columns are spooled to temporary files, so memory stays bounded.
+zero or empty. Rows wait in temporary Arrow files, from which columns are read one by one.
 """
 
 from __future__ import annotations
 
-import contextlib
-import io
-import itertools
-import tempfile
 import zipfile
-from collections.abc import Iterator
-from typing import IO, TYPE_CHECKING, Any, cast
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import IO, TYPE_CHECKING, Any, TypeAlias, cast
 
 import numpy as np
 import pyarrow as pa
@@ -30,6 +27,7 @@ import pyarrow.compute as pc
 
 from hybridlog.formats.writing import FileWriter, Sink, Target, failures
 from hybridlog.schema.arrow_types import (
+    bounds_of,
     converted,
     is_bytes,
     is_list,
@@ -46,8 +44,11 @@ if TYPE_CHECKING:
 
 _LONGEST_STRING = 256
 _STRINGS_AT_ONCE = 1 << 14
-_COPY = 1 << 20
-_OPEN_FILES = 2_000
+
+Pieces: TypeAlias = "Callable[[], Iterator[pa.Array]]"
+"""Reads a column, piece by piece, from its beginning."""
+Arrays: TypeAlias = "Iterator[tuple[str, np.dtype[Any], tuple[int, ...], Iterator[NDArray[Any]]]]"
+"""Name, type, shape and content, piece by piece, of arrays."""
 
 
 class NpzWriter(FileWriter):
@@ -56,12 +57,14 @@ class NpzWriter(FileWriter):
     def __init__(self, target: Target, *, schema: pa.Schema | None = None) -> None:
         super().__init__()
         self._schema = schema
-        self._columns: dict[str, _Column] = {}
+        self._types: dict[str, pa.DataType] = {}
+        self._file: pa.ipc.RecordBatchFileWriter | None = None
+        self._file_schema: pa.Schema | None = None
+        self._paths: list[str] = []
         self._sink = Sink(target)
-        self._rows = 0
         try:
             with failures(self._sink.name):
-                self._spools = _Spools()
+                self._directory = scratch_directory()
         except BaseException:
             self._sink.abort()
             raise
@@ -73,33 +76,60 @@ class NpzWriter(FileWriter):
             UsageError: A column changes its type, or has a type without a numpy form.
             DiskFullError: No space left.
         """
-        with failures(self._sink.name):
-            for batch in table.combine_chunks().to_batches():
-                self._write_batch(batch)
-
-    def _write_batch(self, batch: pa.RecordBatch) -> None:
-        names = batch.schema.names
+        names = table.column_names
         if len(set(names)) != len(names):
             raise UsageError("two columns have the same name; leave one out with --fields")
-        for name, given in zip(names, batch.columns, strict=True):
-            array = self._plain(name, given)
-            column = self._columns.get(name)
-            if column is None:
-                if pa.types.is_null(array.type):
-                    continue  # its type is unknown; nulls are filled in later
-                column = self._columns[name] = _column(_array_name(name), array.type, self._spools)
-                column.append_nulls(self._rows)
-            column.append(array)
-        self._rows += batch.num_rows
-        for name, column in self._columns.items():
-            if name not in names:
-                column.append_nulls(batch.num_rows)
+        with failures(self._sink.name):
+            for batch in table.combine_chunks().to_batches():
+                arrays = [self._plain(*one) for one in zip(names, batch.columns, strict=True)]
+                self._spool(pa.record_batch(arrays, names))
 
     def _plain(self, name: str, array: pa.Array) -> pa.Array:
-        """The array in the type that its column is known to have, JSON as text."""
+        """The array in the type that its column had before, JSON as text."""
         if self._schema is not None and name in self._schema.names:
             array = converted(array, self._schema.field(name).type)
-        return array.storage if isinstance(array, pa.ExtensionArray) else array
+        if isinstance(array, pa.ExtensionArray):
+            array = array.storage
+        if pa.types.is_dictionary(array.type):
+            array = array.dictionary_decode()
+        if pa.types.is_null(array.type):
+            return array  # its type is not known yet
+        if name not in self._types:
+            for _ in _arrays(name, array.type, lambda: iter(())):
+                pass  # a type that numpy does not have is refused here
+            self._types[name] = array.type
+        kind = self._types[name]
+        try:
+            return array.cast(kind)
+        except pa.ArrowException as error:
+            raise UsageError(
+                f"column {name!r} is {kind} at first and {array.type} later, which does not fit "
+                f"({error}); leave it out with --fields"
+            ) from error
+
+    def _spool(self, batch: pa.RecordBatch) -> None:
+        if self._file is None or batch.schema != self._file_schema:
+            self._end_file()
+            self._paths.append(str(self._directory.path / f"{len(self._paths)}.arrow"))
+            self._file = pa.ipc.new_file(self._paths[-1], batch.schema)
+            self._file_schema = batch.schema
+        self._file.write_batch(batch)
+
+    def _end_file(self) -> None:
+        file, self._file = self._file, None
+        if file is not None:
+            file.close()
+
+    def _pieces(self, name: str) -> Iterator[pa.Array]:
+        for path in self._paths:
+            with pa.memory_map(path) as mapped:
+                file = pa.ipc.open_file(mapped)
+                at = file.schema.get_field_index(name)
+                is_there = at >= 0 and not pa.types.is_null(file.schema.types[at])
+                for number in range(file.num_record_batches):
+                    batch = file.get_batch(number)
+                    nulls = pa.nulls(len(batch), self._types[name])
+                    yield batch.column(at) if is_there else nulls
 
     def _finish(self) -> None:
         with (
@@ -107,326 +137,152 @@ class NpzWriter(FileWriter):
             zipfile.ZipFile(cast("IO[bytes]", self._sink), "w", zipfile.ZIP_STORED) as archive,
         ):
             try:
-                self._write_arrays(archive)
+                self._end_file()
+                for name, kind in self._types.items():
+                    pieces = partial(self._pieces, name)
+                    for array in _arrays(_array_name(name), kind, pieces):
+                        _add(archive, *array)
             except BaseException:
                 # Otherwise the archive would be finished, and a stream would look complete.
                 self._sink.abort()
                 raise
         self._sink.commit()
-        self._spools.close()
-
-    def _write_arrays(self, archive: zipfile.ZipFile) -> None:
-        written: set[str] = set()
-        for column in self._columns.values():
-            for name, dtype, shape, chunks in column.arrays():
-                unique = name
-                while unique in written:
-                    unique += "_"
-                written.add(unique)
-                # With a fixed date, equal content makes equal files.
-                entry = zipfile.ZipInfo(f"{unique}.npy", (1980, 1, 1, 0, 0, 0))
-                with archive.open(entry, "w", force_zip64=True) as file:
-                    file.write(_npy_header(dtype, shape))
-                    for chunk in chunks:
-                        file.write(chunk)
+        self._directory.remove()
 
     def _discard(self) -> None:
         self._sink.abort()
-        self._spools.close()
-
-
-class _Spools:
-    """Temporary files of one writer, removed with it."""
-
-    def __init__(self) -> None:
-        self._stack = contextlib.ExitStack()
-        self._directory = scratch_directory()
-        self._count = 0
-
-    def new(self) -> IO[bytes]:
-        """A temporary file for an array's bytes."""
-        self._count += 1
-        if self._count > _OPEN_FILES:
-            raise UsageError("more columns than files can be open; choose some with --fields")
-        return self._stack.enter_context(
-            tempfile.SpooledTemporaryFile(max_size=1 << 16, dir=str(self._directory.path))
-        )
-
-    def close(self) -> None:
-        """Remove all files."""
-        with contextlib.suppress(OSError):
-            self._stack.close()
+        self._end_file()
         self._directory.remove()
 
 
-_Array = tuple[str, "np.dtype[Any]", tuple[int, ...], Iterator[bytes]]
+def _add(
+    archive: zipfile.ZipFile,
+    name: str,
+    dtype: np.dtype[Any],
+    shape: tuple[int, ...],
+    pieces: Iterator[NDArray[Any]],
+) -> None:
+    while f"{name}.npy" in archive.NameToInfo:
+        name += "_"
+    # With a fixed date, equal content makes equal files.
+    entry = zipfile.ZipInfo(f"{name}.npy", (1980, 1, 1, 0, 0, 0))
+    about = {
+        "descr": np.lib.format.dtype_to_descr(dtype),
+        "fortran_order": False,
+        "shape": shape,
+    }
+    with archive.open(entry, "w", force_zip64=True) as file:
+        np.lib.format.write_array_header_1_0(file, about)
+        for piece in pieces:
+            file.write(np.ascontiguousarray(piece, dtype).tobytes())
 
 
-class _Spool:
-    """The bytes of one array of a known dtype."""
+def _arrays(name: str, kind: pa.DataType, pieces: Pieces) -> Arrays:
+    """The arrays of a column.
 
-    def __init__(self, name: str, dtype: np.dtype[Any], spools: _Spools) -> None:
-        self.name = name
-        self.dtype = dtype
-        self.count = 0
-        self._file = spools.new()
-
-    def append(self, values: NDArray[Any]) -> None:
-        self._file.write(np.ascontiguousarray(values, self.dtype).tobytes())
-        self.count += len(values)
-
-    def chunks(self) -> Iterator[bytes]:
-        self._file.seek(0)
-        while chunk := self._file.read(_COPY):
-            yield chunk
-
-    def array(self) -> _Array:
-        return self.name, self.dtype, (self.count,), self.chunks()
-
-
-class _Column:
-    """A column: collects pieces and finally returns arrays."""
-
-    def __init__(self, name: str, kind: pa.DataType, spools: _Spools) -> None:
-        self.name = name
-        self.kind = kind
-        self._valid = _Spool(f"{name}.valid", np.dtype(bool), spools)
-        self._has_nulls = False
-
-    def append(self, array: pa.Array) -> None:
-        """Append values.
-
-        Raises:
-            UsageError: Their type differs from that before.
-        """
-        if array.type != self.kind:
-            try:
-                array = array.cast(self.kind)
-            except pa.ArrowException as error:
-                raise UsageError(
-                    f"column {self.name!r} is {self.kind} at first and {array.type} later, which "
-                    f"does not fit ({error}); leave it out with --fields"
-                ) from error
-        self._valid.append(array.is_valid().to_numpy(zero_copy_only=False))
-        self._has_nulls = self._has_nulls or array.null_count > 0
-        self._append(array)
-
-    def append_nulls(self, count: int) -> None:
-        """Append rows without a value."""
-        if count:
-            self.append(pa.nulls(count, self.kind))
-
-    def arrays(self) -> Iterator[_Array]:
-        """Name, dtype, shape and bytes of each array of the column."""
-        yield from self._arrays()
-        if self._has_nulls:
-            yield self._valid.array()
-
-    def _append(self, array: pa.Array) -> None:
-        raise NotImplementedError
-
-    def _arrays(self) -> Iterator[_Array]:
-        raise NotImplementedError
+    Raises:
+        UsageError: Numpy has no such type.
+    """
+    rows = sum(map(len, pieces()))
+    if is_numeric(kind):
+        yield name, numpy_type(kind), (rows,), map(_numbers, pieces())
+    elif is_time(kind):
+        is_stamp = pa.types.is_timestamp(kind)
+        unit = pa.timestamp("ns") if is_stamp else pa.duration("ns")
+        dtype = np.dtype("datetime64[ns]" if is_stamp else "timedelta64[ns]")
+        yield name, dtype, (rows,), (_ticks(one.cast(unit)).view(dtype) for one in pieces())
+    elif is_text(kind) or is_bytes(kind):
+        yield from _texts(name, kind, rows, pieces)
+    elif pa.types.is_fixed_size_list(kind) and is_numeric(kind.value_type):
+        shape = (rows, kind.list_size)
+        yield name, numpy_type(kind.value_type), shape, map(_matrix, pieces())
+    elif is_list(kind):
+        elements = partial(_each, pieces, lambda one: one.flatten())
+        yield from _arrays(f"{name}.values", kind.value_type, elements)
+        yield f"{name}.offsets", np.dtype(np.int64), (rows + 1,), _offsets(pieces())
+    elif pa.types.is_struct(kind):
+        for n, field in enumerate(kind):
+            member = partial(_each, pieces, partial(_member, n))
+            yield from _arrays(f"{name}.{_array_name(field.name)}", field.type, member)
+    elif pa.types.is_dictionary(kind):
+        decoded = partial(_each, pieces, lambda one: one.dictionary_decode())
+        yield from _arrays(name, kind.value_type, decoded)
+    elif not pa.types.is_null(kind):  # elements of lists that are all empty
+        raise UsageError(
+            f"column {name!r} is {kind}, which numpy does not have; leave it out with --fields"
+        )
+    if not pa.types.is_dictionary(kind) and any(one.null_count for one in pieces()):
+        valid = (one.is_valid().to_numpy(zero_copy_only=False) for one in pieces())
+        yield f"{name}.valid", np.dtype(bool), (rows,), valid
 
 
-class _Numbers(_Column):
-    def __init__(self, name: str, kind: pa.DataType, spools: _Spools) -> None:
-        super().__init__(name, kind, spools)
-        self._spool = _Spool(name, numpy_type(kind), spools)
-
-    def _append(self, array: pa.Array) -> None:
-        if array.null_count:
-            array = pc.fill_null(array, _filler(self.kind))
-        self._spool.append(array.to_numpy(zero_copy_only=False))
-
-    def _arrays(self) -> Iterator[_Array]:
-        yield self._spool.array()
+def _each(pieces: Pieces, how: Callable[[pa.Array], pa.Array]) -> Iterator[pa.Array]:
+    return map(how, pieces())
 
 
-class _Times(_Column):
-    def __init__(self, name: str, kind: pa.DataType, spools: _Spools) -> None:
-        super().__init__(name, kind, spools)
-        stamp = pa.types.is_timestamp(kind)
-        self._unit = pa.timestamp("ns") if stamp else pa.duration("ns")
-        dtype = np.dtype("datetime64[ns]" if stamp else "timedelta64[ns]")
-        self._spool = _Spool(name, dtype, spools)
-
-    def _append(self, array: pa.Array) -> None:
-        plain = array.cast(self._unit).cast(pa.int64())
-        nat = int(np.iinfo(np.int64).min)
-        values = pc.fill_null(plain, nat).to_numpy(zero_copy_only=False)
-        self._spool.append(values.view(self._spool.dtype))
-
-    def _arrays(self) -> Iterator[_Array]:
-        yield self._spool.array()
+def _member(n: int, structs: pa.StructArray) -> pa.Array:
+    return structs.flatten()[n]  # null where the structure is
 
 
-class _Texts(_Column):
-    """Strings and binary values, as bytes and their ends."""
-
-    def __init__(self, name: str, kind: pa.DataType, spools: _Spools) -> None:
-        super().__init__(name, kind, spools)
-        self._text = is_text(kind)
-        self._bytes = _Spool(f"{name}.values", np.dtype(np.uint8), spools)
-        self._offsets = _Spool(f"{name}.offsets", np.dtype(np.int64), spools)
-        self._offsets.append(np.zeros(1, np.int64))
-        self._longest = 0
-        self._has_nul = False
-
-    def _append(self, array: pa.Array) -> None:
-        if not len(array):
-            return
-        values = pc.fill_null(array.cast(pa.large_binary()), b"")
-        _, offset_buffer, data_buffer = values.buffers()
-        offsets = np.frombuffer(offset_buffer, np.int64)
-        offsets = offsets[values.offset : values.offset + len(values) + 1]
-        data = np.zeros(0, np.uint8)
-        if data_buffer is not None:
-            data = np.frombuffer(data_buffer, np.uint8)[offsets[0] : offsets[-1]]
-        self._offsets.append(offsets[1:] - offsets[0] + self._bytes.count)
-        self._bytes.append(data)
-        if self._text:
-            lengths = pc.utf8_length(pc.fill_null(array, ""))
-            self._longest = max(self._longest, int(pc.max(lengths).as_py()))
-            self._has_nul = self._has_nul or not bool(data.all())
-
-    def _arrays(self) -> Iterator[_Array]:
-        if not self._text or self._has_nul or self._longest > _LONGEST_STRING:
-            yield self._bytes.array()
-            yield self._offsets.array()
-            return
-        dtype = np.dtype(f"<U{max(1, self._longest)}")
-        yield self.name, dtype, (self._offsets.count - 1,), self._unicode(dtype)
-
-    def _unicode(self, dtype: np.dtype[Any]) -> Iterator[bytes]:
-        data = b"".join(self._bytes.chunks())
-        offsets = np.frombuffer(b"".join(self._offsets.chunks()), np.int64)
-        for first in range(0, len(offsets) - 1, _STRINGS_AT_ONCE):
-            bounds = offsets[first : first + _STRINGS_AT_ONCE + 1].tolist()
-            words = [data[low:high].decode() for low, high in itertools.pairwise(bounds)]
-            yield np.array(words, dtype).tobytes()
+def _texts(name: str, kind: pa.DataType, rows: int, pieces: Pieces) -> Arrays:
+    """Strings of a fixed width; or bytes and their ends."""
+    is_short = is_text(kind)
+    longest = 1
+    for one in pieces() if is_short else ():
+        longest = max(longest, pc.max(pc.utf8_length(one)).as_py() or 0)
+        has_nul = pc.any(pc.match_substring(one, "\0")).as_py()
+        is_short = is_short and not has_nul and longest <= _LONGEST_STRING
+    if is_short:
+        dtype = np.dtype(f"<U{longest}")
+        parts = (
+            one.slice(at, _STRINGS_AT_ONCE)
+            for one in pieces()
+            for at in range(0, len(one), _STRINGS_AT_ONCE)
+        )
+        words = (np.array(part.fill_null("").to_pylist(), dtype) for part in parts)
+        yield name, dtype, (rows,), words
+        return
+    binary = partial(_each, pieces, lambda one: one.cast(pa.large_binary()))
+    size = sum(int(bounds_of(one)[-1]) for one in binary())
+    joined = (np.frombuffer(b"".join(one.fill_null(b"").to_pylist()), np.uint8) for one in binary())
+    yield f"{name}.values", np.dtype(np.uint8), (size,), joined
+    yield f"{name}.offsets", np.dtype(np.int64), (rows + 1,), _offsets(binary())
 
 
-class _Lists(_Column):
-    def __init__(self, name: str, kind: pa.DataType, spools: _Spools) -> None:
-        super().__init__(name, kind, spools)
-        self._items = _column(f"{name}.values", kind.value_type, spools)
-        self._offsets = _Spool(f"{name}.offsets", np.dtype(np.int64), spools)
-        self._offsets.append(np.zeros(1, np.int64))
-        self._end = 0
-
-    def _append(self, array: pa.Array) -> None:
-        lengths = pc.fill_null(pc.list_value_length(array), 0).to_numpy(zero_copy_only=False)
-        ends = np.cumsum(lengths, dtype=np.int64) + self._end
-        self._offsets.append(ends)
-        self._end = int(ends[-1]) if len(ends) else self._end
-        self._items.append(array.flatten())
-
-    def _arrays(self) -> Iterator[_Array]:
-        yield from self._items.arrays()
-        yield self._offsets.array()
+def _offsets(pieces: Iterator[pa.Array]) -> Iterator[NDArray[np.int64]]:
+    """Ends of rows, behind a 0."""
+    end = 0
+    yield np.zeros(1, np.int64)
+    for one in pieces:
+        bounds = bounds_of(one)
+        yield bounds[1:] + end
+        end += int(bounds[-1])
 
 
-class _FixedLists(_Column):
-    """Lists of numbers of one size: a matrix."""
-
-    def __init__(self, name: str, kind: pa.DataType, spools: _Spools) -> None:
-        super().__init__(name, kind, spools)
-        self._size = kind.list_size
-        self._spool = _Spool(name, numpy_type(kind.value_type), spools)
-        self._rows = 0
-
-    def _append(self, array: pa.Array) -> None:
-        self._rows += len(array)
-        # `values` also has the elements of null rows, which `flatten` omits.
-        items = array.values.slice(array.offset * self._size, len(array) * self._size)
-        if array.null_count:
-            hidden = np.repeat(array.is_null().to_numpy(zero_copy_only=False), self._size)
-            items = pc.if_else(pa.array(hidden), pa.scalar(None, items.type), items)
-        if items.null_count:
-            items = pc.fill_null(items, _filler(self.kind.value_type))
-        self._spool.append(items.to_numpy(zero_copy_only=False))
-
-    def _arrays(self) -> Iterator[_Array]:
-        yield self.name, self._spool.dtype, (self._rows, self._size), self._spool.chunks()
+def _numbers(array: pa.Array) -> NDArray[Any]:
+    """NaN, False or 0 for null."""
+    kind = array.type
+    empty = float("nan") if pa.types.is_floating(kind) else 0
+    filler = pa.scalar(False if pa.types.is_boolean(kind) else empty, kind)
+    found: NDArray[Any] = array.fill_null(filler).to_numpy(zero_copy_only=False)
+    return found
 
 
-class _Structs(_Column):
-    def __init__(self, name: str, kind: pa.DataType, spools: _Spools) -> None:
-        super().__init__(name, kind, spools)
-        self._members = [
-            _column(f"{name}.{_array_name(member.name)}", member.type, spools)
-            for member in (kind.field(index) for index in range(kind.num_fields))
-        ]
-
-    def _append(self, array: pa.Array) -> None:
-        # `flatten` applies the structure's nulls to its members.
-        for member, values in zip(self._members, array.flatten(), strict=True):
-            member.append(values)
-
-    def _arrays(self) -> Iterator[_Array]:
-        for member in self._members:
-            yield from member.arrays()
+def _ticks(array: pa.Array) -> NDArray[np.int64]:
+    """Nanoseconds, with NaT for null."""
+    plain = array.cast(pa.int64()).fill_null(int(np.iinfo(np.int64).min))
+    found: NDArray[np.int64] = plain.to_numpy(zero_copy_only=False)
+    return found
 
 
-class _Decoded(_Column):
-    """A dictionary column, converted to its values."""
-
-    def __init__(self, name: str, kind: pa.DataType, spools: _Spools) -> None:
-        super().__init__(name, kind, spools)
-        self._inner = _column(name, kind.value_type, spools)
-
-    def append(self, array: pa.Array) -> None:
-        plain = pa.types.is_dictionary(array.type)
-        self._inner.append(array.dictionary_decode() if plain else array)
-
-    def arrays(self) -> Iterator[_Array]:
-        yield from self._inner.arrays()
-
-
-class _Nulls(_Column):
-    """Elements of lists that are all empty."""
-
-    def _append(self, array: pa.Array) -> None:
-        pass
-
-    def _arrays(self) -> Iterator[_Array]:
-        yield from ()
-
-
-def _column(name: str, kind: pa.DataType, spools: _Spools) -> _Column:
-    types = pa.types
-    table: list[tuple[bool, type[_Column]]] = [
-        (is_numeric(kind), _Numbers),
-        (is_time(kind), _Times),
-        (is_text(kind) or is_bytes(kind), _Texts),
-        (types.is_fixed_size_list(kind) and is_numeric(kind.value_type), _FixedLists),
-        (is_list(kind), _Lists),
-        (types.is_struct(kind), _Structs),
-        (types.is_dictionary(kind), _Decoded),
-        (types.is_null(kind), _Nulls),
-    ]
-    for fits, make in table:
-        if fits:
-            return make(name, kind, spools)
-    raise UsageError(
-        f"column {name!r} is {kind}, which numpy does not have; leave it out with --fields"
-    )
-
-
-def _filler(kind: pa.DataType) -> pa.Scalar:
-    if pa.types.is_floating(kind):
-        return pa.scalar(float("nan"), kind)
-    return pa.scalar(False if pa.types.is_boolean(kind) else 0, kind)
-
-
-def _npy_header(dtype: np.dtype[Any], shape: tuple[int, ...]) -> bytes:
-    header = io.BytesIO()
-    np.lib.format.write_array_header_1_0(
-        header,
-        {"descr": np.lib.format.dtype_to_descr(dtype), "fortran_order": False, "shape": shape},
-    )
-    return header.getvalue()
+def _matrix(array: pa.Array) -> NDArray[Any]:
+    """The elements of lists of one size, one behind the other; those of null rows are null."""
+    size = array.type.list_size
+    items = array.values.slice(array.offset * size, len(array) * size)
+    if array.null_count:
+        hidden = np.repeat(array.is_null().to_numpy(zero_copy_only=False), size)
+        items = pc.if_else(pa.array(hidden), pa.scalar(None, items.type), items)
+    return _numbers(items)
 
 
 def _array_name(name: str) -> str:
