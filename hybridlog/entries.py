@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Literal, cast
+from typing import TYPE_CHECKING, Any, Final, Literal, cast
 
 import numpy as np
 from msgspec import ValidationError, convert, to_builtins
@@ -33,14 +33,11 @@ from hybridlog_storage.catalog import (
 from hybridlog_storage.disk.directory import PAYLOADS
 from hybridlog_storage.errors import (
     CatalogError,
-    DiskFullError,
     ManifestError,
-    RecordingGoneError,
     SegmentError,
     StoreError,
 )
 from hybridlog_storage.manifest import Fields, File, Manifest, Source, free_name, loss_of
-from hybridlog_storage.manifests import change_in, read_in
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_file import Sealed, sealed_channels
 from hybridlog_storage.segments.segment_reader import SegmentReader, SegmentSummary
@@ -54,6 +51,10 @@ if TYPE_CHECKING:
     from hybridlog_storage.disk.directory import Listing, StoreDirectory
 
 
+NO_MANIFEST: Final = (
+    "{} has no manifest: `hybridlog verify --repair` makes it again from `manifest.old` and the "
+    "segments."
+)
 _TRIES = 10  # to read a recording while its files are replaced
 
 
@@ -161,11 +162,22 @@ def take_inventory(directory: StoreDirectory, folder: str) -> Inventory:
     """Compare the sealed segments of a recording with its manifest.
 
     Raises:
+        RecordingGoneError: It is being removed.
         StoreError: Directory or manifest cannot be read, or it is the copy of another one.
     """
-    path = directory.recording(folder)
     listing = directory.listing(folder)
-    manifest = read_in(path)
+    return inventory_of(directory, folder, listing, directory.manifests.find(folder))
+
+
+def inventory_of(
+    directory: StoreDirectory, folder: str, listing: Listing, manifest: Manifest | None
+) -> Inventory:
+    """Compare the sealed segments of a recording with a manifest; None for a lost one.
+
+    Raises:
+        StoreError: They cannot be read, or are a copy of another recording.
+    """
+    path = directory.recording(folder)
     found = Inventory(folder, listing, manifest)
     listed = manifest.logs if manifest is not None else {}
     numbers = {file.digest: number for number, file in listed.items()}
@@ -218,12 +230,12 @@ def steady_inventory(directory: StoreDirectory, recording: str) -> Inventory:
 
 
 def check_folder(directory: StoreDirectory, folder: str, recording: str) -> None:
-    """Raise if a folder has another name than the id of its recording; hidden ones may have.
+    """Raise if a folder has another name than the id of its recording.
 
     Raises:
         StoreError: It has.
     """
-    if recording and folder != recording and not folder.startswith("."):
+    if recording and folder != recording:
         path = directory.recording(folder)
         if directory.has(recording):
             raise StoreError(f"{path} is a copy of {recording}: remove it.")
@@ -289,10 +301,7 @@ def describe(catalog: Catalog, inventory: Inventory, *, is_open: bool = False) -
     from hybridlog.schema.codecs import codec_for
 
     if inventory.manifest is None:
-        raise ManifestError(
-            f"{inventory.folder} has no manifest: `hybridlog verify --repair` makes it again "
-            "from `manifest.old` and the segments."
-        )
+        raise ManifestError(NO_MANIFEST.format(inventory.folder))
     entry = _base(inventory)
     channels: dict[int, Channel] = {}
     lost: list[dict[str, Any]] = []
@@ -764,29 +773,8 @@ def sealed_of(inventory: Inventory, number: int) -> Sealed:
     return Sealed(number, inventory.listing.sealed[number], size, summary.digest, channels)
 
 
-def announce_removal(
-    directory: StoreDirectory, recording: str, check: Callable[[Manifest], None] = lambda _: None
-) -> None:
-    """Announce the removal of a recording in its manifest.
-
-    On a full disk that may not fit; then the directory's hidden name announces it.
-
-    Args:
-        directory: The store.
-        recording: Its id.
-        check: Called with the newest manifest; raises to keep the recording.
-    """
-
-    def removed(now: Manifest) -> Manifest:
-        check(now)
-        return truth.replace(now, status="removed")
-
-    with suppress(DiskFullError, RecordingGoneError):
-        change_in(directory.recording(recording), removed)
-
-
 def free_name_in(catalog: Catalog, name: str, but: str = "") -> str:
-    """A name that no recording of a store has, but for one, by its id; within `alone`."""
+    """A name that no recording of a store has, but for one, by its id; within `creating`."""
     return free_name(text(name), {one.name for one in catalog.summaries() if one.id != but})
 
 

@@ -57,7 +57,7 @@ class OpenStore(Shared):
         self._is_opened = False  # what a crash left was repaired, unless it is left to another
         self._latest: Session | None = None
         self._changed = 0, False  # as of the latest state, see `StoreDirectory.changed`
-        self._names: list[str] = []  # in `recordings`
+        self._names: list[str] = []  # ids of recordings
         self._looks_at = 0.0  # when the next look for new recordings is due, by `monotonic`
         self._mending = threading.Lock()
 
@@ -84,7 +84,7 @@ class OpenStore(Shared):
             begun = time.monotonic()
             mends, self._is_opened = self._recovers and not self._is_opened, True
             self._changed = self.directory.changed()
-            self._names = self.directory.names()
+            self._names = self.directory.ids()
             try:
                 found = self._files.look_at_all(mends=mends)
             except DiskFullError as error:
@@ -103,7 +103,7 @@ class OpenStore(Shared):
     def _has_names_changed(self) -> bool:
         """True if recordings may have come, gone, or got other names since the latest state."""
         now, before = self.directory.changed(), self._changed
-        if now[0] == before[0] and not before[1] and self.directory.names() == self._names:
+        if now != before and self.directory.ids() == self._names:
             self._changed = now
         return self._changed != now
 
@@ -130,11 +130,11 @@ class OpenStore(Shared):
             if self._latest is None:
                 return
             before = self._latest.snapshot()
-            changed, names = self.directory.changed(), self.directory.names()
+            changed, names = self.directory.changed(), self.directory.ids()
             ids = {*names}.symmetric_difference(before.by_id)
             ids.update(one for one in recordings if one in before.by_id)
             now = self._files.catch_up(before, ids)
-            if now is None or self.directory.names() != names:
+            if now is None or self.directory.ids() != names:
                 self.invalidate()
                 return
             self._changed, self._names = changed, names
@@ -202,7 +202,7 @@ class OpenStore(Shared):
             from hybridlog.columns.recordings_file import write_recordings_file
 
             with suppress(OSError, HybridlogError):
-                present = self.now().snapshot().by_id.keys() & {*self.directory.names()}
+                present = self.now().snapshot().by_id.keys() & {*self.directory.ids()}
                 write_recordings_file(self.catalog, present)
                 self.catalog.has_changed = False
 

@@ -420,6 +420,10 @@ class Segment:
 # --- recordings -----------------------------------------------------------------------
 
 
+def _manifest_of(path: Path) -> Path:
+    return path.parent.parent / "manifests" / f"{path.name}.json"
+
+
 class Recording:
     """A recording: its manifest, the segments that are believed, what follows from both."""
 
@@ -427,7 +431,7 @@ class Recording:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.manifest = Manifest((path / "manifest.json").read_bytes())
+        self.manifest = Manifest(_manifest_of(path).read_bytes())
         sealed: dict[int, Segment | None] = {}
         self.open: set[int] = set()
         for file in sorted(path.iterdir()):
@@ -631,7 +635,7 @@ class FormatReader:
 
     @staticmethod
     def _name(path: Path) -> str:
-        return Manifest((path / "manifest.json").read_bytes()).name
+        return Manifest(_manifest_of(path).read_bytes()).name
 
 
 def collection_name(topic: str) -> str:

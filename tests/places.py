@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Callable
 from pathlib import Path
 
-from hybridlog_storage.manifest import File, Manifest
-from hybridlog_storage.manifests import MANIFEST, read_in
+from hybridlog_storage.manifest import File, Manifest, decode, encode
+from hybridlog_storage.manifests import MANIFEST_OLD, manifests_at
 
 
 def root(store: Path) -> Path:
@@ -31,6 +32,33 @@ def id_of(store: Path, name: str) -> str:
 def segment(store: Path, name: str, number: int = 0) -> Path:
     """A sealed segment of the recording of a name."""
     return folder(store, name) / f"{number:06d}.mcap"
+
+
+def manifest_of(folder: Path) -> Path:
+    """The file of the manifest of the recording in a directory."""
+    return folder.parent.parent / "manifests" / f"{folder.name}.json"
+
+
+def read_in(folder: Path) -> Manifest | None:
+    """The manifest of the recording in a directory; None without one."""
+    return manifests_at(folder).find(folder.name)
+
+
+def old_in(folder: Path) -> Manifest:
+    """The manifest before its last change."""
+    return decode((folder / MANIFEST_OLD).read_bytes())
+
+
+def change_in(folder: Path, how: Callable[[Manifest], Manifest]) -> Manifest:
+    """Change the manifest of the recording in a directory."""
+    return manifests_at(folder).change(folder.name, how)
+
+
+def write_in(folder: Path, new: Manifest) -> None:
+    """Write a manifest, whatever it says."""
+    path = manifest_of(folder)
+    path.parent.mkdir(exist_ok=True)
+    manifests_at(folder)._write(path, encode(new), sync=False)
 
 
 def manifest(store: Path, name: str) -> Manifest:
@@ -73,7 +101,7 @@ def name_of(path: Path) -> str:
     if path.name.startswith("."):
         return path.name
     try:
-        found = json.loads((path / MANIFEST).read_bytes().split(b"\n")[0])["name"]
+        found = json.loads(manifest_of(path).read_bytes().split(b"\n")[0])["name"]
     except (OSError, ValueError, KeyError, TypeError):
         found = ""
     known = re.fullmatch(r"[0-9]{8}-(.+)-[0-9a-f]{16}", path.name)

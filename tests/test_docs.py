@@ -37,7 +37,6 @@ from hybridlog.query.predicate.parser import parse
 from hybridlog.query.predicate.types import check
 from hybridlog_storage import errors
 from hybridlog_storage.errors import HybridlogError, ManifestError
-from hybridlog_storage.manifests import read_in
 from tests import places
 from tests.cli.fork_server import ForkServer
 from tests.format_reader import (
@@ -1024,14 +1023,14 @@ def test_what_people_wrote_is_read_from_the_manifest(recorded: hl.Store, tmp_pat
 
 def test_a_manifest_with_any_other_byte_is_damaged(recorded: hl.Store, tmp_path: Path) -> None:
     robot = places.folder(copied(recorded, tmp_path / "store"), "robot")
-    manifest = robot / "manifest.json"
+    manifest = places.manifest_of(robot)
     data = manifest.read_bytes()
     for at in range(0, len(data), len(data) // 20):
         manifest.write_bytes(data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :])
         with pytest.raises(Damaged):
             Manifest(manifest.read_bytes())
         with pytest.raises(ManifestError):
-            read_in(robot)
+            places.read_in(robot)
     manifest.write_bytes(data)
     assert Manifest(data).id == robot.name
 
@@ -1168,7 +1167,6 @@ def test_the_specification_names_what_there_is() -> None:
     from hybridlog_storage import manifest
     from hybridlog_storage.catalog import CATALOG, ChannelStats, RecordingEntry
     from hybridlog_storage.disk import directory
-    from hybridlog_storage.manifests import MANIFEST
     from hybridlog_storage.mongo import index_state
     from hybridlog_storage.segments import chunk_table, segment_format
     from hybridlog_storage.settings import FORMAT, StoreSettings
@@ -1197,7 +1195,7 @@ def test_the_specification_names_what_there_is() -> None:
         assert f"`{state}`" in text
     for name in (index_state.RECORDINGS, index_state.STORE):
         assert f"`{name}`" in text
-    for name in (CATALOG, directory.LOCK, MANIFEST, directory.REMOVED, directory.IMPORTING):
+    for name in (CATALOG, directory.LOCK, "manifests/<id>.json", "manifest.lock", "manifest.old"):
         assert name in sections(DOCS / "format.md", 2)["Directory"]
 
 

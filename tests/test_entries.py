@@ -38,7 +38,7 @@ from hybridlog_storage.disk.directory import StoreDirectory
 from hybridlog_storage.errors import CatalogError, ManifestError, SegmentError, StoreError
 from hybridlog_storage.manifest import File, Loss, Manifest, Note, Part, Source, new_id, with_file
 from hybridlog_storage.manifest import replace as changed
-from hybridlog_storage.manifests import MANIFEST, MANIFEST_OLD, change_in, old_in, read_in, write_in
+from hybridlog_storage.manifests import MANIFEST_OLD
 from hybridlog_storage.messages import Batch, Channel, Schema
 from hybridlog_storage.segments.segment_format import END_METADATA, LOSSES_METADATA, json_metadata
 from hybridlog_storage.segments.segment_writer import RecordingWriter, SegmentSettings
@@ -80,7 +80,7 @@ class Made:
     def __init__(self, directory: StoreDirectory, name: str = "run", segments: int = 4) -> None:
         self.directory = directory
         self.id = new_id(name)
-        directory.new_recording(self.id)
+        directory.make_folder(self.id)
         self.path = directory.recording(self.id)
         self.said = {
             "id": self.id,
@@ -90,9 +90,8 @@ class Made:
             "created": 77,
         }
         source = Source(path="/x", kind="test", bytes=5)
-        write_in(
-            self.path, Manifest(self.id, name, 77, source=source, tags={"place": "lab"}), sync=False
-        )
+        tags = {"place": "lab"}
+        places.write_in(self.path, Manifest(self.id, name, 77, source=source, tags=tags))
         self.end: dict[str, Any] | None = None
         writer = RecordingWriter(
             self.path,
@@ -119,7 +118,7 @@ class Made:
             self.change(ended(self.end))
 
     def change(self, how: Callable[[Manifest], Manifest]) -> None:
-        change_in(self.path, how, sync=False)
+        places.change_in(self.path, how)
 
     def set(self, **values: Any) -> None:
         self.change(lambda now: changed(now, **values))
@@ -131,7 +130,7 @@ class Made:
         )
 
     def manifest(self) -> Manifest:
-        found = read_in(self.path)
+        found = places.read_in(self.path)
         assert found is not None
         return found
 
@@ -397,7 +396,7 @@ def test_any_flipped_bit_of_a_summary_costs_that_segment(made: Made) -> None:
 
 @pytest.mark.parametrize("harm", ["gone", "cut", "flipped", "empty"])
 def test_without_its_manifest_a_recording_answers_nothing(made: Made, harm: str) -> None:
-    path = made.path / MANIFEST
+    path = places.manifest_of(made.path)
     data = path.read_bytes()
     if harm == "gone":
         path.unlink()
@@ -411,10 +410,10 @@ def test_without_its_manifest_a_recording_answers_nothing(made: Made, harm: str)
 
 def test_a_manifest_that_was_made_again_is_told(made: Made) -> None:
     before = made.entry()
-    (made.path / MANIFEST).unlink()
+    places.manifest_of(made.path).unlink()
     inventory = made.inventory()
     assert (inventory.id, inventory.name, inventory.is_proven) == (made.id, "run", False)
-    write_in(made.path, made_again(inventory, None))
+    places.write_in(made.path, made_again(inventory, None))
     inventory = made.inventory()
     assert made.manifest().logs.keys() == {0, 1, 2, 3}
     assert (inventory.misfits, inventory.lost, inventory.is_proven) == ([], [], False)
@@ -431,8 +430,8 @@ def test_a_manifest_that_was_made_again_says_what_the_old_one_said(made: Made) -
     made.set(notes=(Note(5, "x"),))
     made.segments[2].unlink()
     before = made.entry()
-    (made.path / MANIFEST).unlink()
-    write_in(made.path, made_again(made.inventory(), old_in(made.path)))
+    places.manifest_of(made.path).unlink()
+    places.write_in(made.path, made_again(made.inventory(), places.old_in(made.path)))
     # What is missing does not come back; only the last change is lost.
     entry = made.entry()
     assert entry == replace(before, notes=[], end={**before.end, "status": "unproven"})
@@ -443,9 +442,9 @@ def test_a_manifest_that_was_made_again_says_what_the_old_one_said(made: Made) -
 def test_the_old_manifest_may_lack_the_last_segment_and_the_end(made: Made) -> None:
     before = made.entry()
     whole = made.manifest()
-    write_in(made.path, changed(whole, status="open", files=whole.files[:3]))
-    (made.path / MANIFEST).rename(made.path / MANIFEST_OLD)
-    write_in(made.path, made_again(made.inventory(), old_in(made.path)))
+    places.write_in(made.path, changed(whole, status="open", files=whole.files[:3]))
+    places.manifest_of(made.path).rename(made.path / MANIFEST_OLD)
+    places.write_in(made.path, made_again(made.inventory(), places.old_in(made.path)))
     assert made.manifest().logs.keys() == {0, 1, 2, 3}
     assert made.entry() == unproven(before)
 
@@ -455,11 +454,11 @@ def test_without_a_manifest_most_segments_say_what_recording_it_is(
 ) -> None:
     other = Made(directory, "other")
     shutil.copy(other.segments[0], made.segments[0])
-    (made.path / MANIFEST).unlink()
+    places.manifest_of(made.path).unlink()
     inventory = made.inventory()
     assert inventory.id == made.id
     assert inventory.summaries.keys() == {1, 2, 3}
-    write_in(made.path, made_again(inventory, None))
+    places.write_in(made.path, made_again(inventory, None))
     entry = made.entry()
     assert (entry.id, entry.status) == (made.id, "unproven")
     assert kept(entry) == by_topic(1, 2, 3)
@@ -501,8 +500,8 @@ def test_what_a_crash_took_of_a_listed_segment(made: Made) -> None:
     assert lost(entry) == gone
     # Also when the manifest is made again.
     made.set(notes=(Note(5, "x"),))
-    (made.path / MANIFEST).unlink()
-    write_in(made.path, made_again(made.inventory(), old_in(made.path)))
+    places.manifest_of(made.path).unlink()
+    places.write_in(made.path, made_again(made.inventory(), places.old_in(made.path)))
     entry = made.entry()
     assert (entry.status, lost(entry)) == ("damaged", gone)
 
@@ -550,7 +549,7 @@ def test_chunks_that_cannot_be_read_are_lost_by_topic(made: Made) -> None:
 
 
 def test_nothing_says_what_recording_it_is(directory: StoreDirectory) -> None:
-    directory.new_recording("x")
+    directory.make_folder("x")
     places.segment(directory.path, "x").write_bytes(b"nothing")
     with closing(Catalog(Path("/nowhere"), "x", in_memory=True)) as catalog:
         with pytest.raises(ManifestError, match="x has no manifest"):
@@ -560,9 +559,9 @@ def test_nothing_says_what_recording_it_is(directory: StoreDirectory) -> None:
 
 
 def test_a_manifest_that_cannot_be_read_is_told(made: Made, tmp_path: Path) -> None:
-    (made.path / MANIFEST).rename(tmp_path / "elsewhere")
-    (made.path / MANIFEST).symlink_to(tmp_path / "elsewhere")
-    with pytest.raises(StoreError, match=MANIFEST):
+    places.manifest_of(made.path).rename(tmp_path / "elsewhere")
+    places.manifest_of(made.path).symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(StoreError, match="is a link"):
         made.inventory()
 
 
@@ -642,13 +641,13 @@ def test_a_lost_manifest_is_told_at_every_opening(made: Made) -> None:
     """Nothing is deleted, and nothing made again unasked."""
     opened(made.directory)
     names = sorted(path.name for path in made.path.iterdir())
-    (made.path / MANIFEST).unlink()
+    places.manifest_of(made.path).unlink()
     for _ in range(2):
         entries, report = opened(made.directory)
         assert entries == []
         assert report.unreadable.keys() == {made.id}
         assert "has no manifest" in report.unreadable[made.id]
-        assert sorted({*(path.name for path in made.path.iterdir()), MANIFEST}) == names
+        assert sorted(path.name for path in made.path.iterdir()) == names
 
 
 def test_an_unlisted_segment_is_listed_at_the_opening(made: Made) -> None:

@@ -30,7 +30,6 @@ from benchmarks.simulator.write import write_bag
 from hybridlog_storage.catalog import CATALOG, RecordingEntry
 from hybridlog_storage.errors import DatabaseError, IndexChangedError, SegmentError, StoreError
 from hybridlog_storage.manifest import replace as changed
-from hybridlog_storage.manifests import change_in
 from hybridlog_storage.mongo.database import Database
 from hybridlog_storage.mongo.index_state import RECORDINGS, STORE, IndexState, Through
 from hybridlog_storage.mongo.mongod import EmbeddedMongod
@@ -228,7 +227,7 @@ def unsealed(store: hl.Store, size: int, *, listed: bool) -> None:
     path.with_name(path.name + ".open").write_bytes(path.read_bytes()[:size])
     path.unlink()
     if not listed:
-        change_in(
+        places.change_in(
             path.parent,
             lambda now: changed(
                 now, status="open", files=tuple(one for one in now.files if one.number != number)
@@ -904,7 +903,7 @@ def test_opening_does_not_take_the_directory_of_a_recording_that_begins(
         with hl.open(path, require_database=True) as other:
             assert other.recordings() == []
 
-    calls.change(StoreDirectory, "new_recording", made)
+    calls.change(StoreDirectory, "make_folder", made)
     with hl.open(path, require_database=True) as store:
         store.record(short)
         assert store.verify().findings == []

@@ -39,7 +39,7 @@ from hybridlog_storage.errors import (
     UsageError,
 )
 from hybridlog_storage.manifest import replace
-from hybridlog_storage.manifests import MANIFEST_LOCK, change_in
+from hybridlog_storage.manifests import MANIFEST_LOCK
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.mongo.database import Database
 from hybridlog_storage.mongo.index_state import IndexState
@@ -385,7 +385,7 @@ def test_intervals_of_a_label_and_of_nobody(place: Path, uri: str) -> None:
 
 
 def test_a_removal_that_was_announced_is_finished(place: Path, uri: str) -> None:
-    change_in(places.folder(place, "one"), lambda now: replace(now, status="removed"))
+    places.change_in(places.folder(place, "one"), lambda now: replace(now, status="removed"))
     with hl.open(place, mongo=uri) as store:
         assert store.repairs.removed == ["one"]
         assert not store.recordings()
@@ -639,7 +639,7 @@ def test_two_of_one_name_are_told_apart_by_their_ids(place: Path, uri: str, tmp_
     with hl.open(place, mongo=uri) as store:
         one = store.entry("one").id
         other = store.record(make_log(tmp_path / "b.mcap", 500), name="two").entry.id
-    change_in(places.root(place) / other, lambda now: replace(now, name="one"))
+    places.change_in(places.root(place) / other, lambda now: replace(now, name="one"))
     with hl.open(place, mongo=NOWHERE) as store:
         with pytest.raises(TopicError, match=f"'one' is ambiguous. There are: {one}, {other}"):
             store.select(["one"])

@@ -25,7 +25,6 @@ from hybridlog_storage.disk import files
 from hybridlog_storage.disk.directory import StoreDirectory
 from hybridlog_storage.errors import HybridlogError, PayloadError, StoreError, TimeError
 from hybridlog_storage.manifest import File, Manifest, new_id, replace
-from hybridlog_storage.manifests import MANIFEST, change_in, read_in, write_in
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import places
@@ -71,7 +70,7 @@ keep = partial(answer, "keep")
 
 
 def logs_of(store: Path) -> dict[int, File]:
-    manifest = read_in(places.folder(store, "run"))
+    manifest = places.read_in(places.folder(store, "run"))
     assert manifest is not None
     return manifest.logs
 
@@ -121,7 +120,7 @@ def test_a_pass_makes_room_and_leaves_counts_fields_and_pins(store: Path) -> Non
     assert f"more than 90% of {quota / 1000:.1f} kB" in first["reason"]
     gone = sorted(n for step in done["plan"]["steps"] for n in step["segments"])
     # The oldest went, but for those with what is pinned.
-    manifest = read_in(places.folder(store, "run"))
+    manifest = places.read_in(places.folder(store, "run"))
     assert manifest is not None
     free = [
         number
@@ -356,7 +355,7 @@ def test_what_is_said_meanwhile_stops_what_is_not_listed(
     work = getattr(module, when)
 
     def said_before(*words: Any, **options: Any) -> Any:
-        change_in(places.folder(store, "run"), said)
+        places.change_in(places.folder(store, "run"), said)
         return work(*words, **options)
 
     monkeypatch.setattr(module, when, said_before)
@@ -376,7 +375,7 @@ def test_what_is_said_meanwhile_keeps_a_recording(
     def said_before(*words: Any) -> None:
         pin = keeping.pin_of("now", (None, None), None, "")
         said = {"tags": {"stay": "yes"}} if what == "tag" else {"pins": (pin,)}
-        change_in(places.folder(store, "run"), lambda now: replace(now, **said))
+        places.change_in(places.folder(store, "run"), lambda now: replace(now, **said))
         announce(*words)
 
     monkeypatch.setattr(edit, "announce_removal", said_before)
@@ -469,20 +468,20 @@ class Counting(files.System):
 def test_a_plan_opens_each_manifest_once(recorded: Path, tmp_path: Path, calls: Calls) -> None:
     with hl.open(tmp_path / "many", mongo="none", create=True) as store:
         directory = store.directory
-    manifest = read_in(places.folder(recorded, "run"))
+    manifest = places.read_in(places.folder(recorded, "run"))
     assert manifest is not None
     for _ in range(1000):
         one = replace(manifest, id=new_id("run"))
         folder = directory.recording(one.id)
         folder.mkdir()
-        write_in(folder, one, sync=False)
+        places.write_in(folder, one)
     keeper = Keeper(directory, lambda *_: None)
     rules = Rules.of({"max-age": "0s"})
     counting = Counting()
     time.sleep(0.1)  # what was written just now is read again
     calls.system(counting)
     assert len(keeper.plan(rules).steps) == 1000
-    assert counting.opened == [MANIFEST] * 1000
+    assert counting.opened == [f"{one}.json" for one in directory.ids()]
     counting.opened.clear()
     assert keeper.plan(rules).steps
     assert counting.opened == []

@@ -48,7 +48,7 @@ from hybridlog_storage.catalog import CATALOG, RecordingEntry
 from hybridlog_storage.errors import TimeError, TopicError
 from hybridlog_storage.manifest import Manifest
 from hybridlog_storage.manifest import replace as changed
-from hybridlog_storage.manifests import MANIFEST, MANIFEST_OLD, change_in
+from hybridlog_storage.manifests import MANIFEST_OLD
 from hybridlog_storage.mongo.index_state import IndexState, Through
 from hybridlog_storage.mongo.mongod import EmbeddedMongod
 from hybridlog_storage.segments.segment_writer import SegmentSettings
@@ -655,7 +655,7 @@ class Machine(RuleBasedStateMachine):
         known = self.model[recording]
         folder = places.folder(self.store.directory.path, recording)
         self.store.edit(recording, note="the last change")
-        (folder / MANIFEST).unlink()
+        places.manifest_of(folder).unlink()
         known.status = "unproven"
         if not has_old:
             (folder / MANIFEST_OLD).unlink()
@@ -877,7 +877,7 @@ def change_manifest(folder: Path, without: int | None, **values: Any) -> None:
         marks = tuple(one for one in now.marks if one.segment != without or without is None)
         return changed(now, files=files, marks=marks, **values)
 
-    change_in(folder, how)
+    places.change_in(folder, how)
 
 
 def _exactly(topic: str) -> str:

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 import hybridlog as hl
 from hybridlog_storage.catalog import CATALOG
 from hybridlog_storage.manifest import Loss, encode, replace
-from hybridlog_storage.manifests import MANIFEST, MANIFEST_OLD
+from hybridlog_storage.manifests import MANIFEST_OLD
 from tests import odd_values, places
 from tests.cli.within import answer
 from tests.copying.conftest import expire
@@ -94,8 +94,10 @@ def hold(template: Path, path: Path, manifest: Any, commands: Sequence[Sequence[
     shutil.copytree(template, path)
     text = json.dumps(manifest, separators=(",", ":")).encode()
     folder = places.folder(path, "odd")
-    (folder / MANIFEST).write_bytes(b"%b\n%b\n" % (text, blake3(text).hexdigest().encode()))
-    (folder / MANIFEST_OLD).write_bytes((folder / MANIFEST).read_bytes())
+    (places.manifest_of(folder)).write_bytes(
+        b"%b\n%b\n" % (text, blake3(text).hexdigest().encode())
+    )
+    (folder / MANIFEST_OLD).write_bytes((places.manifest_of(folder)).read_bytes())
     other = ("fetch", "-t", "/number", "-r", "other", "--count")
     for command in (other, *commands, other):
         found = answer(*command, "--mongo", NOWHERE, store=path, code=None)

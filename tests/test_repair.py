@@ -12,7 +12,7 @@ import pytest
 import hybridlog as hl
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.manifest import replace
-from hybridlog_storage.manifests import MANIFEST, MANIFEST_OLD, change_in, read_in, write_in
+from hybridlog_storage.manifests import MANIFEST_OLD
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import places
@@ -174,7 +174,7 @@ def test_what_a_kill_has_left_is_sealed_before_its_manifest_is_made(store: Path)
     folder = places.folder(store, "one")
     for segment in [*folder.glob("*.mcap")]:
         segment.rename(segment.with_name(f"{segment.name}.open"))
-    (folder / MANIFEST).write_bytes(b"")
+    places.manifest_of(folder).write_bytes(b"")
     (folder / MANIFEST_OLD).unlink()
     assert repair(store) == {("one", "manifest"): True}
     assert look(store) == ("unproven", COUNT, 0)
@@ -189,7 +189,7 @@ def test_a_manifest_is_made_again_when_it_is_asked_for(
     with closing(hl.open(store, mongo=NOWHERE)) as opened:
         opened.edit("one", tag={"place": "lab"})
         opened.edit("one", note="wind")
-    path = folder / MANIFEST
+    path = places.manifest_of(folder)
     data = path.read_bytes()
     if harm == "gone":
         path.unlink()
@@ -226,14 +226,14 @@ def test_a_manifest_that_is_made_again_takes_no_name_of_another(store: Path) -> 
         opened.edit("one", name="first")
         with opened.start("one") as recording:
             recording.write(Channel("/m", "json", None), b"{}", log_time=1)
-    (folder / MANIFEST).unlink()
+    places.manifest_of(folder).unlink()
     (folder / MANIFEST_OLD).unlink()
     answer("verify", "--repair", "--mongo", "none", store=store, code=None)
     assert places.name_of(folder) == "one-2"
 
 
 def test_a_recording_without_a_manifest_is_named(store: Path) -> None:
-    (places.folder(store, "one") / MANIFEST).unlink()
+    places.manifest_of(places.folder(store, "one")).unlink()
     recording = places.id_of(store, "one")
     options = ("--mongo", "none")
     for command in (("ls",), ("fetch", "-t", "/n", "--count"), ("verify",)):
@@ -246,11 +246,13 @@ def test_a_recording_without_a_manifest_is_named(store: Path) -> None:
 def test_segments_that_the_manifest_does_not_list(store: Path) -> None:
     """The manifest is an older one, from a backup."""
     folder = places.folder(store, "one")
-    change_in(folder, lambda now: replace(now, files=tuple(f for f in now.files if f.number != 3)))
-    assert read_in(folder).logs.keys().isdisjoint({3})  # type: ignore[union-attr]
+    places.change_in(
+        folder, lambda now: replace(now, files=tuple(f for f in now.files if f.number != 3))
+    )
+    assert places.read_in(folder).logs.keys().isdisjoint({3})  # type: ignore[union-attr]
     assert look(store) == ("complete", COUNT, 0)
     # The opening has listed it.
-    assert 3 in read_in(folder).logs  # type: ignore[union-attr]
+    assert 3 in places.read_in(folder).logs  # type: ignore[union-attr]
     assert repair(store) == {}
     file(store, 3).unlink()
     status, messages, lost = look(store)
@@ -284,11 +286,11 @@ def test_a_segment_that_was_restored_is_answered_from_again(store: Path) -> None
 def test_a_recording_without_its_end_gets_one(store: Path) -> None:
     """The crash came between two segments."""
     folder = places.folder(store, "one")
-    manifest = read_in(folder)
+    manifest = places.read_in(folder)
     assert manifest is not None
-    write_in(folder, replace(manifest, status="open"))
+    places.write_in(folder, replace(manifest, status="open"))
     assert look(store) == ("complete", COUNT, 0)  # the last segment says it
-    assert read_in(folder).status == "complete"  # type: ignore[union-attr]
+    assert places.read_in(folder).status == "complete"  # type: ignore[union-attr]
 
 
 def test_a_mark_beside_a_lost_segment_takes_nothing_of_it(store: Path) -> None:

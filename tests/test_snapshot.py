@@ -18,7 +18,6 @@ from hybridlog.maintenance.opening import StoreFiles
 from hybridlog.snapshot import Snapshot
 from hybridlog_storage.errors import TopicError
 from hybridlog_storage.manifest import replace
-from hybridlog_storage.manifests import change_in
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.summary import (
     RecordingSummary,
@@ -243,7 +242,7 @@ def test_a_manifest_that_has_changed_is_read_at_the_opening(tmp_path: Path) -> N
         path = places.folder(store.directory.path, "talk")
         (before,) = store.summaries()
     assert before.tags == {}
-    change_in(path, lambda now: replace(now, tags={"place": "hall"}))
+    places.change_in(path, lambda now: replace(now, tags={"place": "hall"}))
     with hl.open(tmp_path / "store") as store:
         (now,) = store.summaries()
     assert now.tags == {"place": "hall"}
@@ -270,7 +269,7 @@ def test_topics_that_another_process_changes_meanwhile(
                 recording.write(Channel(f"/{name}", "json", None, {}), b"{}", log_time=10**18)
     with hl.open(path, mongo="none") as store, hl.open(path, mongo="none") as other:
         assert len(store.recordings()) == 2
-        change_in(places.folder(path, "b"), lambda now: replace(now, tags={"seen": "yes"}))
+        places.change_in(places.folder(path, "b"), lambda now: replace(now, tags={"seen": "yes"}))
         ask = store.catalog.recording
 
         def asked(recording: str) -> Any:

@@ -485,7 +485,7 @@ def show_segment(path: Path, *, as_json: bool) -> None:
     Raises:
         StoreError: It is being written, or is no segment of a store.
     """
-    from hybridlog_storage.manifests import MANIFEST
+    from hybridlog_storage.manifests import manifests_at
     from hybridlog_storage.segments.segment_reader import SegmentReader
 
     stem = path.name.split(".")[0]
@@ -500,7 +500,7 @@ def show_segment(path: Path, *, as_json: bool) -> None:
             summary = reader.summary()
             bytes_all = reader.size
     except SegmentError:
-        if not (path.parent / MANIFEST).exists():
+        if not manifests_at(path.parent.absolute()).path(path.parent.name).exists():
             _refuse_log(path)
         raise
     chunks = summary.chunks

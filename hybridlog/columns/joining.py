@@ -19,7 +19,7 @@ from hybridlog.columns.payload_files import RecordingPayloads, next_number
 from hybridlog.columns.payload_writer import TopicWriter
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import StoreError
-from hybridlog_storage.manifests import read_in
+from hybridlog_storage.manifests import manifests_at
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -48,8 +48,7 @@ def join(path: Path, channels: Iterable[Channel], max_files: int) -> int:
     """
     freed = 0
     for channel in channels:
-        manifest = read_in(path)
-        assert manifest is not None  # something has expired
+        manifest = manifests_at(path).read(path.name)
         columns = FieldColumns(channel)
         beginning = f"{columns.folder}/{table_schema_of(channel)[:8]}-"
         small = [

@@ -16,7 +16,7 @@ from hybridlog_storage.disk.directory import PAYLOADS, payload_names
 from hybridlog_storage.errors import HybridlogError, SegmentError, StoreError
 from hybridlog_storage.lazy import lazy
 from hybridlog_storage.manifest import Stored, replace
-from hybridlog_storage.manifests import change_in, read_in
+from hybridlog_storage.manifests import manifests_at
 from hybridlog_storage.segments.segment_file import sealed_name
 from hybridlog_storage.segments.segment_reader import SegmentReader
 
@@ -75,7 +75,7 @@ def announce(
         gone = dict.fromkeys((*now.deleted, *deleted))
         return replace(now, fields=tuple(fields.values()), deleted=tuple(gone))
 
-    manifest = change_in(recording, how)
+    manifest = manifests_at(recording).change(recording.name, how)
     publish(recording, manifest)
     return manifest
 
@@ -83,7 +83,7 @@ def announce(
 def take_back(recording: Path) -> None:
     """Remove unfinished files, unless the manifest lists them; the next opening does the rest."""
     with suppress(HybridlogError, OSError):
-        publish(recording, read_in(recording))
+        publish(recording, manifests_at(recording).find(recording.name))
 
 
 def publish(recording: Path, manifest: Manifest | None) -> None:
@@ -203,7 +203,7 @@ class RecordingPayloads:
         """
         if self._given is not None:
             return self._given
-        manifest = read_in(self._recording)
+        manifest = manifests_at(self._recording).find(self._recording.name)
         return () if manifest is None else manifest.fields
 
     def reader(self, listed: Fields) -> FieldFile:

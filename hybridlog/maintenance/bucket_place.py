@@ -55,10 +55,9 @@ from hybridlog_storage.errors import (
     unreadable,
 )
 from hybridlog_storage.manifest import Manifest, Mark, Note, encode, new_random
-from hybridlog_storage.manifests import MANIFEST
 from hybridlog_storage.remote import TRIES
 from hybridlog_storage.remote.bucket import Upload, other_name, path_of
-from hybridlog_storage.remote.lists import RECORDINGS, TABLES
+from hybridlog_storage.remote.lists import MANIFEST, RECORDINGS, TABLES
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable

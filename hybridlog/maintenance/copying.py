@@ -33,7 +33,6 @@ from hybridlog_storage.disk import durability, files
 from hybridlog_storage.disk.directory import REMOVED, SENDING, StoreDirectory, gone
 from hybridlog_storage.errors import HeldError, StoreError, TopicError, UsageError
 from hybridlog_storage.manifest import Manifest, encode, replace
-from hybridlog_storage.manifests import read_in, write_in
 from hybridlog_storage.remote.bucket import digest_like
 from hybridlog_storage.segments.segment_format import not_copied_record
 from hybridlog_storage.stopping import pause
@@ -283,7 +282,7 @@ class _Copying:
     def _manifest(self, recording: str) -> Manifest | None:
         """The manifest of a recording here; None if it cannot be read."""
         with suppress(StoreError):
-            return read_in(self._source.recording(recording))
+            return self._source.manifests.find(recording)
         return None
 
     def _note_known(self, one: RecordingEntry | RecordingSummary, known: Copied) -> None:
@@ -455,6 +454,7 @@ class _Sent:
 
     def __init__(self, directory: StoreDirectory, recording: str) -> None:
         self.path = directory.recording(recording)
+        self._manifests = directory.manifests
         inventory = take_inventory(directory, recording)
         if inventory.id != recording or inventory.misfits or not inventory.is_proven:
             raise RefusedError(
@@ -481,7 +481,7 @@ class _Sent:
 
     def has_changed(self) -> bool:
         """True if files of it were replaced since: the manifest says so."""
-        now = read_in(self.path)
+        now = self._manifests.find(self.manifest.id)
         return now is not None and (now.files, now.fields) != (
             self.manifest.files,
             self.manifest.fields,
@@ -500,12 +500,11 @@ def _with_fields(source: StoreDirectory, sent: _Sent) -> Iterator[StoreDirectory
     with at_work(source) as folder:
         scratch = StoreDirectory.create(folder / "store")
         path = scratch.recording(sent.manifest.id)
-        files.make_folder(path)
+        scratch.manifests.create(sent.manifest)
         for file in sent.files:
             target = file.below(path)
             files.make_folders(target.parent)
             files.link(file.below(sent.path), target)
-        write_in(path, sent.manifest)
         expire(scratch, sent.manifest.id, sent.segments, record=not_copied_record)
         yield scratch
 

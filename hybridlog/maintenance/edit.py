@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 
 from hybridlog.entries import (
-    announce_removal,
     free_name_in,
     listed,
     put_entry,
@@ -32,10 +31,8 @@ from hybridlog_storage.errors import (
     UsageError,
 )
 from hybridlog_storage.manifest import Manifest, Mark, new_random, replace, with_totals
-from hybridlog_storage.manifests import change_in, read_in
 from hybridlog_storage.messages import EXPIRED_IDS, Batch, Channel
 from hybridlog_storage.mongo.index_state import IndexState
-from hybridlog_storage.remote.store import RemoteDirectory
 from hybridlog_storage.segments.chunk import pack
 from hybridlog_storage.segments.chunk_builder import ChunkBuilder
 from hybridlog_storage.segments.compression import Compressor
@@ -75,14 +72,14 @@ def change(
     with ExitStack() as held:
         held.enter_context(directory.changing())
         if name is not None:
-            held.enter_context(directory.alone())
+            held.enter_context(directory.manifests.creating())
             free, others = free_name_in(catalog, name, entry.id), how
 
             def how(now: Manifest) -> Manifest:
                 return replace(others(now), name=free)
 
         try:
-            directory.change(entry.id, how)
+            directory.manifests.change(entry.id, how)
         except RecordingGoneError as error:
             raise gone(entry.name) from error
         put_entry(directory, catalog, entry.id, is_open=directory.is_recorded(entry.id))
@@ -155,7 +152,9 @@ def mark(
 
             def announce(sealed: Sealed) -> None:
                 change = listed(sealed)
-                change_in(path, lambda now: replace(change(now), marks=(*now.marks, marked)))
+                here.manifests.change(
+                    entry.id, lambda now: replace(change(now), marks=(*now.marks, marked))
+                )
 
             try:
                 segment.define([(channel_id, schema_id, channel)])
@@ -165,7 +164,7 @@ def mark(
                 segment.seal(sync=True, on_sealing=announce)
             except BaseException:
                 segment.abandon()
-                _take_back(segment)
+                _take_back(here, entry.id, segment)
                 raise
         now = put_entry(directory, catalog, entry.id)
         if entry.is_decoded:
@@ -195,8 +194,7 @@ def unmark(
         UsageError: It has no such mark.
     """
     with directory.writing(entry.id, entry.name, wait_s=LOCK_WAIT_S):
-        manifest = read_in(directory.recording(entry.id))
-        marks = manifest.marks if manifest is not None else ()
+        marks = directory.manifests.read(entry.id).marks
         chosen = [mark for mark in marks if mark.text == text and moment in {None, mark.time}]
         if not chosen:
             when = "" if moment is None else " at this time"
@@ -217,21 +215,19 @@ def unmark(
             return with_totals(made)
 
         with directory.at_hand(entry.id, numbers) as here:
-            path = here.recording(entry.id)
-            remove_marks(path, change_in(path, change))
+            remove_marks(here.recording(entry.id), here.manifests.change(entry.id, change))
         now = put_entry(directory, catalog, entry.id)
         if entry.is_decoded:
             decode_again(directory, catalog, now)
 
 
-def _take_back(segment: SegmentFile) -> None:
+def _take_back(directory: StoreDirectory, recording: str, segment: SegmentFile) -> None:
     """Remove the segment of a failed mark, unless the manifest lists it.
 
     The next opening of the store finishes a removal that fails, or a listed mark.
     """
     with suppress(StoreError, OSError):
-        manifest = read_in(segment.path.parent)
-        if manifest is not None and segment.number not in manifest.logs:
+        if segment.number not in directory.manifests.read(recording).logs:
             files.unlink(segment.path)
 
 
@@ -322,9 +318,9 @@ def remove(
 ) -> None:
     """Delete a recording.
 
-    The manifest announces it first. Then the directory gets a hidden name, and the recording
-    is gone; the next opening removes remaining files. In a bucket it is listed no more, and its
-    objects stay for those who read them.
+    Its manifest says so first, then its files go, then the manifest; who may write finishes what
+    was interrupted. In a bucket it is listed no more, and its objects stay for those who read
+    them.
 
     Args:
         directory: The store.
@@ -339,23 +335,15 @@ def remove(
         DatabaseError: MongoDB fails; the files are gone, and the next connection clears it.
     """
     with directory.writing(entry.id, entry.name, wait_s=LOCK_WAIT_S):
-        if isinstance(directory, RemoteDirectory):
-            check(cast("Manifest", read_in(directory.recording(entry.id))))
-            directory.drop(entry.id)
-            catalog.remove(entry.id)
-            return
-        announce_removal(directory, entry.id, check)
-        tables.announce_removal(directory, entry.id)
-        hidden = directory.hide(entry.id)
         try:
-            catalog.remove(entry.id)
-            with suppress(OSError):  # the next connection removes them
-                tables.remove(directory, entry.id, {c.type for c in entry.channels})
-            if database is not None:
-                _clear(database, entry)
-        finally:
-            # On a full disk, the space of these files is needed first.
-            directory.sweep(hidden)
+            directory.manifests.remove(entry.id, check)
+        except RecordingGoneError as error:
+            raise gone(entry.name) from error
+        catalog.remove(entry.id)
+        with suppress(OSError, StoreError):  # the next connection removes them
+            tables.remove(directory, entry.id, {c.type for c in entry.channels})
+        if database is not None:
+            _clear(database, entry)
 
 
 def _clear(database: Database, entry: RecordingEntry) -> None:

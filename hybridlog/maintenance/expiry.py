@@ -33,7 +33,7 @@ from hybridlog.maintenance.thinning import replace_chunks
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk import durability, files
 from hybridlog_storage.errors import HybridlogError, SegmentError, StoreError
-from hybridlog_storage.manifests import read_in
+from hybridlog_storage.manifests import manifests_at
 from hybridlog_storage.segments.segment_format import expired_record
 from hybridlog_storage.settings import EXPIRED
 
@@ -136,16 +136,13 @@ class _Expiry:
         self._topics = topics
         self._check = check
         self._record = record
-        manifest = read_in(path)
-        if manifest is None:
-            raise StoreError(f"{path} has no manifest: run `hybridlog verify --repair` first.")
-        self._manifest = manifest
+        self._manifest = manifests_at(path).read(path.name)
         self._chosen: dict[int, set[int]] = {}  # numbers of chunks by segment
         self._summaries: dict[int, SegmentSummary] = {}
         self._writers: dict[_Key, TopicWriter] = {}
         self._written: dict[tuple[int, int], list[int]] = {}  # checksums by segment and chunk
         self._made: list[Fields] = []
-        self._numbers = count(next_number(manifest))
+        self._numbers = count(next_number(self._manifest))
         for segment in walk(path, segments):
             self._choose(segment)
 

@@ -364,9 +364,9 @@ def _is_current(indexed: Indexed | None, entry: RecordingEntry) -> bool:
 
 
 def keys_present(directory: StoreDirectory) -> set[str]:
-    """Keys of all recordings with a directory."""
-    with directory.alone():  # a copy may be about to take the place of another
-        return {recording[-16:] for recording in directory.ids()}
+    """Keys of all recordings, also of those that have lost their manifests."""
+    recordings = *directory.ids(), *directory.manifests.without()
+    return {recording[-16:] for recording in recordings}
 
 
 def remove_documents(database: Database, key: str, indexed: Indexed | None) -> None:

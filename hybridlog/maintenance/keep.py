@@ -41,7 +41,6 @@ from hybridlog_storage.errors import (
     UsageError,
 )
 from hybridlog_storage.manifest import Pin, with_file
-from hybridlog_storage.manifests import read_in
 from hybridlog_storage.remote.store import RemoteDirectory
 from hybridlog_storage.settings import read_settings
 
@@ -190,7 +189,7 @@ class Keeper:
 
     def _held(self, now: int) -> Iterator[Held]:
         """The content of the recordings; damaged ones are left alone."""
-        looks = self._directory.looks(self._directory.names())
+        looks = self._directory.looks(self._directory.ids())
         self._known = {one: known for one, known in self._known.items() if one in looks}
         for recording, look in looks.items():
             before, held = self._known.get(recording, ("", None))
@@ -210,8 +209,8 @@ class Keeper:
                 yield held if held.is_ended else replace(held, segments=[])
 
     def _read(self, recording: str, now: int) -> Held | None:
-        manifest = read_in(self._directory.recording(recording))
-        if manifest is None or manifest.id != recording or manifest.status == "removed":
+        manifest = self._directory.manifests.find(recording)
+        if manifest is None:
             return None
         return held_of(manifest, now)
 
@@ -251,7 +250,7 @@ class Keeper:
         check, topics = partial(_check, step, rules), step.topics or None
         with self._directory.at_hand(step.id, step.segments) as here:
             done = expire(here, step.id, step.segments, topics, check=check, progress=progress)
-            here.change(step.id, partial(_retained, step.segments, topics))
+            here.manifests.change(step.id, partial(_retained, step.segments, topics))
         self._changed(step.id)
         return done.freed
 

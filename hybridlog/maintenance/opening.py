@@ -11,7 +11,7 @@ import re
 import time
 from collections.abc import Collection, Mapping
 from collections.abc import Set as AbstractSet
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -20,10 +20,10 @@ from msgspec import to_builtins
 from hybridlog.columns import payload_files
 from hybridlog.columns.layout import PAYLOAD_PARTS
 from hybridlog.entries import (
-    announce_removal,
-    check_folder,
+    NO_MANIFEST,
     describe_now,
     ended,
+    inventory_of,
     listed,
     lost_in_crash,
     take_inventory,
@@ -32,21 +32,15 @@ from hybridlog.entries import (
 from hybridlog.snapshot import UNFINISHED, Snapshot
 from hybridlog_storage.catalog import Catalog
 from hybridlog_storage.disk import durability, files
-from hybridlog_storage.disk.directory import IMPORTING, LOCK, REMOVED, SENDING
+from hybridlog_storage.disk.directory import SENDING
 from hybridlog_storage.errors import (
     DiskFullError,
     HeldError,
+    RecordingGoneError,
     StoreError,
     TopicError,
 )
 from hybridlog_storage.manifest import Manifest, replace
-from hybridlog_storage.manifests import (
-    MANIFEST,
-    change_in,
-    clear_in,
-    is_being_written,
-    read_in,
-)
 from hybridlog_storage.segments.segment_file import sealed_name
 
 if TYPE_CHECKING:
@@ -60,12 +54,9 @@ if TYPE_CHECKING:
     from hybridlog_storage.segments.segment_file import Sealed
     from hybridlog_storage.summary import RecordingSummary
 
-_OURS = frozenset({LOCK})
-"""Names in a recording's directory that hold nothing that could be lost."""
 _LEFT_OVER = re.compile(r"\.\d{6}\.mcap\.([0-9a-f]{16}|rebuilt)")
 """Names of files that were being written, and were to get another name when they were whole."""
 _MOVING = re.compile(r"(?P<before>\d{6}\.mcap)\.moving-(?P<number>\d{6})")
-_TRIES = 10
 _RECOVERED_BYTES_PER_S = 200e6
 """Size of the open segments that are recovered in a second, about."""
 
@@ -112,23 +103,16 @@ class StoreFiles:
 
         directory, catalog, report = self.directory, self.catalog, self.report
         mends = mends and not catalog.is_in_memory
-        # A recording has its directory before it has tables.
+        # A recording has its manifest before it has tables.
         gone = tables.unfinished(directory) if mends else set()
         if mends:
-            for name in directory.names():
-                if name.startswith(REMOVED):
-                    directory.sweep(name)
-                elif name.startswith(IMPORTING):
-                    _finish_copy(directory, name)
             with suppress(OSError):  # the next opening tries again
                 clear_stopped(directory)
         rows = catalog.summaries()
         report.unreadable.clear()
-        names = directory.names()
-        if any(name.startswith(IMPORTING) for name in names):
-            with directory.alone():  # one may be about to take the place of another
-                names = directory.names()
-        found = self._find(directory.looks(names), {one.id: one for one in rows}, mends=mends)
+        ids = directory.ids()
+        found = self._find(directory.looks(ids), {one.id: one for one in rows}, mends=mends)
+        self._note_lost(mends=mends)
         for summary in rows if mends or catalog.is_in_memory else ():
             # The row of a recording that is unreadable now may be valid again later.
             if summary.id not in found and summary.id not in report.unreadable:
@@ -139,6 +123,14 @@ class StoreFiles:
             tables.remove_unfinished(directory, snapshot)
             tables.remove_all(directory, gone - found.keys())
         return snapshot
+
+    def _note_lost(self, *, mends: bool) -> None:
+        """Note folders without a manifest, and remove what killed processes left of others."""
+        manifests = self.directory.manifests
+        if mends:
+            manifests.clear()
+        for name in manifests.without():
+            self.report.unreadable[name] = _lost(self.directory, name)
 
     def catch_up(self, snapshot: Snapshot, recordings: AbstractSet[str]) -> Snapshot | None:
         """All recordings after changes of some of them, as of `look_at_all`.
@@ -155,8 +147,9 @@ class StoreFiles:
             return None
         try:
             rows = {summary.id: summary for summary in catalog.summaries(recordings)}
-            found = self._find(directory.looks(sorted(recordings)), rows)
-            if report.unreadable:
+            looks = directory.looks(sorted(recordings))
+            found = self._find(looks, rows)
+            if report.unreadable or any(map(directory.has, recordings - looks.keys())):
                 return None
             topics = {one.topics: catalog.topics(one.topics) for one in found.values()}
         except StoreError:
@@ -234,8 +227,6 @@ class StoreFiles:
 
         None if the recording is gone.
         """
-        if _is_empty(self.directory, recording):
-            return None
         is_open = self.directory.is_recorded(recording)
         if not is_open and self._may_mend(recording):
             self.report.noted.add(recording)
@@ -246,27 +237,29 @@ class StoreFiles:
             return False
         return os.access(self.directory.recording(recording), os.W_OK)
 
-    def _describe(self, recording: str, *, is_open: bool) -> Described:
-        described = describe_now(self.directory, self.catalog, recording, is_open=is_open)
+    def _describe(self, recording: str, *, is_open: bool) -> Described | None:
+        try:
+            described = describe_now(self.directory, self.catalog, recording, is_open=is_open)
+        except StoreError as error:
+            if isinstance(error, RecordingGoneError) or not self.directory.has(recording):
+                return None
+            raise
         self.catalog.put(described, waits=False)
         return described
 
     def _mended(self, recording: str) -> Described | None:
         """Recover a recording after a crash, and update its catalog row; None if it is gone."""
         directory, catalog = self.directory, self.catalog
-        is_empty = _is_empty(directory, recording)
         try:
             with directory.writing(recording):
-                is_new = is_empty and directory.is_beginning(recording)
-                if is_new or not recover(directory, recording, self.report):
+                if not recover(directory, recording, self.report):
                     return None
                 described = describe_now(directory, catalog, recording)
                 catalog.put(described)
                 return described
         except HeldError:
-            if _is_empty(directory, recording):
-                return None  # a process is about to begin it
-        except TopicError:
+            pass
+        except (TopicError, RecordingGoneError):
             return None
         return self._describe(recording, is_open=directory.is_recorded(recording))
 
@@ -323,13 +316,16 @@ def _is_current(
     return True
 
 
-def _is_empty(directory: StoreDirectory, recording: str) -> bool:
-    listing = directory.listing(recording)
-    # What a list names was not begun a moment ago: its objects are lost.
-    is_empty = not (listing.manifest or listing.sealed or listing.open or directory.is_remote)
-    if is_empty and not _OURS.issuperset(listing.others):
-        raise StoreError("it has neither a manifest nor a segment, but other files")
-    return is_empty
+def _lost(directory: StoreDirectory, name: str) -> str:
+    """What to say of a folder without a manifest."""
+    try:
+        listing = directory.listing(name)
+        inventory_of(directory, name, listing, None)
+    except StoreError as error:
+        return str(error)
+    if listing.sealed or listing.open:
+        return NO_MANIFEST.format(name)
+    return "it has neither a manifest nor a segment, but other files"
 
 
 def _open_bytes(directory: StoreDirectory, recording: str) -> int:
@@ -352,71 +348,50 @@ def recover(directory: StoreDirectory, recording: str, report: RepairReport) -> 
         DiskFullError: No room; nothing is lost.
     """
     path = directory.recording(recording)
-    manifest = read_in(path)
-    check_folder(directory, recording, manifest.id if manifest is not None else "")
-    if manifest is not None and manifest.status == "removed":
-        directory.remove(recording)
-        report.removed.append(manifest.name)
+    try:
+        manifest = directory.manifests.read(recording)
+    except RecordingGoneError:
+        directory.manifests.remove(recording)  # finishes a removal, or says that there is none
+        report.removed.append(recording)
         return False
     clear_away(directory, recording)
     listing = directory.listing(recording)
-    if PAYLOAD_PARTS in listing.others or (manifest is not None and manifest.deleted):
+    if PAYLOAD_PARTS in listing.others or manifest.deleted:
         payload_files.publish(path, manifest)
-    if manifest is not None and {*manifest.unmarked} & listing.sealed.keys():
+    if {*manifest.unmarked} & listing.sealed.keys():
         remove_marks(path, manifest)
     payload_files.replace_segments(path, listing.others, manifest)
     recovered = recover_segments(directory, recording, listing, manifest)
     inventory = take_inventory(directory, recording)
-    is_empty = not inventory.summaries and not (manifest is not None and manifest.logs)
-    is_ended = manifest is not None and manifest.is_ended
-    if is_empty and not inventory.listing.sealed and not is_ended:
-        announce_removal(directory, recording)
-        directory.remove(recording)
+    is_empty = not inventory.listing.sealed and not manifest.logs
+    if is_empty and not manifest.is_ended:
+        directory.manifests.remove(recording)
         report.recovered[inventory.name] = recovered
         return False
     if recovered:
         report.recovered[inventory.name] = recovered
-    if manifest is not None:
-        adopt = unlisted(inventory)
-        end = None if is_ended else _end_of(inventory)
+    adopt = unlisted(inventory)
+    end = None if manifest.is_ended else _end_of(inventory)
 
-        def change(now: Manifest) -> Manifest:
-            now = now if adopt is None else adopt(now)
-            return now if end is None or now.is_ended else ended(end)(now)
+    def change(now: Manifest) -> Manifest:
+        now = now if adopt is None else adopt(now)
+        return now if end is None or now.is_ended else ended(end)(now)
 
-        change_in(path, change)
+    directory.manifests.change(recording, change)
     return True
-
-
-def _finish_copy(directory: StoreDirectory, hidden: str) -> None:
-    """Put a copy in its place that was whole: its manifest is written last."""
-    recording = hidden.removeprefix(IMPORTING)
-    if not directory.has(f"{hidden}/{MANIFEST}"):
-        return
-    with suppress(HeldError, TopicError), ExitStack() as held:
-        held.enter_context(directory.writing(hidden))
-        if directory.has(recording):
-            held.enter_context(directory.writing(recording))
-        held.enter_context(directory.alone())
-        directory.put_in_place(hidden, recording)
 
 
 def is_left_over(name: str) -> bool:
     """True if a file in a recording's directory is left from an interrupted step."""
     patterns = (_LEFT_OVER, _MOVING, payload_files.REPLACEMENT)
-    if name == PAYLOAD_PARTS or is_being_written(name):
-        return True
-    return any(pattern.fullmatch(name) for pattern in patterns)
+    return name == PAYLOAD_PARTS or any(pattern.fullmatch(name) for pattern in patterns)
 
 
 def clear_away(directory: StoreDirectory, recording: str) -> None:
     """Remove temporary files, and finish the renaming of segments."""
     finish_moves(directory, recording)
     path = directory.recording(recording)
-    others = directory.listing(recording).others
-    if any(map(is_being_written, others)):
-        clear_in(path)
-    for name in others:
+    for name in directory.listing(recording).others:
         if _LEFT_OVER.fullmatch(name):
             try:
                 files.unlink(path / name)
@@ -526,7 +501,7 @@ def recover_segments(
             def change(now: Manifest) -> Manifest:
                 return replace(listed(sealed)(now), losses=(*now.losses, *lost))
 
-            change_in(path, change)
+            directory.manifests.change(recording, change)
 
     recovered = []
     for number, name in listing.open.items():

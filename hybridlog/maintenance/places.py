@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
+import secrets
 import stat
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
@@ -46,7 +47,7 @@ from hybridlog_storage.manifest import (
     is_id,
     replace,
 )
-from hybridlog_storage.manifests import MANIFEST, MANIFEST_LOCK, read_in, write_in
+from hybridlog_storage.manifests import MANIFEST_LOCK
 from hybridlog_storage.remote.bucket import digest_like
 from hybridlog_storage.segments.segment_check import SegmentCheck
 from hybridlog_storage.settings import EXPIRED
@@ -314,7 +315,7 @@ class DirectoryPlace:
                 ) from error
         known = self.have([recording]).get(recording)
         if known is not None and not (known.lacks_payloads and wants_payloads):
-            self._directory.sweep(hidden)
+            _sweep(self._path)
             self.leave()
             return Begun(known)
         clear_away(self._directory, hidden)
@@ -401,12 +402,12 @@ class DirectoryPlace:
         with ExitStack() as held:
             if self.have([recording]):
                 held.enter_context(directory.writing(recording, wait_s=LOCK_WAIT_S))
-                held.enter_context(directory.alone())
                 name = self._put_over(new)
             else:
-                held.enter_context(directory.alone())
+                create = held.enter_context(directory.manifests.creating())
                 name = free_name_in(self._catalog, new.name, recording)
-                self._put(replace(new, name=name))
+                self._put()
+                create(replace(new, name=name))
             put_entry(directory, self._catalog, recording)
         self.published.append(recording)
         self.leave()
@@ -431,17 +432,18 @@ class DirectoryPlace:
         except OSError as error:
             raise durability.explain(error, path, "copying into") from error
 
-    def _put(self, manifest: Manifest) -> None:
-        """Put the recording in its place."""
-        path = self._path
-        write_in(path, manifest)
-        inventory = take_inventory(self._directory, path.name)
-        if inventory.misfits or not inventory.is_proven:
-            files.unlink(path / MANIFEST)
-            raise StoreError(
-                f"What was copied of recording {manifest.name!r} does not fit together."
-            )
-        self._directory.put_in_place(path.name, self._recording)
+    def _put(self) -> None:
+        """Put the files in their place."""
+        path, final = self._path, self._directory.recording(self._recording)
+        removed = final.with_name(f"{REMOVED}{secrets.token_hex(8)}")
+        try:
+            with suppress(FileNotFoundError):
+                files.rename(final, removed)
+            files.rename(path, final)
+            files.sync_folder(final.parent)
+        except OSError as error:
+            raise durability.explain(error, path, "renaming") from error
+        _sweep(removed)
 
     def _put_over(self, new: Manifest) -> str:
         """Put the recording in the place of a copy without payloads; returns its name."""
@@ -457,10 +459,10 @@ class DirectoryPlace:
                 files.sync_folder(self._path)
             except OSError as error:
                 raise durability.explain(error, self._path, "copying into") from error
-            self._put(made)
-            return there
+            self._put()
+            return made
 
-        return self._directory.change(self._recording, put).name
+        return self._directory.manifests.change(self._recording, put).name
 
     def hold(self, recordings: Sequence[str]) -> bool:
         """As of `Place`."""
@@ -470,7 +472,7 @@ class DirectoryPlace:
         """As of `Place`."""
         if self._recording:
             self._close()
-            self._directory.sweep(self._path.name)
+            _sweep(self._path)
 
     def leave(self) -> None:
         """As of `Place`."""
@@ -482,6 +484,13 @@ class DirectoryPlace:
     def problems(self, recording: str) -> list[str]:
         """As of `Place`."""
         return problems_of(self._directory, recording)
+
+
+def _sweep(path: Path) -> None:
+    try:
+        files.remove_tree(path)
+    except OSError as error:
+        raise durability.explain(error, path, "removing") from error
 
 
 def problems_of(
@@ -513,7 +522,7 @@ def problems_of(
 def manifest_of(directory: StoreDirectory, recording: str) -> Manifest | None:
     """The manifest of a recording; None if it is lost or damaged."""
     with suppress(ManifestError):
-        return read_in(directory.recording(recording))
+        return directory.manifests.find(recording)
     return None
 
 

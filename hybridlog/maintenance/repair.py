@@ -8,7 +8,14 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from hybridlog.columns.payload_files import open_segment
-from hybridlog.entries import free_name_in, made_again, put_entry, take_inventory, unlisted
+from hybridlog.entries import (
+    free_name_in,
+    inventory_of,
+    made_again,
+    put_entry,
+    take_inventory,
+    unlisted,
+)
 from hybridlog.maintenance import tables
 from hybridlog.maintenance.index import StoreIndex
 from hybridlog.maintenance.opening import finish_moves, moving_name, recover_segments
@@ -17,7 +24,6 @@ from hybridlog_storage.disk import durability, files
 from hybridlog_storage.disk.directory import LOCK_WAIT_S, PAYLOADS
 from hybridlog_storage.errors import HeldError, ManifestError, SegmentError, StoreError, TopicError
 from hybridlog_storage.manifest import replace
-from hybridlog_storage.manifests import MANIFEST, change_in, old_in, read_in, write_in
 from hybridlog_storage.mongo.index_state import IndexState
 from hybridlog_storage.segments.recovery import rebuild_summary
 from hybridlog_storage.segments.segment_check import SegmentCheck
@@ -29,6 +35,7 @@ if TYPE_CHECKING:
     from hybridlog.maintenance.report import Progress, RepairReport
     from hybridlog_storage.catalog import Catalog, RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
+    from hybridlog_storage.manifest import Manifest
     from hybridlog_storage.mongo.database import Database
 
 
@@ -64,7 +71,7 @@ def repair(
     done: list[Repaired] = []
     entries = None if entries is None else [*entries]
     checker = tables.TableChecker(directory)
-    names = {one: one for one in directory.ids()}
+    names = {one: one for one in (*directory.ids(), *directory.manifests.without())}
     if entries is not None:
         names = {entry.id: entry.name for entry in entries}
     for recording, name in names.items():
@@ -147,27 +154,27 @@ def _rebuild(inventory: Inventory, misfit: Misfit, path: Path) -> bool:
 def _put_manifest_right(
     directory: StoreDirectory, catalog: Catalog, recording: str
 ) -> list[Repaired]:
-    path = directory.recording(recording)
-    old = old_in(path)
+    manifests = directory.manifests
     try:
-        lacks = read_in(path) is None
+        is_lost = manifests.find(recording) is None
     except ManifestError:
-        lacks = True
-        files.unlink(path / MANIFEST)
-    if lacks:
+        is_lost = True
+    if is_lost:
         recover_segments(directory, recording, directory.listing(recording), None)
+
+        def make(old: Manifest | None) -> Manifest:
+            inventory = inventory_of(directory, recording, directory.listing(recording), None)
+            made = made_again(inventory, old)
+            return replace(made, name=free_name_in(catalog, made.name, recording))
+
+        made = manifests.restore(recording, make)
+        return [Repaired(made.name, "manifest", "made again")]
     inventory = take_inventory(directory, recording)
-    if lacks:
-        made = made_again(inventory, old)
-        with directory.alone():
-            write_in(path, replace(made, name=free_name_in(catalog, made.name, recording)))
-        return [Repaired(inventory.name, "manifest", "made again")]
-    done = []
-    if (adopt := unlisted(inventory)) is not None:
-        change_in(path, adopt)
-        names = [misfit.file for misfit in inventory.misfits if misfit.is_unlisted]
-        done += [Repaired(inventory.name, file, "listed in the manifest") for file in names]
-    return done
+    if (adopt := unlisted(inventory)) is None:
+        return []
+    manifests.change(recording, adopt)
+    names = [misfit.file for misfit in inventory.misfits if misfit.is_unlisted]
+    return [Repaired(inventory.name, file, "listed in the manifest") for file in names]
 
 
 def repair_index(

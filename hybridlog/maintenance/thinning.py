@@ -20,7 +20,7 @@ from hybridlog.columns.layout import replacement_name
 from hybridlog.columns.payload_files import open_segment
 from hybridlog_storage.errors import HybridlogError, SegmentError
 from hybridlog_storage.manifest import Stored, with_file
-from hybridlog_storage.manifests import change_in, read_in
+from hybridlog_storage.manifests import manifests_at
 from hybridlog_storage.messages import EXPIRED_IDS
 from hybridlog_storage.segments.segment_check import SegmentCheck
 from hybridlog_storage.segments.segment_file import sealed_name
@@ -86,10 +86,10 @@ def replace_chunks(
             expired = tuple(sorted({*now.logs[reader.number].expired, *topics}))
             return with_file(now, reader.number, stored=stored, expired=expired)
 
-        now = change_in(path, how)
+        now = manifests_at(path).change(path.name, how)
     except BaseException:
         with suppress(HybridlogError, OSError):  # the next opening does it
-            payload_files.replace_segments(path, [target.name], read_in(path))
+            payload_files.replace_segments(path, [target.name], manifests_at(path).read(path.name))
         raise
     if payload_files.replace_segments(path, [target.name], now) != [name]:
         raise SegmentError(f"{target} changed while it was to replace {name}")

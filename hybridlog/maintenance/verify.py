@@ -17,7 +17,6 @@ from hybridlog.maintenance.index import documents_in
 from hybridlog_storage.disk import files
 from hybridlog_storage.disk.directory import LOCK, PAYLOADS
 from hybridlog_storage.errors import ManifestError, SegmentError, StoreError
-from hybridlog_storage.manifests import MANIFEST, is_being_written
 from hybridlog_storage.mongo.index_documents import recording_key, with_prefix
 from hybridlog_storage.mongo.index_state import IndexState
 from hybridlog_storage.mongo.topic_places import TopicPlaces
@@ -103,7 +102,9 @@ def verify(
     directory.look_closely()
     index = None if database is None else _Index(database, count_all=chosen is None)
     checker = tables.TableChecker(directory)
-    for recording in directory.ids() if chosen is None else chosen:
+    if chosen is None:
+        chosen = [*directory.ids(), *directory.manifests.without()]
+    for recording in chosen:
         result.recordings += 1
         try:
             check = _Check(directory, catalog, index, recording, result, checker=checker)
@@ -222,7 +223,7 @@ class _Check:
         inventory = steady_inventory(self._directory, self._recording)
         self._name = inventory.name
         found = self._directory.lost_of(self._recording)
-        lost = {"manifest" if path == MANIFEST else path for path in found}
+        lost = {"manifest" if path == "manifest.json" else path for path in found}
         for place in sorted(lost):
             self.found(place, "its object is missing or was changed", _COPY_AGAIN)
         self._lost = lost
@@ -260,7 +261,7 @@ class _Check:
         if manifest is None:
             self.found("manifest", "it is missing, so other losses are unknown", _REPAIR)
             return
-        self._result.bytes_read += files.status(self._path / MANIFEST).st_size
+        self._result.bytes_read += files.status(self._directory.manifests.path(manifest.id)).st_size
         if manifest.status == "unproven":
             self.found(
                 "manifest",
@@ -279,8 +280,7 @@ class _Check:
             if not is_held:
                 self.found(name, "a crash has left it open", "open the store with write permission")
         for name in inventory.listing.others:
-            is_ours = name in _KNOWN or is_being_written(name)  # which an edit may do right now
-            if not is_ours and not name.endswith(".damaged"):
+            if name not in _KNOWN and not name.endswith(".damaged"):
                 self.found(name, "it is not a file of a recording", "move it out of the store")
 
     def _payloads(self, inventory: Inventory) -> None:

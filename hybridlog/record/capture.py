@@ -18,7 +18,6 @@ from msgspec import convert
 
 from hybridlog.columns.table_writer import TableWriter
 from hybridlog.entries import (
-    announce_removal,
     ended,
     free_name_in,
     listed,
@@ -34,7 +33,7 @@ from hybridlog_storage.catalog import RecordingEntry
 from hybridlog_storage.disk.directory import LOCK_WAIT_S
 from hybridlog_storage.errors import DatabaseError, DiskFullError, HybridlogError, UsageError
 from hybridlog_storage.manifest import Manifest, Source, new_id
-from hybridlog_storage.manifests import change_in, write_in
+from hybridlog_storage.manifest import replace as replaced
 from hybridlog_storage.mongo.index_state import IndexState
 from hybridlog_storage.mongo.topic_places import TopicPlaces
 from hybridlog_storage.segments.segment_format import END_METADATA, LOSSES_METADATA, json_metadata
@@ -126,17 +125,31 @@ class Capture:
         self._end: Mapping[str, Any] | None = None
         self._turn = 1
         self._held = ExitStack()
-        with self._held, directory.alone():
-            # Of two processes that record the same content now, one is refused.
-            if check is not None:
-                check(self.catalog)
-            self.entry = self._begin(name, tags, source, target.database)
+        recording = new_id(name)
+        with self._held:
+            try:
+                with directory.manifests.creating() as create:
+                    # Of two processes that record the same content now, one is refused.
+                    if check is not None:
+                        check(self.catalog)
+                    manifest = Manifest(
+                        recording,
+                        free_name_in(self.catalog, name),
+                        time.time_ns(),
+                        source=convert(dict(source), Source),
+                        tags={text(key): text(value) for key, value in tags.items()},
+                    )
+                    self.entry = self._begin(create, manifest, target.database)
+            except BaseException:
+                with suppress(HybridlogError):
+                    directory.manifests.remove(recording)
+                raise
             self._held = self._held.pop_all()
         self._target = target
-        recording = directory.recording(self.entry.id)
+        folder = directory.recording(recording)
         self._tables = TableWriter(directory.path, self.entry.id, self.entry.name)
         self.index = IndexWriter(
-            recording,
+            folder,
             self.entry,
             target,
             catalog,
@@ -147,7 +160,7 @@ class Capture:
         )
         self._held.callback(self.index.release)
         self.writer = RecordingWriter(
-            recording,
+            folder,
             recording_metadata(self.entry),
             self.index.submit,
             settings,
@@ -224,7 +237,7 @@ class Capture:
         self.index.seal(sealed)
 
     def _change(self, how: Callable[[Manifest], Manifest]) -> None:
-        change_in(self._directory.recording(self.entry.id), how, sync=self._sync)
+        self._directory.manifests.change(self.entry.id, how, sync=self._sync)
 
     def _finish(self) -> DatabaseError | None:
         self.index.close()
@@ -255,14 +268,14 @@ class Capture:
 
     def rollback(self) -> None:
         """Remove the whole recording; the next opening finishes a removal that fails."""
-        entry = self.entry
-        with suppress(HybridlogError):  # the directory's hidden name announces it, too
-            announce_removal(self._directory, entry.id)
+        entry, manifests = self.entry, self._directory.manifests
+        with suppress(HybridlogError):  # or else the files go first
+            manifests.change(entry.id, lambda now: replaced(now, status="removed"))
         self.writer.abort()
         self.index.abandon()
         self._tables.discard()
         with suppress(HybridlogError):
-            self._directory.remove(entry.id)
+            manifests.remove(entry.id)
         with suppress(HybridlogError):
             self.catalog.remove(entry.id)
         # If MongoDB is unavailable, the next connection finds an entry without files.
@@ -276,32 +289,17 @@ class Capture:
         self._held.close()
 
     def _begin(
-        self,
-        name: str,
-        tags: Mapping[str, str],
-        source: Mapping[str, Any],
-        database: Database | None,
+        self, create: Callable[[Manifest], None], manifest: Manifest, database: Database | None
     ) -> RecordingEntry:
-        """Create and lock the recording's directory, its manifest and its index entry."""
-        manifest = Manifest(
-            new_id(name),
-            free_name_in(self.catalog, name),
-            time.time_ns(),
-            source=convert(dict(source), Source),
-            tags={text(key): text(value) for key, value in tags.items()},
-        )
+        """Create and lock the recording's folder, then its manifest and its index entry."""
         recording = manifest.id
-        self._directory.new_recording(recording)
-        try:
-            lock = self._directory.writing(recording, wait_s=LOCK_WAIT_S, records=True)
-            self._held.enter_context(lock)
-            write_in(self._directory.recording(recording), manifest)
-            entry = put_entry(self._directory, self.catalog, recording, is_open=True)
-            if database is not None:
-                IndexState(database).put(entry, "open", turn=self._turn)
-        except BaseException:
-            self._directory.remove(recording)
-            raise
+        self._directory.make_folder(recording)
+        lock = self._directory.writing(recording, wait_s=LOCK_WAIT_S, records=True)
+        self._held.enter_context(lock)
+        create(manifest)
+        entry = put_entry(self._directory, self.catalog, recording, is_open=True)
+        if database is not None:
+            IndexState(database).put(entry, "open", turn=self._turn)
         return entry
 
 

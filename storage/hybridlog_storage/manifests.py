@@ -13,9 +13,6 @@ On a disk:
     recordings/<id>/manifest.old     the manifest before the last change
 
 In a bucket, the first one only. All that is in `recordings/<id>` goes with a removal.
-
-Recordings are not written so yet: their manifest is `recordings/<id>/manifest.json`, for the
-functions that end in `_in`.
 """
 
 from __future__ import annotations
@@ -24,7 +21,7 @@ import errno
 import fcntl
 import os
 import random
-import re
+import stat
 import time
 from abc import ABC, abstractmethod
 from contextlib import ExitStack, contextmanager, suppress
@@ -32,6 +29,7 @@ from typing import TYPE_CHECKING, Final
 
 from hybridlog_storage.disk import durability, files
 from hybridlog_storage.errors import (
+    DiskFullError,
     HeldError,
     ManifestError,
     ObjectChangedError,
@@ -57,11 +55,16 @@ _YIELD_S: Final = 0.05
 _last: Final[dict[Path, tuple[float, float]]] = {}
 """Of the lock that this process had last: when it was left, and how long it was held."""
 _NO_LOCKS: Final = frozenset({errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS})
-_FOLDER: Final = "manifests"
+MANIFESTS: Final = "manifests"
 _RECORDINGS: Final = "recordings"
 _SUFFIX: Final = ".json"
+_NEW: Final = ".new"
 _ALL: Final = ".lock"
 MANIFEST_LOCK: Final = "manifest.lock"
+WRITER_LOCK: Final = "writer.lock"
+_LOCKS: Final = frozenset({MANIFEST_LOCK, WRITER_LOCK})
+COPYING: Final = ".copying"
+"""Name of a file in a folder that gets its manifest when all else of it has been copied."""
 MANIFEST_OLD: Final = "manifest.old"
 
 
@@ -100,23 +103,26 @@ class Manifests(ABC):
             return None
         return _present(found)
 
-    def change(self, recording: str, how: Callable[[Manifest], Manifest]) -> Manifest:
+    def change(
+        self, recording: str, how: Callable[[Manifest], Manifest], *, sync: bool = True
+    ) -> Manifest:
         """Replace a manifest.
 
         Args:
             recording: Its id.
             how: Makes the new manifest of the newest one, perhaps several times; if it returns
                 what it was given, nothing is written. What it raises ends the change.
+            sync: Whether it is on the disk when this returns.
 
         Returns:
-            The manifest with the change; it is on the disk.
+            The manifest with the change.
 
         Raises:
             RecordingGoneError: There is no such recording, or it was removed meanwhile.
             ManifestError: The manifest is damaged.
             HybridlogError: It cannot be written; the old one is still there.
         """
-        return self._change(recording, lambda now: how(_present(now)))
+        return self._change(recording, lambda now: how(_present(now)), sync=sync)
 
     def create(self, manifest: Manifest) -> None:
         """Create the manifest of a new recording; errors as of `creating`."""
@@ -137,7 +143,8 @@ class Manifests(ABC):
 
         Args:
             recording: Its id.
-            make: Makes it of the one before the last change, if there is one.
+            make: Makes it of the one before the last change, if there is one; nobody begins a
+                recording meanwhile.
 
         Returns:
             The manifest; the one that is there if it can be read.
@@ -153,18 +160,34 @@ class Manifests(ABC):
             create(made)
             return made
 
-    def remove(self, recording: str) -> None:
+    def remove(self, recording: str, check: Callable[[Manifest], object] = lambda _: None) -> None:
         """Remove a recording with all its files; finishes a removal that was interrupted.
+
+        Args:
+            recording: Its id.
+            check: Called with the newest manifest; raises to keep the recording.
 
         Raises:
             RecordingGoneError: There is no such recording.
             HybridlogError: It cannot be changed, or something cannot be deleted.
         """
-        self._change(recording, lambda now: replace(now, status="removed"))
+
+        def removed(now: Manifest) -> Manifest:
+            if now.status != "removed":
+                check(now)
+            return replace(now, status="removed")
+
+        try:
+            self._change(recording, removed)
+        except DiskFullError:
+            self._delete_files(recording)  # which makes room for the change
+            self._change(recording, removed)
         self._delete_files(recording)
         self._forget(recording)
 
-    def _change(self, recording: str, how: Callable[[Manifest], Manifest]) -> Manifest:
+    def _change(
+        self, recording: str, how: Callable[[Manifest], Manifest], *, sync: bool = True
+    ) -> Manifest:
         end = time.monotonic() + WAIT_S
         with self._alone(recording):
             while True:
@@ -174,7 +197,7 @@ class Manifests(ABC):
                     return now
                 new = replace(made, id=now.id, created=now.created, changes=now.changes + 1)
                 try:
-                    self._replace(recording, encode(new), version)
+                    self._replace(recording, encode(new), version, sync=sync)
                 except ObjectChangedError:
                     if time.monotonic() > end:
                         raise
@@ -210,7 +233,7 @@ class Manifests(ABC):
         """Keep others, where there are locks, from replacing a manifest."""
 
     @abstractmethod
-    def _replace(self, recording: str, data: bytes, version: str) -> None:
+    def _replace(self, recording: str, data: bytes, version: str, *, sync: bool) -> None:
         """Replace a manifest. Raises ObjectChangedError if it has another version by now."""
 
     @abstractmethod
@@ -238,37 +261,101 @@ class DiskManifests(Manifests):
     """
 
     def __init__(self, path: Path) -> None:
-        self._folder = path / _FOLDER
+        self._folder = path / MANIFESTS
         self._recordings = path / _RECORDINGS
 
     def ids(self) -> list[str]:
         """Ids of all recordings that have a manifest, sorted; also of those being removed."""
+        return _ids(self._names(self._folder))
+
+    def without(self) -> list[str]:
+        """Names of folders in `recordings` without a manifest, sorted: lost, or copied by hand.
+
+        Those with nothing but locks are left out: a recording begins, or was removed. So are
+        those of copies that have not ended.
+        """
+        found = self._names(self._recordings)
+        others = sorted({*found} - {*self.ids()})
+        return [name for name in others if name[0] != "." and self._holds(name)]
+
+    def _holds(self, recording: str) -> bool:
+        """True for a folder with more than locks."""
         try:
-            names = files.names(self._folder)
+            found = files.names(self._recordings / recording).keys()
+            return COPYING not in found and not found <= _LOCKS
+        except (FileNotFoundError, NotADirectoryError):  # or a link
+            return False
+
+    def _names(self, folder: Path) -> list[str]:
+        try:
+            with files.folder(folder) as fd:
+                return os.listdir(fd)  # noqa: PTH208 - of a handle
         except FileNotFoundError:
             return []
         except OSError as error:
-            raise unreadable(error, self._folder) from error
-        return _ids(names)
+            if odd := _odd(folder / _ALL):
+                raise StoreError(odd) from error
+            raise unreadable(error, folder) from error
+
+    def path(self, recording: str) -> Path:
+        """Where the manifest of a recording lies."""
+        return self._folder / f"{recording}{_SUFFIX}"
+
+    def clear(self) -> None:
+        """Remove what is left of beginnings and removals of processes that were killed.
+
+        While a recording begins, nothing is removed.
+
+        Raises:
+            HybridlogError: Something cannot be removed.
+        """
+        if not self._left():
+            return
+        with suppress(HeldError), self._all_locked(wait_s=0):
+            try:
+                for path in self._left():
+                    files.remove_tree(path)
+            except OSError as error:
+                raise durability.explain(error, self._folder, "clearing") from error
+
+    def _left(self) -> list[Path]:
+        """Manifests that were being written, and folders without one that hold only locks."""
+        names, folders = self._names(self._folder), self._names(self._recordings)
+        known = {*self.ids()}
+        new = {f".{one}{_NEW}" for one in known}  # somebody may write them right now
+        left = [self._folder / one for one in names if one.endswith(_NEW) and one not in new]
+        for name in filter(is_id, {*folders} - known):
+            with suppress(OSError):
+                if files.names(self._recordings / name).keys() <= _LOCKS:
+                    left.append(self._recordings / name)
+        return left
 
     @contextmanager
     def creating(self) -> Iterator[Callable[[Manifest], None]]:
         """Create manifests; nobody else can create one meanwhile."""
-        files.make_folders(self._folder)
-        files.sync_folder(self._folder.parent)
-        _make_file(self._folder / _ALL)
-        with _locked(self._folder / _ALL):
+        with self._all_locked():
             yield self._create
 
+    @contextmanager
+    def _all_locked(self, wait_s: float | None = None) -> Iterator[None]:
+        try:
+            files.make_folders(self._folder)
+            files.sync_folder(self._folder.parent)
+        except OSError as error:
+            raise durability.explain(error, self._folder, "making") from error
+        _make_file(self._folder / _ALL)
+        with _locked(self._folder / _ALL, wait_s):
+            yield
+
     def _create(self, manifest: Manifest) -> None:
-        data, path = encode(manifest), self._path(manifest.id)
+        data, path = encode(manifest), self.path(manifest.id)
         if _exists(path):
             raise RecordingExistsError(f"There is a recording {manifest.id} already.")
         folder = self._recordings / manifest.id
         try:
             self._make_lock(folder)
             with _locked(folder / MANIFEST_LOCK):
-                self._write(path, data)
+                self._write(path, data, sync=True)
         except OSError as error:
             raise durability.explain(error, path, "writing") from error
 
@@ -278,16 +365,15 @@ class DiskManifests(Manifests):
         files.sync_folder(self._recordings)
         _make_file(folder / MANIFEST_LOCK)
 
-    def _path(self, recording: str) -> Path:
-        return self._folder / f"{recording}{_SUFFIX}"
-
     def _get(self, recording: str) -> tuple[bytes, str]:
-        path = self._path(recording)
+        path = self.path(recording)
         try:
             return files.read_file(path, MAX_BYTES), ""
         except FileNotFoundError:
             raise
         except OSError as error:
+            if odd := _odd(path):
+                raise ManifestError(odd) from error
             raise unreadable(error, path) from error
 
     @contextmanager
@@ -297,45 +383,63 @@ class DiskManifests(Manifests):
             try:
                 stack.enter_context(_locked(folder / MANIFEST_LOCK))
             except FileNotFoundError:
-                if not _exists(self._path(recording)):
+                if not _exists(self.path(recording)):
                     raise RecordingGoneError(f"There is no recording {recording!r}.") from None
                 self._make_lock(folder)  # copies of a store may leave out what is empty
                 stack.enter_context(_locked(folder / MANIFEST_LOCK))
             yield
 
-    def _replace(self, recording: str, data: bytes, version: str) -> None:
-        path = self._path(recording)
+    def _replace(self, recording: str, data: bytes, version: str, *, sync: bool) -> None:
+        path = self.path(recording)
         _keep_old(path, self._recordings / recording)
         try:
-            self._write(path, data)
+            self._write(path, data, sync=sync)
         except OSError as error:
             raise durability.explain(error, path, "writing") from error
 
-    def _write(self, path: Path, data: bytes) -> None:
+    def _write(self, path: Path, data: bytes, *, sync: bool) -> None:
         """Write a manifest whose lock is held."""
-        new = path.with_name(f".{path.stem}.new")
+        new = path.with_name(f".{path.stem}{_NEW}")
+        modified = time.time_ns()
+        with suppress(FileNotFoundError):
+            # Clocks of file systems tick in milliseconds, and sizes and inodes come again: what
+            # was read of a manifest must never pass for what another one says.
+            modified = max(modified, files.status(path).st_mtime_ns + 1)
         with suppress(FileNotFoundError):
             files.unlink(new)  # of a writer that died
         fd = files.open_file(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL)
         try:
             try:
                 durability.write_all(fd, [data])
-                durability.sync_file(fd)
+                os.utime(fd, ns=(modified, modified))
+                if sync:
+                    durability.sync_file(fd)
             finally:
                 os.close(fd)
-            durability.publish(new, path)
+            files.rename(new, path)
+            if sync:
+                files.sync_folder(path.parent)
         except BaseException:
             with suppress(OSError):
                 files.unlink(new)
             raise
 
     def _old(self, recording: str) -> Manifest | None:
-        found = old_in(self._recordings / recording)
-        return found if found is not None and found.id == recording else None
+        with suppress(OSError, ValueError):
+            found = decode(files.read_file(self._recordings / recording / MANIFEST_OLD, MAX_BYTES))
+            return found if found.id == recording else None
+        return None
 
     def _drop(self, recording: str) -> None:
-        with suppress(FileNotFoundError):
-            files.unlink(self._path(recording))
+        path = self.path(recording)
+        try:
+            files.unlink(path)
+        except FileNotFoundError:
+            pass
+        except OSError as error:
+            if odd := _odd(path):
+                raise ManifestError(odd) from error
+            raise durability.explain(error, path, "removing") from error
 
     def _delete_files(self, recording: str) -> None:
         folder = self._recordings / recording
@@ -377,8 +481,8 @@ class BucketManifests(Manifests):
 
     def ids(self) -> list[str]:
         """Ids of all recordings that have a manifest, sorted; 1,000 a request."""
-        about = self._bucket.objects(f"{_FOLDER}/")
-        return _ids(one.name.removeprefix(f"{_FOLDER}/") for one in about)
+        about = self._bucket.objects(f"{MANIFESTS}/")
+        return _ids(one.name.removeprefix(f"{MANIFESTS}/") for one in about)
 
     @contextmanager
     def creating(self) -> Iterator[Callable[[Manifest], None]]:
@@ -399,7 +503,7 @@ class BucketManifests(Manifests):
     def _alone(self, recording: str) -> Iterator[None]:
         yield
 
-    def _replace(self, recording: str, data: bytes, version: str) -> None:
+    def _replace(self, recording: str, data: bytes, version: str, *, sync: bool) -> None:
         self._bucket.replace(_object(recording), data, version)
 
     def _old(self, recording: str) -> Manifest | None:
@@ -419,88 +523,9 @@ class BucketManifests(Manifests):
                 self._drop(recording)
 
 
-MANIFEST: Final = "manifest.json"
-"""Name of the manifest in the folder of its recording."""
-_NEW: Final = re.compile(r"\.manifest\.old|\.manifest\.json\.[0-9a-f]{16}")
-
-
-def read_in(folder: Path) -> Manifest | None:
-    """The manifest in the folder of a recording; None if there is none.
-
-    Raises:
-        ManifestError: It is damaged.
-        StoreError: It cannot be read.
-    """
-    path = folder / MANIFEST
-    try:
-        data = files.read_file(path, MAX_BYTES)
-    except FileNotFoundError:
-        return None
-    except OSError as error:
-        raise unreadable(error, path) from error
-    try:
-        return decode(data)
-    except ValueError as error:
-        raise ManifestError(
-            f"{path} is damaged: {error}. `hybridlog verify --repair` makes it again."
-        ) from error
-
-
-def old_in(folder: Path) -> Manifest | None:
-    """The manifest of a recording before its last change; None if it cannot be read."""
-    try:
-        return decode(files.read_file(folder / MANIFEST_OLD, MAX_BYTES))
-    except (OSError, ValueError):
-        return None
-
-
-def write_in(folder: Path, manifest: Manifest, *, sync: bool = True) -> None:
-    """Write the manifest of a recording that nobody else changes.
-
-    Raises:
-        HybridlogError: It cannot be written; the one before is still there.
-    """
-    path = folder / MANIFEST
-    try:
-        modified = time.time_ns()
-        with suppress(FileNotFoundError):
-            # Clocks of file systems tick in milliseconds, and sizes and inodes come again: what
-            # was read of a manifest must never pass for what another one says.
-            modified = max(modified, files.status(path).st_mtime_ns + 1)
-        files.write_file(path, encode(manifest), sync=sync, modified=modified)
-    except OSError as error:
-        raise durability.explain(error, path, "writing") from error
-
-
-def change_in(folder: Path, how: Callable[[Manifest], Manifest], *, sync: bool = True) -> Manifest:
-    """Replace the manifest of a recording, if it is unchanged.
-
-    Args:
-        folder: That of the recording.
-        how: Makes the new manifest of the newest one; if it returns that one, nothing is
-            written. What it raises ends the change.
-        sync: Whether it is on the disk when this returns.
-
-    Raises:
-        RecordingGoneError: There is no such recording, or it was removed meanwhile.
-        ManifestError: The manifest is damaged.
-        HybridlogError: It cannot be written; the old one is still there.
-    """
-    try:
-        _make_file(folder / MANIFEST_LOCK)
-        with _locked(folder / MANIFEST_LOCK):
-            now = read_in(folder)
-            if now is None:
-                raise RecordingGoneError(f"{folder} has no manifest any more.")
-            made = how(_present(now))
-            if made == now:
-                return now
-            new = replace(made, id=now.id, created=now.created, changes=now.changes + 1)
-            _keep_old(folder / MANIFEST, folder)
-            write_in(folder, new, sync=sync)
-            return new
-    except FileNotFoundError as error:
-        raise RecordingGoneError(f"{folder} is gone.") from error
+def manifests_at(folder: Path) -> DiskManifests:
+    """The manifests of the store in which the folder of a recording lies."""
+    return DiskManifests(folder.parent.parent)
 
 
 def _keep_old(path: Path, folder: Path) -> None:
@@ -514,28 +539,8 @@ def _keep_old(path: Path, folder: Path) -> None:
         files.unlink(new)  # a change that was killed has kept this one already
 
 
-def is_being_written(name: str) -> bool:
-    """True for the file of a manifest that is being written, or was when its writer died."""
-    return _NEW.fullmatch(name) is not None
-
-
-def clear_in(folder: Path) -> None:
-    """Remove what changes that were killed have left in the folder of a recording.
-
-    Raises:
-        HybridlogError: It cannot be removed.
-    """
-    _make_file(folder / MANIFEST_LOCK)
-    with _locked(folder / MANIFEST_LOCK):
-        try:
-            for name in filter(is_being_written, files.names(folder)):
-                files.unlink(folder / name)
-        except OSError as error:
-            raise durability.explain(error, folder, "removing files of") from error
-
-
 def _object(recording: str) -> str:
-    return f"{_FOLDER}/{recording}{_SUFFIX}"
+    return f"{MANIFESTS}/{recording}{_SUFFIX}"
 
 
 def _ids(names: Iterable[str]) -> list[str]:
@@ -550,7 +555,7 @@ def _present(manifest: Manifest) -> Manifest:
 
 
 @contextmanager
-def _locked(path: Path) -> Iterator[None]:
+def _locked(path: Path, wait_s: float | None = None) -> Iterator[None]:
     """Hold a file's lock. If the file was deleted meanwhile, the one of its name is locked.
 
     A process that changes a recording again and again would find the lock free before others
@@ -559,7 +564,7 @@ def _locked(path: Path) -> Iterator[None]:
     left, held = _last.get(path, (0.0, 0.0))
     if (pause := left + held - time.monotonic()) > 0:
         time.sleep(min(pause, _YIELD_S))
-    end = time.monotonic() + WAIT_S
+    end = time.monotonic() + (WAIT_S if wait_s is None else wait_s)
     while True:
         fd = _opened(path, os.O_RDWR)
         try:
@@ -583,11 +588,25 @@ def _make_file(path: Path) -> None:
 
 def _opened(path: Path, flags: int) -> int:
     try:
-        return files.open_file(path, flags)
+        return files.open_file(path, flags | os.O_NONBLOCK)
     except FileNotFoundError:
         raise
     except OSError as error:
+        if odd := _odd(path):
+            raise StoreError(odd) from error
         raise durability.explain(error, path, "locking") from error
+
+
+def _odd(path: Path) -> str:
+    """What is wrong with a file's place, or its folder, that is no file or folder; else empty."""
+    for place, fits in ((path.parent, stat.S_ISDIR), (path, stat.S_ISREG)):
+        with suppress(OSError):
+            if not fits(files.status(place).st_mode):
+                return (
+                    f"{place} is a link, or of another kind than a store has there: move it out "
+                    "of the store, then run `hybridlog verify --repair`."
+                )
+    return ""
 
 
 def _lock(fd: int, path: Path, end: float) -> None:

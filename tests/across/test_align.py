@@ -19,7 +19,6 @@ import hybridlog as hl
 from hybridlog.across import topic_reader
 from hybridlog.across.match import UNKNOWN, interpolated, match
 from hybridlog_storage.errors import TimeError, TopicError, UsageError
-from hybridlog_storage.manifests import MANIFEST
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import places
@@ -462,7 +461,7 @@ def test_losses_of_an_unknown_time_explain_no_row(tmp_path: Path) -> None:
         with store.start("now") as recording:
             for n, topic in enumerate(("/a", "/b")):
                 recording.write(Channel(topic, "json", None, {}), b"{}", log_time=BASE + n)
-    (places.folder(tmp_path / "store", "now") / MANIFEST).unlink()
+    (places.manifest_of(places.folder(tmp_path / "store", "now"))).unlink()
     with hl.open(tmp_path / "store") as store:
         store.verify(repair=True)
         aligned = store.align("/a", "/b")

@@ -8,7 +8,7 @@ import pytest
 
 import hybridlog as hl
 from hybridlog.live.control_server import ControlServer
-from hybridlog_storage.manifests import MANIFEST, MANIFEST_OLD
+from hybridlog_storage.manifests import MANIFEST_OLD
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import places
@@ -105,7 +105,7 @@ def test_what_was_lost_is_not_called_a_damaged_source(damaged: Path) -> None:
 @pytest.mark.parametrize("has_old", [True, False])
 def test_a_lost_manifest_is_said_with_answers(damaged: Path, has_old: bool) -> None:
     recording = places.id_of(damaged, "part")
-    (places.folder(damaged, "part") / MANIFEST).unlink()
+    (places.manifest_of(places.folder(damaged, "part"))).unlink()
     if not has_old:
         (places.folder(damaged, "part") / MANIFEST_OLD).unlink()
     done = run("fetch", "-t", "/kept", "--count", store=damaged, code=None)

@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from hybridlog_storage.manifest import Manifest, replace
-from hybridlog_storage.manifests import MANIFEST, change_in
 from tests import places
 from tests.faults import logs
 from tests.faults.cases import (
@@ -92,7 +91,7 @@ def _repair(bench: Bench) -> Scenario:
         summary = bytearray((a / "000002.mcap").read_bytes())
         summary[-60] ^= 1
         (a / "000002.mcap").write_bytes(summary)
-        (places.folder(store, "b") / MANIFEST).write_bytes(b"damaged")
+        places.manifest_of(places.folder(store, "b")).write_bytes(b"damaged")
 
     def allowed(state: State, _before: State, _outcome: str) -> bool:
         """The one without a manifest answers nothing until it is made again."""
@@ -188,11 +187,11 @@ def _forget_segment(store: Path) -> None:
     def how(now: Manifest) -> Manifest:
         return replace(now, files=tuple(one for one in now.files if one.number != 1))
 
-    change_in(places.folder(store, "a"), how)
+    places.change_in(places.folder(store, "a"), how)
 
 
 def _announce(store: Path) -> None:
-    change_in(places.folder(store, "a"), lambda now: replace(now, status="removed"))
+    places.change_in(places.folder(store, "a"), lambda now: replace(now, status="removed"))
 
 
 def _hide(store: Path) -> None:

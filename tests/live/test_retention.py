@@ -19,7 +19,6 @@ from hybridlog.live.recorder import Recorder, RecorderOptions
 from hybridlog.maintenance.retention import MIN_SEGMENT
 from hybridlog.maintenance.sizes import disk_bytes
 from hybridlog_storage.errors import PayloadError
-from hybridlog_storage.manifests import read_in
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.mongo.index_state import NOTHING, IndexState
 from hybridlog_storage.settings import write_settings
@@ -124,7 +123,7 @@ def test_the_quota_holds_while_recording_and_nothing_is_lost(
 
 def has_expired(folder: Path) -> bool:
     """True once a rule was applied to a segment of a recording."""
-    manifest = read_in(folder)
+    manifest = places.read_in(folder)
     return manifest is not None and any(log.retained is not UNSET for log in manifest.logs.values())
 
 

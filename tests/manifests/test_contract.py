@@ -21,7 +21,7 @@ def begun(name: str = "run") -> Manifest:
 def spoil(manifests: Manifests, one: Manifest, data: bytes | None) -> None:
     """Damage a manifest, or delete it."""
     if isinstance(manifests, DiskManifests):
-        path = manifests._path(one.id)
+        path = manifests.path(one.id)
         path.unlink()
         if data is not None:
             path.write_bytes(data)

@@ -26,7 +26,7 @@ from hybridlog_storage.errors import (
     StoreError,
 )
 from hybridlog_storage.manifest import Manifest, Note, encode, new_id, replace
-from hybridlog_storage.manifests import DiskManifests, change_in, clear_in, read_in, write_in
+from hybridlog_storage.manifests import DiskManifests
 from tests.calls import Calls
 from tests.limits import Limit
 from tests.power import PowerCut
@@ -282,14 +282,31 @@ def test_after_a_killed_change_no_second_name_stays(store: Path) -> None:
     assert not [name for name in names(store) if Path(name).name.startswith(".manifest")]
 
 
-def test_what_killed_changes_left_is_removed_under_the_lock(store: Path) -> None:
-    folder = store / "recordings" / ONE.id
-    left = [folder / ".manifest.old", folder / f".manifest.json.{'0' * 16}"]
+def test_what_killed_processes_left_is_removed_unless_a_recording_begins(store: Path) -> None:
+    manifests = DiskManifests(store)
+    bare = store / "recordings" / OTHER.id
+    left = [store / "manifests" / f".{OTHER.id}.new", bare / "manifest.lock", bare / "writer.lock"]
+    bare.mkdir()
     for path in left:
         path.write_bytes(b"x")
-    clear_in(folder)
-    assert not any(path.exists() for path in left)
-    assert (folder / "000000.mcap").exists()
+    with manifests.creating():
+        manifests.clear()
+    assert all(path.exists() for path in left)
+    manifests.clear()
+    assert not any(path.exists() for path in (*left, bare))
+    assert (store / "recordings" / ONE.id / "000000.mcap").exists()
+
+
+def test_folders_without_a_manifest_are_told_unless_they_hold_nothing(store: Path) -> None:
+    manifests = DiskManifests(store)
+    for name, file in (("bare", "manifest.lock"), ("copied", ".copying"), ("lost", "manifest.old")):
+        (store / "recordings" / name).mkdir()
+        (store / "recordings" / name / file).touch()
+    (store / "recordings" / "copied" / "000000.mcap").touch()
+    (store / "recordings" / "file").touch()
+    (store / "recordings" / "link").symlink_to(store)
+    assert manifests.without() == ["lost"]
+    assert manifests.ids() == [ONE.id]
 
 
 def test_who_stands_still_is_not_waited_for_without_end(store: Path, limit: Limit) -> None:
@@ -386,22 +403,60 @@ def test_notes_are_kept_in_order(store: Path) -> None:
     assert [note.at for note in manifests.read(ONE.id).notes] == [3, 1, 2]
 
 
-def test_no_two_manifests_look_alike(tmp_path: Path) -> None:
+def test_no_two_manifests_look_alike(store: Path) -> None:
     """However fast they follow each other; sizes and inodes come again."""
-    folder = tmp_path / "recordings" / ONE.id
-    folder.mkdir(parents=True)
-    write_in(folder, ONE)
+    manifests = DiskManifests(store)
     seen = set()
     for number in range(100):
-        change_in(folder, lambda now, n=number: replace(now, tags={"a": f"{n:03d}"}), sync=False)
-        seen.add((folder / "manifest.json").stat().st_mtime_ns)
+        how = lambda now, n=number: replace(now, tags={"a": f"{n:03d}"})  # noqa: E731
+        manifests.change(ONE.id, how, sync=False)
+        seen.add(manifests.path(ONE.id).stat().st_mtime_ns)
     assert len(seen) == 100
 
 
-def test_a_removed_recording_is_not_changed(tmp_path: Path) -> None:
-    folder = tmp_path / "recordings" / ONE.id
-    folder.mkdir(parents=True)
-    write_in(folder, replace(ONE, status="removed"))
-    with pytest.raises(RecordingGoneError):
-        change_in(folder, tagged)
-    assert read_in(folder) == replace(ONE, status="removed")
+def test_on_a_full_disk_files_make_room_for_the_removal(
+    store: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class FullOfIt(files.System):
+        def writev(self, fd: int, parts: Sequence[memoryview]) -> int:
+            if (store / "recordings" / ONE.id / "000000.mcap").exists():
+                raise OSError(errno.ENOSPC, "No space left on device")
+            return os.writev(fd, parts)
+
+    monkeypatch.setattr(files, "system", FullOfIt())
+    DiskManifests(store).remove(ONE.id)
+    assert names(store) == ["hybridlog.toml", "manifests/.lock"]
+
+
+def test_who_keeps_a_recording_is_asked_first_and_not_again(store: Path) -> None:
+    manifests = DiskManifests(store)
+
+    def pinned(_: Manifest) -> None:
+        raise StoreError("A pin was set meanwhile.")
+
+    with pytest.raises(StoreError, match="pin"):
+        manifests.remove(ONE.id, pinned)
+    assert manifests.read(ONE.id).status == "open"
+    manifests.change(ONE.id, lambda now: replace(now, status="removed"))
+    manifests.remove(ONE.id, pinned)
+    assert manifests.ids() == []
+
+
+@pytest.mark.parametrize(
+    ("place", "what"),
+    [("manifest", "link"), ("manifest", "folder"), ("manifest", "pipe"),
+     ("lock", "link"), ("lock", "folder")],  # a pipe is a lock like any file
+)  # fmt: skip
+def test_odd_things_are_told_by_a_plain_sentence(store: Path, what: str, place: str) -> None:
+    manifests = DiskManifests(store)
+    lock = store / "recordings" / ONE.id / "manifest.lock"
+    path = manifests.path(ONE.id) if place == "manifest" else lock
+    path.unlink()
+    make = {
+        "link": lambda: path.symlink_to("x"),
+        "folder": path.mkdir,
+        "pipe": lambda: os.mkfifo(path),
+    }
+    make[what]()
+    with pytest.raises(StoreError, match=f"^{path} is a link, or of another kind .*: move it out"):
+        manifests.change(ONE.id, tagged)

@@ -20,7 +20,6 @@ from hybridlog.maintenance import expiry
 from hybridlog.maintenance.expiry import Expired
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import IncompleteError, PayloadError, StoreError
-from hybridlog_storage.manifests import MANIFEST, read_in
 from tests import places
 from tests.cli.within import answer
 from tests.copies import bring
@@ -191,7 +190,7 @@ def test_what_is_left_is_copied_checked_and_never_made_again(copy: Path, tmp_pat
         store.edit("log", name="new")
         store.edit("new", name="log")
     assert answers(other) == right
-    (recording_of(copy) / MANIFEST).unlink()
+    (places.manifest_of(recording_of(copy))).unlink()
     with hl.open(copy, mongo="none") as store:
         store.verify(repair=True)
     assert answers(copy) | {"status": 0} == right | {"status": 0}
@@ -220,7 +219,7 @@ def test_files_of_fields_are_joined(copy: Path, tmp_path: Path) -> None:
     before = answers(copy)
     for segment in (0, 1):
         expire(copy, [segment], max_files=0)
-    listed = read_in(recording_of(copy))
+    listed = places.read_in(recording_of(copy))
     assert listed is not None
     assert sorted(file.topic for file in listed.fields) == TOPICS
     assert len(listed.deleted) > len(TOPICS)
@@ -234,11 +233,11 @@ def test_files_of_fields_are_joined(copy: Path, tmp_path: Path) -> None:
     # One that has lost its manifest knows from the one before which files were joined.
     with hl.open(copy, mongo="none") as store:
         store.edit("log", note="looked at")
-    (recording_of(copy) / MANIFEST).unlink()
+    (places.manifest_of(recording_of(copy))).unlink()
     with hl.open(copy, mongo="none") as store:
         store.verify(repair=True)
         assert [one.place for one in store.verify().findings] == ["manifest"]
-    made = read_in(recording_of(copy))
+    made = places.read_in(recording_of(copy))
     assert made is not None
     assert (made.fields, made.deleted) == (listed.fields, listed.deleted)
     after = answers(copy)

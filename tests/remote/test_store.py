@@ -26,11 +26,10 @@ from hybridlog_storage.errors import (
     StoreError,
     UsageError,
 )
-from hybridlog_storage.manifests import MANIFEST
 from hybridlog_storage.remote import address_of
 from hybridlog_storage.remote.blocks import BLOCK, BlockCache
 from hybridlog_storage.remote.bucket import Bucket
-from hybridlog_storage.remote.lists import StoreList, list_name
+from hybridlog_storage.remote.lists import MANIFEST, StoreList, list_name
 from hybridlog_storage.remote.store import RemoteDirectory
 from tests.cli import running as commands
 from tests.cli.within import Answer, answer

@@ -17,9 +17,8 @@ from typing import Any
 import pytest
 
 from hybridlog_storage.disk import files
-from hybridlog_storage.disk.directory import LOCK, REMOVED, Holder, StoreDirectory
+from hybridlog_storage.disk.directory import LOCK, Holder, StoreDirectory
 from hybridlog_storage.errors import HeldError, StoreError, TopicError
-from hybridlog_storage.manifests import MANIFEST
 from tests.other_user import User, needs_root, open_place
 
 
@@ -102,11 +101,15 @@ def test_many_make_the_same_store_at_once(tmp_path: Path) -> None:
         for thread in threads:
             thread.join()
         assert set(made) == {StoreDirectory(path).settings.store_id}
-        assert sorted(p.name for p in path.iterdir()) == ["hybridlog.toml", "recordings"]
+        assert sorted(p.name for p in path.iterdir()) == [
+            "hybridlog.toml",
+            "manifests",
+            "recordings",
+        ]
 
 
 def made(store: StoreDirectory, name: str = "r") -> Path:
-    store.new_recording(name)
+    store.make_folder(name)
     return store.recording(name)
 
 
@@ -121,32 +124,6 @@ def test_segments_are_told_by_their_numbers(store: StoreDirectory) -> None:
     assert store.segments("nothing") == []
 
 
-def test_other_things_among_the_recordings(store: StoreDirectory, tmp_path: Path) -> None:
-    base = store.path / "recordings"
-    (base / "file").write_text("")
-    (base / ".removed-x-1").mkdir()
-    (base / "link").symlink_to(tmp_path)
-    made(store)
-    assert store.ids() == ["r"]
-    base.rename(base.with_name("elsewhere"))
-    assert store.ids() == []
-
-
-def test_removing(store: StoreDirectory) -> None:
-    recording = made(store)
-    (recording / "000000.mcap").write_bytes(b"x")
-    hidden = store.hide("r")
-    assert store.ids() == []
-    assert hidden.startswith(REMOVED)
-    assert store.names() == [hidden]
-    assert (store.recording(hidden) / "000000.mcap").read_bytes() == b"x"
-    store.sweep(hidden)
-    assert list((store.path / "recordings").iterdir()) == []
-    store.sweep(hidden)  # somebody else was quicker
-    with pytest.raises(StoreError, match="renaming"):
-        store.hide("r")
-
-
 def test_what_a_recording_looks_like_changes_with_its_files(store: StoreDirectory) -> None:
     recording = made(store)
     seen = [store.listing("r").print]
@@ -155,11 +132,11 @@ def test_what_a_recording_looks_like_changes_with_its_files(store: StoreDirector
         seen.append(store.listing("r").print)
         return seen[-1] not in seen[:-1]
 
-    (recording / MANIFEST).write_bytes(b"one\n")
+    store.manifests.path("r").write_bytes(b"one\n")
     assert changed()
     (recording / "000000.mcap").write_bytes(b"segment")
     assert changed()
-    (recording / MANIFEST).write_bytes(b"two\n")
+    store.manifests.path("r").write_bytes(b"two\n")
     assert changed()
     (recording / "000000.mcap").rename(recording / "000001.mcap")
     assert changed()
@@ -167,18 +144,6 @@ def test_what_a_recording_looks_like_changes_with_its_files(store: StoreDirector
     assert changed()
     (recording / "notes.txt").write_bytes(b"x")
     assert not changed()
-    recording.rename(recording.with_name("s"))
-    assert store.listing("s").print == seen[-1]
-
-
-def test_a_folder_takes_the_place_of_another_one(store: StoreDirectory) -> None:
-    for name, content in (("r", b"old"), (".new", b"new")):
-        (made(store, name) / "000000.mcap").write_bytes(content)
-    for _ in range(2):
-        store.put_in_place(".new", "r")
-        assert store.names() == ["r"]
-        assert (store.recording("r") / "000000.mcap").read_bytes() == b"new"
-        store.recording("r").rename(store.recording(".new"))
 
 
 HOLD = """
@@ -292,7 +257,7 @@ def test_a_recording_that_was_removed_is_not_locked(
 
     def opened(path: Path, *args: Any, **options: Any) -> int:
         found: int = open_file(path, *args, **options)
-        store.hide("r")
+        files.remove_tree(store.recording("r"))
         return found
 
     monkeypatch.setattr(files, "open_file", opened)
@@ -308,7 +273,7 @@ def test_a_store_that_cannot_be_written(store: StoreDirectory) -> None:
         with pytest.raises(StoreError, match="read-only"):
             store.check_writable()
         with pytest.raises(StoreError, match="Not allowed"):
-            store.new_recording("r")
+            store.make_folder("r")
     finally:
         recordings.chmod(0o755)
     store.check_writable()
@@ -320,7 +285,7 @@ from pathlib import Path
 from hybridlog_storage.disk.directory import StoreDirectory
 from hybridlog_storage.errors import StoreError
 store = StoreDirectory(Path(sys.argv[1]))
-for step in (store.check_writable, lambda: store.new_recording("r")):
+for step in (store.check_writable, lambda: store.make_folder("r")):
     try:
         step()
     except StoreError as error:
@@ -335,8 +300,7 @@ def test_a_store_that_another_user_cannot_write() -> None:
         done = User(place).python("-c", AS_A_READER, store.path)
         assert "read-only" in done.lines[0]
         assert "Not allowed" in done.lines[1]
-        assert store.ids() == []
-        for path in (store.path, store.path / "recordings"):
+        for path in (store.path, store.path / "manifests", store.path / "recordings"):
             path.chmod(0o777)
         assert User(place).python("-c", AS_A_READER, store.path).lines == []
-        assert store.ids() == ["r"]
+        assert (store.path / "recordings/r").is_dir()

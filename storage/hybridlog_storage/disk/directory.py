@@ -3,7 +3,8 @@
 ```
 <store>/
   hybridlog.toml        format version, id of the store, settings
-  recordings/<id>/      one recording: manifest, segments, columns; writer.lock while it is written
+  manifests/<id>.json   what a recording is: name, tags, files, losses
+  recordings/<id>/      its files: segments, columns; writer.lock while it is written
   catalog.sqlite        derived: recordings and channels
   mongod/               derived: data of the embedded MongoDB
 ```
@@ -21,7 +22,7 @@ import secrets
 import stat
 import sys
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from itertools import takewhile
@@ -31,14 +32,19 @@ from typing import Any, ClassVar, Final
 from hybridlog_storage.cells import Cells
 from hybridlog_storage.disk import durability, files
 from hybridlog_storage.errors import HeldError, StoreError, TopicError, unreadable
-from hybridlog_storage.manifest import Manifest
-from hybridlog_storage.manifests import MANIFEST, MANIFEST_LOCK, MANIFEST_OLD, change_in
+from hybridlog_storage.manifests import (
+    MANIFEST_LOCK,
+    MANIFEST_OLD,
+    MANIFESTS,
+    WRITER_LOCK,
+    DiskManifests,
+)
 from hybridlog_storage.segments.segment_file import OPEN_SUFFIX, SEALED_SUFFIX
 from hybridlog_storage.settings import NAME as SETTINGS
 from hybridlog_storage.settings import StoreSettings, read_settings, write_settings
 from hybridlog_storage.stopping import pause
 
-LOCK: Final = "writer.lock"
+LOCK: Final = WRITER_LOCK
 LOCK_WAIT_S: Final = 10.0
 """Seconds that a command waits for another one that holds its recording."""
 PAYLOADS: Final = "payloads"
@@ -50,6 +56,7 @@ SENDING: Final = ".copying-"
 IMPORTING: Final = ".importing-"
 """Prefix of the directory of a recording that is being imported."""
 _RECORDINGS: Final = "recordings"
+_OF_MANIFEST: Final = frozenset({MANIFEST_LOCK, MANIFEST_OLD, f".{MANIFEST_OLD}"})
 _TICK_NS: Final = 50_000_000
 _POLL_S = 0.02
 _RECORDER_WAIT_S = 0.5  # a reader's look at a lock must not pass for a recorder
@@ -74,7 +81,6 @@ class Listing:
     """Content of a recording's directory.
 
     Attributes:
-        manifest: Whether it has a manifest.
         sealed: Names of sealed segments, by number.
         open: Names of segments that were never sealed, by number.
         others: All other names.
@@ -83,7 +89,6 @@ class Listing:
         print: A value that changes whenever a relevant file changes.
     """
 
-    manifest: bool
     sealed: Mapping[int, str]
     open: Mapping[int, str]
     others: tuple[str, ...]
@@ -100,6 +105,7 @@ class StoreDirectory:
         read_only: Behave as if this user could not write it.
 
     Attributes:
+        manifests: The manifests of its recordings: all that they are.
         is_remote: Whether it stands for a place in a bucket, see `remote.store`.
 
     Raises:
@@ -110,6 +116,7 @@ class StoreDirectory:
 
     def __init__(self, path: Path, *, read_only: bool = False) -> None:
         self.path = path
+        self.manifests = DiskManifests(path)
         self.read_only = read_only
         self.settings = read_settings(path)
 
@@ -141,12 +148,13 @@ class StoreDirectory:
                     settings = StoreSettings(secrets.token_hex(16), mongo=mongo, cache_mb=cache_mb)
                     cls._make(path, settings)
             store = cls(path)
-            try:
-                files.make_folder(path / _RECORDINGS)
-            except FileExistsError:
-                pass
-            else:
-                files.sync_folder(path)
+            for folder in (MANIFESTS, _RECORDINGS):
+                try:
+                    files.make_folder(path / folder)
+                except FileExistsError:
+                    pass
+                else:
+                    files.sync_folder(path)
         except OSError as error:
             raise durability.explain(error, path, "making the store") from error
         return store
@@ -169,9 +177,8 @@ class StoreDirectory:
         """True if this user may change the store."""
         if self.read_only:
             return False
-        return os.access(self.path / _RECORDINGS, os.W_OK | os.X_OK) and os.access(
-            self.path, os.W_OK | os.X_OK
-        )
+        folders = self.path, self.path / MANIFESTS, self.path / _RECORDINGS
+        return all(os.access(folder, os.W_OK | os.X_OK) for folder in folders)
 
     def check_writable(self) -> None:
         """Raise if the store cannot be written.
@@ -205,7 +212,7 @@ class StoreDirectory:
         Raises:
             StoreError: They cannot be written.
         """
-        with self.alone():
+        with self.manifests.creating():
             settings = replace(read_settings(self.path), **changes)
             try:
                 write_settings(self.path, settings)
@@ -223,65 +230,51 @@ class StoreDirectory:
         return self.recordings / recording
 
     def ids(self) -> list[str]:
-        """Ids of all recordings that have a directory, sorted."""
-        return [name for name in self._folders() if not name.startswith(".")]
-
-    def names(self) -> list[str]:
-        """All names below `recordings`, sorted; some may not be recordings.
-
-        Raises:
-            StoreError: It cannot be read.
-        """
-        try:
-            with files.folder(self.recordings) as fd:
-                return sorted(os.listdir(fd))  # noqa: PTH208 - of a handle
-        except FileNotFoundError:
-            return []
-        except OSError as error:
-            raise unreadable(error, self.path, f"The store {self.path}") from error
+        """Ids of all recordings that have a manifest, sorted."""
+        return self.manifests.ids()
 
     def changed(self) -> tuple[int, bool]:
-        """Time at which a recording came or went last, ns, and if that is a while ago.
+        """Time at which a manifest came, went or changed last, ns, and if that is a while ago.
 
         Within a tick of the file system's clock another change would show the same time.
         """
         try:
-            changed = files.status(self.recordings).st_mtime_ns
+            changed = files.status(self.path / MANIFESTS).st_mtime_ns
         except OSError:
             return 0, False
         return changed, _is_a_tick_ago(changed)
 
-    def looks(self, names: Sequence[str]) -> dict[str, str]:
-        """The look of each recording's directory, by id.
+    def looks(self, ids: Sequence[str]) -> dict[str, str]:
+        """The look of each recording, by id; those without a manifest are left out.
 
         It changes whenever a file gets or loses its name, and when the manifest changes. A
         change inside a segment shows only in `Listing.print`.
 
         Args:
-            names: From `names`.
+            ids: From `ids`.
 
         Raises:
             StoreError: They cannot be read.
         """
         found: dict[str, str] = {}
+        if not ids:
+            return found
         try:
-            with files.folder(self.recordings) as fd:
-                for name in names:
-                    if not name.startswith("."):
-                        with suppress(OSError):
-                            about = os.stat(name, dir_fd=fd, follow_symlinks=False)
-                            if stat.S_ISDIR(about.st_mode):
-                                found[name] = _look(about, f"{name}/{MANIFEST}", fd)
-        except FileNotFoundError:
-            return {}
+            with (
+                files.folder(self.path / MANIFESTS) as fd,
+                files.folder(self.recordings) as inside,
+            ):
+                for one in ids:
+                    with suppress(FileNotFoundError):
+                        about = os.stat(f"{one}.json", dir_fd=fd, follow_symlinks=False)
+                        found[one] = f"{_folder_look(one, inside)} {_file_look(about)}"
         except OSError as error:
             raise unreadable(error, self.path, f"The store {self.path}") from error
         return found
 
     def _look_of(self, recording: str) -> str:
-        """The look of one recording."""
-        with files.folder(self.recording(recording)) as fd:
-            return _look(os.fstat(fd), MANIFEST, fd)
+        """The look of one recording; empty if there is none."""
+        return self.looks([recording]).get(recording, "")
 
     @property
     def address(self) -> str:
@@ -302,15 +295,6 @@ class StoreDirectory:
         """The cells of the catalog; None for those in its file here."""
         return None
 
-    def change(self, recording: str, how: Callable[[Manifest], Manifest]) -> Manifest:
-        """Replace the manifest of a recording, if it is unchanged; see `manifests.change_in`.
-
-        Raises:
-            RecordingGoneError: The recording is gone.
-            StoreError: It cannot be written.
-        """
-        return change_in(self.recording(recording), how)
-
     @contextmanager
     def changing(self) -> Iterator[None]:
         """Change a manifest and its row of the catalog at once; here nobody needs that."""
@@ -322,23 +306,16 @@ class StoreDirectory:
         yield self
 
     def has(self, recording: str) -> bool:
-        """True if this name exists below `recordings`."""
-        try:
-            files.status(self.recording(recording))
-        except FileNotFoundError:
-            return False
-        except OSError:
+        """True if there is a manifest or a folder of a recording."""
+        for path in (self.manifests.path(recording), self.recording(recording)):
+            try:
+                files.status(path)
+            except FileNotFoundError:
+                continue
+            except OSError:
+                pass
             return True
-        return True
-
-    def _folders(self) -> list[str]:
-        try:
-            found = files.names(self.recordings)
-        except FileNotFoundError:
-            return []
-        except OSError as error:
-            raise unreadable(error, self.path, f"The store {self.path}") from error
-        return sorted(name for name, about in found.items() if stat.S_ISDIR(about.st_mode))
+        return False
 
     def look_closely(self) -> bool:
         """Compare a list of files with the files; True if some are missing. Here is no list."""
@@ -355,9 +332,10 @@ class StoreDirectory:
             StoreError: It cannot be read.
         """
         path = self.recording(recording)
-        look, found, payloads = "", {}, {}
+        look = self._look_of(recording)
+        manifest = look.split(" ", 3)[-1]
+        found, payloads = {}, {}
         try:
-            look = self._look_of(recording)
             found = files.names(path)
             if PAYLOADS in found:
                 payloads = payload_names(path)
@@ -369,6 +347,7 @@ class StoreDirectory:
         opened: dict[int, str] = {}
         others = []
         looks = hashlib.blake2b(digest_size=16)
+        looks.update(f"{manifest}\n".encode())
         for name, about in sorted(found.items()):
             number, kind = _numbered(name)
             if kind == OPEN_SUFFIX:
@@ -376,23 +355,13 @@ class StoreDirectory:
                 looks.update(f"{name}\n".encode())
             elif kind == SEALED_SUFFIX:
                 sealed[number] = name
-            elif name in {MANIFEST_LOCK, MANIFEST_OLD}:
-                continue
-            elif name != MANIFEST:
+            elif name not in _OF_MANIFEST:
                 others.append(name)
-                continue
-            if kind != OPEN_SUFFIX:
-                looks.update(
-                    f"{name} {about.st_size} {about.st_mtime_ns} {about.st_ctime_ns} "
-                    f"{about.st_ino}\n".encode()
-                )
+            if kind == SEALED_SUFFIX:
+                looks.update(f"{name} {_file_look(about)}\n".encode())
         for name, about in sorted(payloads.items()):
-            looks.update(
-                f"{name} {about.st_size} {about.st_mtime_ns} {about.st_ctime_ns} "
-                f"{about.st_ino}\n".encode()
-            )
+            looks.update(f"{name} {_file_look(about)}\n".encode())
         return Listing(
-            MANIFEST in found,
             dict(sorted(sealed.items())),
             dict(sorted(opened.items())),
             tuple(others),
@@ -411,76 +380,12 @@ class StoreDirectory:
         """Directory of the embedded MongoDB."""
         return self.path / "mongod"
 
-    def new_recording(self, recording: str) -> None:
-        """Create the directory of a new recording."""
+    def make_folder(self, recording: str) -> None:
+        """Make the folder of a recording that begins, within `manifests.creating`."""
         try:
             files.make_folder(self.recording(recording))
         except OSError as error:
             raise durability.explain(error, self.path, "starting a recording in") from error
-        self._sync()
-
-    def is_beginning(self, recording: str) -> bool:
-        """True if a process may be about to lock this empty recording.
-
-        A process that begins a recording locks `recordings` until the recording itself is
-        locked. Without that lock, an empty recording is left from a crash.
-        """
-        try:
-            with files.locked_folder(self.recordings, 0):
-                return False
-        except OSError:
-            return True
-
-    def put_in_place(self, hidden: str, recording: str) -> None:
-        """Durably give a hidden directory the name of a recording; one that had it goes.
-
-        Within `alone`. A crash in between leaves `hidden`, and this can be called again.
-        """
-        removed = f"{REMOVED}{recording}-{secrets.token_hex(4)}" if self.has(recording) else ""
-        try:
-            if removed:
-                files.rename(self.recording(recording), self.recording(removed))
-            files.rename(self.recording(hidden), self.recording(recording))
-            self._sync()
-        except OSError as error:
-            raise durability.explain(error, self.recording(hidden), "renaming") from error
-        if removed:
-            self.sweep(removed)
-
-    def hide(self, recording: str) -> str:
-        """Durably give a recording a hidden name, and return that name."""
-        hidden = f"{REMOVED}{recording}-{secrets.token_hex(4)}"
-        try:
-            files.rename(self.recording(recording), self.recording(hidden))
-            self._sync()
-        except OSError as error:
-            raise durability.explain(error, self.recording(recording), "renaming") from error
-        return hidden
-
-    def remove(self, recording: str) -> None:
-        """Hide a recording's directory, then delete its files."""
-        self.sweep(self.hide(recording))
-
-    def sweep(self, name: str) -> None:
-        """Delete a hidden directory below `recordings`."""
-        path = self.recording(name)
-        try:
-            files.remove_tree(path)
-            self._sync()
-        except OSError as error:
-            raise durability.explain(error, path, "removing") from error
-
-    def _sync(self) -> None:
-        files.sync_folder(self.recordings)
-
-    @contextmanager
-    def alone(self) -> Iterator[None]:
-        """Lock `recordings`, so that no other process starts a recording; for moments only."""
-        try:
-            with files.locked_folder(self.recordings):
-                yield
-        except OSError as error:
-            raise durability.explain(error, self.path, "locking") from error
 
     @contextmanager
     def retaining(self) -> Iterator[bool]:
@@ -517,7 +422,9 @@ class StoreDirectory:
             try:
                 fd = files.open_file(path, os.O_RDWR | os.O_CREAT)
             except FileNotFoundError as error:
-                raise gone(name or recording) from error
+                if not self._makes_folder(recording):
+                    raise gone(name or recording) from error
+                continue
             except OSError as error:
                 raise durability.explain(error, path, "locking") from error
             is_mine = False
@@ -547,6 +454,14 @@ class StoreDirectory:
                     is_recording=holder.is_recording,
                 )
             pause(_POLL_S)
+
+    def _makes_folder(self, recording: str) -> bool:
+        """True if a recording's folder is there by now; copies of a store leave out empty ones."""
+        if recording not in self.looks([recording]):
+            return False
+        with suppress(FileExistsError):
+            self.make_folder(recording)
+        return True
 
     def holder(self, recording: str) -> Holder | None:
         """The process that holds a recording's lock at this moment."""
@@ -604,25 +519,22 @@ def _is_at(fd: int, path: Path) -> bool:
         raise durability.explain(error, path, "locking") from error
 
 
-def _look(about: os.stat_result, manifest: str, fd: int) -> str:
-    """The look of a recording.
-
-    Args:
-        about: The status of its directory.
-        manifest: Path of its manifest.
-        fd: Handle of the folder that the path begins in.
-    """
-    look = f"{about.st_ino} {about.st_mtime_ns} {about.st_ctime_ns}"
+def _folder_look(recording: str, folders: int) -> str:
+    """The look of a recording's folder, which copies of a store leave out if it is empty."""
     try:
-        lines = os.stat(manifest, dir_fd=fd, follow_symlinks=False)
-    except OSError:
-        return look
-    return f"{look} {lines.st_ino} {lines.st_size} {lines.st_mtime_ns} {lines.st_ctime_ns}"
+        about = os.stat(recording, dir_fd=folders, follow_symlinks=False)
+    except FileNotFoundError:
+        return "0 0 0"
+    return f"{about.st_ino} {about.st_mtime_ns} {about.st_ctime_ns}"
+
+
+def _file_look(about: os.stat_result) -> str:
+    return f"{about.st_ino} {about.st_size} {about.st_mtime_ns} {about.st_ctime_ns}"
 
 
 def is_stable(look: str) -> bool:
     """False if the look is so new that it would be the same after another change."""
-    times = look.split()[2::4]  # of the directory, and of the manifest if there is one
+    times = look.split()[2::4]  # of the folder, and of the manifest
     return all(_is_a_tick_ago(int(one)) for one in times)
 
 

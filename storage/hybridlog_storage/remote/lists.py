@@ -27,6 +27,8 @@ from hybridlog_storage.remote.bucket import Object
 LISTS: Final = "lists"
 RECORDINGS: Final = "recordings"
 TABLES: Final = "tables"
+MANIFEST: Final = "manifest.json"
+"""Path under which a list has the manifest of a recording."""
 MAX_LIST: Final = 1 << 30
 """Largest list that is read, bytes, packed and unpacked."""
 _FORMAT: Final = 1

@@ -36,18 +36,13 @@ from hybridlog_storage.errors import (
     StoreError,
 )
 from hybridlog_storage.manifest import Manifest, encode
-from hybridlog_storage.manifests import (
-    MANIFEST,
-    MANIFEST_LOCK,
-    MANIFEST_OLD,
-    read_in,
-    write_in,
-)
+from hybridlog_storage.manifests import MANIFEST_LOCK, MANIFEST_OLD, MANIFESTS, DiskManifests
 from hybridlog_storage.remote import TRIES
 from hybridlog_storage.remote.blocks import BlockCache, inode_of
 from hybridlog_storage.remote.bucket import UNLISTED_DAYS, Bucket, Object, other_name
 from hybridlog_storage.remote.lists import (
     LISTS,
+    MANIFEST,
     MAX_LIST,
     RECORDINGS,
     TABLES,
@@ -66,7 +61,7 @@ _DAY_NS: Final = 86_400 * 10**9
 _ALONE: Final = 4  # recordings that are compared with the bucket one by one; then all at once
 _MAX_SETTINGS: Final = 1 << 20
 _PIECE: Final = 1 << 20  # bytes of a file that are sent at once
-_NOT_LISTED: Final = frozenset({LOCK, MANIFEST, MANIFEST_LOCK, MANIFEST_OLD})
+_NOT_LISTED: Final = frozenset({LOCK, MANIFEST_LOCK, MANIFEST_OLD})
 _FOLDER: Final = stat.S_IFDIR | 0o555
 _FILE: Final = stat.S_IFREG | 0o444
 _Node = Mapping[str, Any]
@@ -250,12 +245,22 @@ class BucketFiles:
         if top == RECORDINGS and len(inner) == 1:
             recordings = {recording: {} for recording in listed.recordings}
         elif top == RECORDINGS and inner[1] in listed.recordings:
-            recordings = {inner[1]: _folder(self.files_of(inner[1]))}
+            found = {p: o for p, o in self.files_of(inner[1]).items() if p != MANIFEST}
+            recordings = {inner[1]: _folder(found)}
         return {
+            MANIFESTS: self._manifests(inner[-1]) if top == MANIFESTS else {},
             RECORDINGS: recordings,
             TABLES: self._tables_of(listed) if top == TABLES else {},
             SETTINGS: self.read_settings(),
         }
+
+    def _manifests(self, name: str) -> _Node:
+        """The manifest of a recording, by the name of its file."""
+        recording = name.removesuffix(".json")
+        if recording not in self.list.recordings:
+            return {}
+        found = self.files_of(recording).get(MANIFEST)
+        return {} if found is None else {name: found}
 
     def _tables_of(self, listed: StoreList) -> _Node:
         known, folders = self._tables
@@ -348,6 +353,49 @@ class ListedCells(Cells):
         """Do nothing: others use the cells, too."""
 
 
+class ListedManifests(DiskManifests):
+    """The manifests of a store in a bucket, by its newest list."""
+
+    def __init__(self, directory: RemoteDirectory) -> None:
+        super().__init__(directory.path)
+        self._directory = directory
+
+    def ids(self) -> list[str]:
+        """All ids, sorted."""
+        return self._directory.ids()
+
+    def without(self) -> list[str]:
+        """None: a list names all."""
+        return []
+
+    def clear(self) -> None:
+        """Nothing: what no list names is not there."""
+
+    @contextmanager
+    def creating(self) -> Iterator[Callable[[Manifest], None]]:
+        """Nothing: who is second begins again; files are not written here one by one."""
+        yield lambda _: self._directory.check_writable()
+
+    def change(
+        self, recording: str, how: Callable[[Manifest], Manifest], *, sync: bool = True
+    ) -> Manifest:
+        """The list names a new object in the place of the one before.
+
+        Raises:
+            RecordingGoneError: The recording is gone.
+            ManifestError: The manifest is damaged or lost.
+            ObjectExistsError: Another process was faster: begin again.
+        """
+        return self._directory.change(recording, how)
+
+    def remove(self, recording: str, check: Callable[[Manifest], object] = lambda _: None) -> None:
+        """List a recording no more, within `writing`; its objects stay."""
+        found = self.find(recording)
+        if found is not None:  # or it was lost
+            check(found)
+        self._directory.drop(recording)
+
+
 class RemoteDirectory(StoreDirectory):
     """A store in a bucket. It is read like a directory, and changed by a list at a time.
 
@@ -374,6 +422,7 @@ class RemoteDirectory(StoreDirectory):
         super().__init__(self.source.path, read_only=read_only)
         self.settings = replace(self.settings, mongo=NONE)
         self.source.look(self.settings.store_id, now=True)
+        self.manifests = ListedManifests(self)
         self._cells = ListedCells(self.source, self.settings.store_id)
         self._after: StoreList | None = None
 
@@ -432,7 +481,7 @@ class RemoteDirectory(StoreDirectory):
         self.check_changes()
         self.source.change_settings(changed)
 
-    def new_recording(self, recording: str) -> None:
+    def make_folder(self, recording: str) -> None:
         """Raise: nothing is recorded into a bucket."""
         self.check_writable()
         raise AssertionError(recording)
@@ -445,25 +494,19 @@ class RemoteDirectory(StoreDirectory):
     def _now(self) -> StoreList:
         return self.source.list
 
-    def names(self) -> list[str]:
+    def ids(self) -> list[str]:
         """All ids, sorted."""
         return sorted(self._now.recordings)
-
-    def _folders(self) -> list[str]:
-        return self.names()
 
     def changed(self) -> tuple[int, bool]:
         """The number of the newest list, and True."""
         self.source.look(self.settings.store_id)
         return self._now.number, True
 
-    def looks(self, names: Sequence[str]) -> dict[str, str]:
+    def looks(self, ids: Sequence[str]) -> dict[str, str]:
         """The look of each recording, by id: it changes whenever any file does."""
         listed = self._now.recordings
-        return {name: _look(self.files_of(name)) for name in names if name in listed}
-
-    def _look_of(self, recording: str) -> str:
-        return self.looks([recording]).get(recording, "")
+        return {one: _look(self.files_of(one)) for one in ids if one in listed}
 
     def look_closely(self) -> bool:
         """Compare all files with their objects; True if some were lost."""
@@ -474,11 +517,6 @@ class RemoteDirectory(StoreDirectory):
         """As of a directory; files count whose objects are there."""
         self.source.compare(recording)
         return super().listing(recording)
-
-    @contextmanager
-    def alone(self) -> Iterator[None]:
-        """Nothing: who is second begins again."""
-        yield
 
     @contextmanager
     def retaining(self) -> Iterator[bool]:
@@ -543,13 +581,7 @@ class RemoteDirectory(StoreDirectory):
             raise StoreError(f"The store {self.place} was opened for reading only.")
 
     def change(self, recording: str, how: Callable[[Manifest], Manifest]) -> Manifest:
-        """As of a directory: the list names a new object in the place of the one before.
-
-        Raises:
-            RecordingGoneError: The recording is gone.
-            ManifestError: The manifest is damaged or lost.
-            ObjectExistsError: Another process was faster: begin again.
-        """
+        """See `ListedManifests.change`."""
         with self.changing():
             if recording not in self._now.recordings:
                 raise RecordingGoneError(f"There is no recording {recording!r}.")
@@ -562,7 +594,7 @@ class RemoteDirectory(StoreDirectory):
             return made
 
     def _manifest(self, recording: str) -> Manifest:
-        found = read_in(self.recording(recording))
+        found = self.manifests.find(recording)
         if found is None:
             raise ManifestError(
                 f"{self.recording(recording)} has lost its manifest: `hybridlog copy` brings it "
@@ -591,8 +623,7 @@ class RemoteDirectory(StoreDirectory):
             there = StoreDirectory.create(Path(place) / "store")
             folder = there.recording(recording)
             manifest = self._manifest(recording)
-            folder.mkdir()
-            write_in(folder, manifest, sync=False)
+            there.manifests.create(manifest)
             for path in wanted:
                 try:
                     self.fetch(objects[path], folder / path)
@@ -611,8 +642,8 @@ class RemoteDirectory(StoreDirectory):
             for path in before.keys() - after.keys():
                 del listed[path]
             self._relist(recording, listed)
-            changed = read_in(folder)
-            if changed is not None and changed != manifest:
+            changed = there.manifests.read(recording)
+            if changed != manifest:
                 self._list_manifest(recording, changed)
 
     def fetch(self, about: Object, path: Path) -> None:
@@ -761,7 +792,7 @@ def _look(objects: Mapping[str, Object]) -> str:
     digest = hashlib.sha256()
     for path, one in sorted(objects.items()):
         digest.update(f"{path}\n{one.name}\n{one.size}\n{one.version}\n".encode())
-    return f"{digest.hexdigest()[:32]} 0 0"
+    return f"0 0 0 {digest.hexdigest()[:32]} 0 0 0"
 
 
 def _stat(mode: int, inode: int, size: int, changed: int = 0) -> os.stat_result:
