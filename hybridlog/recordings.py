@@ -34,7 +34,7 @@ class Recordings(Sequence["RecordingEntry"]):
     ) -> None:
         self.summaries = tuple(summaries)
         self._source = source
-        self._problem = problem or source.directory.when_empty
+        self._problem = problem
 
     def __len__(self) -> int:
         return len(self.summaries)
@@ -97,7 +97,7 @@ class Recordings(Sequence["RecordingEntry"]):
             TopicError: There is none; names the condition that no recording satisfies.
         """
         if not self.summaries:
-            raise TopicError(self._problem)
+            raise TopicError(self._problem or self._source.now().when_empty)
         return self
 
     def topics(self) -> list[str]:

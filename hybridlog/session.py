@@ -22,7 +22,7 @@ from hybridlog.query.chunk_counts import Parts, part_rows
 from hybridlog.query.question import RecordedChannel, field_types
 from hybridlog.query.topics import resolve
 from hybridlog.snapshot import UNFINISHED
-from hybridlog.wording import listed
+from hybridlog.wording import counted, listed
 from hybridlog_storage.catalog import ChannelStats, schema_hash
 from hybridlog_storage.disk.directory import gone
 from hybridlog_storage.errors import (
@@ -261,6 +261,14 @@ class Session:
                 found.append(entry)
         return found
 
+    @property
+    def when_empty(self) -> str:
+        """The sentence for a store without recordings that can be read."""
+        number = len(self.shared.repairs.unreadable)
+        if number:
+            return f"{counted(number, 'recording')} cannot be read: `hybridlog verify` says why."
+        return self.directory.when_empty
+
     def select(self, names: Iterable[str | RecordingEntry] | None) -> list[RecordingEntry]:
         """Recordings by name, id, or the beginning of one of these; None for all.
 
@@ -272,10 +280,10 @@ class Session:
         snapshot = self._recordings
         return [self.entry_of(snapshot.summaries[place]) for place in self.named(names)]
 
-    def as_now(self, entries: Iterable[RecordingEntry]) -> list[RecordingEntry]:
+    def as_now(self, ids: Iterable[str]) -> list[RecordingEntry]:
         """Recordings as they are now, oldest first; those that are gone are left out."""
         snapshot = self._recordings
-        places = sorted(snapshot.by_id.get(entry.id, -1) for entry in entries)
+        places = sorted(snapshot.by_id.get(one, -1) for one in ids)
         return [self.entry_of(snapshot.summaries[place]) for place in places if place >= 0]
 
     def named(self, names: Iterable[str | RecordingEntry]) -> list[int]:

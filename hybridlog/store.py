@@ -981,14 +981,20 @@ class Store:
         if repair:
             return self._repair(recordings, progress)
         self.refresh()
-        chosen = None if recordings is None else [one.id for one in self.select(recordings)]
         return verify(
             self.directory,
             self.catalog,
             self.database,
-            recordings=chosen,
+            recordings=None if recordings is None else self._with_unreadable(recordings),
             progress=progress,
         )
+
+    def _with_unreadable(self, names: Names) -> dict[str, str]:
+        """Names of recordings by id, where ids of those that cannot be read stand for them."""
+        unreadable, names = self.repairs.unreadable, [*names]
+        found = {one: one for one in names if isinstance(one, str) and one in unreadable}
+        others = self.select([one for one in names if one not in found])
+        return found | {one.id: one.name for one in others}
 
     def _repair(self, recordings: Names | None, progress: Progress | None) -> list[Repaired]:
         self._check_on_disk()
@@ -996,9 +1002,8 @@ class Store:
 
         self._to_change().mend()
         self.refresh()
-        chosen = [] if recordings is None else self.select(recordings)
-        entries = None if recordings is None else chosen
-        done = repair(self.directory, self.catalog, self.repairs, entries)
+        names = None if recordings is None else self._with_unreadable(recordings)
+        done = repair(self.directory, self.catalog, self.repairs, names)
         self.refresh()
         database = self.shared.index.writable_database
         if database is not None:
@@ -1006,7 +1011,7 @@ class Store:
                 self.directory,
                 self.catalog,
                 database,
-                self.session.recordings() if recordings is None else self.session.as_now(chosen),
+                self.session.recordings() if names is None else self.session.as_now(names),
                 progress=progress,
             )
             self.refresh()

@@ -79,7 +79,7 @@ def export_command(given: _Given) -> None:
     with given.opened(snapshot=True) as store:
         query = given.query(store)
         if not query.topics:
-            raise UsageError(store.directory.when_empty)
+            raise UsageError(store.session.when_empty)
         if given.tags is not None:
             query = query.tags(*parse_fields(given.tags, "--tags"))
         if form == LEROBOT:

@@ -164,7 +164,7 @@ def _show(store: Store, given: _Given) -> None:
     if sys.stdout.isatty() and len(chosen) <= _MAX_DRAWN:
         drawn = {entry.id: _densities(store, entry) for entry in chosen}
     if not chosen:
-        output.note(store.directory.when_empty)
+        output.note(store.session.when_empty)
     for number, entry in enumerate(chosen):
         if number:
             output.say()

@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import time
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING
 
 import click
 
 from hybridlog.cli import output
 from hybridlog.cli.binder import command, option
-from hybridlog.cli.options import AsJson, InStore, Named, Quiet
+from hybridlog.cli.options import AsJson, InStore, Named, Quiet, recordings_of
 from hybridlog.cli.progress import Stages, progress_bar
 from hybridlog.wording import listed
-from hybridlog_storage.errors import DatabaseError, UsageError, WithoutMongoError
+from hybridlog_storage.errors import DatabaseError, TopicError, UsageError, WithoutMongoError
 
 if TYPE_CHECKING:
     from hybridlog.maintenance.verify import Verification
+    from hybridlog.store import Store
+    from hybridlog_storage.summary import RecordingSummary
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,17 +47,18 @@ def verify_command(given: _Verify) -> None:
         raise UsageError("--moved and --new-id are for --repair: give that, too.")
     started = time.monotonic()
     with given.opened(quiet=given.quiet) as store:
-        chosen = given.recordings_in(store)
-        total = sum(entry.stored_bytes for entry in chosen.summaries)
+        chosen, unreadable = _chosen(given, store)
+        total = sum(entry.stored_bytes for entry in chosen)
+        names = None if given.choice.is_everything else [*(one.id for one in chosen), *unreadable]
         with progress_bar("verify", total, quiet=given.quiet) as bar:
-            result = store.verify(None if given.choice.is_everything else chosen, Stages(bar))
+            result = store.verify(names, Stages(bar))
         why = store.shared.index.unavailable
     elapsed = time.monotonic() - started
     if given.as_json:
         output.print_json({**asdict(result), "seconds": round(elapsed, 3)})
     else:
         _print(result, elapsed, quiet=given.quiet)
-        running = [one.name for one in chosen.summaries if one.status == "open"]
+        running = [one.name for one in chosen if one.status == "open"]
         if running and not given.quiet:
             output.note(f"Still being recorded, and checked as far as sealed: {listed(running)}.")
     is_wanted = not isinstance(why, WithoutMongoError)
@@ -63,6 +68,21 @@ def verify_command(given: _Verify) -> None:
         raise click.exceptions.Exit(1)
     if not result.index and is_wanted and why is not None:
         raise DatabaseError(f"The index was not compared: {why}")
+
+
+def _chosen(given: _Verify, store: Store) -> tuple[Sequence[RecordingSummary], list[str]]:
+    """The chosen recordings, and ids of chosen ones that cannot be read: their names are lost."""
+    choice, known = given.choice, [*store.repairs.unreadable]
+    unreadable = [one for one in known if any(fnmatchcase(one, name) for name in choice.name)]
+    names = tuple(name for name in choice.name if name not in unreadable)
+    if unreadable and not names:
+        return [], unreadable
+    try:
+        return recordings_of(store, replace(choice, name=names)).summaries, unreadable
+    except TopicError:
+        if not unreadable:
+            raise
+        return [], unreadable
 
 
 def _print(result: Verification, elapsed: float, *, quiet: bool) -> None:
@@ -97,9 +117,10 @@ def _repair(given: _Verify) -> None:
         if given.moved:
             store.shared.index.take_over()
             output.note("The index belongs to the store at this place now.")
-        chosen = None if given.choice.is_everything else given.recordings_in(store)
+        chosen, unreadable = _chosen(given, store)
+        names = None if given.choice.is_everything else [*(one.id for one in chosen), *unreadable]
         with progress_bar("repair", 0, quiet=given.quiet) as bar:
-            done = store.verify(chosen, Stages(bar), repair=True)
+            done = store.verify(names, Stages(bar), repair=True)
     left = [one for one in done if not one.is_cured]
     if given.as_json:
         output.print_json([asdict(one) for one in done])

@@ -67,7 +67,7 @@ class Index:
         elif left:
             raise next(iter(left.values()))
         shared.invalidate()
-        return shared.now().as_now([entry for entry in chosen if entry.id not in left])
+        return shared.now().as_now([entry.id for entry in chosen if entry.id not in left])
 
     @again_if_lost
     def add(self, topic: str, *fields: str) -> _FieldIndexes:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -60,21 +60,24 @@ def repair(
     directory: StoreDirectory,
     catalog: Catalog,
     repairs: RepairReport,
-    entries: Iterable[RecordingEntry] | None,
+    names: Mapping[str, str] | None,
 ) -> list[Repaired]:
     """Repair files, manifests and the catalog.
+
+    Args:
+        directory: The store.
+        catalog: Its catalog.
+        repairs: Says which recordings cannot be read.
+        names: Names of the recordings by id; None for all.
 
     Raises:
         StoreError: The store cannot be written.
     """
     directory.check_writable()
     done: list[Repaired] = []
-    entries = None if entries is None else [*entries]
     checker = tables.TableChecker(directory)
-    names = {one: one for one in (*directory.ids(), *directory.manifests.without())}
-    if entries is not None:
-        names = {entry.id: entry.name for entry in entries}
-    for recording, name in names.items():
+    all_ids = (*directory.ids(), *directory.manifests.without())
+    for recording, name in ({one: one for one in all_ids} if names is None else names).items():
         try:
             with directory.writing(recording, name, wait_s=LOCK_WAIT_S):
                 done += _repair_one(directory, catalog, recording)
@@ -84,7 +87,7 @@ def repair(
                 made = checker.repair(entry)
                 done += [Repaired(entry.name, f"table of {topic}", "made again") for topic in made]
         except HeldError as error:
-            if entries is not None or recording in repairs.unreadable:
+            if names is not None or recording in repairs.unreadable:
                 done.append(Repaired(name, "recording", str(error), is_cured=False))
         except (StoreError, TopicError) as error:
             done.append(Repaired(name, "recording", str(error), is_cured=False))

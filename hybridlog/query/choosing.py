@@ -68,7 +68,7 @@ def choose(session: Session, choice: Choice) -> Chosen:
     choosing = _Choosing(session)
     try:
         if not choosing.left and not choice.is_everything:
-            raise _NothingLeftError(session.directory.when_empty)
+            raise _NothingLeftError(session.when_empty)
         if choice.name:
             choosing.by_name(choice.name)
         choosing.look()
