@@ -35,7 +35,6 @@ ALLOWED = {
     "blake3": (
         "hybridlog_storage.disk.append_file",
         "hybridlog_storage.manifest",
-        "hybridlog_storage.recordings",
         "hybridlog_storage.schemas",
     ),
     "bson": (
@@ -71,7 +70,6 @@ ALLOWED = {
         "hybridlog.record.capture",
         "hybridlog_storage.catalog",
         "hybridlog_storage.manifest",
-        "hybridlog_storage.recordings",
         "hybridlog_storage.segments.statements",
         "hybridlog_storage.summary",
     ),

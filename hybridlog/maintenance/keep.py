@@ -29,6 +29,7 @@ from hybridlog.maintenance.retention import (
 )
 from hybridlog.maintenance.sizes import disk_bytes
 from hybridlog.record.losses import extent_of
+from hybridlog.wording import listed
 from hybridlog_storage.disk.directory import LOCK_WAIT_S, is_stable
 from hybridlog_storage.errors import (
     DiskFullError,
@@ -113,15 +114,22 @@ class Keeper:
         self._known: dict[str, tuple[str, Held]] = {}  # by id, with its look
         # Ids and segments that this pass could not change; -1 for the whole recording.
         self._failed: set[tuple[str, int]] = set()
+        self._unproven: set[str] = set()  # names of recordings whose manifests were made again
 
     def plan(self, rules: Rules) -> Plan:
         """The deletions that are due now."""
         path, now = self._directory.path, time.time_ns()
         if isinstance(self._directory, RemoteDirectory):
-            used = self._directory.listed_bytes
-            return plan(self._held(now), rules, used=used, free=None, now=now)
-        used, free = disk_bytes(path), shutil.disk_usage(path).free
-        return plan(self._held(now), rules, used=used, free=free, now=now)
+            used, free = self._directory.listed_bytes, None
+        else:
+            used, free = disk_bytes(path), shutil.disk_usage(path).free
+        found = plan(self._held(now), rules, used=used, free=free, now=now)
+        if self._unproven:
+            found.warnings.append(
+                f"{listed(sorted(self._unproven))}: left alone, since a manifest that was lost "
+                "and made again may lack pins."
+            )
+        return found
 
     def keep(self, rules: Rules, progress: Progress | None = None) -> KeepReport:
         """Let go what has to go.
@@ -188,7 +196,8 @@ class Keeper:
             yield
 
     def _held(self, now: int) -> Iterator[Held]:
-        """The content of the recordings; damaged ones are left alone."""
+        """The content of the recordings; damaged and unproven ones are left alone."""
+        self._unproven.clear()
         looks = self._directory.looks(self._directory.ids())
         self._known = {one: known for one, known in self._known.items() if one in looks}
         for recording, look in looks.items():
@@ -211,6 +220,9 @@ class Keeper:
     def _read(self, recording: str, now: int) -> Held | None:
         manifest = self._directory.manifests.find(recording)
         if manifest is None:
+            return None
+        if manifest.status == "unproven":
+            self._unproven.add(manifest.name)
             return None
         return held_of(manifest, now)
 
