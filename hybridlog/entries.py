@@ -37,7 +37,15 @@ from hybridlog_storage.errors import (
     SegmentError,
     StoreError,
 )
-from hybridlog_storage.manifest import Fields, File, Manifest, Source, free_name, loss_of
+from hybridlog_storage.manifest import (
+    Fields,
+    File,
+    Manifest,
+    Source,
+    free_name,
+    is_id,
+    loss_of,
+)
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_file import Sealed, sealed_channels
 from hybridlog_storage.segments.segment_reader import SegmentReader, SegmentSummary
@@ -237,7 +245,8 @@ def check_folder(directory: StoreDirectory, folder: str, recording: str) -> None
     """
     if recording and folder != recording:
         path = directory.recording(folder)
-        if directory.has(recording):
+        own = directory.listing(recording) if is_id(recording) else None
+        if own is not None and (own.sealed or own.open):
             raise StoreError(f"{path} is a copy of {recording}: remove it.")
         raise StoreError(f"{path} is recording {recording}: give the folder this name again.")
 

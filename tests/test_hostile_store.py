@@ -36,7 +36,8 @@ FILES = {
     "catalog": "catalog.sqlite",
     "journal of the catalog": "catalog.sqlite-journal",
     "log of the catalog": "catalog.sqlite-wal",
-    "manifest": "{small}/manifest.json",
+    "manifest": "manifests/{id}.json",
+    "lock of all manifests": "manifests/.lock",
     "manifest before": "{small}/manifest.old",
     "lock of the manifest": "{small}/manifest.lock",
     "lock": "{small}/writer.lock",
@@ -49,7 +50,7 @@ FILES = {
 FOLDERS = {
     "recordings": "{root}",
     "recording": "{small}",
-    "removed recording": "{root}/.removed-small-0123abcd",
+    "manifests": "manifests",
     "recorders": "recorders",
     "tables": "tables",
     "unfinished tables": "tables.part",
@@ -210,7 +211,8 @@ def name_of(store: Path, kind: str) -> str:
         "root": places.root(store),
         "small": places.folder(store, "small"),
     }
-    inside = {key: path.relative_to(store) for key, path in found.items()}
+    inside: dict[str, object] = {key: path.relative_to(store) for key, path in found.items()}
+    inside["id"] = found["small"].name
     return {**FILES, **FOLDERS}[kind].format(**inside)
 
 
@@ -497,7 +499,7 @@ def test_every_kind_of_file_is_tried(tmp_path: Path, bag: Path) -> None:
         seen |= {str(p.relative_to(place)) for p in place.rglob("*")}
         small = places.folder(place, "small").relative_to(place)
     known = {name_of(place, kind) for kind in (*FILES, *FOLDERS)}
-    alike = {name.replace(f"{begun}/", f"{small}/") for name in seen - {str(begun)}}
+    alike = {name.replace(begun.name, small.name) for name in seen}
     alike = {re.sub(r"/\d+\.mcap", "/000001.mcap", name) for name in alike}
     # Tables, whose names are drawn, are tried by themselves.
     drawn = (OF_MONGOD, OF_TABLES)

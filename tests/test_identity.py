@@ -32,14 +32,16 @@ from hybridlog_storage.disk import directory as directory_module
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import (
     DatabaseError,
+    HeldError,
     HybridlogError,
+    RecordingGoneError,
     StoreError,
     TimeError,
     TopicError,
     UsageError,
 )
 from hybridlog_storage.manifest import replace
-from hybridlog_storage.manifests import MANIFEST_LOCK
+from hybridlog_storage.manifests import MANIFEST_LOCK, manifests_at
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.mongo.database import Database
 from hybridlog_storage.mongo.index_state import IndexState
@@ -105,10 +107,11 @@ def test_a_folder_with_another_name_is_told_and_left_alone(place: Path) -> None:
     folder = places.folder(place, "one")
     folder.rename(folder.with_name("other"))
     with hl.open(place, mongo=NOWHERE) as store:
-        assert not store.recordings()
+        assert [one.status for one in store.recordings()] == ["damaged"]
         assert "give the folder this name again" in store.repairs.unreadable["other"]
-        (finding,) = store.verify().findings
-        assert (finding.recording, folder.name in finding.problem) == ("other", True)
+        findings = {one.recording: one.problem for one in store.verify().findings}
+        assert folder.name in findings["other"]
+        assert findings.keys() == {"one", "other"}
     folder.with_name("other").rename(folder)
     with hl.open(place, mongo=NOWHERE) as store:
         assert answers(store) == answers(store, "one") == right()
@@ -145,7 +148,9 @@ def test_a_recording_that_was_copied_from_another_store_answers(
     with hl.open(tmp_path / "mine", create=True):
         pass
     theirs = places.folder(place, "one")
-    shutil.copytree(theirs, places.new_folder(tmp_path / "mine", theirs.name))
+    mine = places.new_folder(tmp_path / "mine", theirs.name)
+    shutil.copytree(theirs, mine)
+    shutil.copy(places.manifest_of(theirs), places.manifest_of(mine))
     with hl.open(tmp_path / "mine") as store:
         (entry,) = store.recordings()
         assert (entry.name, entry.status, entry.tags) == ("one", "complete", {"a": "1"})
@@ -212,10 +217,11 @@ def documents(uri: str) -> dict[str, int]:
 def test_a_copied_store_with_a_uri_is_noticed_and_removes_nothing(
     place: Path, uri: str, tmp_path: Path
 ) -> None:
-    copy = tmp_path / "copy"
+    copy, one = tmp_path / "copy", places.folder(place, "one")
     shutil.copytree(place, copy)
     before = documents(uri)
     shutil.rmtree(places.folder(copy, "one"))
+    places.manifest_of(places.root(copy) / one.name).unlink()
     for _ in range(2):
         with hl.open(copy, mongo=uri) as store:
             assert store.database is None
@@ -229,8 +235,8 @@ def test_a_copied_store_with_a_uri_is_noticed_and_removes_nothing(
     with hl.open(place, mongo=uri) as store:
         assert answers(store) == right()
     # With an id and a database of its own it is a store like any other.
-    one = places.folder(place, "one")
     shutil.copytree(one, places.new_folder(copy, one.name))
+    shutil.copy(places.manifest_of(one), copy / "manifests")
     become_another(copy, "embedded")
     with hl.open(copy) as store:
         assert answers(store) == right()
@@ -423,12 +429,12 @@ class Exchange:
         self.left -= 1
         if self.left == -1:
             self.is_over = True
-            with ExitStack() as held, suppress(BlockingIOError, FileNotFoundError):
-                for path in (self.recording.parent, *self.recording.glob("writer.lock")):
+            with ExitStack() as held, suppress(BlockingIOError, HeldError, RecordingGoneError):
+                for path in self.recording.glob("writer.lock"):
                     fd = os.open(path, os.O_RDONLY)
                     held.callback(os.close, fd)
                     fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)  # as who removes one does
-                self.recording.rename(self.recording.with_name(".removed-a"))
+                manifests_at(self.recording).remove(self.recording.name)
 
 
 def replace_segments(recording: Path) -> None:
@@ -437,12 +443,22 @@ def replace_segments(recording: Path) -> None:
         (recording / f"{old:06d}.mcap").rename(recording / f"{new:06d}.mcap")
 
 
+def is_removed(store: Path, recording: str) -> bool:
+    """Whether a recording is gone, or about to."""
+    try:
+        return places.read_in(places.root(store) / recording) is None
+    except RecordingGoneError:
+        return True
+
+
 _LOCKS = {"writer.lock", MANIFEST_LOCK}
 
 
 def content_of(store: Path, recording: str) -> dict[str, bytes]:
     """Files of a recording, by its id, and their content; empty if it is gone."""
     top, found = places.root(store) / recording, {}
+    with suppress(FileNotFoundError):
+        found["manifest"] = places.manifest_of(top).read_bytes()
     for path in top.rglob("*") if top.exists() else ():
         if path.is_file() and path.name not in _LOCKS:
             found[str(path.relative_to(top))] = path.read_bytes()
@@ -496,7 +512,7 @@ def test_a_command_whose_recording_is_removed_changes_no_other(
 ) -> None:
     base, one, other = two
     others = content_of(base, other)
-    limit(sync=lambda *_: None)
+    limit(sync=lambda *_: None, manifest_wait_s=0)
     monkeypatch.setattr(IndexAccess, "database", None)
     for first, after in enumerate([False, True]):
         for step in count(7 * first % stride, stride):
@@ -517,7 +533,7 @@ def test_a_command_whose_recording_is_removed_changes_no_other(
                         problem = error
             about = (after, step, problem)
             assert content_of(place, other) == others, about
-            is_gone = (places.root(place) / ".removed-a").exists()
+            is_gone = is_removed(place, one)
             assert problem is None or is_gone, about
             if not is_gone:
                 assert content_of(place, one) != before, about

@@ -16,7 +16,7 @@ import pytest
 import hybridlog as hl
 from hybridlog.cli.keep import keep_command
 from hybridlog.cli.open import print_unplayed
-from hybridlog.maintenance import edit, expiry
+from hybridlog.maintenance import expiry
 from hybridlog.maintenance import keep as keeping
 from hybridlog.maintenance.keep import Keeper
 from hybridlog.maintenance.retention import Rules
@@ -25,6 +25,7 @@ from hybridlog_storage.disk import files
 from hybridlog_storage.disk.directory import StoreDirectory
 from hybridlog_storage.errors import HybridlogError, PayloadError, StoreError, TimeError
 from hybridlog_storage.manifest import File, Manifest, new_id, replace
+from hybridlog_storage.manifests import DiskManifests
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import places
@@ -370,15 +371,15 @@ def test_what_is_said_meanwhile_keeps_a_recording(
     store: Path, monkeypatch: pytest.MonkeyPatch, what: str
 ) -> None:
     keep("--max-age", "0s", store=store)
-    announce = edit.announce_removal
+    remove = DiskManifests.remove
 
-    def said_before(*words: Any) -> None:
+    def said_before(*words: Any) -> Manifest:
         pin = keeping.pin_of("now", (None, None), None, "")
         said = {"tags": {"stay": "yes"}} if what == "tag" else {"pins": (pin,)}
         places.change_in(places.folder(store, "run"), lambda now: replace(now, **said))
-        announce(*words)
+        return remove(*words)
 
-    monkeypatch.setattr(edit, "announce_removal", said_before)
+    monkeypatch.setattr(DiskManifests, "remove", said_before)
     found = keep("--fields-age", "0s", "--never-tag", "stay", store=store)
     assert "was set meanwhile" in found.err
     assert places.names(store) == ["run"]

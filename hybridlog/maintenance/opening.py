@@ -257,9 +257,9 @@ class StoreFiles:
                 described = describe_now(directory, catalog, recording)
                 catalog.put(described)
                 return described
-        except HeldError:
+        except (HeldError, TopicError):
             pass
-        except (TopicError, RecordingGoneError):
+        except RecordingGoneError:
             return None
         return self._describe(recording, is_open=directory.is_recorded(recording))
 
@@ -351,8 +351,8 @@ def recover(directory: StoreDirectory, recording: str, report: RepairReport) -> 
     try:
         manifest = directory.manifests.read(recording)
     except RecordingGoneError:
-        directory.manifests.remove(recording)  # finishes a removal, or says that there is none
-        report.removed.append(recording)
+        removed = directory.manifests.remove(recording)  # finishes it, or says that there is none
+        report.removed.append(removed.name)
         return False
     clear_away(directory, recording)
     listing = directory.listing(recording)

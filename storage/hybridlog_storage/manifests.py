@@ -63,8 +63,6 @@ _ALL: Final = ".lock"
 MANIFEST_LOCK: Final = "manifest.lock"
 WRITER_LOCK: Final = "writer.lock"
 _LOCKS: Final = frozenset({MANIFEST_LOCK, WRITER_LOCK})
-COPYING: Final = ".copying"
-"""Name of a file in a folder that gets its manifest when all else of it has been copied."""
 MANIFEST_OLD: Final = "manifest.old"
 
 
@@ -160,12 +158,17 @@ class Manifests(ABC):
             create(made)
             return made
 
-    def remove(self, recording: str, check: Callable[[Manifest], object] = lambda _: None) -> None:
+    def remove(
+        self, recording: str, check: Callable[[Manifest], object] = lambda _: None
+    ) -> Manifest:
         """Remove a recording with all its files; finishes a removal that was interrupted.
 
         Args:
             recording: Its id.
             check: Called with the newest manifest; raises to keep the recording.
+
+        Returns:
+            What it was.
 
         Raises:
             RecordingGoneError: There is no such recording.
@@ -178,12 +181,13 @@ class Manifests(ABC):
             return replace(now, status="removed")
 
         try:
-            self._change(recording, removed)
+            found = self._change(recording, removed)
         except DiskFullError:
             self._delete_files(recording)  # which makes room for the change
-            self._change(recording, removed)
+            found = self._change(recording, removed)
         self._delete_files(recording)
         self._forget(recording)
+        return found
 
     def _change(
         self, recording: str, how: Callable[[Manifest], Manifest], *, sync: bool = True
@@ -272,7 +276,7 @@ class DiskManifests(Manifests):
         """Names of folders in `recordings` without a manifest, sorted: lost, or copied by hand.
 
         Those with nothing but locks are left out: a recording begins, or was removed. So are
-        those of copies that have not ended.
+        those of copies that have not ended, which have no `manifest.lock` yet.
         """
         found = self._names(self._recordings)
         others = sorted({*found} - {*self.ids()})
@@ -282,7 +286,7 @@ class DiskManifests(Manifests):
         """True for a folder with more than locks."""
         try:
             found = files.names(self._recordings / recording).keys()
-            return COPYING not in found and not found <= _LOCKS
+            return not found <= _LOCKS and (MANIFEST_LOCK in found or not is_id(recording))
         except (FileNotFoundError, NotADirectoryError):  # or a link
             return False
 
@@ -309,26 +313,36 @@ class DiskManifests(Manifests):
         Raises:
             HybridlogError: Something cannot be removed.
         """
-        if not self._left():
+        if not (self._left() or self._bare()):
             return
         with suppress(HeldError), self._all_locked(wait_s=0):
             try:
-                for path in self._left():
-                    files.remove_tree(path)
+                for path, lock in self._left():
+                    with suppress(FileNotFoundError, HeldError), _locked(lock, 0):
+                        files.unlink(path)
+                for folder in self._bare():
+                    files.remove_tree(folder)
             except OSError as error:
                 raise durability.explain(error, self._folder, "clearing") from error
 
-    def _left(self) -> list[Path]:
-        """Manifests that were being written, and folders without one that hold only locks."""
-        names, folders = self._names(self._folder), self._names(self._recordings)
-        known = {*self.ids()}
-        new = {f".{one}{_NEW}" for one in known}  # somebody may write them right now
-        left = [self._folder / one for one in names if one.endswith(_NEW) and one not in new]
-        for name in filter(is_id, {*folders} - known):
-            with suppress(OSError):
-                if files.names(self._recordings / name).keys() <= _LOCKS:
-                    left.append(self._recordings / name)
-        return left
+    def _left(self) -> list[tuple[Path, Path]]:
+        """Manifests that are being written, or were when their writers died, and their locks."""
+        names = (one for one in self._names(self._folder) if one.endswith(_NEW))
+        ids = {one: one.removeprefix(".").removesuffix(_NEW) for one in names}
+        locks = {one: self._recordings / of / MANIFEST_LOCK for one, of in ids.items()}
+        return [(self._folder / one, lock) for one, lock in locks.items()]
+
+    def _bare(self) -> list[Path]:
+        """Folders without a manifest that hold only locks."""
+        found = {*self._names(self._recordings)}
+        found -= {*self.ids()}
+        folders = [self._recordings / name for name in found if is_id(name)]
+        return [folder for folder in folders if self._is_bare(folder)]
+
+    def _is_bare(self, folder: Path) -> bool:
+        with suppress(OSError):
+            return files.names(folder).keys() <= _LOCKS
+        return False
 
     @contextmanager
     def creating(self) -> Iterator[Callable[[Manifest], None]]:

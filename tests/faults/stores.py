@@ -37,7 +37,7 @@ from tests.indexed import EVERYTHING
 
 WHERE = 20
 """Messages with `n` of at least this are asked for."""
-_ANY_FILE = {LOCK, MANIFEST_LOCK, MANIFEST_OLD}
+_ANY_FILE = {LOCK, MANIFEST_LOCK, MANIFEST_OLD, f".{MANIFEST_OLD}"}
 _MADE_UP = re.compile(r"\b([0-9]{8}-[a-z0-9-]+-)?[0-9a-f]{16}\b|\b[0-9a-f]{32}\b|\d{19}")
 
 

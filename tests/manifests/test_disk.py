@@ -299,13 +299,14 @@ def test_what_killed_processes_left_is_removed_unless_a_recording_begins(store: 
 
 def test_folders_without_a_manifest_are_told_unless_they_hold_nothing(store: Path) -> None:
     manifests = DiskManifests(store)
-    for name, file in (("bare", "manifest.lock"), ("copied", ".copying"), ("lost", "manifest.old")):
-        (store / "recordings" / name).mkdir()
-        (store / "recordings" / name / file).touch()
-    (store / "recordings" / "copied" / "000000.mcap").touch()
+    lost, copied, bare = (new_id(name) for name in ("lost", "copied", "bare"))
+    for path in (f"{lost}/manifest.lock", f"{lost}/000000.mcap", f"{copied}/000000.mcap",
+                 f"{bare}/manifest.lock", "by-hand/000000.mcap"):  # fmt: skip
+        (store / "recordings" / path).parent.mkdir(exist_ok=True)
+        (store / "recordings" / path).touch()
     (store / "recordings" / "file").touch()
     (store / "recordings" / "link").symlink_to(store)
-    assert manifests.without() == ["lost"]
+    assert manifests.without() == [lost, "by-hand"]
     assert manifests.ids() == [ONE.id]
 
 

@@ -388,12 +388,14 @@ class ListedManifests(DiskManifests):
         """
         return self._directory.change(recording, how)
 
-    def remove(self, recording: str, check: Callable[[Manifest], object] = lambda _: None) -> None:
+    def remove(
+        self, recording: str, check: Callable[[Manifest], object] = lambda _: None
+    ) -> Manifest:
         """List a recording no more, within `writing`; its objects stay."""
-        found = self.find(recording)
-        if found is not None:  # or it was lost
-            check(found)
+        found = self.read(recording)
+        check(found)
         self._directory.drop(recording)
+        return found
 
 
 class RemoteDirectory(StoreDirectory):
