@@ -278,9 +278,12 @@ class DiskManifests(Manifests):
         Those with nothing but locks are left out: a recording begins, or was removed. So are
         those of copies that have not ended, which have no `manifest.lock` yet.
         """
-        found = self._names(self._recordings)
-        others = sorted({*found} - {*self.ids()})
-        return [name for name in others if name[0] != "." and self._holds(name)]
+        return [name for name in sorted(self._others()) if name[0] != "." and self._holds(name)]
+
+    def _others(self) -> set[str]:
+        """Names in `recordings` of what has no manifest."""
+        found = {*self._names(self._recordings)}  # before the manifests, which come later
+        return found - {name.removesuffix(_SUFFIX) for name in self._names(self._folder)}
 
     def _holds(self, recording: str) -> bool:
         """True for a folder with more than locks."""
@@ -334,9 +337,7 @@ class DiskManifests(Manifests):
 
     def _bare(self) -> list[Path]:
         """Folders without a manifest that hold only locks."""
-        found = {*self._names(self._recordings)}
-        found -= {*self.ids()}
-        folders = [self._recordings / name for name in found if is_id(name)]
+        folders = [self._recordings / name for name in self._others() if is_id(name)]
         return [folder for folder in folders if self._is_bare(folder)]
 
     def _is_bare(self, folder: Path) -> bool:
