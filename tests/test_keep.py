@@ -385,6 +385,16 @@ def test_what_is_said_meanwhile_keeps_a_recording(
     assert places.names(store) == ["run"]
 
 
+def test_what_may_have_lost_pins_is_left_alone_and_named(store: Path) -> None:
+    places.manifest_of(places.folder(store, "run")).unlink()
+    answer("verify", "--repair", "--mongo", "none", store=store)
+    found = keep("--max-age", "0s", "--fields-age", "0s", store=store)
+    assert (
+        "run: left alone, since a manifest that was lost and made again may lack pins" in found.err
+    )
+    assert all(raw == image(n) for n, raw in payloads(store).items())
+
+
 def test_one_process_at_a_time(store: Path) -> None:
     with StoreDirectory(store).retaining() as is_alone:
         assert is_alone

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import hybridlog as hl
-from hybridlog_storage.errors import SegmentError
+from hybridlog_storage.errors import SegmentError, TopicError
 from hybridlog_storage.manifest import replace
 from hybridlog_storage.manifests import MANIFEST_OLD
 from hybridlog_storage.messages import Channel
@@ -307,3 +307,28 @@ def test_a_mark_beside_a_lost_segment_takes_nothing_of_it(store: Path) -> None:
         assert (entry.status, entry.messages, len(entry.marks)) == ("complete", COUNT + 1, 1)
         seqs = [m.seq for m in opened.all_topics().in_recording("one")]
         assert len(set(seqs)) == len(seqs) == COUNT + 1
+
+
+@pytest.mark.parametrize("chosen", ["its id", "*"])
+def test_a_recording_that_cannot_be_read_is_chosen_by_its_id(store: Path, chosen: str) -> None:
+    recording = places.id_of(store, "one")
+    places.manifest_of(places.folder(store, "one")).unlink()
+    words = ("-r", recording if chosen == "its id" else "*", "--mongo", "none")
+    found = answer("verify", "--json", *words, store=store, code=None).json
+    assert ("one", "manifest") in {(one["recording"], one["place"]) for one in found["findings"]}
+    assert found["recordings"] == (1 if chosen == "its id" else 2)
+    answer("verify", "--repair", *words, store=store)
+    assert look(store) == ("unproven", COUNT, 0)
+
+
+def test_a_store_whose_recordings_cannot_be_read_is_not_empty(store: Path) -> None:
+    for name in ("one", "two"):
+        places.manifest_of(places.folder(store, name)).unlink()
+    said = answer("info", "--mongo", "none", store=store)
+    assert "2 recordings cannot be read: `hybridlog verify` says why." in said.err
+    assert "empty" not in said.out + said.err
+    with (
+        hl.open(store, mongo="none") as opened,
+        pytest.raises(TopicError, match="2 recordings cannot be read"),
+    ):
+        opened.recordings("one").check()
