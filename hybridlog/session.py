@@ -427,7 +427,7 @@ class Session:
     def _resolve(self, names: tuple[str, ...]) -> tuple[tuple[str, ...], tuple[str, ...] | None]:
         known = self.topics()
         if not names:
-            there = f"There are: {listed(known)}." if known else "The store is empty."
+            there = f"There are: {listed(known)}." if known else self.when_empty
             raise TopicError(f"Name a topic. {there}")
         return self.having(resolve(names, known))
 

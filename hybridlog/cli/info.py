@@ -139,7 +139,8 @@ def _show_part(store: Store, given: _Given) -> bool:
             return True
         show_topics(store, query, given.topic, as_json=as_json)
     elif given.sizes is not None:
-        show_sizes(store.sizes(given.recordings_in(store)), given.sizes, as_json=as_json)
+        sizes = store.sizes(given.recordings_in(store))
+        show_sizes(sizes, given.sizes, as_json=as_json, without=store.session.when_empty)
     elif given.attachments or given.attachment is not None:
         found = [one for entry in given.recordings_in(store) for one in store.attachments(entry)]
         show_attachments(found, given.attachment, given.output, force=given.force, as_json=as_json)

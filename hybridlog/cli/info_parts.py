@@ -184,13 +184,14 @@ def _loss_cells(row: dict[str, Any]) -> list[str]:
     ]
 
 
-def show_sizes(sizes: Sizes, by: str, *, as_json: bool) -> None:
+def show_sizes(sizes: Sizes, by: str, *, as_json: bool, without: str) -> None:
     """Print the bytes of recordings, topics, or topics of each recording.
 
     Args:
         sizes: The sizes.
         by: `recording`, `topic` or `both`.
         as_json: Print JSON.
+        without: What to say without any.
     """
     rows = sizes.rows
     if by != "both":
@@ -201,7 +202,7 @@ def show_sizes(sizes: Sizes, by: str, *, as_json: bool) -> None:
     elif rows:
         _print_sizes(rows, sizes.total, recordings=by != "topic", topics=by != "recording")
     else:
-        output.note("The store is empty.")
+        output.note(without)
 
 
 _NO_TOPIC = "(no topic)"

@@ -194,10 +194,6 @@ def _announce(store: Path) -> None:
     places.change_in(places.folder(store, "a"), lambda now: replace(now, status="removed"))
 
 
-def _hide(store: Path) -> None:
-    places.folder(store, "a").rename(places.root(store) / ".removed-a-00000000")
-
-
 def _lose_segment(store: Path) -> None:
     places.segment(store, "a", 1).unlink()
 
@@ -222,7 +218,6 @@ SCENARIOS: Mapping[str, Callable[[Bench], Scenario]] = {
         lambda bench: _changed(bench, "unlisted", _forget_segment), a=FIRST, b=SECOND
     ),
     "open while removing": _opening(lambda bench: _changed(bench, "removing", _announce), b=SECOND),
-    "open after removing": _opening(lambda bench: _changed(bench, "hidden", _hide), b=SECOND),
     "open after a mark": _opening(_marked, b=SECOND),
     "open without a segment": _opening(
         lambda bench: _changed(bench, "lost", _lose_segment), b=SECOND

@@ -40,7 +40,7 @@ def once(action: Callable[[], object], calls: Calls, looking: str = "looks") -> 
 def test_a_recording_that_is_removed_is_no_unreadable_one(
     case: Case, monkeypatch: pytest.MonkeyPatch, calls: Calls
 ) -> None:
-    once(lambda: StoreDirectory(case.path).hide(places.id_of(case.path, "a")), calls)
+    once(lambda: StoreDirectory(case.path).manifests.remove(places.id_of(case.path, "a")), calls)
     with case.open() as store:
         assert {entry.name for entry in store.recordings()} == {"b"}
         assert not store.repairs.unreadable
