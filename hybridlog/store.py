@@ -993,7 +993,7 @@ class Store:
         """Names of recordings by id, where ids of those that cannot be read stand for them."""
         unreadable, names = self.repairs.unreadable, [*names]
         found = {one: one for one in names if isinstance(one, str) and one in unreadable}
-        others = self.select([one for one in names if one not in found])
+        others = self.select([one for one in names if not isinstance(one, str) or one not in found])
         return found | {one.id: one.name for one in others}
 
     def _repair(self, recordings: Names | None, progress: Progress | None) -> list[Repaired]:

@@ -180,13 +180,13 @@ class Manifests(ABC):
                 check(now)
             return replace(now, status="removed")
 
+        is_said = True
         try:
             found = self._change(recording, removed)
-        except DiskFullError:
-            self._delete_files(recording)  # which makes room for the change
-            found = self._change(recording, removed)
+        except DiskFullError:  # and who wants to free some space comes here
+            is_said, found = False, self._read(recording)[0]
         self._delete_files(recording)
-        self._forget(recording)
+        self._forget(recording, is_said=is_said)
         return found
 
     def _change(
@@ -253,8 +253,8 @@ class Manifests(ABC):
         """Delete the files of a removed recording, but not its lock."""
 
     @abstractmethod
-    def _forget(self, recording: str) -> None:
-        """Delete the manifest of a removed recording."""
+    def _forget(self, recording: str, *, is_said: bool) -> None:
+        """Delete the manifest of a removed recording, which says so unless the disk was full."""
 
 
 class DiskManifests(Manifests):
@@ -468,13 +468,13 @@ class DiskManifests(Manifests):
         except OSError as error:
             raise durability.explain(error, folder, "deleting") from error
 
-    def _forget(self, recording: str) -> None:
+    def _forget(self, recording: str, *, is_said: bool) -> None:
         # A copy may have created it anew meanwhile, if somebody else has finished the removal.
         # A change makes no lock where there is no manifest, so the folder is empty in the end.
         _make_file(self._folder / _ALL)  # copies of a store may leave out what is empty
         with _locked(self._folder / _ALL):
             with suppress(RecordingGoneError):
-                if self._read(recording)[0].status != "removed":
+                if is_said and self._read(recording)[0].status != "removed":
                     return
             try:
                 self._drop(recording)
@@ -531,7 +531,7 @@ class BucketManifests(Manifests):
         names = [one.name for one in self._bucket.objects(f"{_RECORDINGS}/{recording}/")]
         self._bucket.delete(names)
 
-    def _forget(self, recording: str) -> None:
+    def _forget(self, recording: str, *, is_said: bool) -> None:
         # Servers have no condition for deletions: between these two it could be created anew.
         with suppress(RecordingGoneError):
             if self._read(recording)[0].status == "removed":
