@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 _LONG_LOOK_S = 0.05  # a look for new recordings that takes longer is not made all the time,
 _LOOK_SHARE = 0.1  # but for this share of it,
 _MAX_BETWEEN_LOOKS_S = 1.0  # and at least so often
+_LIST_EVERY_S = 1.0  # between two comparisons of ids: tools that copy may write manifests later
 
 
 class OpenStore(Shared):
@@ -58,6 +59,7 @@ class OpenStore(Shared):
         self._latest: Session | None = None
         self._changed = 0, False  # as of the latest state, see `StoreDirectory.changed`
         self._names: list[str] = []  # ids of recordings
+        self._listed_at = 0.0  # when they were compared last, by `monotonic`
         self._looks_at = 0.0  # when the next look for new recordings is due, by `monotonic`
         self._mending = threading.Lock()
 
@@ -101,11 +103,15 @@ class OpenStore(Shared):
             return latest
 
     def _has_names_changed(self) -> bool:
-        """True if recordings may have come, gone, or got other names since the latest state."""
-        now, before = self.directory.changed(), self._changed
-        if now != before and self.directory.ids() == self._names:
-            self._changed = now
-        return self._changed != now
+        """True if recordings have come or gone since the latest state."""
+        now = self.directory.changed()
+        is_due = time.monotonic() - self._listed_at >= _LIST_EVERY_S
+        if now == self._changed and not is_due:
+            return False
+        self._listed_at = time.monotonic()
+        is_same = self.directory.ids() == self._names
+        self._changed = now if is_same else (0, False)
+        return not is_same
 
     def has_changed(self) -> bool:
         """True if files of recordings that were read look different by now."""
@@ -130,11 +136,14 @@ class OpenStore(Shared):
             if self._latest is None:
                 return
             before = self._latest.snapshot()
-            changed, names = self.directory.changed(), self.directory.ids()
-            ids = {*names}.symmetric_difference(before.by_id)
-            ids.update(one for one in recordings if one in before.by_id)
+            ids = {one for one in recordings if one in before.by_id}
+            changed, names = self.directory.changed(), self._names
+            has_changed = changed != self._changed
+            if has_changed:
+                names = self.directory.ids()
+                ids.update({*names}.symmetric_difference(before.by_id))
             now = self._files.catch_up(before, ids)
-            if now is None or self.directory.ids() != names:
+            if now is None or (has_changed and self.directory.ids() != names):
                 self.invalidate()
                 return
             self._changed, self._names = changed, names

@@ -48,7 +48,7 @@ class _Edit(InStore, Quiet):
 def edit_command(given: _Edit) -> None:
     """Give a recording another name, or write a note about it.
 
-    With the name, its directory is renamed as well; nothing else of the recording changes.
+    The name is what people call it; nothing else of the recording changes.
     """
     if given.name is None and given.note is None:
         raise UsageError("Say what to change: --name NAME or --note TEXT.")

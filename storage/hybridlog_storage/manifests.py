@@ -266,11 +266,17 @@ class DiskManifests(Manifests):
 
     def __init__(self, path: Path) -> None:
         self._folder = path / MANIFESTS
+        self._listed: tuple[set[str], list[str]] = set(), []
         self._recordings = path / _RECORDINGS
 
     def ids(self) -> list[str]:
         """Ids of all recordings that have a manifest, sorted; also of those being removed."""
-        return _ids(self._names(self._folder))
+        names = {*self._names(self._folder)}
+        before, ids = self._listed
+        if names != before:
+            ids = _ids(names)
+            self._listed = names, ids
+        return [*ids]
 
     def without(self) -> list[str]:
         """Names of folders in `recordings` without a manifest, sorted: lost, or copied by hand.
@@ -371,6 +377,8 @@ class DiskManifests(Manifests):
             self._make_lock(folder)
             with _locked(folder / MANIFEST_LOCK):
                 self._write(path, data, sync=True)
+            with files.folder(self._recordings) as fd:
+                os.utime(fd)  # from which readers see that a recording has come
         except OSError as error:
             raise durability.explain(error, path, "writing") from error
 
