@@ -1195,7 +1195,14 @@ def test_the_specification_names_what_there_is() -> None:
         assert f"`{state}`" in text
     for name in (index_state.RECORDINGS, index_state.STORE):
         assert f"`{name}`" in text
-    for name in (CATALOG, directory.LOCK, "manifests/<id>.json", "manifest.lock", "manifest.old"):
+    for name in (
+        CATALOG,
+        directory.LOCK,
+        "manifests/",
+        "<id>.json",
+        "manifest.lock",
+        "manifest.old",
+    ):
         assert name in sections(DOCS / "format.md", 2)["Directory"]
 
 

@@ -22,7 +22,7 @@ import hybridlog as hl
 from hybridlog.maintenance import copying, ssh
 from hybridlog.maintenance.copying import CopyOptions, CopyReport, run
 from hybridlog.maintenance.places import CopiedFile, Place, RefusedError, merged
-from hybridlog_storage import manifest, manifests
+from hybridlog_storage import manifest
 from hybridlog_storage.disk import files
 from hybridlog_storage.disk.directory import StoreDirectory
 from hybridlog_storage.errors import DiskFullError, HeldError, StoreError, UsageError
@@ -191,7 +191,7 @@ NONE = "other-" + "0" * 16
 
 
 def test_a_place_believes_nothing(robots: Path, tmp_path: Path, place_at: PlaceAt) -> None:
-    found = manifests.read_in(places.folder(robots, "recorded"))
+    found = places.read_in(places.folder(robots, "recorded"))
     assert found is not None
     recording, whole = found.id, manifest.encode(found)
     other = manifest.encode(manifest.replace(found, id=NONE))
@@ -329,10 +329,10 @@ def test_only_what_has_a_copy_expires(robots: Path, tmp_path: Path, place_at: Pl
     # One of the copies was made by hand before the end of the recording.
     cut = tmp_path / "cut"
     shutil.copytree(lab, cut)
-    found = manifests.read_in(places.folder(cut, "noted"))
+    found = places.read_in(places.folder(cut, "noted"))
     assert found is not None
     left = tuple(one for one in found.files if one.number != 1)
-    manifests.write_in(places.folder(cut, "noted"), manifest.replace(found, files=left))
+    places.write_in(places.folder(cut, "noted"), manifest.replace(found, files=left))
     places.segment(cut, "noted", 1).unlink()
 
     def run_to(path: Path, change: Any = None) -> CopyReport:
