@@ -1,7 +1,8 @@
 """Makes catalog entries of recordings from their manifests and segments, and puts them there.
 
 Recording, recovery and opening use the same functions, so their entries are equal. Files that
-differ from the manifest are not used. Content that the manifest lists and that is missing or
+differ from the manifest in size or content are not used; whole files are compared with its
+digests by `verify` only. Content that the manifest lists and that is missing or
 changed becomes rows of the loss ledger.
 """
 
@@ -12,7 +13,7 @@ import time
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, Literal, cast
 
 import numpy as np
@@ -29,6 +30,7 @@ from hybridlog_storage.catalog import (
     channel_entry,
     channel_totals,
     content_of,
+    spans_of,
 )
 from hybridlog_storage.disk.directory import PAYLOADS
 from hybridlog_storage.errors import (
@@ -47,7 +49,7 @@ from hybridlog_storage.manifest import (
     loss_of,
 )
 from hybridlog_storage.messages import Channel
-from hybridlog_storage.segments.segment_file import Sealed, sealed_channels
+from hybridlog_storage.segments.segment_file import Sealed, sealed_channels, sealed_name
 from hybridlog_storage.segments.segment_reader import SegmentReader, SegmentSummary
 from hybridlog_storage.summary import RecordingSummary, TopicType, hash_of, topics_to_json
 
@@ -102,20 +104,19 @@ class Inventory:
 
     Attributes:
         folder: Name of the directory.
-        listing: Names of its files.
+        path: The directory.
+        listing: Names of its files; of several segments of one number, the listed one.
         manifest: Its manifest; None without one.
         summaries: Summaries of valid segments, by number.
-        stored: Digest and size of the files of segments with expired chunks, by number. Their
-            summaries have the digest of the segment as it was before.
         misfits: Files that differ from the manifest.
         lost: Listed segments that are missing or changed.
     """
 
     folder: str
+    path: Path
     listing: Listing
     manifest: Manifest | None
     summaries: dict[int, SegmentSummary] = field(default_factory=dict)
-    stored: dict[int, tuple[str, int]] = field(default_factory=dict)
     misfits: list[Misfit] = field(default_factory=list)
     lost: list[File] = field(default_factory=list)
 
@@ -147,10 +148,21 @@ class Inventory:
             found |= {file.file: file for file in self.manifest.fields}
         return found
 
-    def stored_file(self, number: int) -> tuple[str, int]:
-        """Digest and size of the file of a valid segment."""
-        summary = self.summaries[number]
-        return self.stored.get(number, (summary.digest, summary.size))
+    @property
+    def logs(self) -> Mapping[int, File]:
+        """The segments that the manifest lists, by number."""
+        return {} if self.manifest is None else self.manifest.logs
+
+    def digest(self, number: int) -> str:
+        """Digest of the file of a valid segment; one that is not listed is read for it.
+
+        Raises:
+            SegmentError: It cannot be read.
+        """
+        if number in self.logs:
+            return self.logs[number].digest
+        with SegmentReader(self.path / self.listing.sealed[number], number) as reader:
+            return reader.digest()
 
     @property
     def end(self) -> Mapping[str, Any] | None:
@@ -186,9 +198,9 @@ def inventory_of(
         StoreError: They cannot be read, or are a copy of another recording.
     """
     path = directory.recording(folder)
-    found = Inventory(folder, listing, manifest)
     listed = manifest.logs if manifest is not None else {}
-    numbers = {file.digest: number for number, file in listed.items()}
+    listing = listing.choosing(file.name for file in listed.values())
+    found = Inventory(folder, path, listing, manifest)
     unmarked = manifest.unmarked if manifest is not None else ()
     for number, name in listing.sealed.items():
         if number in unmarked:
@@ -204,13 +216,12 @@ def inventory_of(
         problem = _difference(found, summary, number, recording)
         if problem is not None:
             del found.summaries[number]
-            belongs = numbers.get(summary.whole_digest)
+            belongs = _belongs(listed, summary, name, recording)
             found.misfits.append(Misfit(number, name, problem, belongs=belongs))
-        elif manifest is not None and not _is_listed(found, manifest, number):
+        elif manifest is not None and number not in listed:
             reason = "the manifest does not list it"
             found.misfits.append(Misfit(number, name, reason, is_unlisted=True))
     for number, file in listed.items():
-        # A listed segment with its old name is about to be renamed.
         if number not in found.summaries and number not in listing.open:
             found.lost.append(file)
             if number not in listing.sealed:
@@ -254,36 +265,37 @@ def check_folder(directory: StoreDirectory, folder: str, recording: str) -> None
 def _difference(
     inventory: Inventory, summary: SegmentSummary, number: int, recording: str
 ) -> str | None:
-    """The difference of a whole segment from the manifest; None if it matches.
-
-    A segment with expired chunks gets the digest that it had before, which it names itself: the
-    manifest may not say so yet.
-    """
+    """The difference of a whole segment from the manifest; None if it matches."""
     its_id, its_number = summary.recording.get("id"), summary.recording.get("segment")
     if its_id != recording:
         return f"it is a segment of another recording, {its_id}"
     if its_number != number:
         return f"it is segment {its_number} of this recording"
-    manifest = inventory.manifest
-    sealed = manifest.logs.get(number) if manifest is not None else None
-    whole = summary.whole_digest
-    if whole != summary.digest and (sealed is None or sealed.digest == whole):
-        inventory.stored[number] = summary.digest, summary.size
-        inventory.summaries[number] = replace(summary, digest=whole)
-    elif sealed is not None and (summary.digest, summary.size) != (sealed.digest, sealed.bytes):
+    log = inventory.logs.get(number)
+    if log is not None and inventory.listing.sealed[number] != log.name:
+        return f"the manifest lists {log.name} in its place"
+    if log is not None and (summary.size, _parts_of(summary)) != (log.bytes, log.parts):
         return "it is not the segment that the manifest lists: an older or a changed one"
     return None
 
 
-def _is_listed(inventory: Inventory, manifest: Manifest, number: int) -> bool:
-    """True if the manifest lists a valid segment as its file is now, and what that needs."""
-    file = manifest.logs.get(number)
-    if file is None:
-        return False
-    named = (inventory.summaries[number].compacted or {}).get("files", ())
-    stored = file.stored and (file.stored.digest, file.stored.bytes)
-    known = {*manifest.deleted, *(one.file for one in manifest.fields)}
-    return inventory.stored.get(number) in (None, stored) and {f["file"] for f in named} <= known
+def _parts_of(summary: SegmentSummary) -> dict[int, truth.Part]:
+    """What a segment has of each channel, as a manifest lists it."""
+    channels = sealed_channels(summary.table.as_stored(), summary.channels)
+    return {
+        one.id: truth.Part(one.messages, one.payload_bytes, one.first, one.last) for one in channels
+    }
+
+
+def _belongs(
+    listed: Mapping[int, File], summary: SegmentSummary, name: str, recording: str
+) -> int | None:
+    """The number under which the manifest lists a segment that has another name."""
+    number = summary.recording.get("segment")
+    log = listed.get(number) if isinstance(number, int) else None
+    is_same = log is not None and (summary.size, _parts_of(summary)) == (log.bytes, log.parts)
+    is_ours = summary.recording.get("id") == recording
+    return log.number if log is not None and is_ours and is_same and log.name != name else None
 
 
 def read_summary(path: Path, number: int) -> SegmentSummary:
@@ -332,12 +344,15 @@ def describe(catalog: Catalog, inventory: Inventory, *, is_open: bool = False) -
     entry.status = _status(inventory, end, is_open=is_open, has_losses=has_losses)
     if lost or ours:
         entry.end["losses"] = joined([*entry.end.get("losses", ()), *lost]) + ours
-    entry.stored = {str(number): digest for number, (digest, _) in inventory.stored.items()}
-    entry.digests = {str(number): summary.digest for number, summary in inventory.summaries.items()}
+    for number, summary in inventory.summaries.items():
+        entry.digests[str(number)] = summary.content(inventory.digest(number))
+        name = inventory.listing.sealed[number]
+        if name != sealed_name(number):
+            entry.files[str(number)] = name
     entry.spans = [
-        (number, int(summary.table.chunks["first"].min()), int(summary.table.chunks["last"].max()))
+        span
         for number, summary in inventory.summaries.items()
-        if len(summary.table.chunks)
+        for span in spans_of(number, summary.table)
     ]
     entry.channels = [
         channel_entry(channel_id, channel, codec_for(channel).reason)
@@ -692,7 +707,9 @@ def listed(sealed: Sealed) -> Callable[[Manifest], Manifest]:
     channels = {one.id: truth.Channel(one.topic, one.encoding, one.type) for one in sealed.channels}
 
     def how(now: Manifest) -> Manifest:
-        others = tuple(one for one in now.files if one.name != file.name)
+        others = tuple(
+            one for one in now.files if (one.kind, one.number) != (file.kind, file.number)
+        )
         known = {**channels, **now.channels}
         numbers = tuple(one for one in now.unmarked if one != file.number)
         made = truth.replace(now, files=(*others, file), channels=known, unmarked=numbers)
@@ -724,8 +741,8 @@ def ended(end: Mapping[str, Any]) -> Callable[[Manifest], Manifest]:
 
 def unlisted(inventory: Inventory) -> Callable[[Manifest], Manifest] | None:
     """The change that lists valid segments which the manifest lacks, and what they need."""
-    files = [misfit.segment for misfit in inventory.misfits if misfit.is_unlisted]
-    return _listing_of(inventory, files) if files else None
+    numbers = [misfit.segment for misfit in inventory.misfits if misfit.is_unlisted]
+    return _listing_of(inventory, numbers) if numbers else None
 
 
 def made_again(inventory: Inventory, old: Manifest | None) -> Manifest:
@@ -739,7 +756,9 @@ def made_again(inventory: Inventory, old: Manifest | None) -> Manifest:
         SegmentError: Nothing says what recording it is.
     """
     made = old or described(inventory)
-    numbers = [n for n in inventory.summaries if n not in made.logs]
+    names = {number: log.name for number, log in made.logs.items()}
+    sealed = inventory.listing.sealed
+    numbers = [n for n in inventory.summaries if names.get(n) != sealed[n]]
     made = _listing_of(inventory, numbers)(made)
     end = inventory.end
     if end is not None and not made.is_ended:
@@ -748,18 +767,15 @@ def made_again(inventory: Inventory, old: Manifest | None) -> Manifest:
 
 
 def _listing_of(inventory: Inventory, numbers: Iterable[int]) -> Callable[[Manifest], Manifest]:
-    changes = [listed(sealed_of(inventory, number)) for number in numbers]
+    found = [sealed_of(inventory, number) for number in numbers]
 
     def how(now: Manifest) -> Manifest:
-        for change, number in zip(changes, numbers, strict=True):
-            if number not in now.logs:
-                now = change(now)
-        stored = {n: one for n, one in inventory.stored.items() if n in now.logs}
-        for number, (digest, size) in stored.items():
-            file = now.logs[number]
-            topics = tuple(sorted({*file.expired, *_expired_topics(inventory, number)}))
-            what = truth.Stored(size, digest)
-            now = truth.with_file(now, number, stored=what, expired=topics)
+        for one in found:
+            if one.segment not in now.logs:
+                now = listed(one)(now)
+            what = {"name": one.file, "bytes": one.bytes, "digest": one.digest}
+            expired = tuple(_expired_topics(inventory, one.segment))
+            now = truth.with_file(now, one.segment, expired=expired, **what)
         fields = {**{one.file: one for one in now.fields}, **inventory.fields}
         there = tuple(file for path, file in fields.items() if path not in now.deleted)
         return truth.replace(now, fields=there)
@@ -773,13 +789,10 @@ def _expired_topics(inventory: Inventory, number: int) -> list[str]:
 
 
 def sealed_of(inventory: Inventory, number: int) -> Sealed:
-    """An existing segment, as it was sealed."""
-    summary = inventory.summaries[number]
+    """An existing segment, as a manifest lists it."""
+    summary, name = inventory.summaries[number], inventory.listing.sealed[number]
     channels = sealed_channels(summary.table.as_stored(), summary.channels)
-    size = summary.size
-    if number in inventory.stored and summary.compacted is not None:
-        size = summary.compacted.get("bytes", size)
-    return Sealed(number, inventory.listing.sealed[number], size, summary.digest, channels)
+    return Sealed(number, name, summary.size, inventory.digest(number), channels)
 
 
 def free_name_in(catalog: Catalog, name: str, but: str = "") -> str:

@@ -597,7 +597,7 @@ class Session:
             newer = self._newer_of(recording)
             if newer is not None:
                 now = newer.entry(recording.id)
-                if (now.digests, now.stored) != (recording.digests, recording.stored):
+                if (now.digests, now.files) != (recording.digests, recording.files):
                     self._entries[recording.id] = now
                     raise _changed(recording) from None
             read_again(self.directory, self.catalog, recording)
@@ -666,7 +666,7 @@ class Session:
             count(chunk)
             return chunk
 
-        key = recording.id, segment, place.number, recording.stored.get(str(segment), "")
+        key = recording.id, segment, place.number, recording.file_of(segment)
         return self.cache.made("chunk", *key, make=read, size_of=_size_of)
 
     def segment(self, recording: str, number: int) -> SegmentReader:
@@ -753,7 +753,7 @@ class Session:
 
 def _files_of(entry: RecordingEntry) -> tuple[object, ...]:
     """What tells the files of a recording from later ones."""
-    return entry.digests, entry.stored, entry.flushed.keys()
+    return entry.digests, entry.files, entry.flushed.keys()
 
 
 def _in_order(by_topic: Iterable[Sequence[RecordedChannel]]) -> list[RecordedChannel]:

@@ -67,7 +67,7 @@ class Shared(ABC):
         self.schemas: dict[str, Schema] = {}
         self.channels: dict[str, tuple[RecordingEntry, dict[str, list[RecordedChannel]]]] = {}
         self.columns: dict[tuple[str, int, frozenset[int]], tuple[ChunkTable, ChunkColumns]] = {}
-        self._segments: dict[tuple[str, int, str], SegmentReader] = {}
+        self._segments: dict[tuple[str, str], SegmentReader] = {}
         self._contents: dict[tuple[Path, frozenset[tuple[str, str]]], RecordingPayloads] = {}
         self._tables_tried: set[tuple[str, str]] = set()  # looked for, and noted if missing
         self._opening = threading.Lock()
@@ -209,14 +209,14 @@ class Shared(ABC):
             SegmentError: It cannot be opened, as where the recording has another name by now.
         """
         with self._opening:
-            # A segment with expired chunks is another file than before.
-            key = entry.id, number, entry.stored.get(str(number), "")
+            name = entry.file_of(number)
+            key = entry.id, name
             reader = self._segments.get(key)
             if reader is None:
                 _make_room(self._segments)
                 path = self.directory.recording(entry.id)
                 reader = self._segments[key] = open_segment(
-                    path / f"{number:06d}.mcap", number, self._contents_of(entry)
+                    path / name, number, self._contents_of(entry)
                 )
             return reader
 
@@ -226,7 +226,7 @@ class Shared(ABC):
             return self._contents_of(entry)
 
     def _contents_of(self, entry: RecordingEntry) -> RecordingPayloads:
-        key = self.directory.recording(entry.id), frozenset(entry.stored.items())
+        key = self.directory.recording(entry.id), frozenset(entry.files.items())
         found = self._contents.get(key)
         if found is None:
             _make_room(self._contents)

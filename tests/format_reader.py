@@ -200,7 +200,7 @@ class Segment:
         demand((opcode, length) == (0x02, 20), "no footer")
         demand(8 <= start <= offsets <= len(data) - 37, "a footer that leads elsewhere")
         demand(zlib.crc32(data[start : len(data) - 12]) == crc, "the checksum of the summary")
-        self.digest = "sha256:" + hashlib.sha256(data[start:]).hexdigest()
+        self.digest = blake3(data).hexdigest()
         self.schemas: dict[int, tuple[str, str, bytes]] = {}
         self.channels: dict[int, tuple[int, str, str, dict[str, str]]] = {}
         self._metadata: list[tuple[int, int, str]] = []
@@ -235,7 +235,9 @@ class Segment:
         assert table is not None
         self._table(table, start)
         self.about = self._json("hybridlog.recording")[0]
-        self.compacted = next(iter(self._json("hybridlog.compacted")), None)
+        compacted = next(iter(self._json("hybridlog.compacted")), {})
+        self.content: str = compacted.get("digest", self.digest)
+        """Its digest before payloads expired, by which derived data know it."""
         self.end = next(iter(self._json("hybridlog.end")), None)
         self.losses = [row for said in self._json("hybridlog.losses") for row in said["rows"]]
 
@@ -301,6 +303,27 @@ class Segment:
     def _check(self, piece: Other) -> None:
         data = self.data[piece.offset : piece.offset + piece.length]
         demand(zlib.crc32(data) == piece.crc, f"byte {piece.offset}")
+
+    @property
+    def is_whole(self) -> bool:
+        """True if every byte before the summary has its checksum."""
+        pieces = [(c.offset, c.length, c.crc) for c in self.chunks]
+        pieces += [(c.offset + c.length, c.trailer, c.trailer_crc) for c in self.chunks]
+        return all(
+            zlib.crc32(self.data[offset : offset + length]) == crc
+            for offset, length, crc in [*pieces, *self.others]
+        )
+
+    @property
+    def totals(self) -> dict[int, list[int]]:
+        """Messages, bytes, first and last log time of each channel."""
+        found: dict[int, list[int]] = {}
+        for part in self.parts:
+            now = found.setdefault(part.channel, [0, 0, part.first, part.last])
+            now[0] += part.messages
+            now[1] += part.payload_bytes
+            now[2:] = min(now[2], part.first), max(now[3], part.last)
+        return found
 
     def check_others(self) -> None:
         for piece in self.others:
@@ -427,36 +450,35 @@ def _manifest_of(path: Path) -> Path:
 class Recording:
     """A recording: its manifest, the segments that are believed, what follows from both."""
 
-    _NAME: ClassVar = re.compile(r"(\d{6}|[1-9]\d{6,})\.mcap(\.open)?")
+    _NAME: ClassVar = re.compile(r"(\d{6}|[1-9]\d{6,})(\.[1-9]\d*)?\.mcap(\.open)?")
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.manifest = Manifest(_manifest_of(path).read_bytes())
         sealed: dict[int, Segment | None] = {}
         self.open: set[int] = set()
-        for file in sorted(path.iterdir()):
+        listed = self.manifest.logs
+        for file in sorted(path.iterdir(), key=lambda file: (file.name.count("."), file.name)):
             match = self._NAME.fullmatch(file.name)
             if match is None or not file.is_file():
                 continue
-            if match[2]:
-                self.open.add(int(match[1]))
+            number = int(match[1])
+            if match[3]:
+                self.open.add(number)
+                continue
+            if number in sealed if number not in listed else listed[number]["name"] != file.name:
                 continue
             try:
-                sealed[int(match[1])] = Segment(file)
+                sealed[number] = Segment(file)
             except Damaged:
-                sealed[int(match[1])] = None
+                sealed[number] = None
         self.id = self.manifest.id
-        listed = self.manifest.logs
         self.segments = {
             number: segment
             for number, segment in sorted(sealed.items())
             if segment is not None and self._is_believed(number, segment, listed.get(number))
         }
-        self.unlisted = {
-            number
-            for number, segment in self.segments.items()
-            if not self._is_listed(number, segment, listed.get(number))
-        }
+        self.unlisted = {number for number in self.segments if number not in listed}
         for segment in self.segments.values():
             segment.columns = Columns(path / "payloads", self.manifest.fields, self.id)
         self.end = self._end()
@@ -471,16 +493,8 @@ class Recording:
             return False
         if listed is None:
             return True
-        was = listed["digest"], listed["bytes"]
-        whole = segment.compacted or {}
-        said = whole.get("digest"), whole.get("bytes")
-        return was in {(segment.digest, len(segment.data)), said}
-
-    def _is_listed(self, number: int, segment: Segment, listed: Mapping[str, Any] | None) -> bool:
-        if listed is None:
-            return False
-        are = [len(segment.data), segment.digest]
-        return are in ([listed["bytes"], listed["digest"]], listed.get("stored"))
+        parts = {int(channel): part for channel, part in listed.get("parts", {}).items()}
+        return (len(segment.data), segment.totals) == (listed["bytes"], parts)
 
     def _end(self) -> dict[str, Any] | None:
         if self.manifest.status == "open":
@@ -568,6 +582,9 @@ class Recording:
         """All messages: segment, chunk and offset as in `_meta.ref`; the message."""
         for number, segment in self.segments.items():
             segment.check_others()
+            if number not in self.unlisted and segment.is_whole:
+                listed = self.manifest.logs[number]["digest"]
+                demand(segment.digest == listed, "the digest of a segment")
             for chunk in range(len(segment.chunks)):
                 if (number, chunk) not in self.damage:
                     for offset, message in segment.chunk(chunk):

@@ -1137,7 +1137,7 @@ def check_state(second: FormatReader, database: Any, recordings: Mapping[str, Re
         segments = recording.segments
         assert entry["id"] == recording.id == recording.path.name
         assert (entry["status"], entry["end"]) == (recording.status, recording.end)
-        digests = {str(number): segment.digest for number, segment in segments.items()}
+        digests = {str(number): segment.content for number, segment in segments.items()}
         assert entry["digests"] == entry["index"]["segments"] == digests
         assert entry["index"]["state"] == "complete"
         assert entry["spans"] == [

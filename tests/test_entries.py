@@ -490,7 +490,7 @@ def test_what_a_crash_took_of_a_listed_segment(made: Made) -> None:
     parts = {
         n: changed_part(part, 10 if topics[n] != "/c" else 0) for n, part in there.parts.items()
     }
-    made.change(lambda now: with_file(now, 3, bytes=9, digest=f"sha256:{5:064x}", parts=parts))
+    made.change(lambda now: with_file(now, 3, bytes=9, digest=f"{5:064x}", parts=parts))
     losses = tuple(lost_in_crash(made.manifest(), sealed))
     made.change(lambda now: changed(listed(sealed)(now), losses=losses, status="damaged"))
     assert made.inventory().misfits == []
@@ -515,7 +515,7 @@ def changed_part(part: Part, more: int) -> Part:
 
 
 def test_a_lost_segment_of_which_nothing_is_known_is_a_row_all_the_same(made: Made) -> None:
-    file = File(4, 4, "000004.mcap", "log", 9, f"sha256:{5:064x}", 5)
+    file = File(4, 4, "000004.mcap", "log", 9, f"{5:064x}", 5)
     made.change(lambda now: changed(now, files=(*now.files, file)))
     entry = made.entry()
     assert entry.status == "damaged"
@@ -682,7 +682,7 @@ def test_chunks_of_another_segment_are_refused(made: Made) -> None:
     with closing(Catalog(made.directory.path, "x", in_memory=True)) as empty:
         entry = made.entry()
         assert len(empty.table(entry, 0).chunks)
-        changed = replace(entry, digests={**entry.digests, "0": entry.digests["1"]})
+        changed = replace(entry, files={"0": "000001.mcap"})
         with pytest.raises(CatalogError, match="has changed"):
             empty.table(changed, 0)
         with pytest.raises(CatalogError, match="cannot be opened"):

@@ -757,7 +757,7 @@ def test_an_altered_index_is_found_and_mended(
         lambda db: db[RECORDINGS].update_one({}, {"$set": {"tags": {"a": "b"}}}),
         lambda db: db[RECORDINGS].update_one({}, {"$set": {"index.state": "indexing"}}),
         lambda db: db[RECORDINGS].update_one({}, {"$set": {"index.state": "clearing"}}),
-        lambda db: db[RECORDINGS].update_one({}, {"$set": {"index.segments.0": "sha256:x"}}),
+        lambda db: db[RECORDINGS].update_one({}, {"$set": {"index.segments.0": "x"}}),
         lambda db: db[RECORDINGS].update_one({}, {"$unset": {"index": 1}}),
         lambda db: db[RECORDINGS].delete_one({}),
         lambda db: db.drop_collection(RECORDINGS),

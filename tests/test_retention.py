@@ -33,7 +33,7 @@ def sealed(number: int, age: float, last: int | None = None, **other: Any) -> Fi
     at = NOW - round(age * DAY)
     span = (at - DAY, at - 1) if last is None else (last, last)
     parts = {n: Part(9, size, *span) for n, size in enumerate((8 * MB, 2 * MB))}
-    name, digest = f"{number:06d}.mcap", f"sha256:{number:064x}"
+    name, digest = f"{number:06d}.mcap", f"{number:064x}"
     return File(number, number, name, "log", 10 * MB, digest, at, *span, parts, **other)
 
 

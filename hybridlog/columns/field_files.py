@@ -131,14 +131,29 @@ class FieldFile(ColumnFile):
             super().__init__(path)
         except FileNotFoundError as error:
             raise StoreError(f"The file of fields {path} is missing.{RESTORE}") from error
-        if (self.size_bytes, self.digest) != (listed.bytes, listed.digest):
-            raise StoreError(
-                f"The file of fields {path} is not the one that the manifest lists.{RESTORE}"
-            )
+        rows = sum(
+            one.topics[listed.topic].rows
+            for one in self.about.recordings
+            if listed.topic in one.topics
+        )
+        if (self.size_bytes, rows) != (listed.bytes, listed.messages):
+            raise self._other()
         try:
             self.places = self._read_places(self.about.payloads["chunks"])
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise StoreError(f"The description in {path} is invalid: {error!r}.") from error
+
+    def check(self) -> str:
+        """As of `ParquetFileReader`; it is the file that the manifest lists."""
+        digest = super().check()
+        if digest != self.listed.digest:
+            raise self._other()
+        return digest
+
+    def _other(self) -> StoreError:
+        return StoreError(
+            f"The file of fields {self.path} is not the one that the manifest lists.{RESTORE}"
+        )
 
     def _read_places(self, chunks: Any) -> dict[tuple[int, int], Place]:
         found: dict[tuple[int, int], Place] = {}

@@ -136,11 +136,6 @@ def topics_of(entry: RecordingEntry) -> set[str]:
     return {c.topic for c in entry.channels if c.stats.messages}
 
 
-def replacement_name(segment: str) -> str:
-    """Name of a segment with expired chunks until it takes the place of the whole one."""
-    return f"{segment}.thinned"
-
-
 def payload_file(folder: str, schema: str, number: int) -> str:
     """Path of a file below `payloads`.
 

@@ -8,7 +8,6 @@ Files are read with `pread`: truncation of a mapped file would kill the process.
 
 from __future__ import annotations
 
-import hashlib
 import os
 import re
 import threading
@@ -28,6 +27,7 @@ from hybridlog.schema.arrow_types import is_list
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk import durability, files
 from hybridlog_storage.errors import HybridlogError, StoreError, exhausted
+from hybridlog_storage.manifest import hasher
 
 if TYPE_CHECKING:
     from hybridlog_storage.messages import Buffer
@@ -150,7 +150,7 @@ class ParquetFileWriter:
             sync: True to force it to the disk.
 
         Returns:
-            Its bytes, and the digest of its footer.
+            Its bytes, and BLAKE3 of them.
 
         Raises:
             OSError: the file cannot be written.
@@ -203,6 +203,7 @@ class _Sink:
         self._checksums: list[str] = []
         self._rest = bytearray()  # of the body, less than a block
         self._footer: bytearray | None = None
+        self._digest = hasher()
 
     def write(self, data: Buffer) -> int:
         """Write bytes."""
@@ -233,7 +234,7 @@ class _Sink:
         return self._position, "".join(self._checksums)
 
     def finish(self, *, sync: bool) -> tuple[int, str]:
-        """Seal the footer, write all remaining bytes; return size and digest of the footer."""
+        """Seal the footer, write all remaining bytes; return size and digest of the file."""
         assert self._footer is not None
         marks = [found.start(1) for found in _SEAL.finditer(self._footer)]
         if len(marks) != 1:
@@ -246,7 +247,7 @@ class _Sink:
             files.system.sync(self._fd)
         os.close(self._fd)
         self._fd = -1
-        return self._position, digest_of(self._footer)
+        return self._position, self._digest.hexdigest()
 
     def abandon(self) -> None:
         self._is_abandoned = True
@@ -256,7 +257,9 @@ class _Sink:
         self._fd = -1
 
     def _flush(self) -> None:
-        durability.write_all(self._fd, [bytes(self._waiting)])
+        data = bytes(self._waiting)
+        durability.write_all(self._fd, [data])
+        self._digest.update(data)
         self._waiting.clear()
 
     def flush(self) -> None:
@@ -313,11 +316,6 @@ class ParquetFileReader:
     def size_bytes(self) -> int:
         """Bytes of the file."""
         return self._source.size
-
-    @property
-    def digest(self) -> str:
-        """Digest of the footer, which has checksums of all other bytes."""
-        return digest_of(self._source.footer)
 
     @property
     def groups(self) -> int:
@@ -387,17 +385,18 @@ class ParquetFileReader:
             raise self._damaged(StoreError("a row group has the wrong number of rows"))
         return table
 
-    def check(self) -> None:
-        """Read every byte and every value.
+    def check(self) -> str:
+        """Read every byte and every value; returns BLAKE3 of all bytes.
 
         Raises:
             StoreError: a part is damaged.
         """
         try:
-            self._source.check()
+            digest = self._source.check()
         except (OSError, StoreError) as error:
             raise self._damaged(error) from error
         self.table()
+        return digest
 
     def _damaged(self, error: Exception) -> HybridlogError:
         if isinstance(error, OSError):
@@ -443,10 +442,13 @@ class _Source:
         text = about.checksums.encode()
         self._checksums = [text[at : at + 8] for at in range(0, len(text), 8)]
 
-    def check(self) -> None:
-        """Read and verify the whole body."""
+    def check(self) -> str:
+        """Read and verify the whole body; returns BLAKE3 of all bytes."""
+        digest = hasher()
         for at in range(0, self._body, 64 * BLOCK):
-            self.checked(at, min(at + 64 * BLOCK, self._body))
+            digest.update(self.checked(at, min(at + 64 * BLOCK, self._body)))
+        digest.update(self.footer)
+        return digest.hexdigest()
 
     def fetch(self, group: Any, leaves: Iterable[int]) -> None:
         """Ask a bucket once for some columns of a row group."""
@@ -619,11 +621,6 @@ def _runs(path: str, kind: pa.DataType) -> bool:
     if path in _RUNNING or pa.types.is_timestamp(kind):
         return True
     return path.endswith(".seq") and bool(pa.types.is_integer(kind))
-
-
-def digest_of(footer: Buffer) -> str:
-    """Digest of a footer, which has checksums of all other bytes."""
-    return f"sha256:{hashlib.sha256(footer).hexdigest()}"
 
 
 def _checksum(data: Buffer) -> str:

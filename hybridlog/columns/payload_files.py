@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import re
 import threading
 from collections import defaultdict
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from hybridlog.columns.layout import PAYLOAD_PARTS
 from hybridlog_storage.cache import Cache
@@ -15,9 +14,9 @@ from hybridlog_storage.disk import durability, files
 from hybridlog_storage.disk.directory import PAYLOADS, payload_names
 from hybridlog_storage.errors import HybridlogError, SegmentError, StoreError
 from hybridlog_storage.lazy import lazy
-from hybridlog_storage.manifest import Stored, replace
+from hybridlog_storage.manifest import replace
 from hybridlog_storage.manifests import manifests_at
-from hybridlog_storage.segments.segment_file import sealed_name
+from hybridlog_storage.segments.segment_file import number_of
 from hybridlog_storage.segments.segment_reader import SegmentReader
 
 if TYPE_CHECKING:
@@ -27,12 +26,9 @@ if TYPE_CHECKING:
     from hybridlog.columns.column_file import OpenFiles
     from hybridlog.columns.field_files import FieldFile
     from hybridlog.columns.topic_table import TopicTable
-    from hybridlog_storage.manifest import Fields, File, Manifest
+    from hybridlog_storage.manifest import Fields, Manifest
     from hybridlog_storage.segments.chunk import ExpiredMessages, StoredChunk
     from hybridlog_storage.segments.segment_reader import ChunkPlace, SegmentSummary
-
-REPLACEMENT: Final = re.compile(r"(?P<number>\d{6,9})\.mcap\.thinned")
-"""Name of a segment that is about to replace the whole one."""
 
 
 def next_number(manifest: Manifest) -> int:
@@ -118,52 +114,33 @@ def publish(recording: Path, manifest: Manifest | None) -> None:
         raise durability.explain(error, final, "moving fields to") from error
 
 
-def replace_segments(recording: Path, names: Iterable[str], manifest: Manifest | None) -> list[str]:
-    """Put finished segments with expired chunks in the place of the whole ones.
-
-    Those that the manifest does not list are removed.
+def remove_replaced(recording: Path, names: Iterable[str], manifest: Manifest | None) -> None:
+    """Remove segments in whose place the manifest lists another file of their number.
 
     Args:
         recording: The recording's directory, locked by this process.
         names: Names of files in it.
         manifest: Its manifest; None if it is lost.
 
-    Returns:
-        Names of the segments that were replaced.
-
     Raises:
-        HybridlogError: A file cannot be renamed or removed.
+        HybridlogError: A file cannot be removed.
     """
-    done = []
-    logs = {} if manifest is None else manifest.logs
+    there, logs = {*names}, {} if manifest is None else manifest.logs
+    gone = [
+        name
+        for name in sorted(there)
+        if (found := number_of(name)) is not None
+        and (log := logs.get(found[0])) is not None
+        and log.name in there - {name}
+    ]
     try:
-        for name in names:
-            found = REPLACEMENT.fullmatch(name)
-            if found is None:
-                continue
-            number = int(found["number"])
-            log = logs.get(number)
-            if log is not None and _is_stored(recording / name, log):
-                final = sealed_name(number)
-                files.rename(recording / name, recording / final)
-                done.append(final)
-            else:
+        for name in gone:
+            with suppress(FileNotFoundError):
                 files.unlink(recording / name)
-        if done:
+        if gone:
             files.sync_folder(recording)
     except OSError as error:
-        raise durability.explain(error, recording, "replacing segments of") from error
-    return done
-
-
-def _is_stored(path: Path, log: File) -> bool:
-    """True if a file is the one that the manifest lists since payloads of a log have expired."""
-    try:
-        with SegmentReader(path, log.number) as reader:
-            summary = reader.summary()
-    except SegmentError:
-        return False
-    return log.stored == Stored(summary.size, summary.digest)
+        raise durability.explain(error, recording, "removing replaced segments of") from error
 
 
 class RecordingPayloads:
@@ -324,7 +301,7 @@ class WalkedSegment:
 
 def walk(
     recording: Path,
-    numbers: Iterable[int],
+    names: Mapping[int, str],
     contents: RecordingPayloads | None = None,
     report: Callable[[int], None] = lambda _: None,
     *,
@@ -334,7 +311,7 @@ def walk(
 
     Args:
         recording: The recording's directory.
-        numbers: Numbers of the segments.
+        names: Names of the segments, by number.
         contents: As for `open_segment`.
         report: As for `WalkedSegment`; told at the end of each segment, too.
         known: Footers that were read before.
@@ -344,8 +321,8 @@ def walk(
     """
     contents = contents or RecordingPayloads(recording)
     begin = 0
-    for number in numbers:
-        with open_segment(recording / sealed_name(number), number, contents) as reader:
+    for number, name in names.items():
+        with open_segment(recording / name, number, contents) as reader:
             summary = (known or {}).get(number) or reader.summary()
             yield WalkedSegment(number, reader, summary, begin, report)
             begin += reader.size

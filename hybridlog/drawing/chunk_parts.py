@@ -53,7 +53,7 @@ class RecordedChunks:
         before, self._recording = self._recording, recording
         return (
             recording.status == before.status
-            and recording.stored == before.stored
+            and recording.files == before.files
             and all(
                 before.digests.get(number) in {None, recording.digests.get(number)}
                 for number in map(str, self._known)

@@ -161,8 +161,7 @@ class BucketPlace:
             return {}
         found = {f"{PAYLOADS}/{one.file}": copied_file(one) for one in manifest.fields}
         for log in manifest.logs.values():
-            now = log.stored or log
-            found[log.name] = CopiedFile(log.name, now.bytes, now.digest)
+            found[log.name] = CopiedFile(log.name, log.bytes, log.digest)
         lost = self._target.lost_of(recording)
         return {path: file for path, file in found.items() if path in lost}
 

@@ -327,8 +327,7 @@ class _Copying:
         if content_of(listed) == known.content:
             return 0
         there, marks = self._place.segments(here.id), {mark.segment for mark in here.marks}
-        same = {number for number, one in there.items() if listed.get(number) == one.digest}
-        return len(listed.keys() - marks - same)
+        return len(listed.keys() - marks - there.keys())
 
     def _copy(self, one: RecordingEntry | RecordingSummary) -> None:
         """Copy a recording.

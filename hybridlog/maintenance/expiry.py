@@ -3,10 +3,10 @@
 First the rows of what goes are written to files of their own: the fields as in tables, the
 index documents, times, sizes and hashes (`columns/field_files.py`). They are forced to the
 disk, and read and compared; then the manifest lists them. From then on they are the truth.
-Then each segment is written again with short records in place of the chunks that go
-(`thinning.py`), the manifest lists the new one, and it takes the place of the old one. A
-segment that loses all of its payloads keeps its definitions, times, arrival numbers, metadata
-and attachments in a small file.
+Then each segment is written again with short records in place of the chunks that go, as
+another file, which the manifest lists in the place of the old one (`thinning.py`). A segment
+that loses all of its payloads keeps its definitions, times, arrival numbers, metadata and
+attachments in a small file.
 
 A crash before the first change leaves files that the next opening removes. After it, fields of
 chunks that are still there do no harm: readers use them for expired chunks alone, and the
@@ -21,6 +21,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import count
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -38,7 +39,7 @@ from hybridlog_storage.segments.segment_format import expired_record
 from hybridlog_storage.settings import EXPIRED
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator
+    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -83,6 +84,7 @@ def expire(
     segments: Collection[int],
     topics: Collection[str] | None = None,
     *,
+    digests: Mapping[int, str] = MappingProxyType({}),
     check: Callable[[Manifest], object] = lambda _: None,
     record: Callable[[Buffer], bytes] = expired_record,
     progress: Progress | None = None,
@@ -99,6 +101,7 @@ def expire(
         segments: Numbers of sealed segments.
         topics: Full names of the topics whose payloads go; None for all. Messages of other
             topics in the same chunk keep theirs, and so the chunk stays.
+        digests: Digests that files of these segments must have, by number.
         check: Part of each change of the manifest; raises if these payloads must stay by now.
         record: Makes the record in place of that of a chunk.
         progress: Called after each chunk.
@@ -110,7 +113,8 @@ def expire(
         DiskFullError: There is no room for the fields; nothing is deleted.
     """
     path = directory.recording(recording)
-    work = _Expiry(path, sorted(segments), topics, check=check, record=record, min_bytes=min_bytes)
+    work = _Expiry(path, topics, check=check, record=record, min_bytes=min_bytes)
+    work.choose(sorted(segments), digests)
     done = work.run(directory, progress)
     # Files that cannot be joined stay as they are, and the next expiry tries again.
     with suppress(HybridlogError, OSError):
@@ -124,7 +128,6 @@ class _Expiry:
     def __init__(
         self,
         path: Path,
-        segments: list[int],
         topics: Collection[str] | None,
         *,
         check: Callable[[Manifest], object],
@@ -143,18 +146,33 @@ class _Expiry:
         self._written: dict[tuple[int, int], list[int]] = {}  # checksums by segment and chunk
         self._made: list[Fields] = []
         self._numbers = count(next_number(self._manifest))
-        for segment in walk(path, segments):
+
+    def choose(self, segments: Iterable[int], digests: Mapping[int, str]) -> None:
+        """Note the chunks of segments that go.
+
+        Raises:
+            StoreError: A segment is not as it is listed, or has another digest.
+        """
+        logs = self._manifest.logs
+        for number in segments:
+            if (
+                number not in logs
+                or digests.get(number, logs[number].digest) != logs[number].digest
+            ):
+                raise StoreError(f"{self._manifest.name}: segment {number} was replaced meanwhile.")
+        for segment in walk(self._path, self._names(segments)):
+            if segment.summary.size != logs[segment.number].bytes:
+                raise StoreError(
+                    f"{segment.reader.path} is not the segment that the manifest lists; nothing "
+                    "was deleted. Run `hybridlog verify --repair` first."
+                )
             self._choose(segment)
 
+    def _names(self, segments: Iterable[int]) -> dict[int, str]:
+        return {number: self._manifest.logs[number].name for number in segments}
+
     def _choose(self, segment: WalkedSegment) -> None:
-        """Note the chunks of a segment that go."""
         number, summary = segment.number, segment.summary
-        log = self._manifest.logs.get(number)
-        if log is None or summary.whole_digest != log.digest:
-            raise StoreError(
-                f"{segment.reader.path} is not the segment that the manifest lists; nothing was "
-                "deleted. Run `hybridlog verify --repair` first."
-            )
         chosen = {place.number for place in summary.chunks if self._goes(place, summary)}
         if chosen:
             self._chosen[number], self._summaries[number] = chosen, summary
@@ -187,7 +205,7 @@ class _Expiry:
             self._remove_arrays(directory)
         done.field_bytes = sum(file.bytes for file in made)
         done.freed = -done.field_bytes
-        for segment in walk(self._path, self._chosen, known=self._summaries):
+        for segment in walk(self._path, self._names(self._chosen), known=self._summaries):
             done.freed += self._replace(segment)
             done.segments.append(segment.number)
             for place in self._places(segment.number):
@@ -205,8 +223,15 @@ class _Expiry:
             if channel.topic in directory.settings.arrays
         }
         if gone:
-            digests = {str(number): log.digest for number, log in self._manifest.logs.items()}
-            folders = TableFolders(directory.path, self._manifest.id, digests)
+            logs = self._manifest.logs
+            folders = TableFolders(
+                directory.path,
+                self._manifest.id,
+                {
+                    str(one.number): one.summary.content(logs[one.number].digest)
+                    for one in walk(self._path, self._names(logs))
+                },
+            )
             with suppress(OSError):
                 folders.add({}, {*gone}, {type_prefix(kind) for kind in gone.values()})
 
@@ -238,7 +263,7 @@ class _Expiry:
 
     def _chunks(self, report: Callable[[int], None]) -> Iterator[tuple[WalkedSegment, StoredChunk]]:
         known = self._summaries
-        for segment in walk(self._path, known, report=report, known=known):
+        for segment in walk(self._path, self._names(known), report=report, known=known):
             chosen = self._chosen[segment.number]
             wanted = {*chosen}
 
@@ -264,7 +289,8 @@ class _Expiry:
             rows = np.flatnonzero(np.isin(chunk.batch.channel, numbers))
             writer = self._writer(key, channel)
             table = writer.columns.table(chunk, rows, has_publish_time)
-            writer.add(table, chunk.segment, chunk.number, summary.whole_digest)
+            digest = summary.content(self._manifest.logs[chunk.segment].digest)
+            writer.add(table, chunk.segment, chunk.number, digest)
         self._written[chunk.segment, chunk.number] = _checksums(chunk.batch)
 
     def _writer(self, key: _Key, channel: Channel) -> TopicWriter:

@@ -260,10 +260,10 @@ class StoreIndex:
         sent = time.monotonic()
         # A chunk that is indexed already may be missing in the tables all the same.
         in_tables = tables.channels_of(entry, topics)
-        numbers = [number for number, _, _ in entry.spans]
+        names, path = entry.files_of(), directory.recording(entry.id)
         report = reporter(self.progress, entry.name, entry.stored_bytes)
         try:
-            for segment in walk(directory.recording(entry.id), numbers, report=report):
+            for segment in walk(path, names, report=report):
                 number, channels = segment.number, segment.summary.channels
                 stats: dict[int, Mapping[int, ChannelStats]] = {}
                 wanted = {
@@ -497,11 +497,12 @@ def _decoded(
         if catalog.stamps(entry, number, summary.table) is None
     }
     report = reporter(progress, entry.name, sum(summary.size for summary in missing.values()))
-    for segment in walk(directory.recording(entry.id), missing, report=report, known=missing):
+    names = {number: inventory.listing.sealed[number] for number in missing}
+    for segment in walk(inventory.path, names, report=report, known=missing):
         summary = segment.summary
         stats: dict[int, Mapping[int, ChannelStats]] = {}
         for place, chunk in segment.chunks():
             if not isinstance(chunk, SegmentError):  # an unreadable chunk has no results
                 _, (of_chunk,) = indexer.documents_of([chunk], summary.channels)
                 stats[place.number] = of_chunk.stats
-        yield segment.number, summary.digest, stamps_of(summary.table, stats)
+        yield segment.number, entry.digests[str(segment.number)], stamps_of(summary.table, stats)

@@ -164,7 +164,7 @@ class Keeper:
 
         Args:
             recording: Its id.
-            digests: The segments that have a copy elsewhere: digests as sealed, by number.
+            digests: The segments that have a copy elsewhere: digests by number.
             rules: Rules whose `never_tag` holds.
             reason: Why they go.
             progress: Called while payloads are replaced.
@@ -261,7 +261,15 @@ class Keeper:
     def _expire(self, step: Step, rules: Rules, progress: Progress | None) -> int:
         check, topics = partial(_check, step, rules), step.topics or None
         with self._directory.at_hand(step.id, step.segments) as here:
-            done = expire(here, step.id, step.segments, topics, check=check, progress=progress)
+            done = expire(
+                here,
+                step.id,
+                step.segments,
+                topics,
+                digests=step.digests,
+                check=check,
+                progress=progress,
+            )
             here.manifests.change(step.id, partial(_retained, step.segments, topics))
         self._changed(step.id)
         return done.freed
@@ -279,7 +287,7 @@ def _check(step: Step, rules: Rules, manifest: Manifest) -> None:
         raise StoreError(f"{step.recording}: a pin was set meanwhile.")
     for number in step.segments:
         log = manifest.logs.get(number)
-        if log is None or step.digests.get(number, log.digest) != log.digest:
+        if log is None:
             raise StoreError(f"{step.recording}: segment {number} was replaced meanwhile.")
         pinned = pinned_topics(log, manifest)
         if pinned & {*step.topics} if step.topics else pinned:

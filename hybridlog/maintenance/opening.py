@@ -41,7 +41,7 @@ from hybridlog_storage.errors import (
     TopicError,
 )
 from hybridlog_storage.manifest import Manifest, replace
-from hybridlog_storage.segments.segment_file import sealed_name
+from hybridlog_storage.segments.segment_file import number_of, sealed_name
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -54,9 +54,9 @@ if TYPE_CHECKING:
     from hybridlog_storage.segments.segment_file import Sealed
     from hybridlog_storage.summary import RecordingSummary
 
-_LEFT_OVER = re.compile(r"\.\d{6}\.mcap\.([0-9a-f]{16}|rebuilt)")
+_LEFT_OVER = re.compile(r"\.[0-9.]+\.mcap\.([0-9a-f]{16}|rebuilt)")
 """Names of files that were being written, and were to get another name when they were whole."""
-_MOVING = re.compile(r"(?P<before>\d{6}\.mcap)\.moving-(?P<number>\d{6})")
+_MOVING = re.compile(r"(?P<before>[0-9.]+\.mcap)\.moving-(?P<final>[0-9.]+\.mcap)")
 _RECOVERED_BYTES_PER_S = 200e6
 """Size of the open segments that are recovered in a second, about."""
 
@@ -360,7 +360,7 @@ def recover(directory: StoreDirectory, recording: str, report: RepairReport) -> 
         payload_files.publish(path, manifest)
     if {*manifest.unmarked} & listing.sealed.keys():
         remove_marks(path, manifest)
-    payload_files.replace_segments(path, listing.others, manifest)
+    payload_files.remove_replaced(path, (*listing.sealed.values(), *listing.others), manifest)
     recovered = recover_segments(directory, recording, listing, manifest)
     inventory = take_inventory(directory, recording)
     is_empty = not inventory.listing.sealed and not manifest.logs
@@ -383,8 +383,9 @@ def recover(directory: StoreDirectory, recording: str, report: RepairReport) -> 
 
 def is_left_over(name: str) -> bool:
     """True if a file in a recording's directory is left from an interrupted step."""
-    patterns = (_LEFT_OVER, _MOVING, payload_files.REPLACEMENT)
-    return name == PAYLOAD_PARTS or any(pattern.fullmatch(name) for pattern in patterns)
+    if name == PAYLOAD_PARTS or number_of(name) is not None:
+        return True
+    return any(pattern.fullmatch(name) for pattern in (_LEFT_OVER, _MOVING))
 
 
 def clear_away(directory: StoreDirectory, recording: str) -> None:
@@ -423,9 +424,9 @@ def is_at_work(source: StoreDirectory, name: str) -> bool:
         return isinstance(error, BlockingIOError)
 
 
-def moving_name(name: str, number: int) -> str:
+def moving_name(name: str, final: str) -> str:
     """Temporary name of a segment that is being renamed."""
-    return f"{name}.moving-{number:06d}"
+    return f"{name}.moving-{final}"
 
 
 def finish_moves(
@@ -449,8 +450,9 @@ def finish_moves(
             moving = _MOVING.fullmatch(name)
             if moving is None:
                 continue
-            final = path / sealed_name(int(moving["number"]))
-            if final.name in directory.listing(recording).sealed.values():
+            final = path / moving["final"]
+            listing = directory.listing(recording)
+            if final.name in {*listing.sealed.values(), *listing.others}:
                 if not replace:
                     continue
                 files.rename(

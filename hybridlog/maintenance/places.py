@@ -107,11 +107,8 @@ class CopiedFile(Fields, frozen=True):
 
                 FieldFile(recording / PAYLOADS, self).check()
                 return True
-            with SegmentCheck(recording / self.file) as check:
-                found = check.summary
-                if found is None or (found.digest, found.size) != (self.digest, self.bytes):
-                    return False
-                return not any(True for _ in check.problems())
+            with SegmentCheck(recording / self.file, self.digest) as check:
+                return check.summary is not None and not any(True for _ in check.problems())
         except StoreError:
             return False
 
@@ -139,18 +136,16 @@ class CopiedSegment(NamedTuple):
     """A segment of a recording that a place has.
 
     Attributes:
-        digest: Its digest as it was sealed.
-        now: That of its file, if payloads of it have expired; else empty.
+        digest: Its digest.
         expired: Topics whose payloads have.
     """
 
     digest: str
-    now: str = ""
     expired: tuple[str, ...] = ()
 
     def holds(self, other: CopiedSegment) -> bool:
         """True if it surely has all that another copy of the segment has."""
-        return self.digest == other.digest and self.now in {"", other.now}
+        return self.digest == other.digest or not self.expired
 
 
 @dataclass(frozen=True, slots=True)
@@ -529,10 +524,7 @@ def manifest_of(directory: StoreDirectory, recording: str) -> Manifest | None:
 def segments_of(manifest: Manifest | None) -> dict[int, CopiedSegment]:
     """As of `Place`, by the manifest of a recording."""
     logs = {} if manifest is None else manifest.logs
-    return {
-        number: CopiedSegment(one.digest, one.stored.digest if one.stored else "", one.expired)
-        for number, one in logs.items()
-    }
+    return {number: CopiedSegment(one.digest, one.expired) for number, one in logs.items()}
 
 
 def has_lost(one: Mapping[int, CopiedSegment], other: Mapping[int, CopiedSegment]) -> bool:
@@ -617,10 +609,8 @@ def proven_manifest(data: bytes, recording: str, proven: Mapping[str, CopiedFile
         ) from error
     for log in found.files:
         sent = proven.get(log.name)
-        right = {(log.digest, log.bytes)}
-        if log.stored is not None:
-            right.add((log.stored.digest, log.stored.bytes))
-        if not log.is_here or sent is None or (sent.digest, sent.bytes) not in right:
+        right = log.digest, log.bytes
+        if not log.is_here or sent is None or (sent.digest, sent.bytes) != right:
             raise StoreError(f"{log.name} was not copied, and the manifest lists it.")
     for one in found.fields:
         if proven.get(one.file) != copied_file(one):
@@ -629,7 +619,7 @@ def proven_manifest(data: bytes, recording: str, proven: Mapping[str, CopiedFile
 
 
 def digests_of(manifest: Manifest) -> dict[int, str]:
-    """Digests of the segments of a recording as they were sealed, by number."""
+    """Digests of the segments of a recording, by number."""
     return {number: log.digest for number, log in manifest.logs.items()}
 
 
@@ -647,8 +637,8 @@ def files_of(inventory: Inventory) -> list[CopiedFile]:
     """The files of a recording, as they are copied."""
     listed = [copied_file(one) for one in inventory.fields.values()]
     for number in inventory.summaries:
-        digest, size = inventory.stored_file(number)
-        listed.append(CopiedFile(inventory.listing.sealed[number], size, digest))
+        name, size = inventory.listing.sealed[number], inventory.summaries[number].size
+        listed.append(CopiedFile(name, size, inventory.digest(number)))
     return sorted(listed, key=lambda file: (not file.is_segment, file.file))
 
 

@@ -112,7 +112,7 @@ def _damage(path: Path, inventory: Inventory) -> Iterator[Repaired]:
         yield Repaired(inventory.name, f"{PAYLOADS}/{file}", what, is_cured=False)
     for number in inventory.summaries:
         name = inventory.listing.sealed[number]
-        with SegmentCheck(path / name) as check:
+        with SegmentCheck(path / name, inventory.digest(number)) as check:
             for offset, problem in check.problems():
                 what = f"{problem}; {RESTORE}"
                 yield Repaired(inventory.name, f"{name} byte {offset}", what, is_cured=False)
@@ -136,7 +136,8 @@ def _put_segments_right(directory: StoreDirectory, recording: str) -> list[Repai
                 wanted.discard(misfit.belongs)
                 # Temporary names first, since two exchanged segments need each other's name. If
                 # this is interrupted, the temporary name tells the remaining step.
-                files.rename(path / misfit.file, path / moving_name(misfit.file, misfit.belongs))
+                final = inventory.logs[misfit.belongs].name
+                files.rename(path / misfit.file, path / moving_name(misfit.file, final))
     except OSError as error:
         raise durability.explain(error, path, "renaming segments of") from error
     return done + [
@@ -147,11 +148,10 @@ def _put_segments_right(directory: StoreDirectory, recording: str) -> list[Repai
 
 def _rebuild(inventory: Inventory, misfit: Misfit, path: Path) -> bool:
     """Rebuild a damaged summary, if the result has the digest in the manifest."""
-    manifest = inventory.manifest
-    sealed = manifest.logs.get(misfit.segment) if manifest is not None else None
-    if sealed is None or misfit.belongs is not None:
+    log = inventory.logs.get(misfit.segment)
+    if log is None or log.name != misfit.file or misfit.belongs is not None:
         return False
-    return rebuild_summary(path / misfit.file, sealed.digest)
+    return rebuild_summary(path / misfit.file, log.digest)
 
 
 def _put_manifest_right(
@@ -215,7 +215,7 @@ def repair_index(
 def _is_restored(directory: StoreDirectory, catalog: Catalog, entry: RecordingEntry) -> bool:
     """True if an unreadable chunk is readable again, after its file was restored."""
     for number, chunk in catalog.damage(entry.id):
-        path = directory.recording(entry.id) / f"{number:06d}.mcap"
+        path = directory.recording(entry.id) / entry.file_of(number)
         with suppress(SegmentError), open_segment(path, number) as reader:
             reader.read_chunk(reader.summary().chunks[chunk])
             return True

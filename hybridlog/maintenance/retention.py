@@ -264,12 +264,11 @@ def _segment(log: File, written: int, manifest: Manifest, expired: Collection[st
             topics[topic] += part.bytes
             messages[topic] += part.messages
     # Chunks with few stored bytes a message stay. How well each is compressed, nobody knows yet.
-    packed = min(log.bytes / max(sum(part.bytes for part in log.parts.values()), 1), 1)
+    packed = min(log.bytes / max(sum(topics.values()), 1), 1)
     small = [t for t, count in topics.items() if count * packed < MIN_BYTES * messages[t]]
     stays = sum(topics.pop(topic) for topic in small)
-    size = log.bytes if log.stored is None else log.stored.bytes
     pinned = frozenset(pinned_topics(log, manifest))
-    return HeldSegment(log.number, written, size, topics, pinned, stays)
+    return HeldSegment(log.number, written, log.bytes, topics, pinned, stays)
 
 
 def pinned_topics(log: File, manifest: Manifest) -> set[str]:
@@ -303,7 +302,7 @@ class Step:
         bytes: About the bytes that become free.
         reason: Why it goes.
         before: The time before which it was written, ns.
-        digests: Digests that segments must have had when they were sealed, by number.
+        digests: Digests that the files of segments must have, by number.
     """
 
     recording: str

@@ -159,11 +159,9 @@ class Server:
         """As of `Place`."""
         found = _mapping(self._ask("segments", recording=recording))
         return {
-            int(number): CopiedSegment(str(one[0]), str(one[1]), tuple(map(str, one[2])))
+            int(number): CopiedSegment(str(one[0]), tuple(map(str, one[1])))
             for number, one in found.items()
-            if number.isdigit()
-            and isinstance(one, list)
-            and list(map(type, one)) == [str, str, list]
+            if number.isdigit() and isinstance(one, list) and list(map(type, one)) == [str, list]
         }
 
     def begin(self, recording: str, *, wants_payloads: bool) -> Begun:

@@ -90,9 +90,9 @@ def make(
             writer = TableWriter(directory.path, entry.id, entry.name, topics=wanted, is_new=is_new)
             try:
                 channels = channels_of(entry, wanted)
-                numbers = [number for number, _, _ in entry.spans]
+                names, path = entry.files_of(), directory.recording(entry.id)
                 report = reporter(progress, entry.name, entry.stored_bytes)
-                for segment in walk(directory.recording(entry.id), numbers, report=report):
+                for segment in walk(path, names, report=report):
                     for _, chunk in segment.chunks(lambda p: not channels.isdisjoint(p.channels)):
                         if time.monotonic() > until:
                             raise TimeoutError
@@ -150,10 +150,9 @@ def _sharing(
 ) -> set[str]:
     """Topics that share chunks with some topics, or with another one of them."""
     topics = {channel.id: channel.topic for channel in entry.channels}
-    numbers = [number for number, _, _ in entry.spans]
     together = {
         frozenset(topics[channel] for channel in place.channels if channel in topics)
-        for segment in walk(directory.recording(entry.id), numbers)
+        for segment in walk(directory.recording(entry.id), entry.files_of())
         for place in segment.summary.chunks
     }
     found, before = {*wanted_topics}, 0

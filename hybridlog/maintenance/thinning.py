@@ -1,9 +1,8 @@
 """Puts a segment without the content of some chunks in the place of the whole one.
 
-It is written next to the old one, and every chunk of it is read and compared with the old one.
-Only then the manifest lists it, and it takes the place of the old one. A crash before that
-change leaves a file that the next opening removes; after it, the next opening renames it. Until
-then both segments are right.
+It is another file, with another name, and every chunk of it is read and compared with the old
+one. Only then the manifest lists it in the place of the old one, which is removed. A crash on
+either side of that change leaves a file that the next opening removes.
 """
 
 from __future__ import annotations
@@ -16,14 +15,13 @@ import numpy as np
 from msgspec import structs
 
 from hybridlog.columns import payload_files
-from hybridlog.columns.layout import replacement_name
 from hybridlog.columns.payload_files import open_segment
 from hybridlog_storage.errors import HybridlogError, SegmentError
-from hybridlog_storage.manifest import Stored, with_file
+from hybridlog_storage.manifest import with_file
 from hybridlog_storage.manifests import manifests_at
 from hybridlog_storage.messages import EXPIRED_IDS
 from hybridlog_storage.segments.segment_check import SegmentCheck
-from hybridlog_storage.segments.segment_file import sealed_name
+from hybridlog_storage.segments.segment_file import number_of, sealed_name
 from hybridlog_storage.segments.segment_thinning import thin
 
 if TYPE_CHECKING:
@@ -68,31 +66,31 @@ def replace_chunks(
         SegmentError: The new segment is not what it should be.
         DiskFullError: There is no room.
     """
-    name = sealed_name(reader.number)
-    target = path / replacement_name(name)
+    log = manifest.logs[reader.number]
+    _, version = number_of(log.name) or (log.number, 0)
+    target = path / sealed_name(log.number, version + 1)
     about = {
-        "digest": summary.whole_digest,
-        "bytes": manifest.logs[reader.number].bytes,
+        "digest": summary.content(log.digest),
         "files": [structs.asdict(file) for file in manifest.fields],
     }
     try:
         written = thin(reader, target, records, about)
         _prove(target, reader, summary, records, contents)
         topics = summary.topics_in(one for one in summary.chunks if one.number in records)
-        stored = Stored(written.bytes, written.digest)
 
         def how(now: Manifest) -> Manifest:
             check(now)
             expired = tuple(sorted({*now.logs[reader.number].expired, *topics}))
-            return with_file(now, reader.number, stored=stored, expired=expired)
+            what = {"name": target.name, "bytes": written.bytes, "digest": written.digest}
+            return with_file(now, log.number, expired=expired, **what)
 
         now = manifests_at(path).change(path.name, how)
     except BaseException:
         with suppress(HybridlogError, OSError):  # the next opening does it
-            payload_files.replace_segments(path, [target.name], manifests_at(path).read(path.name))
+            now = manifests_at(path).read(path.name)
+            payload_files.remove_replaced(path, [log.name, target.name], now)
         raise
-    if payload_files.replace_segments(path, [target.name], now) != [name]:
-        raise SegmentError(f"{target} changed while it was to replace {name}")
+    payload_files.remove_replaced(path, [log.name, target.name], now)
     return reader.size - written.bytes
 
 

@@ -21,7 +21,6 @@ from hybridlog_storage.mongo.index_documents import recording_key, with_prefix
 from hybridlog_storage.mongo.index_state import IndexState
 from hybridlog_storage.mongo.topic_places import TopicPlaces
 from hybridlog_storage.segments.segment_check import SegmentCheck
-from hybridlog_storage.segments.segment_file import sealed_name
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -272,7 +271,10 @@ class _Check:
     def _files(self, inventory: Inventory, *, is_held: bool) -> None:
         for misfit in inventory.misfits:
             place = misfit.file or f"segment {misfit.segment}"
-            if sealed_name(misfit.segment) in self._lost:
+            if (
+                misfit.segment in inventory.logs
+                and inventory.logs[misfit.segment].name in self._lost
+            ):
                 continue
             can_mend = misfit.is_unlisted or misfit.belongs is not None
             self.found(place, misfit.reason, _REPAIR if can_mend or misfit.file else _RESTORE_LOST)
@@ -307,14 +309,16 @@ class _Check:
         """Check every byte of a segment, and every chunk as a reader reads it."""
         summary = inventory.summaries.get(number)
         try:
-            with SegmentCheck(self._path / name) as check:
+            log = inventory.logs.get(number)
+            with SegmentCheck(self._path / name, "" if log is None else log.digest) as check:
                 for offset, problem in check.problems(tell):
                     self._is_damaged = True
                     cure = RESTORE if check.summary is not None else _REPAIR
                     self.found(f"{name} byte {offset}", problem, cure)
             if summary is None:
                 return
-            for segment in walk(self._path, [number], self._contents, known={number: summary}):
+            known = {number: summary}
+            for segment in walk(self._path, {number: name}, self._contents, known=known):
                 for place, chunk in segment.chunks():
                     self._chunk(place, chunk, summary.channels, name)
                 self._result.bytes_read += segment.reader.bytes_read

@@ -186,8 +186,8 @@ class RecordingEntry:
         marks: Marks set after it ended: `time` (ns), `text`, `tags`; those that last, `end` (ns).
         pins: What is never deleted to make room: `id`, `from`, `to`, `topics`, `reason`.
         spans: Number, first and last log time (ns) of each segment that has messages.
-        digests: Digest of each valid segment, by its number as text.
-        stored: Digest of the files of those with expired chunks.
+        digests: Digest of each valid segment as it was sealed, by its number as text.
+        files: Names of the files of those with expired chunks.
         is_decoded: Whether messages were decoded. Otherwise header stamps, and messages that
         do not fit their definition, are unknown.
         payloads: Files with fields of expired messages: `file`, `bytes`, `digest`, `topic`,
@@ -214,7 +214,7 @@ class RecordingEntry:
     pins: list[dict[str, Any]] = field(default_factory=list)
     spans: list[tuple[Int, Int, Int]] = field(default_factory=list)
     digests: dict[str, str] = field(default_factory=dict)
-    stored: dict[str, str] = field(default_factory=dict)
+    files: dict[str, str] = field(default_factory=dict)
     is_decoded: bool = False
     payloads: list[dict[str, Any]] = field(default_factory=list)
     flushed: dict[int, Flushed] = field(default_factory=dict)
@@ -226,6 +226,16 @@ class RecordingEntry:
     def key(self) -> str:
         """The random digits of the id, 16; index documents refer to it."""
         return self.id[-16:]
+
+    def file_of(self, number: int) -> str:
+        """Name of the file of a sealed segment."""
+        return self.files.get(str(number)) or sealed_name(number)
+
+    def files_of(self, numbers: Iterable[int] | None = None) -> dict[int, str]:
+        """Names of the files of some sealed segments, by number; None for all with messages."""
+        if numbers is None:
+            numbers = (number for number, _, _ in self.spans)
+        return {number: self.file_of(number) for number in numbers}
 
     @property
     def messages(self) -> int:
@@ -772,7 +782,7 @@ class Catalog:
             "table",
             entry.id,
             number,
-            entry.stored.get(str(number), digest),
+            digest + entry.file_of(number),
             make=lambda: self._read_table(entry, number, digest),
             size_of=lambda found: _size(found[0]),
         )
@@ -780,17 +790,15 @@ class Catalog:
     def _read_table(
         self, entry: RecordingEntry, number: int, digest: str
     ) -> tuple[ChunkTable, NDArray[np.void] | None]:
-        path = self._store / _RECORDINGS / entry.id / sealed_name(number)
+        path = self._store / _RECORDINGS / entry.id / entry.file_of(number)
         try:
             with SegmentReader(path, number) as reader:
                 summary = reader.summary()
         except SegmentError as error:
             raise CatalogError(str(error)) from error
-        # Expired messages are on other channels than before.
-        is_expired = bool(summary.table.is_expired.any())
-        is_known = summary.digest == entry.stored.get(str(number), digest) or not is_expired
-        is_ours = summary.recording.get("id") == entry.id and summary.whole_digest == digest
-        if not (is_ours and is_known):
+        said = summary.recording.get("id"), summary.recording.get("segment")
+        is_ours = said == (entry.id, number) and summary.content(digest) == digest
+        if not is_ours or {*spans_of(number, summary.table)} - {*entry.spans}:
             raise CatalogError(f"Segment {path} has changed since the store was opened.")
         return summary.table, self.stamps(entry, number, summary.table)
 
@@ -864,6 +872,13 @@ def schema_hash(schema: Schema) -> str:
     for part in (schema.name.encode(), schema.encoding.encode(), bytes(schema.data)):
         digest.update(len(part).to_bytes(8, "little") + part)
     return digest.hexdigest()
+
+
+def spans_of(number: int, table: ChunkTable) -> list[tuple[int, int, int]]:
+    """Number of a segment, first and last log time of its messages, ns; none without any."""
+    if not len(table.chunks):
+        return []
+    return [(number, int(table.chunks["first"].min()), int(table.chunks["last"].max()))]
 
 
 def channel_entry(channel_id: int, channel: Channel, reason: str | None) -> ChannelEntry:

@@ -38,8 +38,8 @@ Random = Annotated[str, Meta(pattern=r"\A[0-9a-f]{16}\Z")]
 PinId = Annotated[str, Meta(pattern=r"\A[^\s/\0]{1,64}\Z")]
 """Drawn as well; that of a copy begins with what it is known by."""
 Id = Annotated[str, Meta(pattern=r"\A[a-z0-9](-?[a-z0-9]){0,63}-[0-9a-f]{16}\Z")]
-Digest = Annotated[str, Meta(pattern=r"\A(sha256:)?[0-9a-f]{64}\Z")]
-"""BLAKE3 of all bytes of a file; with `sha256:`, SHA-256 of its summary or footer."""
+Digest = Annotated[str, Meta(pattern=r"\A[0-9a-f]{64}\Z")]
+"""BLAKE3 of all bytes of a file."""
 FileName = Annotated[str, Meta(pattern=r"\A[0-9]{6}(\.[a-z0-9_-]{1,64})?\.(mcap|parquet)\Z")]
 FieldsName = Annotated[str, Meta(pattern=r"\A(?!\.)[^/\0]{1,255}/(?!\.)[^/\0]{1,255}\Z")]
 Tags = dict[Key, Text]
@@ -109,13 +109,6 @@ class Part(Record, frozen=True, array_like=True):
     last: Nanoseconds | None = None
 
 
-class Stored(Record, frozen=True, array_like=True):
-    """The bytes and the digest of a log some of whose payloads have expired."""
-
-    bytes: Count
-    digest: Digest
-
-
 class File(Record, frozen=True):
     """A file below `recordings/<id>`, which never changes.
 
@@ -132,8 +125,6 @@ class File(Record, frozen=True):
         parts: What it has of each channel.
         gone: Why the file is no longer here; absent while it is.
         copy: Address of a proven copy, if it is gone.
-        stored: What the file is since payloads of it have expired; None before. `bytes` and
-            `digest` are of the file as it was sealed.
         expired: Topics whose payloads have expired, at least some of them.
         retained: Topics that a rule was applied to; None for all; absent for none.
     """
@@ -150,7 +141,6 @@ class File(Record, frozen=True):
     parts: dict[ChannelNumber, Part] = {}
     gone: Literal["expired", "elsewhere"] | UnsetType = UNSET
     copy: Text = ""
-    stored: Stored | None = None
     expired: tuple[Topic, ...] = ()
     retained: tuple[Topic, ...] | UnsetType | None = UNSET
 
@@ -166,7 +156,7 @@ class Fields(Record, frozen=True):
     Attributes:
         file: Its path below the recording's `payloads`.
         bytes: Its size.
-        digest: Of its footer.
+        digest: BLAKE3 of its bytes.
         topic: The topic.
         messages: Number of messages in it.
     """
@@ -317,6 +307,13 @@ class Manifest(Record, frozen=True):
             raise ValueError("two files have one name")
         if any(int(file.name[:6]) != file.number for file in self.files):
             raise ValueError("a file has the number of another one")
+        if len({(file.kind, file.number) for file in self.files}) < len(self.files):
+            raise ValueError("two files have one number")
+        if not {file.number for file in self.files}.isdisjoint(self.unmarked):
+            raise ValueError("a file is both listed and removed")
+        paths = {file.file for file in self.fields}
+        if len(paths) < len(self.fields) or not paths.isdisjoint(self.deleted):
+            raise ValueError("a file of fields is listed twice, or was replaced")
         for ids in ([mark.id for mark in self.marks], [pin.id for pin in self.pins]):
             if len({*ids}) < len(ids):
                 raise ValueError("two marks or pins have one id")

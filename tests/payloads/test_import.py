@@ -62,7 +62,7 @@ def cut(path: Path) -> None:
 
 @pytest.mark.parametrize("fault", [flip, cut, Path.unlink])
 @pytest.mark.parametrize(
-    "name", ["payloads/fields=cloud/*", "payloads/fields=scan/*", "000001.mcap"]
+    "name", ["payloads/fields=cloud/*", "payloads/fields=scan/*", "000001.1.mcap"]
 )
 def test_a_source_that_was_mended_is_imported(
     source: Path, mine: hl.Store, thin: Path, name: str, fault: Callable[[Path], None]
@@ -117,11 +117,11 @@ def test_what_an_earlier_import_left_is_checked(source: Path, mine: hl.Store, th
         hidden = places.root(mine.directory.path) / f".importing-{store.recordings()[0].id}"
     shutil.copytree(recording_of(source), hidden)
     (hidden / "manifest.json").unlink()  # it is written when all else is whole
-    shutil.copy(hidden / "000000.mcap", hidden / "000077.mcap")
+    shutil.copy(hidden / "000000.1.mcap", hidden / "000077.mcap")
     (hidden / "payloads" / "fields=scan" / "stale.parquet").write_bytes(b"stale")
     for path in hidden.glob("payloads/fields=cloud/*"):
         flip(path)
-    cut(hidden / "000001.mcap")
+    cut(hidden / "000001.1.mcap")
     assert bring(mine, source).copied == ["log"]
     assert files_of(mine.directory.path) == files_of(thin)
     assert mine.recordings()[0].status == "complete"

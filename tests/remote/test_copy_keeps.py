@@ -301,7 +301,7 @@ def test_other_payloads_expired_there(
     class Other(BucketPlace):
         def segments(self, recording: str) -> dict[int, CopiedSegment]:
             found = super().segments(recording)
-            other = found[number]._replace(now="sha256:of others", expired=("/scan",))
+            other = found[number]._replace(digest="of others", expired=("/scan",))
             return {**found, number: other}
 
     target = RemoteDirectory.create_in(address)

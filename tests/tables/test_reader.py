@@ -293,7 +293,7 @@ def test_tables_of_other_recordings_are_not_believed(
     tables = Tables(recorded.directory.path)
     assert all(tables.of(one, topic) is None for topic in topics_of(one))
     assert all(tables.of(other, topic) for topic in topics_of(other))
-    forged = replace(one, id=other.id, digests=dict.fromkeys(one.digests, f"sha256:{'0' * 64}"))
+    forged = replace(one, id=other.id, digests=dict.fromkeys(one.digests, "0" * 64))
     for topic in topics_of(one):
         with pytest.raises(FileNotFoundError):
             tables.check(forged, topic)

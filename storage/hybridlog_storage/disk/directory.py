@@ -22,7 +22,7 @@ import secrets
 import stat
 import sys
 import time
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from itertools import takewhile
@@ -39,7 +39,7 @@ from hybridlog_storage.manifests import (
     WRITER_LOCK,
     DiskManifests,
 )
-from hybridlog_storage.segments.segment_file import OPEN_SUFFIX, SEALED_SUFFIX
+from hybridlog_storage.segments.segment_file import OPEN_SUFFIX, SEALED_SUFFIX, number_of
 from hybridlog_storage.settings import NAME as SETTINGS
 from hybridlog_storage.settings import StoreSettings, read_settings, write_settings
 from hybridlog_storage.stopping import pause
@@ -81,7 +81,7 @@ class Listing:
     """Content of a recording's directory.
 
     Attributes:
-        sealed: Names of sealed segments, by number.
+        sealed: Names of sealed segments, by number; of several, the one with the least version.
         open: Names of segments that were never sealed, by number.
         others: All other names.
         payloads: Sizes of files of fields, by path below `payloads`.
@@ -95,6 +95,15 @@ class Listing:
     payloads: Mapping[str, int]
     look: str
     print: str
+
+    def choosing(self, names: Iterable[str]) -> Listing:
+        """The same, with these of several sealed segments of one number."""
+        chosen = {int(name[:6]): name for name in {*names} & {*self.others}}
+        chosen = {number: name for number, name in chosen.items() if number in self.sealed}
+        if not chosen:
+            return self
+        others = {*self.others, *(self.sealed[number] for number in chosen)} - {*chosen.values()}
+        return replace(self, sealed={**self.sealed, **chosen}, others=tuple(sorted(others)))
 
 
 class StoreDirectory:
@@ -343,28 +352,30 @@ class StoreDirectory:
             pass
         except OSError as error:
             raise unreadable(error, path) from error
-        sealed: dict[int, str] = {}
         opened: dict[int, str] = {}
         others = []
+        versions: dict[int, dict[int, str]] = {}
         looks = hashlib.blake2b(digest_size=16)
         looks.update(f"{manifest}\n".encode())
         for name, about in sorted(found.items()):
-            number, kind = _numbered(name)
+            number, version, kind = _numbered(name)
             if kind == OPEN_SUFFIX:
                 opened[number] = name
                 looks.update(f"{name}\n".encode())
             elif kind == SEALED_SUFFIX:
-                sealed[number] = name
+                versions.setdefault(number, {})[version] = name
             elif name not in _OF_MANIFEST:
                 others.append(name)
             if kind == SEALED_SUFFIX:
                 looks.update(f"{name} {_file_look(about)}\n".encode())
         for name, about in sorted(payloads.items()):
             looks.update(f"{name} {_file_look(about)}\n".encode())
+        sealed = {number: names.pop(min(names)) for number, names in sorted(versions.items())}
+        others += (name for names in versions.values() for name in names.values())
         return Listing(
-            dict(sorted(sealed.items())),
+            sealed,
             dict(sorted(opened.items())),
-            tuple(others),
+            tuple(sorted(others)),
             {name: about.st_size for name, about in sorted(payloads.items())},
             look,
             looks.hexdigest(),
@@ -560,12 +571,10 @@ def payload_names(recording: Path, folder: str = PAYLOADS) -> dict[str, os.stat_
     return found
 
 
-def _numbered(name: str) -> tuple[int, str]:
-    """Number and suffix of a segment's file; an empty suffix for other files."""
-    for suffix in (OPEN_SUFFIX, SEALED_SUFFIX):
-        stem = name.removesuffix(suffix)
-        if stem != name and stem.isascii() and stem.isdigit() and len(stem) <= 9:
-            if f"{int(stem):06d}" == stem:
-                return int(stem), suffix
-            return 0, ""
-    return 0, ""
+def _numbered(name: str) -> tuple[int, int, str]:
+    """Number, version and suffix of a segment's file; an empty suffix for other files."""
+    sealed = name.removesuffix(OPEN_SUFFIX) + SEALED_SUFFIX if name.endswith(OPEN_SUFFIX) else name
+    found = number_of(sealed)
+    if found is None or (sealed != name and found[1]):
+        return 0, 0, ""
+    return *found, SEALED_SUFFIX if sealed == name else OPEN_SUFFIX

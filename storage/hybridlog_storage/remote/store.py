@@ -50,7 +50,6 @@ from hybridlog_storage.remote.lists import (
     list_name,
     number_of,
 )
-from hybridlog_storage.segments.segment_file import sealed_name
 from hybridlog_storage.settings import EXPIRED, NONE, StoreSettings, read_settings, settings_text
 from hybridlog_storage.settings import NAME as SETTINGS
 
@@ -618,13 +617,13 @@ class RemoteDirectory(StoreDirectory):
             StoreError: An object that is needed is lost.
         """
         objects, bucket = self.files_of(recording), self.source.bucket
-        wanted = {sealed_name(number) for number in segments}
+        manifest = self._manifest(recording)
+        wanted = {manifest.logs[number].name for number in segments}
         if wanted:  # fields of expired messages belong to all segments
             wanted |= {path for path in objects if path.startswith(f"{PAYLOADS}/")}
         with tempfile.TemporaryDirectory(prefix="hybridlog-") as place:
             there = StoreDirectory.create(Path(place) / "store")
             folder = there.recording(recording)
-            manifest = self._manifest(recording)
             there.manifests.create(manifest)
             for path in wanted:
                 try:

@@ -39,7 +39,6 @@ from hybridlog_storage.segments.chunk_table import parts_of
 from hybridlog_storage.segments.segment_check import damaged_pieces
 from hybridlog_storage.segments.segment_file import (
     OPEN_SUFFIX,
-    SEALED_SUFFIX,
     OnSealing,
     Sealed,
     SegmentFile,
@@ -484,11 +483,11 @@ def _complete(path: Path, number: int) -> Sealed | None:
         if summary.size < file.position:
             file.cut(summary.size)
         file.sync()
-        blake3 = file.digest()
+        digest = file.digest()
     finally:
         file.close()
     channels = sealed_channels(summary.table, summary.channels)
-    return Sealed(number, sealed_name(number), summary.size, summary.digest, channels, blake3)
+    return Sealed(number, sealed_name(number), summary.size, digest, channels)
 
 
 def _proven_summary(path: Path, number: int) -> SegmentSummary | None:
@@ -550,7 +549,7 @@ def rebuild_summary(path: Path, digest: str) -> bool:
         StoreError: It cannot be read, or the copy cannot be written.
         DiskFullError: No room for the copy.
     """
-    number = int(path.name.removesuffix(SEALED_SUFFIX))
+    number = int(path.name.partition(".")[0])
     copy = path.with_name(f".{path.name}.rebuilt")
     try:
         _copy(path, copy)

@@ -1,4 +1,4 @@
-"""Checks every byte of a sealed segment against the checksums in its summary."""
+"""Checks every byte of a sealed segment against its digest, and finds what is damaged."""
 
 from __future__ import annotations
 
@@ -6,12 +6,15 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Self
 
 from hybridlog_storage.errors import SegmentError
+from hybridlog_storage.manifest import hasher
 from hybridlog_storage.mcap.mcap_scan import ScanDamage, ScannedChunk, scan
 from hybridlog_storage.segments.segment_reader import SegmentReader
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
     from pathlib import Path
+
+    from blake3 import blake3
 
     from hybridlog_storage.segments.chunk_table import ChunkTable
     from hybridlog_storage.segments.segment_reader import SegmentSummary
@@ -20,11 +23,16 @@ if TYPE_CHECKING:
 class SegmentCheck:
     """Checks one sealed segment; a context manager.
 
+    Args:
+        path: The file.
+        digest: The one in the manifest; empty if it lists none.
+
     Raises:
         SegmentError: It cannot be opened.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, digest: str = "") -> None:
+        self._digest = digest
         self.summary: SegmentSummary | None = None
         """The segment's summary; None if it is damaged."""
         self._reader = SegmentReader(path, 0)
@@ -56,10 +64,7 @@ class SegmentCheck:
                 Byte and description, in file order; a damaged summary comes first.
         """
         if self._table is not None:
-            problems = list(damaged_pieces(self._reader, self._table, progress, self._names()))
-            yield from problems
-            if self.summary is None and not problems:
-                yield self._table.end, self._problem
+            yield from self._problems(self._table, progress)
             return
         yield max(self._reader.size - 1, 0), self._problem
         with self._reader.stream() as file:
@@ -74,6 +79,20 @@ class SegmentCheck:
                 if progress is not None:
                     progress(offset)
 
+    def _problems(
+        self, table: ChunkTable, progress: Callable[[int], None] | None
+    ) -> Iterator[tuple[int, str]]:
+        digest = hasher()
+        pieces = damaged_pieces(self._reader, table, progress, self._names(), digest)
+        problems = list(pieces)
+        yield from problems
+        if not problems and self.summary is None:
+            yield table.end, self._problem
+        elif not problems and self._digest:
+            self._reader.checksum(table.end, self._reader.size - table.end, digest)
+            if digest.hexdigest() != self._digest:
+                yield 0, "it is not the file that the manifest lists: their digests differ"
+
     def _names(self) -> dict[int, str]:
         """Descriptions of the records of the source, by their offset."""
         if self.summary is None:
@@ -87,6 +106,7 @@ def damaged_pieces(
     table: ChunkTable,
     progress: Callable[[int], None] | None = None,
     names: Mapping[int, str] = MappingProxyType({}),
+    digest: blake3 | None = None,
 ) -> Iterator[tuple[int, str]]:
     """Find the parts of a segment that differ from their checksums.
 
@@ -95,13 +115,14 @@ def damaged_pieces(
         table: The chunk table of its summary.
         progress: Called with the byte up to which the segment has been read.
         names: Descriptions of records outside of chunks, by their offset.
+        digest: Gets all bytes before the summary.
 
     Yields:
         Byte and description, in file order.
     """
     for start, length, crc, what in _pieces(table, names):
         try:
-            if reader.checksum(start, length) != crc:
+            if reader.checksum(start, length, digest) != crc:
                 yield start, f"{what} changed: the checksum of {length} bytes differs"
         except SegmentError as error:
             yield start, str(error)

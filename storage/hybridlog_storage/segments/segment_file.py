@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -65,6 +65,7 @@ if TYPE_CHECKING:
 
 OPEN_SUFFIX = ".mcap.open"
 SEALED_SUFFIX = ".mcap"
+_SEALED = re.compile(r"(?P<number>[0-9]{6,9})(\.(?P<version>[1-9][0-9]{0,8}))?\.mcap")
 _SMALL_DEFINITIONS = 1024  # bytes of definitions that are not compressed
 
 
@@ -101,10 +102,8 @@ class Sealed:
         segment: Its number.
         file: Its name once it is sealed.
         bytes: Its size.
-        digest: `sha256:` and the hex digest of its bytes from the start of the summary on.
-            The summary has checksums of all bytes before, so this proves the whole file.
+        digest: BLAKE3 of all its bytes.
         channels: Channels with messages, by channel id.
-        blake3: BLAKE3 of all its bytes; empty if that was not worked out.
     """
 
     segment: int
@@ -112,21 +111,24 @@ class Sealed:
     bytes: int
     digest: str
     channels: tuple[SealedChannel, ...]
-    blake3: str = ""
 
 
 OnSealing = Callable[[Sealed], None]
 """Called when a segment is complete and on the disk, before it gets its final name."""
 
 
-def digest_of(tail: Buffer) -> str:
-    """Digest of a segment's bytes from the start of its summary to its end."""
-    return f"sha256:{hashlib.sha256(tail).hexdigest()}"
+def sealed_name(number: int, version: int = 0) -> str:
+    """File name of a sealed segment; it has a version once payloads of it have expired."""
+    return f"{number:06d}{f'.{version}' if version else ''}{SEALED_SUFFIX}"
 
 
-def sealed_name(number: int) -> str:
-    """File name of a sealed segment."""
-    return f"{number:06d}{SEALED_SUFFIX}"
+def number_of(name: str) -> tuple[int, int] | None:
+    """Number and version of a sealed segment, by the name of its file; None for other files."""
+    found = _SEALED.fullmatch(name)
+    if found is None:
+        return None
+    number, version = int(found["number"]), int(found["version"] or 0)
+    return (number, version) if sealed_name(number, version) == name else None
 
 
 def sealed_channels(
@@ -532,9 +534,8 @@ class SegmentFile:
             self.number,
             sealed_name(self.number),
             self.position,
-            digest_of(tail),
-            sealed_channels(table, channels),
             self._digest(),
+            sealed_channels(table, channels),
         )
         return self._sealed
 

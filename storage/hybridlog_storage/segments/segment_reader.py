@@ -26,6 +26,7 @@ from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk import files
 from hybridlog_storage.disk.append_file import BLOCK, DIRECT
 from hybridlog_storage.errors import SegmentError, exhausted
+from hybridlog_storage.manifest import hasher
 from hybridlog_storage.mcap.mcap_content import (
     MESSAGE_HEAD,
     RECORD_HEAD,
@@ -43,7 +44,6 @@ from hybridlog_storage.segments.attachments import (
 from hybridlog_storage.segments.chunk import ExpiredMessages, StoredChunk
 from hybridlog_storage.segments.chunk_table import ChunkTable
 from hybridlog_storage.segments.compression import FilePart, decompress
-from hybridlog_storage.segments.segment_file import digest_of
 from hybridlog_storage.segments.segment_format import (
     ADDED_IDS,
     CHUNK_HEAD,
@@ -71,6 +71,7 @@ from hybridlog_storage.segments.statements import compacted_of, end_of, loss_row
 from hybridlog_storage.stopping import check_wanted
 
 if TYPE_CHECKING:
+    from blake3 import blake3
     from numpy.typing import NDArray
 
     from hybridlog_storage.messages import Batch
@@ -127,10 +128,9 @@ class SegmentSummary:
         losses: Rows of the loss ledger written with its messages.
         attachments: Attachments of the source, in file order.
         metadata: Metadata records of the source, in file order.
-        compacted: `digest` and `bytes` of a segment before chunks expired, and the `files`
-            of fields that it needs; None in others.
+        compacted: `digest` of a segment before chunks expired, and the `files` of fields that
+            it needs; None in others.
         table: The chunk table.
-        digest: Digest of the bytes from the start of the summary on, as in `Sealed`.
         size: Bytes of the file.
     """
 
@@ -144,7 +144,6 @@ class SegmentSummary:
     metadata: list[MetadataIndex]
     compacted: dict[str, Any] | None
     table: ChunkTable
-    digest: str
     size: int
 
     @property
@@ -152,10 +151,13 @@ class SegmentSummary:
         """Position of each chunk, in file order."""
         return places_of(self.table)
 
-    @property
-    def whole_digest(self) -> str:
-        """Its digest before chunks of it expired."""
-        return (self.compacted or {}).get("digest", self.digest)  # type: ignore[no-any-return]
+    def content(self, digest: str) -> str:
+        """Its digest before chunks of it expired, by which tables and the index know it.
+
+        Args:
+            digest: That of its file.
+        """
+        return (self.compacted or {}).get("digest", digest)  # type: ignore[no-any-return]
 
     def topics_in(self, chunks: Iterable[ChunkPlace]) -> list[str]:
         """Topics of some chunks, in order."""
@@ -281,7 +283,7 @@ class SegmentReader:
         with self._explained():
             start, tail = self._tail()
             records = _records(tail[: len(tail) - _TAIL])
-            return self._summary(records, self._table(records, start), digest_of(tail))
+            return self._summary(records, self._table(records, start))
 
     def table(self) -> ChunkTable:
         """The chunk table of the summary, without reading metadata.
@@ -342,7 +344,7 @@ class SegmentReader:
                 record = _metadata(self.read(index.offset, index.length), index.offset, self.path)
                 check_format(json_of(record), self.path)
 
-    def _summary(self, records: _Records, table: ChunkTable, digest: str) -> SegmentSummary:
+    def _summary(self, records: _Records, table: ChunkTable) -> SegmentSummary:
         found: dict[str, dict[str, object]] = {}
         losses: list[dict[str, Any]] = []
         for index in records.metadata:
@@ -378,7 +380,6 @@ class SegmentReader:
             metadata=[i for i in records.metadata if not i.name.startswith(OUR_NAMES)],
             compacted=found.get(COMPACTED_METADATA),
             table=table,
-            digest=digest,
             size=self.size,
         )
 
@@ -573,16 +574,34 @@ class SegmentReader:
         except SegmentError as error:
             raise self._damaged(place, error) from error
 
-    def checksum(self, offset: int, length: int) -> int:
+    def checksum(self, offset: int, length: int, digest: blake3 | None = None) -> int:
         """CRC-32 of a range of bytes of the file.
+
+        Args:
+            offset: Where it starts.
+            length: Its bytes.
+            digest: Gets these bytes, too.
 
         Raises:
             SegmentError: They cannot be read.
         """
         crc = 0
         for at in range(offset, offset + length, _PIECE):
-            crc = crc32(self.read(at, min(_PIECE, offset + length - at)), crc)
+            piece = self.read(at, min(_PIECE, offset + length - at))
+            crc = crc32(piece, crc)
+            if digest is not None:
+                digest.update(piece)
         return crc
+
+    def digest(self) -> str:
+        """BLAKE3 of all bytes, which are read for it.
+
+        Raises:
+            SegmentError: They cannot be read.
+        """
+        found = hasher()
+        self.checksum(0, self.size, found)
+        return found.hexdigest()
 
     @property
     def is_fetched(self) -> bool:

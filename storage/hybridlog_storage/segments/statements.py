@@ -48,10 +48,9 @@ class FieldsRow(TypedDict):
 
 
 class Compacted(TypedDict):
-    """A segment with expired chunks: its digest and size before, and files that it needs."""
+    """A segment with expired chunks: its digest before, and files that it needs."""
 
     digest: Digest
-    bytes: Count
     files: list[FieldsRow]
 
 
