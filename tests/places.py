@@ -58,7 +58,7 @@ def write_in(folder: Path, new: Manifest) -> None:
     """Write a manifest, whatever it says."""
     path = manifest_of(folder)
     path.parent.mkdir(exist_ok=True)
-    manifests_at(folder)._write(path, encode(new), sync=False)
+    manifests_at(folder)._write(path, encode(new))
 
 
 def manifest(store: Path, name: str) -> Manifest:

@@ -115,7 +115,6 @@ class Capture:
         self.catalog = catalog
         self._directory = directory
         self._no_index = no_index or (lambda _: False)
-        self._sync = settings.sync != "never"
         largest = min(
             settings.segment_size,
             Rules.of(directory.settings.retention).segment_size,
@@ -237,7 +236,7 @@ class Capture:
         self.index.seal(sealed)
 
     def _change(self, how: Callable[[Manifest], Manifest]) -> None:
-        self._directory.manifests.change(self.entry.id, how, sync=self._sync)
+        self._directory.manifests.change(self.entry.id, how)
 
     def _finish(self) -> DatabaseError | None:
         self.index.close()

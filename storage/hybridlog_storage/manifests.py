@@ -101,16 +101,13 @@ class Manifests(ABC):
             return None
         return _present(found)
 
-    def change(
-        self, recording: str, how: Callable[[Manifest], Manifest], *, sync: bool = True
-    ) -> Manifest:
+    def change(self, recording: str, how: Callable[[Manifest], Manifest]) -> Manifest:
         """Replace a manifest.
 
         Args:
             recording: Its id.
             how: Makes the new manifest of the newest one, perhaps several times; if it returns
                 what it was given, nothing is written. What it raises ends the change.
-            sync: Whether it is on the disk when this returns.
 
         Returns:
             The manifest with the change.
@@ -120,7 +117,7 @@ class Manifests(ABC):
             ManifestError: The manifest is damaged.
             HybridlogError: It cannot be written; the old one is still there.
         """
-        return self._change(recording, lambda now: how(_present(now)), sync=sync)
+        return self._change(recording, lambda now: how(_present(now)))
 
     def create(self, manifest: Manifest) -> None:
         """Create the manifest of a new recording; errors as of `creating`."""
@@ -189,9 +186,7 @@ class Manifests(ABC):
         self._forget(recording, is_said=is_said)
         return found
 
-    def _change(
-        self, recording: str, how: Callable[[Manifest], Manifest], *, sync: bool = True
-    ) -> Manifest:
+    def _change(self, recording: str, how: Callable[[Manifest], Manifest]) -> Manifest:
         end = time.monotonic() + WAIT_S
         with self._alone(recording):
             while True:
@@ -201,7 +196,7 @@ class Manifests(ABC):
                     return now
                 new = replace(made, id=now.id, created=now.created, changes=now.changes + 1)
                 try:
-                    self._replace(recording, encode(new), version, sync=sync)
+                    self._replace(recording, encode(new), version)
                 except ObjectChangedError:
                     if time.monotonic() > end:
                         raise
@@ -237,7 +232,7 @@ class Manifests(ABC):
         """Keep others, where there are locks, from replacing a manifest."""
 
     @abstractmethod
-    def _replace(self, recording: str, data: bytes, version: str, *, sync: bool) -> None:
+    def _replace(self, recording: str, data: bytes, version: str) -> None:
         """Replace a manifest. Raises ObjectChangedError if it has another version by now."""
 
     @abstractmethod
@@ -376,7 +371,7 @@ class DiskManifests(Manifests):
         try:
             self._make_lock(folder)
             with _locked(folder / MANIFEST_LOCK):
-                self._write(path, data, sync=True)
+                self._write(path, data)
             with files.folder(self._recordings) as fd:
                 os.utime(fd)  # from which readers see that a recording has come
         except OSError as error:
@@ -412,16 +407,16 @@ class DiskManifests(Manifests):
                 stack.enter_context(_locked(folder / MANIFEST_LOCK))
             yield
 
-    def _replace(self, recording: str, data: bytes, version: str, *, sync: bool) -> None:
+    def _replace(self, recording: str, data: bytes, version: str) -> None:
         path = self.path(recording)
         _keep_old(path, self._recordings / recording)
         try:
-            self._write(path, data, sync=sync)
+            self._write(path, data)
         except OSError as error:
             raise durability.explain(error, path, "writing") from error
 
-    def _write(self, path: Path, data: bytes, *, sync: bool) -> None:
-        """Write a manifest whose lock is held."""
+    def _write(self, path: Path, data: bytes) -> None:
+        """Write a manifest whose lock is held; a power cut never leaves a part of it."""
         new = path.with_name(f".{path.stem}{_NEW}")
         modified = time.time_ns()
         with suppress(FileNotFoundError):
@@ -435,13 +430,10 @@ class DiskManifests(Manifests):
             try:
                 durability.write_all(fd, [data])
                 os.utime(fd, ns=(modified, modified))
-                if sync:
-                    durability.sync_file(fd)
+                durability.sync_file(fd)
             finally:
                 os.close(fd)
-            files.rename(new, path)
-            if sync:
-                files.sync_folder(path.parent)
+            durability.publish(new, path)
         except BaseException:
             with suppress(OSError):
                 files.unlink(new)
@@ -526,7 +518,7 @@ class BucketManifests(Manifests):
     def _alone(self, recording: str) -> Iterator[None]:
         yield
 
-    def _replace(self, recording: str, data: bytes, version: str, *, sync: bool) -> None:
+    def _replace(self, recording: str, data: bytes, version: str) -> None:
         self._bucket.replace(_object(recording), data, version)
 
     def _old(self, recording: str) -> Manifest | None:

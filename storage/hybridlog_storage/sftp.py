@@ -346,7 +346,7 @@ class _ServerManifests(Manifests):
     def _alone(self, recording: str) -> AbstractContextManager[None]:
         return nullcontext()
 
-    def _replace(self, recording: str, data: bytes, version: str, *, sync: bool) -> None:
+    def _replace(self, recording: str, data: bytes, version: str) -> None:
         server, final = self._server, _path(recording)
         changed = ObjectChangedError(f"{server.address}/{final} was changed meanwhile.")
         with self._beside(data) as new:

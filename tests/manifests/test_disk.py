@@ -410,7 +410,7 @@ def test_no_two_manifests_look_alike(store: Path) -> None:
     seen = set()
     for number in range(100):
         how = lambda now, n=number: replace(now, tags={"a": f"{n:03d}"})  # noqa: E731
-        manifests.change(ONE.id, how, sync=False)
+        manifests.change(ONE.id, how)
         seen.add(manifests.path(ONE.id).stat().st_mtime_ns)
     assert len(seen) == 100
 
