@@ -112,6 +112,9 @@ def test_a_changed_byte_is_seen() -> None:
 FILE = {"number": 0, "group": 0, "name": "000000.mcap", "kind": "log", "bytes": 1,
         "digest": DIGEST, "written": 1}  # fmt: skip
 
+FIELDS = {"file": "fields=a/1-000000.parquet", "bytes": 1, "digest": DIGEST, "topic": "/a",
+          "messages": 1}  # fmt: skip
+
 
 @pytest.mark.parametrize(
     "values",
@@ -138,6 +141,11 @@ FILE = {"number": 0, "group": 0, "name": "000000.mcap", "kind": "log", "bytes": 
         {"files": [{**FILE, "bytes": -1}]},
         {"files": [{**FILE, "number": 10**6, "name": "1000000.mcap"}]},
         {"files": [FILE, FILE]},
+        {"files": [FILE, {**FILE, "name": "000000.1.mcap"}]},
+        {"files": [{**FILE, "digest": f"sha256:{DIGEST}"}]},
+        {"files": [FILE], "unmarked": [0]},
+        {"fields": [FIELDS, FIELDS]},
+        {"fields": [FIELDS], "deleted": [FIELDS["file"]]},
         {"files": [{**FILE, "parts": {"3": [1, 1]}}]},
         {"files": [{**FILE, "first": 2, "last": 1}]},
         {"files": [{**FILE, "gone": "lost"}]},

@@ -13,6 +13,7 @@ from typing import Any
 
 import bson
 import pytest
+from blake3 import blake3
 
 import hybridlog as hl
 from hybridlog.entries import put_entry
@@ -20,6 +21,7 @@ from hybridlog.maintenance import expiry
 from hybridlog.maintenance.expiry import Expired
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import IncompleteError, PayloadError, StoreError
+from hybridlog_storage.manifest import replace, with_file
 from tests import places
 from tests.cli.within import answer
 from tests.copies import bring
@@ -124,6 +126,105 @@ def test_answers_stay_when_payloads_go(
         assert store.verify().findings == []
 
 
+def logs(store: Path) -> dict[str, bytes]:
+    """The segments that are there, with their content."""
+    return {path.name: path.read_bytes() for path in recording_of(store).glob("*.mcap")}
+
+
+def test_a_file_never_changes(copy: Path) -> None:
+    """What is left of a segment is another file, and what derives from it stays valid."""
+    with hl.open(copy, mongo="none") as store:
+        digests = store.recordings()[0].digests
+    names = [{"000000.mcap", "000001.mcap"}]
+    seen = logs(copy)
+    for topics in (["/cloud"], None):
+        expire(copy, [0], topics)
+        there = logs(copy)
+        assert all(seen.get(name, data) == data for name, data in there.items())
+        seen |= there
+        names.append({*there})
+        listed = places.manifest(copy, "log")
+        for file in listed.files:
+            assert (len(there[file.name]), blake3(there[file.name]).hexdigest()) == (
+                file.bytes, file.digest,
+            )  # fmt: skip
+        for file in listed.fields:
+            data = (recording_of(copy) / "payloads" / file.file).read_bytes()
+            assert (len(data), blake3(data).hexdigest()) == (file.bytes, file.digest)
+        with hl.open(copy, mongo="none") as store:
+            (entry,) = store.recordings()
+            assert (entry.digests, [*entry.files.values()]) == (digests, [listed.logs[0].name])
+    assert names[1:] == [{f"000000.{n}.mcap", "000001.mcap"} for n in (1, 2)]
+
+
+def test_what_is_left_of_a_replaced_segment_is_removed_by_the_next_writer(copy: Path) -> None:
+    whole, right = logs(copy), answers(copy)
+    expire(copy, [0])
+    thin = logs(copy)
+    segment = recording_of(copy) / "000000.mcap"
+    for beside in (segment, segment.with_name("000000.7.mcap")):
+        beside.write_bytes(whole["000000.mcap"])
+        with hl.open(copy, mongo="none", read_only=True) as store:
+            assert store.topic("/cloud").count() == COUNT
+            assert store.recordings()[0].status == "complete"
+        assert beside.exists()
+        assert answers(copy) == right
+        assert logs(copy) == thin
+    # What the manifest lists is gone: nothing else of it is removed.
+    (recording_of(copy) / "000000.1.mcap").unlink()
+    segment.write_bytes(whole["000000.mcap"])
+    with hl.open(copy, mongo="none") as store:
+        assert store.recordings()[0].status == "damaged"
+        (found,) = (one for one in store.verify().findings if one.place == "000000.mcap")
+        assert found.problem == "the manifest lists 000000.1.mcap in its place"
+    assert segment.exists()
+
+
+@pytest.mark.parametrize("old", ["without", "thin", "whole"])
+def test_a_lost_manifest_is_made_again_of_what_has_expired(copy: Path, old: str) -> None:
+    right = answers(copy)
+    before = places.manifest_of(recording_of(copy)).read_bytes()
+    expire(copy, [0, 1])
+    listed = places.manifest(copy, "log")
+    path = recording_of(copy) / "manifest.old"
+    path.unlink()
+    if old != "without":
+        is_whole = old == "whole"
+        path.write_bytes(before if is_whole else places.manifest_of(path.parent).read_bytes())
+    places.manifest_of(path.parent).unlink()
+    with hl.open(copy, mongo="none") as store:
+        store.verify(repair=True)
+        assert [one.place for one in store.verify().findings] == ["manifest"]
+    assert answers(copy) | {"status": 0} == right | {"status": 0}
+    made = places.manifest(copy, "log")
+    assert made.status == "unproven"
+    assert {*made.fields} == {*listed.fields}
+    for log in made.files:
+        was = listed.logs[log.number]
+        assert (log.name, log.bytes, log.digest) == (was.name, was.bytes, was.digest)
+        assert log.expired == was.expired
+
+
+@pytest.mark.parametrize("kind", ["log", "fields"])
+def test_another_file_than_the_listed_one_is_found(copy: Path, kind: str) -> None:
+    """Also if it has the size of the listed one, and all of its own checksums are right."""
+    expire(copy, [0])
+    listed = places.manifest(copy, "log")
+    if kind == "log":
+        changed, place = with_file(listed, 1, digest="0" * 64), "000001.mcap byte 0"
+    else:
+        one = replace(listed.fields[0], digest="0" * 64)
+        changed = replace(listed, fields=(one, *listed.fields[1:]))
+        place = f"payloads/{one.file}"
+    places.write_in(recording_of(copy), changed)
+    with hl.open(copy, mongo="none") as store:
+        assert store.recordings()[0].status == "complete"
+        (found,) = store.verify().findings
+        assert found.place == place
+        assert "the manifest lists" in found.problem
+        assert not all(one.is_cured for one in store.verify(repair=True))
+
+
 class Dying(files.System):
     """A file system of a process that dies before its n-th change."""
 
@@ -166,6 +267,8 @@ def test_a_death_at_any_step_is_finished_or_undone(copy: Path, tmp_path: Path, s
         lived = die_at(step, partial(expire, place, [0, 1], max_files=0))
         with hl.open(place, mongo="none") as store:  # finishes or undoes it
             assert not store.verify().findings
+            listed = {log.name for log in places.manifest(place, "log").files}
+            assert logs(place).keys() == listed
             states = [message.state.value for message in store.all_topics()]
         assert answers(place) == right
         seen.add(states.count("expired"))
