@@ -23,7 +23,7 @@ from hybridlog.query.question import RecordedChannel, field_types
 from hybridlog.query.topics import resolve
 from hybridlog.snapshot import UNFINISHED
 from hybridlog.wording import counted, listed
-from hybridlog_storage.catalog import ChannelStats, schema_hash
+from hybridlog_storage.catalog import ChannelStats, file_of, schema_hash
 from hybridlog_storage.disk.directory import gone
 from hybridlog_storage.errors import (
     CatalogError,
@@ -666,7 +666,7 @@ class Session:
             count(chunk)
             return chunk
 
-        key = recording.id, segment, place.number, recording.file_of(segment)
+        key = recording.id, segment, place.number, file_of(recording, segment)
         return self.cache.made("chunk", *key, make=read, size_of=_size_of)
 
     def segment(self, recording: str, number: int) -> SegmentReader:

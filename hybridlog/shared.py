@@ -14,6 +14,7 @@ from hybridlog.maintenance.opening import StoreFiles, open_catalog
 from hybridlog.maintenance.report import RepairReport
 from hybridlog.snapshot import UNFINISHED
 from hybridlog_storage.cache import Cache
+from hybridlog_storage.catalog import file_of
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import StoreError, UsageError
 from hybridlog_storage.lazy import lazy
@@ -209,7 +210,7 @@ class Shared(ABC):
             SegmentError: It cannot be opened, as where the recording has another name by now.
         """
         with self._opening:
-            name = entry.file_of(number)
+            name = file_of(entry, number)
             key = entry.id, name
             reader = self._segments.get(key)
             if reader is None:

@@ -15,7 +15,7 @@ from hybridlog.entries import put_entry, take_inventory
 from hybridlog.index.indexing import ChunkIndexer
 from hybridlog.maintenance import tables
 from hybridlog.maintenance.report import Progress, RepairReport, reporter
-from hybridlog_storage.catalog import decoded_rows, stamps_of
+from hybridlog_storage.catalog import decoded_rows, files_of, stamps_of
 from hybridlog_storage.disk.directory import LOCK_WAIT_S
 from hybridlog_storage.errors import (
     HeldError,
@@ -260,7 +260,7 @@ class StoreIndex:
         sent = time.monotonic()
         # A chunk that is indexed already may be missing in the tables all the same.
         in_tables = tables.channels_of(entry, topics)
-        names, path = entry.files_of(), directory.recording(entry.id)
+        names, path = files_of(entry), directory.recording(entry.id)
         report = reporter(self.progress, entry.name, entry.stored_bytes)
         try:
             for segment in walk(path, names, report=report):

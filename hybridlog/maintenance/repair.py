@@ -20,6 +20,7 @@ from hybridlog.maintenance import tables
 from hybridlog.maintenance.index import StoreIndex
 from hybridlog.maintenance.opening import finish_moves, moving_name, recover_segments
 from hybridlog.maintenance.verify import RESTORE, damaged_files
+from hybridlog_storage.catalog import file_of
 from hybridlog_storage.disk import durability, files
 from hybridlog_storage.disk.directory import LOCK_WAIT_S, PAYLOADS
 from hybridlog_storage.errors import HeldError, ManifestError, SegmentError, StoreError, TopicError
@@ -215,7 +216,7 @@ def repair_index(
 def _is_restored(directory: StoreDirectory, catalog: Catalog, entry: RecordingEntry) -> bool:
     """True if an unreadable chunk is readable again, after its file was restored."""
     for number, chunk in catalog.damage(entry.id):
-        path = directory.recording(entry.id) / entry.file_of(number)
+        path = directory.recording(entry.id) / file_of(entry, number)
         with suppress(SegmentError), open_segment(path, number) as reader:
             reader.read_chunk(reader.summary().chunks[chunk])
             return True

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from hybridlog.columns.layout import PARTS, parts_folder, topics_of, type_prefix
 from hybridlog.columns.payload_files import walk
 from hybridlog.maintenance.report import reporter
+from hybridlog_storage.catalog import files_of
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import SegmentError, StoreError, TopicError
 
@@ -90,7 +91,7 @@ def make(
             writer = TableWriter(directory.path, entry.id, entry.name, topics=wanted, is_new=is_new)
             try:
                 channels = channels_of(entry, wanted)
-                names, path = entry.files_of(), directory.recording(entry.id)
+                names, path = files_of(entry), directory.recording(entry.id)
                 report = reporter(progress, entry.name, entry.stored_bytes)
                 for segment in walk(path, names, report=report):
                     for _, chunk in segment.chunks(lambda p: not channels.isdisjoint(p.channels)):
@@ -152,7 +153,7 @@ def _sharing(
     topics = {channel.id: channel.topic for channel in entry.channels}
     together = {
         frozenset(topics[channel] for channel in place.channels if channel in topics)
-        for segment in walk(directory.recording(entry.id), entry.files_of())
+        for segment in walk(directory.recording(entry.id), files_of(entry))
         for place in segment.summary.chunks
     }
     found, before = {*wanted_topics}, 0

@@ -227,16 +227,6 @@ class RecordingEntry:
         """The random digits of the id, 16; index documents refer to it."""
         return self.id[-16:]
 
-    def file_of(self, number: int) -> str:
-        """Name of the file of a sealed segment."""
-        return self.files.get(str(number)) or sealed_name(number)
-
-    def files_of(self, numbers: Iterable[int] | None = None) -> dict[int, str]:
-        """Names of the files of some sealed segments, by number; None for all with messages."""
-        if numbers is None:
-            numbers = (number for number, _, _ in self.spans)
-        return {number: self.file_of(number) for number in numbers}
-
     @property
     def messages(self) -> int:
         """Number of messages in all channels."""
@@ -782,7 +772,7 @@ class Catalog:
             "table",
             entry.id,
             number,
-            digest + entry.file_of(number),
+            digest + file_of(entry, number),
             make=lambda: self._read_table(entry, number, digest),
             size_of=lambda found: _size(found[0]),
         )
@@ -790,7 +780,7 @@ class Catalog:
     def _read_table(
         self, entry: RecordingEntry, number: int, digest: str
     ) -> tuple[ChunkTable, NDArray[np.void] | None]:
-        path = self._store / _RECORDINGS / entry.id / entry.file_of(number)
+        path = self._store / _RECORDINGS / entry.id / file_of(entry, number)
         try:
             with SegmentReader(path, number) as reader:
                 summary = reader.summary()
@@ -872,6 +862,16 @@ def schema_hash(schema: Schema) -> str:
     for part in (schema.name.encode(), schema.encoding.encode(), bytes(schema.data)):
         digest.update(len(part).to_bytes(8, "little") + part)
     return digest.hexdigest()
+
+
+def file_of(entry: RecordingEntry, number: int) -> str:
+    """Name of the file of a sealed segment."""
+    return entry.files.get(str(number)) or sealed_name(number)
+
+
+def files_of(entry: RecordingEntry) -> dict[int, str]:
+    """Names of the files of all sealed segments with messages, by number."""
+    return {number: file_of(entry, number) for number, _, _ in entry.spans}
 
 
 def spans_of(number: int, table: ChunkTable) -> list[tuple[int, int, int]]:
