@@ -469,6 +469,7 @@ def _base(inventory: Inventory) -> RecordingEntry:
         marks=[mark_values(mark) for mark in manifest.marks],
         pins=[pin_values(pin) for pin in manifest.pins],
         payloads=[to_builtins(file) for file in inventory.fields.values()],
+        copies=sorted({file.copy for file in manifest.files if file.copy}),
     )
 
 

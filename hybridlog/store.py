@@ -24,7 +24,7 @@ from typing import (
     overload,
 )
 
-from hybridlog.entries import text
+from hybridlog.entries import free_name_in, put_entry, text
 from hybridlog.index import consent
 from hybridlog.index.connection import again_if_lost
 from hybridlog.index.of_store import Index
@@ -54,7 +54,7 @@ from hybridlog_storage.errors import (
     TopicError,
     UsageError,
 )
-from hybridlog_storage.manifest import Manifest, Note, replace
+from hybridlog_storage.manifest import Manifest, Note, free_name, replace
 from hybridlog_storage.remote import TRIES, address_of, directory_of
 from hybridlog_storage.settings import (
     EMBEDDED,
@@ -74,9 +74,8 @@ if TYPE_CHECKING:
     from hybridlog.contract.judge import Result
     from hybridlog.formats.reading import Source
     from hybridlog.live import LiveOptions, LiveRecording
-    from hybridlog.maintenance.copying import CopyOptions, CopyReport
+    from hybridlog.maintenance.copying import CopyOptions, CopyReport, Target
     from hybridlog.maintenance.keep import KeepReport
-    from hybridlog.maintenance.places import DirectoryPlace, Place
     from hybridlog.maintenance.repair import Repaired
     from hybridlog.maintenance.sizes import Sizes
     from hybridlog.maintenance.verify import Verification
@@ -186,44 +185,40 @@ def _session_of(address: str | Path, mongo: str | None) -> Session:
 
 
 @contextmanager
-def receiving(store: Store) -> Iterator[DirectoryPlace]:
-    """A store as a place that recordings are copied to."""
+def _target(to: str | Path, options: CopyOptions, store: Store) -> Iterator[Target]:
+    """Where recordings of a store are copied to."""
     from hybridlog.maintenance import tables
-    from hybridlog.maintenance.places import DirectoryPlace
-
-    store.shared.catch_up()
-    _ = store.session  # the catalog then has all names
-    place = DirectoryPlace(store.directory, store.catalog)
-    yield place
-    store.shared.catch_up()
-    for entry in store.select(place.published):  # so that other readers find them
-        tables.make(store.directory, entry, is_new=True)
-
-
-@contextmanager
-def _place(to: str | Path, options: CopyOptions, store: Store) -> Iterator[Place]:
-    """The place that recordings of a store are copied to."""
-    from hybridlog.maintenance.ssh import is_ssh, ssh_place
+    from hybridlog.maintenance.copying import Target
+    from hybridlog_storage.copy_places import BucketStore, Directory
+    from hybridlog_storage.remote.bucket import Bucket
 
     source, address = store.directory, address_of(to)
-    if address is not None:
-        from hybridlog.maintenance.bucket_place import BucketPlace
-        from hybridlog_storage.remote.store import RemoteDirectory
+    if str(to).startswith("ssh://"):
+        from hybridlog_storage.sftp import Server
 
-        if source.place == address:
-            raise UsageError(f"{address} is this very store: there is nothing to copy.")
-        target = RemoteDirectory.create_in(address)
-        yield BucketPlace(target, source, store.catalog, store.shared.tables)
+        with Server(str(to), options.ssh) as server:
+            server.begin()
+            yield Target(server, lambda name: free_name(name, server.names()))
         return
-    if is_ssh(str(to)):
-        with ssh_place(str(to), options.ssh, options.program) as server:
-            yield server
-        return
-    path = _local(to)
-    if not source.is_remote and source.path.resolve() in path.resolve().parents:
-        raise UsageError(f"{to} lies inside the store {source.path}: copy to another directory.")
-    with open_store(path, create=True) as other, receiving(other) as place:
-        yield place
+    if address is None:
+        path = _local(to)
+        if not source.is_remote and source.path.resolve() in path.resolve().parents:
+            raise UsageError(
+                f"{to} lies inside the store {source.path}: copy to another directory."
+            )
+    elif source.place == address:
+        raise UsageError(f"{address} is this very store: there is nothing to copy.")
+    with open_store(to if address is None else address, create=True) as other:
+        place = Directory(path) if address is None else BucketStore(Bucket(address))
+        _ = other.session  # the catalog then has all names
+        directory, catalog = other.directory, other.catalog
+        found = Target(
+            place, partial(free_name_in, catalog), partial(put_entry, directory, catalog)
+        )
+        yield found
+        other.shared.catch_up()
+        for entry in other.select(found.arrived):  # so that other readers find them
+            tables.make(other.directory, entry)
 
 
 def _local(to: str | Path) -> Path:
@@ -1280,7 +1275,7 @@ class Store:
     ) -> CopyReport:
         """Copy recordings to another store; what is there already is not copied again.
 
-        Every byte is proved there before a recording gets its name. After an interruption the
+        Every byte is proved there before a recording is seen. After an interruption the
         next call goes on where this one stopped.
 
         Args:
@@ -1307,18 +1302,18 @@ class Store:
             self.directory.check_writable()
         self._to_change().catch_up()
         chosen = self._chosen(recordings)
-        with _place(to, wanted, self) as place:
+        with _target(to, wanted, self) as target:
 
             def expire(recording: str, digests: Mapping[int, str]) -> None:
-                self._expire(recording, digests, place.name, found, progress)
+                self._expire(recording, digests, target.place.address, found, progress)
 
             run(
                 self.directory,
-                place,
+                target,
                 chosen,
                 wanted,
+                expire=expire,
                 progress=progress,
-                proved=expire,
                 report=found,
             )
         return found
@@ -1339,8 +1334,7 @@ class Store:
         rules = Rules.of(self.directory.settings.retention)
         keeper = Keeper(self.directory, partial(remove_if, self.shared))
         try:
-            reason = f"it was copied to {where}"
-            expired = keeper.expire_all(recording, digests, rules, reason, progress)
+            expired = keeper.expire_all(recording, digests, rules, where, progress)
         except HeldError as error:
             report.problems.append(f"Payloads stay: {error}")
             report.held.append(recording)

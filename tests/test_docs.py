@@ -1190,7 +1190,7 @@ def test_the_specification_names_what_there_is() -> None:
     m = manifest
     for part in (m.Manifest, m.File, m.Mark, m.Pin, m.Fields, m.Loss):
         for name in part.__struct_fields__:
-            assert f"`{name}`" in rows or name in {"copy", "gone", "uncounted_marks"}, name
+            assert f"`{name}`" in rows or name in {"gone", "uncounted_marks"}, name
     for state in typing.get_args(index_state.State):
         assert f"`{state}`" in text
     for name in (index_state.RECORDINGS, index_state.STORE):

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Final
 
 from hybridlog.cli import options, output
 from hybridlog.cli.binder import argument, command, option
-from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.options import AsJson, Choosing, InStore, Quiet
 from hybridlog.cli.progress import LateBar
 from hybridlog.cli.signals import if_stopped
@@ -42,7 +41,7 @@ class _Copy(Choosing, InStore, AsJson, Quiet):
         "Delete payloads here once their copy is proved there; pinned ones stay."
     )
     limit_rate: str | None = option("Bytes a second at most, such as 5MB/s.", "RATE")
-    check: bool = option("Read copies that are there already, too, and mend them in a bucket.")
+    check: bool = option("Read copies that are there already, too, and mend them.")
     watch: bool = option("Go on with what ends later, until Ctrl-C.")
     ssh: str | None = option(
         "The ssh program, with options; without, ssh.",
@@ -50,8 +49,6 @@ class _Copy(Choosing, InStore, AsJson, Quiet):
         envvar="HYBRIDLOG_SSH",
         show_envvar=True,
     )
-    program: str = option("hybridlog on the server.", "PATH", default="hybridlog")
-    receive: bool = option("Be the other side of a copy: run by it on the server.")
 
 
 @command(_Copy, "copy")
@@ -59,8 +56,8 @@ def copy_command(given: _Copy) -> None:
     """Copy recordings to or from another store.
 
     It is a directory, a server over ssh, or a bucket. Every byte is proved there before a
-    recording gets its name. After a cut, run it again: it goes on where it stopped. A recording
-    that is there already is not copied again.
+    recording is seen. After a cut, run it again: it goes on where it stopped. A recording that is
+    there already is not copied again.
     """
     from hybridlog.maintenance.copying import CopyOptions
 
@@ -68,13 +65,8 @@ def copy_command(given: _Copy) -> None:
         given = _from_elsewhere(given, given.source)
     if given.to is None:
         raise UsageError("Name the place to copy to, or with --from STORE the one to copy from.")
-    if given.receive:
-        _receive(Path(given.to))
-        return
     rate = _rate(given.limit_rate)
-    how = CopyOptions(
-        given.only_fields, given.then_expire, rate, given.ssh, given.program, check=given.check
-    )
+    how = CopyOptions(given.only_fields, given.then_expire, rate, given.ssh, given.check)
     with (
         given.opened(is_lasting=given.watch) as store,
         if_stopped("What arrived stays there: run the command again."),
@@ -140,19 +132,6 @@ def _look(store: Store, given: _Copy, how: CopyOptions, done: set[str]) -> Itera
     if report.held:
         raise StoreError(" ".join(problems))
     yield from map(StoreError, problems)
-
-
-def _receive(path: Path) -> None:
-    """Do what the copy on the other side of standard input asks."""
-    from hybridlog.maintenance.ssh import serve
-    from hybridlog.store import receiving
-
-    with (
-        opened_store(path, None, create=True, quiet=True) as opened,
-        receiving(opened) as place,
-        open(0, "rb", buffering=0, closefd=False) as requests,
-    ):
-        serve(place, requests, sys.stdout.buffer)
 
 
 def _print(

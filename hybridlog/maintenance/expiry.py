@@ -17,6 +17,7 @@ Each expiry writes files of fields; where a topic has many, they are joined (`co
 
 from __future__ import annotations
 
+import secrets
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
@@ -30,13 +31,14 @@ from hybridlog.columns import payload_files
 from hybridlog.columns.layout import PAYLOAD_PARTS, table_schema_of
 from hybridlog.columns.payload_files import RecordingPayloads, next_number, walk
 from hybridlog.maintenance.report import reporter
-from hybridlog.maintenance.thinning import replace_chunks
+from hybridlog.maintenance.thinning import replace_chunks, write_thinned
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk import durability, files
+from hybridlog_storage.disk.directory import PAYLOADS
 from hybridlog_storage.errors import HybridlogError, SegmentError, StoreError
-from hybridlog_storage.manifests import manifests_at
-from hybridlog_storage.segments.segment_format import expired_record
-from hybridlog_storage.settings import EXPIRED
+from hybridlog_storage.manifest import replace
+from hybridlog_storage.segments.segment_file import sealed_name
+from hybridlog_storage.segments.segment_format import expired_record, not_copied_record
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
@@ -49,7 +51,7 @@ if TYPE_CHECKING:
     from hybridlog.maintenance.report import Progress
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.manifest import Fields, Manifest
-    from hybridlog_storage.messages import Batch, Buffer, Channel
+    from hybridlog_storage.messages import Batch, Channel
     from hybridlog_storage.segments.chunk import StoredChunk
     from hybridlog_storage.segments.segment_reader import ChunkPlace, SegmentSummary
 
@@ -86,7 +88,6 @@ def expire(
     *,
     digests: Mapping[int, str] = MappingProxyType({}),
     check: Callable[[Manifest], object] = lambda _: None,
-    record: Callable[[Buffer], bytes] = expired_record,
     progress: Progress | None = None,
     min_bytes: int = MIN_BYTES,
     max_files: int = MAX_FILES,
@@ -103,7 +104,6 @@ def expire(
             topics in the same chunk keep theirs, and so the chunk stays.
         digests: Digests that files of these segments must have, by number.
         check: Part of each change of the manifest; raises if these payloads must stay by now.
-        record: Makes the record in place of that of a chunk.
         progress: Called after each chunk.
         min_bytes: Chunks with fewer stored bytes a message stay.
         max_files: Small files of fields that a topic may have.
@@ -113,7 +113,8 @@ def expire(
         DiskFullError: There is no room for the fields; nothing is deleted.
     """
     path = directory.recording(recording)
-    work = _Expiry(path, topics, check=check, record=record, min_bytes=min_bytes)
+    manifest = directory.manifests.read(recording)
+    work = _Expiry(path, manifest, path, topics, check=check, min_bytes=min_bytes)
     work.choose(sorted(segments), digests)
     done = work.run(directory, progress)
     # Files that cannot be joined stay as they are, and the next expiry tries again.
@@ -122,30 +123,55 @@ def expire(
     return done
 
 
+def without_payloads(
+    path: Path, manifest: Manifest, segments: Collection[int], into: Path
+) -> Manifest:
+    """Write segments of a recording without payloads, which are to be copied later.
+
+    Args:
+        path: The recording's directory; it stays as it is.
+        manifest: Its manifest.
+        segments: Numbers of the segments; those that would save nothing stay as they are.
+        into: A folder for the new files, those of fields included. Their names are drawn, so that
+            no other file of the recording gets them.
+
+    Returns:
+        The manifest with the new files in the place of others.
+
+    Raises:
+        StoreError: Files cannot be read or written.
+        DiskFullError: There is no room.
+    """
+    work = _Expiry(path, manifest, into, None, check=lambda _: None, min_bytes=MIN_BYTES)
+    work.choose(sorted(segments), {})
+    return work.write_apart()
+
+
 class _Expiry:
     """The steps for one recording."""
 
     def __init__(
         self,
         path: Path,
+        manifest: Manifest,
+        into: Path,
         topics: Collection[str] | None,
         *,
         check: Callable[[Manifest], object],
-        record: Callable[[Buffer], bytes],
         min_bytes: int,
     ) -> None:
         self._path = path
+        self._into = into
         self._min_bytes = min_bytes
         self._topics = topics
         self._check = check
-        self._record = record
-        self._manifest = manifests_at(path).read(path.name)
+        self._manifest = manifest
         self._chosen: dict[int, set[int]] = {}  # numbers of chunks by segment
         self._summaries: dict[int, SegmentSummary] = {}
         self._writers: dict[_Key, TopicWriter] = {}
         self._written: dict[tuple[int, int], list[int]] = {}  # checksums by segment and chunk
         self._made: list[Fields] = []
-        self._numbers = count(next_number(self._manifest))
+        self._numbers = count(next_number(manifest))
 
     def choose(self, segments: Iterable[int], digests: Mapping[int, str]) -> None:
         """Note the chunks of segments that go.
@@ -194,7 +220,6 @@ class _Expiry:
             made = self._write(report)
             if not self._chosen:
                 return done
-            directory.require(EXPIRED)
             self._manifest = payload_files.announce(self._path, made, check=self._check)
         except BaseException as error:
             payload_files.take_back(self._path)
@@ -246,15 +271,14 @@ class _Expiry:
 
     def _write(self, report: Callable[[int], None]) -> list[Fields]:
         """Write what is left of the chosen messages, and compare it with them."""
-        folder = self._path / PAYLOAD_PARTS
-        files.remove_tree(folder)
+        files.remove_tree(self._into / PAYLOAD_PARTS)
         for segment, chunk in self._chunks(report):
             self._add(chunk, segment.summary)
         self._chosen = {number: chosen for number, chosen in self._chosen.items() if chosen}
         for writer in self._writers.values():
             writer.close()
         made = [file for writer in self._writers.values() for file in writer.written]
-        left = RecordingPayloads(self._path, made, PAYLOAD_PARTS)
+        left = RecordingPayloads(self._into, made, PAYLOAD_PARTS)
         self._made = made
         for (segment_number, number), known in self._written.items():
             if _checksums(left.expired(segment_number, number).batch) != known:
@@ -300,7 +324,7 @@ class _Expiry:
             from hybridlog.columns.payload_writer import TopicWriter
 
             columns, number = FieldColumns(channel), partial(next, self._numbers)
-            folder = self._path / PAYLOAD_PARTS
+            folder = self._into / PAYLOAD_PARTS
             found = TopicWriter(folder, self._manifest.id, channel, columns, number)
             self._writers[key] = found
         return found
@@ -321,10 +345,34 @@ class _Expiry:
             self._manifest,
             segment.reader,
             segment.summary,
-            dict.fromkeys(chosen, self._record),
+            dict.fromkeys(chosen, expired_record),
             contents=RecordingPayloads(self._path, self._made),
             check=self._check,
         )
+
+    def write_apart(self) -> Manifest:
+        """As of `without_payloads`."""
+        drawn = secrets.randbelow(8 * 10**8) + 10**8
+        self._numbers = count(drawn)
+        made = self._write(lambda _: None)
+        if not self._chosen:
+            return self._manifest
+        files.rename(self._into / PAYLOAD_PARTS, self._into / PAYLOADS)
+        now = replace(self._manifest, fields=(*self._manifest.fields, *made), lacks_payloads=True)
+        contents = RecordingPayloads(self._into, made)
+        for segment in walk(self._path, self._names(self._chosen), known=self._summaries):
+            number, records = (
+                segment.number,
+                dict.fromkeys(self._chosen[segment.number], not_copied_record),
+            )
+            target = self._into / sealed_name(number, drawn)
+            log = write_thinned(
+                target, now, segment.reader, segment.summary, records, contents=contents
+            )
+            now = replace(
+                now, files=tuple(log if one.number == number else one for one in now.files)
+            )
+        return now
 
 
 def _parts_of(summary: SegmentSummary, place: ChunkPlace) -> NDArray[np.void]:

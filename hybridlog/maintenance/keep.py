@@ -9,7 +9,7 @@ from __future__ import annotations
 import shutil
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -157,7 +157,7 @@ class Keeper:
         recording: str,
         digests: Mapping[int, str],
         rules: Rules,
-        reason: str,
+        copy: str,
         progress: Progress | None = None,
     ) -> KeepReport:
         """Let payloads of a recording go, but for what pins and rules keep.
@@ -166,7 +166,7 @@ class Keeper:
             recording: Its id.
             digests: The segments that have a copy elsewhere: digests by number.
             rules: Rules whose `never_tag` holds.
-            reason: Why they go.
+            copy: Address of the store with the copies.
             progress: Called while payloads are replaced.
 
         Raises:
@@ -180,7 +180,10 @@ class Keeper:
                     numbers = tuple(one.number for one in going)
                     size = sum(one.size for one in going)
                     if numbers:
-                        step = Step(held.name, held.id, numbers, (), size, reason, now, digests)
+                        reason = f"it was copied to {copy}"
+                        step = Step(
+                            held.name, held.id, numbers, (), size, reason, now, digests, copy
+                        )
                         found.plan.steps.append(step)
                         self._do(step, rules, found, progress)
         return found
@@ -270,7 +273,7 @@ class Keeper:
                 check=check,
                 progress=progress,
             )
-            here.manifests.change(step.id, partial(_retained, step.segments, topics))
+            here.manifests.change(step.id, partial(_retained, step, {*done.segments}))
         self._changed(step.id)
         return done.freed
 
@@ -294,17 +297,16 @@ def _check(step: Step, rules: Rules, manifest: Manifest) -> None:
             raise StoreError(f"{step.recording}: a pin was set meanwhile.")
 
 
-def _retained(
-    segments: Iterable[int], topics: Iterable[str] | None, manifest: Manifest
-) -> Manifest:
-    """Note that a rule was applied to segments: payloads of topics, None for all, are gone."""
-    for number in segments:
-        before = manifest.logs[number].retained
-        known = () if before is UNSET else before
+def _retained(step: Step, thinned: Collection[int], manifest: Manifest) -> Manifest:
+    """Note what a step was applied to: payloads of its topics are gone, and where copies are."""
+    for number in step.segments:
+        log = manifest.logs[number]
+        known = () if log.retained is UNSET else log.retained
         after = None
-        if topics is not None and known is not None:
-            after = tuple(sorted({*known, *topics}))
-        manifest = with_file(manifest, number, retained=after)
+        if step.topics and known is not None:
+            after = tuple(sorted({*known, *step.topics}))
+        copy = step.copy if step.copy and number in thinned else log.copy
+        manifest = with_file(manifest, number, retained=after, copy=copy)
     return manifest
 
 

@@ -32,7 +32,6 @@ from hybridlog.entries import (
 from hybridlog.snapshot import UNFINISHED, Snapshot
 from hybridlog_storage.catalog import Catalog
 from hybridlog_storage.disk import durability, files
-from hybridlog_storage.disk.directory import SENDING
 from hybridlog_storage.errors import (
     DiskFullError,
     HeldError,
@@ -105,9 +104,6 @@ class StoreFiles:
         mends = mends and not catalog.is_in_memory
         # A recording has its manifest before it has tables.
         gone = tables.unfinished(directory) if mends else set()
-        if mends:
-            with suppress(OSError):  # the next opening tries again
-                clear_stopped(directory)
         rows = catalog.summaries()
         report.unreadable.clear()
         ids = directory.ids()
@@ -398,30 +394,6 @@ def clear_away(directory: StoreDirectory, recording: str) -> None:
                 files.unlink(path / name)
             except OSError as error:
                 raise durability.explain(error, path / name, "removing") from error
-
-
-def clear_stopped(directory: StoreDirectory) -> None:
-    """Remove the hidden folders of copies out of a store that were stopped.
-
-    They have second names of payloads, which could not be deleted otherwise.
-
-    Raises:
-        OSError: They cannot be removed.
-    """
-    for name in files.names(directory.path):
-        path = directory.path / name
-        if name.startswith(SENDING):
-            with suppress(BlockingIOError), files.locked_folder(path, 0):
-                files.remove_tree(path)
-
-
-def is_at_work(source: StoreDirectory, name: str) -> bool:
-    """True if a hidden folder of a copy is locked: the copy goes on."""
-    try:
-        with files.locked_folder(source.path / name, 0):
-            return False
-    except OSError as error:
-        return isinstance(error, BlockingIOError)
 
 
 def moving_name(name: str, final: str) -> str:

@@ -303,6 +303,7 @@ class Step:
         reason: Why it goes.
         before: The time before which it was written, ns.
         digests: Digests that the files of segments must have, by number.
+        copy: Address of a store with proven copies of them; empty if there is none.
     """
 
     recording: str
@@ -313,6 +314,7 @@ class Step:
     reason: str
     before: int
     digests: Mapping[int, str] = field(default_factory=dict)
+    copy: str = ""
 
 
 @dataclass(slots=True)

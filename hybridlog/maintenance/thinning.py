@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from hybridlog.columns.payload_files import RecordingPayloads
-    from hybridlog_storage.manifest import Manifest
+    from hybridlog_storage.manifest import File, Manifest
     from hybridlog_storage.messages import Buffer
     from hybridlog_storage.segments.chunk import StoredChunk
     from hybridlog_storage.segments.segment_reader import (
@@ -69,20 +69,14 @@ def replace_chunks(
     log = manifest.logs[reader.number]
     _, version = number_of(log.name) or (log.number, 0)
     target = path / sealed_name(log.number, version + 1)
-    about = {
-        "digest": summary.content(log.digest),
-        "files": [structs.asdict(file) for file in manifest.fields],
-    }
     try:
-        written = thin(reader, target, records, about)
-        _prove(target, reader, summary, records, contents)
-        topics = summary.topics_in(one for one in summary.chunks if one.number in records)
+        made = write_thinned(target, manifest, reader, summary, records, contents=contents)
 
         def how(now: Manifest) -> Manifest:
             check(now)
-            expired = tuple(sorted({*now.logs[reader.number].expired, *topics}))
-            what = {"name": target.name, "bytes": written.bytes, "digest": written.digest}
-            return with_file(now, log.number, expired=expired, **what)
+            topics = {*now.logs[log.number].expired, *made.expired}
+            what = {"name": made.name, "bytes": made.bytes, "digest": made.digest}
+            return with_file(now, log.number, expired=tuple(sorted(topics)), **what)
 
         now = manifests_at(path).change(path.name, how)
     except BaseException:
@@ -91,7 +85,47 @@ def replace_chunks(
             payload_files.remove_replaced(path, [log.name, target.name], now)
         raise
     payload_files.remove_replaced(path, [log.name, target.name], now)
-    return reader.size - written.bytes
+    return reader.size - made.bytes
+
+
+def write_thinned(
+    target: Path,
+    manifest: Manifest,
+    reader: SegmentReader,
+    summary: SegmentSummary,
+    records: Mapping[int, Callable[[Buffer], bytes]],
+    *,
+    contents: RecordingPayloads,
+) -> File:
+    """Write a segment without the content of some chunks, and prove it; its line of the manifest.
+
+    Args:
+        target: The new file.
+        manifest: As of `replace_chunks`, as are the others.
+        reader: The segment.
+        summary: Its footer.
+        records: As for `thin`.
+        contents: Has what is left of them.
+
+    Raises:
+        SegmentError: The new segment is not what it should be.
+        DiskFullError: There is no room.
+    """
+    log = manifest.logs[reader.number]
+    about = {
+        "digest": summary.content(log.digest),
+        "files": [structs.asdict(file) for file in manifest.fields],
+    }
+    written = thin(reader, target, records, about)
+    _prove(target, reader, summary, records, contents)
+    topics = summary.topics_in(one for one in summary.chunks if one.number in records)
+    return structs.replace(
+        log,
+        name=target.name,
+        bytes=written.bytes,
+        digest=written.digest,
+        expired=tuple(sorted({*log.expired, *topics})),
+    )
 
 
 def _prove(

@@ -192,6 +192,7 @@ class RecordingEntry:
         do not fit their definition, are unknown.
         payloads: Files with fields of expired messages: `file`, `bytes`, `digest`, `topic`,
             `messages`.
+        copies: Addresses of stores with copies that have more payloads.
         flushed: Content of segments that are not sealed, by number, at one moment; the
             catalog's file does not have it.
     """
@@ -217,6 +218,7 @@ class RecordingEntry:
     files: dict[str, str] = field(default_factory=dict)
     is_decoded: bool = False
     payloads: list[dict[str, Any]] = field(default_factory=list)
+    copies: list[str] = field(default_factory=list)
     flushed: dict[int, Flushed] = field(default_factory=dict)
 
     def __repr__(self) -> str:

@@ -1,267 +1,333 @@
-"""Copies a recording from a store to another one: its definitions, its files, its manifest last.
+"""Copies a recording from a store to another one: its files, then its manifest.
 
 What is there already is not sent. Into a manifest that is there go files, channels, losses and
-the status; what people said of the recording there stays.
+the status; what people said of the recording there stays (`merging`).
 """
 
 from __future__ import annotations
 
 import time
+from contextlib import ExitStack
 from dataclasses import dataclass, field
-from functools import partial
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
-from hybridlog_storage.copy_places import (
-    RECORDINGS,
-    SCHEMAS,
-    RefusedError,
-    Sending,
-    digest_of,
-)
-from hybridlog_storage.errors import RecordingExistsError, StoreError, UsageError
-from hybridlog_storage.manifest import File, Manifest, replace
-from hybridlog_storage.merging import check_origin, files_of, merged
+from hybridlog_storage.copy_places import RECORDINGS, RefusedError, Sending
+from hybridlog_storage.disk.directory import PAYLOADS
+from hybridlog_storage.errors import ManifestError, RecordingExistsError, StoreError
+from hybridlog_storage.manifest import Manifest, replace
+from hybridlog_storage.manifests import MANIFEST_LOCK, WRITER_LOCK
+from hybridlog_storage.merging import check_origin, merged, needs_fields, wanted
 from hybridlog_storage.stopping import pause, safe_point
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
+    from contextlib import AbstractContextManager
 
     from hybridlog_storage.copy_places import Place, Source
+    from hybridlog_storage.manifest import File
 
-_MAX_DEFINITION: Final = 64 << 20
 _TRIES: Final = 3  # of a recording whose files expire meanwhile
+Prepared = tuple[Manifest, "Source"]
+"""A manifest to send, and the store that has the files which are in no other one."""
 
 
 @dataclass(frozen=True, slots=True)
-class CopyOptions:
-    """Options of a copy.
+class How:
+    """How recordings are copied.
 
     Attributes:
-        only_fields: Leave files for later that have the fields of others beside them: only the
-            first file of each group goes, and those of kind `rows`.
+        prepare: Makes of a manifest, and of those of its logs that are to be sent, what is sent
+            in its place; None to send the files as they are.
         check: Prove what is there already, too, and send it again if it is wrong.
         limit_rate: Bytes a second, at most; None for no limit.
-        address: Of the source, for files that stay there; empty if others cannot reach it.
-        settings: Content of `hybridlog.toml`, for a place that has none.
+        named: Makes a free name there of the name here.
+        made: Called with the id of a recording that is new there. Meanwhile, as in `named`, nobody
+            else begins one, where there are locks.
+        progress: Called with the bytes done, and those in all.
+        proved: Called with the digests here of logs that were proved there just now, by number;
+            where there are locks, nobody changes the copy meanwhile.
     """
 
-    only_fields: bool = False
+    prepare: Callable[[Manifest, list[File]], AbstractContextManager[Prepared]] | None = None
     check: bool = False
     limit_rate: float | None = None
-    address: str = ""
-    settings: bytes = b""
+    named: Callable[[str], str] = lambda name: name
+    made: Callable[[str], object] = lambda _: None
+    progress: Callable[[int, int], None] = lambda *_: None
+    proved: Callable[[Mapping[int, str]], None] | None = None
 
 
 @dataclass(slots=True)
 class Copied:
-    """The result of `copy`.
+    """What was copied.
 
     Attributes:
         manifest: As it is there now.
-        is_new: Whether the recording was not there before.
-        sent: Names of the files that were sent.
-        lacking: Names of files that have expired there, and are here.
+        is_new: Whether it was not there before.
+        bytes: Of the files that were sent, or proved.
+        sent: Paths of the files that were sent, below the recording.
         sent_bytes: Bytes of them, without those that an interrupted copy had sent.
+        lacking: Numbers of logs of which payloads have expired there, and are here.
+        lost: Paths of files that the copy has lost, and that are not here.
     """
 
     manifest: Manifest
-    is_new: bool
+    is_new: bool = False
+    bytes: int = 0
     sent: list[str] = field(default_factory=list)
-    lacking: list[str] = field(default_factory=list)
     sent_bytes: int = 0
+    lacking: list[int] = field(default_factory=list)
+    lost: list[str] = field(default_factory=list)
 
 
-def copy(
-    source: Source,
-    target: Place,
-    recording: str,
-    options: CopyOptions | None = None,
-    *,
-    progress: Callable[[int, int], None] = lambda *_: None,
-    named: Callable[[str], str] = lambda name: name,
-    then_expire: Callable[[frozenset[int]], None] | None = None,
-) -> Copied:
+class _File(NamedTuple):
+    """A file of a recording: its path below it, its size and its digest."""
+
+    path: str
+    bytes: int
+    digest: str
+
+
+def copy(source: Source, target: Place, recording: str, how: How | None = None) -> Copied:
     """Copy a recording. What an interrupted copy has left is used by the next one.
 
     Args:
         source: The store that has it.
         target: Where it goes.
         recording: Its id.
-        options: How it is copied.
-        progress: Called with the bytes done, and those in all.
-        named: Makes a free name there of its name here, if it is not there yet.
-        then_expire: Called with the numbers of the files that are here, and were proved there
-            just now.
+        how: How it is copied.
 
     Raises:
         RefusedError: It is damaged, or another recording there has its id; others can be copied.
-        UsageError: Files are to expire, and the target is this very store.
         RecordingGoneError: It is not here, or is being removed there.
         HybridlogError: A store does not answer, or cannot be written; what was copied stays.
     """
     for attempt in range(_TRIES):
         here = source.manifests.read(recording)
         try:
-            return _Copy(source, target, options or CopyOptions(), progress, then_expire).run(
-                here, named
-            )
+            return _Copy(source, target, here, how or How()).run()
         except RefusedError:  # a file that has expired meanwhile is no damage
-            if attempt + 1 == _TRIES or source.manifests.read(recording).files == here.files:
+            if attempt + 1 == _TRIES or source.manifests.read(recording) == here:
                 raise
     raise AssertionError
+
+
+def known(source: Source, target: Place, recording: str, how: How) -> Copied | None:
+    """What a copy would give, if it has nothing to do; None if it has.
+
+    Raises:
+        HybridlogError: A store does not answer.
+    """
+    here = source.manifests.read(recording)
+    try:
+        there = target.manifests.find(recording)
+        return None if there is None else _Copy(source, target, here, how).known(there)
+    except (ManifestError, RefusedError):
+        return None
 
 
 class _Copy:
     """The steps of a copy."""
 
-    def __init__(
-        self,
-        source: Source,
-        target: Place,
-        options: CopyOptions,
-        progress: Callable[[int, int], None],
-        then_expire: Callable[[frozenset[int]], None] | None,
-    ) -> None:
-        self._source = source
-        self._options = options
-        self._target = target
-        self._progress = progress
-        self._then_expire = then_expire
+    def __init__(self, source: Source, target: Place, here: Manifest, how: How) -> None:
+        self._source, self._target, self._here, self._how = source, target, here, how
+        self._own = {one.path for one in files_of(here)}
+        self._others = source  # has the files that are not in `_own`
+        self._must_prove = how.check or how.proved is not None
         self._done = self._total = 0
         self._sent_bytes = 0
         self._due = 0.0  # time from which more may be sent
-        self._here: dict[str, File] = {}  # files that were sent, or proved there
+        self._new: set[str] = set()  # paths of files that the manifest there did not list
+        self._proved: dict[str, str] = {}  # digests by path
 
-    def run(self, here: Manifest, named: Callable[[str], str]) -> Copied:
-        target, recording = self._target, here.id
-        self._check_is_other(recording)
-        with target.working(recording):
-            there = target.manifests.find(recording)
-            if there is None and self._options.settings:
-                target.put("hybridlog.toml", self._options.settings)
+    def known(self, there: Manifest) -> Copied | None:
+        """As of the function."""
+        here = self._here
+        check_origin(here, there)
+        if self._must_prove or there.status == "unproven" or self._wanted(there):
+            return None
+        if self._target.mends:
+            sizes = self._target.sizes(here.id)
+            if any(sizes.get(one.path) != one.bytes for one in files_of(there)):
+                return None
+        return Copied(there, lacking=_lacking(here, there))
+
+    def run(self) -> Copied:
+        here, target = self._here, self._target
+        if here.status == "unproven":
+            raise RefusedError(
+                f"{here.name} is not copied: its manifest was lost and made again, so nothing "
+                f"says that it is whole. Copy it from a store that has lost nothing of it."
+            )
+        with target.working(here.id), ExitStack() as stack:
+            sizes = target.sizes(here.id)
+            there = self._find(sizes)
             check_origin(here, there)
-            self._bring_definitions(here, there)
-            copied = Copied(here, there is None)
-            self._bring_files(here, there, copied)
-            copied.manifest = self._publish(here, there, named)
-            copied.sent_bytes = self._sent_bytes
-        if self._then_expire is not None:
-            logs = [one for one in target.manifests.read(recording).files if one.kind == "log"]
-            proved = [one.is_here and one.name in self._here for one in logs]
-            others = {
-                one.number for one, is_proved in zip(logs, proved, strict=True) if not is_proved
-            }
-            numbers = frozenset(one.number for one in logs) - others
-            if numbers:
-                self._then_expire(numbers)
+            logs = self._wanted(there)
+            if logs and self._how.prepare is not None:
+                here, self._others = stack.enter_context(self._how.prepare(here, logs))
+                logs = [here.logs[log.number] for log in logs]
+            copied = Copied(here, there is None, lacking=_lacking(here, there))
+            self._bring(here, there, logs, sizes, copied)
+            copied.manifest = self._publish(here, there, {log.name for log in logs})
+            self._clear(there, copied.manifest, sizes)
+            if self._how.proved is not None:
+                self._how.proved(self._proved_logs(here))
         return copied
 
-    def _check_is_other(self, recording: str) -> None:
-        """Raise if the last copy would be deleted: both are one store, by whatever path."""
-        if self._then_expire is not None:
-            with self._source.marked(recording) as mark:
-                if mark in self._target.sizes(f"{RECORDINGS}/{recording}"):
-                    raise UsageError(f"{self._target.address} is this very store.")
+    def _wanted(self, there: Manifest | None) -> list[File]:
+        return wanted(self._here, there, awaited=self._how.prepare is None)
 
-    def _bring_definitions(self, here: Manifest, there: Manifest | None) -> None:
-        known = {} if there is None else there.channels
-        wanted = {one.schema for one in here.channels.values() if one.schema}
-        wanted -= {one.schema for one in known.values()}
-        if wanted:
-            wanted -= self._target.sizes(SCHEMAS).keys()
-        for digest in sorted(wanted):
-            name = f"{SCHEMAS}/{digest}"
-            content = b""
-            for piece in self._source.pieces(name, 0, None):
-                content += piece
-                if len(content) > _MAX_DEFINITION:
-                    break
-            if digest_of([content]) != digest:
-                raise RefusedError(f"{self._source.address}/{name} is damaged.")
-            self._target.put(name, content)
+    def _find(self, sizes: Mapping[str, int]) -> Manifest | None:
+        """The manifest there; one that is lost or damaged is made again."""
+        here, target = self._here, self._target
+        try:
+            there = target.manifests.find(here.id)
+            is_begun = WRITER_LOCK in sizes and MANIFEST_LOCK not in sizes  # by a stopped copy
+            if there is not None or is_begun:
+                return there
+            old = target.manifests.old(here.id) if target.mends else None
+            if not (MANIFEST_LOCK in sizes or old is not None or self._more(sizes)):
+                return None
+        except ManifestError as error:
+            if not target.mends:
+                raise RefusedError(
+                    f"{here.name} is not copied. {target.address}: {error}"
+                ) from error
 
-    def _bring_files(self, here: Manifest, there: Manifest | None, copied: Copied) -> None:
-        target, files, listed = self._target, files_of(here), files_of(there)
-        must_prove = self._options.check or self._then_expire is not None
-        sizes = target.sizes(f"{RECORDINGS}/{here.id}")
-        wanted: list[tuple[Sending, bool]] = []
+        def make(old: Manifest | None) -> Manifest:
+            if old is not None and old.created == here.created:
+                return old
+            if more := self._more(sizes):
+                raise RefusedError(
+                    f"{here.name} in {target.address} has lost its manifest, and has payloads "
+                    f"that are not here, in {', '.join(more)}. It stays as it is."
+                )
+            return replace(here, name=self._how.named(here.name), files=(), fields=())
 
-        def sending(file: File) -> Sending:
-            return Sending(self._source, here.id, file, self._count, self._options.limit_rate)
+        if target.mends:
+            return target.manifests.restore(here.id, make)
+        make(None)
+        return None
 
-        for file in self._chosen(here):
-            known = listed.get(file.name)
-            is_listed = known is not None and known.is_here
-            if known is not None and known.gone == "expired":
-                copied.lacking.append(file.name)
-                continue
-            expected = known if known is not None and is_listed else file
-            has_size = sizes.get(file.name) == expected.bytes
-            if is_listed and has_size and not must_prove:
-                continue
-            wanted.append((sending(expected), has_size))
-            self._total += file.bytes
-        for sent, has_size in wanted:
-            name = sent.file.name
-            if has_size and target.is_whole(sent):
-                self._count(sent.file.bytes, False)
+    def _more(self, sizes: Mapping[str, int]) -> list[str]:
+        """Logs there that are larger than those of their numbers here."""
+        here = {f"{number:06d}": log.bytes for number, log in self._here.logs.items()}
+        return sorted(
+            path
+            for path, size in sizes.items()
+            if path.endswith(".mcap") and size > here.get(path[:6], -1)
+        )
+
+    def _bring(
+        self,
+        here: Manifest,
+        there: Manifest | None,
+        logs: list[File],
+        sizes: Mapping[str, int],
+        copied: Copied,
+    ) -> None:
+        """Send what is lacking, or lost, and prove what has to be."""
+        target = self._target
+        ours = {one.path: one for one in files_of(here)}
+        listed = {one.path: one for one in ([] if there is None else files_of(there))}
+        new = [ours[log.name] for log in logs]
+        if needs_fields(logs):
+            fields = (one for path, one in ours.items() if path.startswith(f"{PAYLOADS}/"))
+            new += [one for one in fields if one.path not in listed]
+        kept = merged(here, there, {log.name for log in logs})
+        old = [listed[one.path] for one in files_of(kept) if one.path in listed]
+        self._new = {one.path for one in new}
+        doubtful = [one for one in old if self._must_prove or sizes.get(one.path) != one.bytes]
+        self._total = sum(one.bytes for one in (*new, *doubtful))
+        for one in (*new, *doubtful):
+            sending = self._sending(one)
+            is_old = one.path not in self._new
+            if sizes.get(one.path) == one.bytes and target.is_whole(sending, reads=is_old):
+                self._count(one.bytes, False)
+            elif ours.get(one.path) == one:
+                target.send(sending)
+                copied.sent.append(one.path)
             else:
-                target.send(sending(files[name]))
-                copied.sent.append(name)
-            self._here[name] = files[name] if name in copied.sent else sent.file
-        if not self._options.only_fields:
-            for name in sizes.keys() - {f".{name}.part" for name in copied.sent}:
-                if name.startswith(".") and name.endswith(".part"):
-                    target.drop(f"{RECORDINGS}/{here.id}/{name}")
+                copied.lost.append(one.path)
+                continue
+            self._proved[one.path] = one.digest
+        copied.bytes, copied.sent_bytes = self._total, self._sent_bytes
 
-    def _chosen(self, here: Manifest) -> list[File]:
-        """The files that are to be there in the end."""
-        first: dict[int, int] = {}
-        for file in here.files:
-            first[file.group] = min(first.get(file.group, file.number), file.number)
-        all_of_it = not self._options.only_fields
-        return [
-            file
-            for file in here.files
-            if file.is_here
-            and (all_of_it or file.kind == "rows" or file.number == first[file.group])
-        ]
+    def _sending(self, file: _File) -> Sending:
+        source = self._source if file.path in self._own else self._others
+        rate = self._how.limit_rate
+        return Sending(source, self._here.id, *file, self._count, rate)
 
     def _count(self, size: int, is_sent: bool) -> None:  # noqa: FBT001 - as of Sending
         """Note bytes that were sent, or were there; wait as long as the limit of the rate asks."""
         safe_point()
         self._done += size
-        self._progress(min(self._done, self._total), self._total)
+        self._how.progress(min(self._done, self._total), self._total)
         if is_sent:
             self._sent_bytes += size
-        if is_sent and self._options.limit_rate is not None:
+        if is_sent and self._how.limit_rate is not None:
             now = time.monotonic()
-            self._due = max(self._due, now) + size / self._options.limit_rate
+            self._due = max(self._due, now) + size / self._how.limit_rate
             pause(max(self._due - now, 0.0))
 
-    def _publish(
-        self, here: Manifest, there: Manifest | None, named: Callable[[str], str]
-    ) -> Manifest:
-        manifests, address = self._target.manifests, self._options.address
+    def _publish(self, here: Manifest, there: Manifest | None, names: set[str]) -> Manifest:
+        manifests = self._target.manifests
+        self._check_files()
         if there is None:
             try:
                 with manifests.creating() as create:
-                    made = merged(here, None, brought=self._here, address=address)
-                    made = replace(made, name=named(here.name))
-                    self._check_files(made)
+                    made = replace(here, name=self._how.named(here.name))
                     create(made)
+                    self._how.made(here.id)
                 return made
             except RecordingExistsError:
                 pass  # another process was faster
-        elif self._here:
-            self._check_files(replace(here, files=tuple(self._here.values())))
+        return manifests.change(here.id, lambda now: merged(here, now, names))
 
-        return manifests.change(here.id, partial(merged, here, brought=self._here, address=address))
-
-    def _check_files(self, made: Manifest) -> None:
+    def _check_files(self) -> None:
         """Raise if files are no longer there: a removal that ends takes them along."""
-        sizes = self._target.sizes(f"{RECORDINGS}/{made.id}")
-        if any(sizes.get(file.name) != file.bytes for file in made.files if file.is_here):
+        if self._new and not self._new <= self._target.sizes(self._here.id).keys():
             raise StoreError(
-                f"Files of {made.name} have gone from {self._target.address} meanwhile. Copy again."
+                f"Files of {self._here.name} have gone from {self._target.address} meanwhile. "
+                "Copy again."
             )
+
+    def _clear(self, there: Manifest | None, now: Manifest, sizes: Mapping[str, int]) -> None:
+        """Delete files that others have replaced, and what has arrived of those not to come."""
+        before = [] if there is None else files_of(there)
+        left = {one.path for one in before} - {one.path for one in files_of(now)}
+        if self._how.prepare is None:  # the next copy may go on with them
+            left |= {path for path in sizes if path.endswith(".part")}
+        for path in left:
+            self._target.drop(f"{RECORDINGS}/{now.id}/{path}")
+
+    def _proved_logs(self, here: Manifest) -> dict[int, str]:
+        """Digests here of logs whose copies were proved, and that the manifest there still lists.
+
+        A copy that has lost no payloads has those of each later version, too.
+        """
+        there = self._target.manifests.read(here.id).logs
+        return {
+            number: log.digest
+            for number, log in here.logs.items()
+            if number in there
+            and self._proved.get(there[number].name) == there[number].digest
+            and (there[number].digest == log.digest or not there[number].expired)
+        }
+
+
+def files_of(manifest: Manifest) -> list[_File]:
+    """All files that a manifest lists."""
+    logs = [_File(one.name, one.bytes, one.digest) for one in manifest.files]
+    return logs + [_File(f"{PAYLOADS}/{o.file}", o.bytes, o.digest) for o in manifest.fields]
+
+
+def _lacking(here: Manifest, there: Manifest | None) -> list[int]:
+    if there is None or there.lacks_payloads:
+        return []
+    return [
+        number
+        for number, log in here.logs.items()
+        if number in there.logs and {*there.logs[number].expired} - {*log.expired}
+    ]

@@ -2,7 +2,7 @@
 
 A place makes a file visible under its name only when all of it has arrived and is proved: its
 bytes were read back, or the server has told their checksum. In a directory it grows beside, as
-`.NAME.part`, where the next copy goes on. A server is a place in `sftp`.
+`.DIGEST.part`, where the next copy goes on. A server is a place in `sftp`.
 """
 
 from __future__ import annotations
@@ -15,31 +15,37 @@ from abc import ABC, abstractmethod
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, ClassVar, Final
 
 from hybridlog_storage.disk import durability, files
+from hybridlog_storage.disk.directory import (
+    LOCK,
+    LOCK_WAIT_S,
+    PAYLOADS,
+    StoreDirectory,
+    payload_names,
+)
 from hybridlog_storage.errors import (
-    HeldError,
     ObjectChangedError,
-    ObjectExistsError,
     StoreError,
+    TopicError,
     unreadable,
 )
 from hybridlog_storage.manifest import hasher
-from hybridlog_storage.manifests import WAIT_S, BucketManifests, DiskManifests
+from hybridlog_storage.manifests import BucketManifests, DiskManifests
 from hybridlog_storage.remote.bucket import digest_like
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
     from contextlib import AbstractContextManager
 
-    from hybridlog_storage.manifest import File
     from hybridlog_storage.manifests import Manifests
     from hybridlog_storage.remote.bucket import Bucket, Object
 
 RECORDINGS: Final = "recordings"
-SCHEMAS: Final = "schemas"
 MANIFESTS: Final = "manifests"
+MARK: Final = ".copying-"
+"""Prefix of small files in `manifests` that live for a moment."""
 _PIECE: Final = 1 << 20
 _FETCHED: Final = 8 << 20  # bytes that a bucket is asked for
 
@@ -63,7 +69,9 @@ class Sending:
     Attributes:
         source: The store that has it.
         recording: Id of its recording.
-        file: As the manifest has it.
+        file: Its path below its recording.
+        size: Its bytes.
+        digest: Of all of them, as the manifest has it.
         count: Told of bytes that were sent, or were there already; waits if that is too fast,
             and is a safe point.
         limit_rate: Bytes a second, at most; None for no limit.
@@ -71,14 +79,21 @@ class Sending:
 
     source: Source
     recording: str
-    file: File
+    file: str
+    size: int
+    digest: str
     count: Callable[[int, bool], None]
     limit_rate: float | None
 
     @property
     def name(self) -> str:
         """Its path below a store."""
-        return f"{RECORDINGS}/{self.recording}/{self.file.name}"
+        return f"{RECORDINGS}/{self.recording}/{self.file}"
+
+    @property
+    def part(self) -> str:
+        """The same, while it arrives."""
+        return f"{RECORDINGS}/{self.recording}/.{self.digest[:32]}.part"
 
     def again(self, at: int = 0) -> Iterator[bytes]:
         """Its bytes from one on.
@@ -86,7 +101,7 @@ class Sending:
         Raises:
             RefusedError: It cannot be read, or has another size.
         """
-        return self.source.pieces(self.name, at, self.file.bytes)
+        return self.source.pieces(self.name, at, self.size)
 
     def pieces(self, at: int = 0) -> Iterator[bytes]:
         """The same, as fast as they may go; they are counted."""
@@ -109,7 +124,7 @@ class Sending:
             if last:
                 yield last
             last = piece
-        if found.hexdigest() != self.file.digest:
+        if found.hexdigest() != self.digest:
             raise self.damaged()
         yield last
 
@@ -127,10 +142,13 @@ class Place(ABC):
     Attributes:
         address: What people call it.
         manifests: Its manifests.
+        mends: Whether each copy looks for lost files, and makes a lost manifest again: not on a
+            server, where each look takes a while.
     """
 
     address: str
     manifests: Manifests
+    mends: ClassVar[bool] = True
 
     @abstractmethod
     def working(self, recording: str) -> AbstractContextManager[None]:
@@ -142,19 +160,15 @@ class Place(ABC):
         """
 
     @abstractmethod
-    def sizes(self, folder: str) -> dict[str, int]:
-        """Bytes of each ordinary file of a folder, by name.
+    def sees(self, name: str) -> bool:
+        """True if a file that another store has made in `manifests` is here, too."""
+
+    @abstractmethod
+    def sizes(self, recording: str) -> dict[str, int]:
+        """Bytes of each ordinary file of a recording, by path below it.
 
         Raises:
             HybridlogError: The place does not answer.
-        """
-
-    @abstractmethod
-    def put(self, name: str, content: bytes) -> None:
-        """Write a small file, unless there is one of its name.
-
-        Raises:
-            HybridlogError: It cannot be written.
         """
 
     @abstractmethod
@@ -171,8 +185,13 @@ class Place(ABC):
         """Delete what has arrived of a file that is no longer to come."""
 
     @abstractmethod
-    def is_whole(self, sent: Sending) -> bool:
-        """True if a file that is there has the digest; it is on the disk then."""
+    def is_whole(self, sent: Sending, *, reads: bool = False) -> bool:
+        """True if a file that is there has the digest; it is on the disk then.
+
+        Args:
+            sent: The file.
+            reads: Believe no checksum that was worked out when the file arrived.
+        """
 
 
 class Source(Place):
@@ -191,10 +210,6 @@ class Source(Place):
             RefusedError: It is missing, or has another size.
             HybridlogError: The place does not answer.
         """
-
-    @abstractmethod
-    def marked(self, recording: str) -> AbstractContextManager[str]:
-        """Make a hidden file beside those of a recording, for a moment; gives its name."""
 
     @contextmanager
     def opened(self, name: str, size: int) -> Iterator[int]:
@@ -225,63 +240,38 @@ class Directory(Source):
 
     @contextmanager
     def working(self, recording: str) -> Iterator[None]:
-        """As of `Place`; a removal may take the folder that is locked."""
-        folder = self._path / RECORDINGS / recording
-        is_held = False
-        while not is_held:
-            with ExitStack() as held:
-                try:
-                    self._make_folders(folder)
-                    before = files.status(folder)
-                    held.enter_context(files.locked_folder(folder, WAIT_S))
-                    with suppress(FileNotFoundError):
-                        is_held = os.path.samestat(before, files.status(folder))
-                except BlockingIOError:
-                    raise HeldError(
-                        f"Another process copies {recording} into {self.address} at this moment.",
-                        is_recording=False,
-                    ) from None
-                except FileNotFoundError:
-                    if not os.path.lexists(self._path):
-                        raise StoreError(f"There is no store {self.address}.") from None
-                    continue  # it was removed meanwhile
-                except OSError as error:
-                    raise durability.explain(error, folder, "copying into") from error
-                if is_held:
-                    yield
+        """As of `Place`; nobody else writes the recording meanwhile."""
+        directory, path = StoreDirectory(self._path), self._path / RECORDINGS / recording
+        with ExitStack() as held:
+            while True:
+                self._make_folders(path / LOCK)
+                with suppress(TopicError):  # it was removed meanwhile
+                    held.enter_context(directory.writing(recording, wait_s=LOCK_WAIT_S))
+                    break
+            yield
 
-    def _make_folders(self, recording: Path) -> None:
-        for folder in (RECORDINGS, SCHEMAS, MANIFESTS):
-            with suppress(FileExistsError):
-                files.make_folder(self._path / folder)
-        files.sync_folder(self._path)
-        with suppress(FileExistsError):
-            files.make_folder(recording)
-
-    def sizes(self, folder: str) -> dict[str, int]:
+    def sees(self, name: str) -> bool:
         """As of `Place`."""
-        path = self._path / folder
+        with suppress(FileNotFoundError):
+            return name in files.names(self._path / MANIFESTS)
+        return False
+
+    def sizes(self, recording: str) -> dict[str, int]:
+        """As of `Place`."""
+        path = self._path / RECORDINGS / recording
         try:
-            found = files.names(path).items()
+            inside = {f"{PAYLOADS}/{name}": about for name, about in payload_names(path).items()}
+            found = files.names(path) | inside
         except FileNotFoundError:
             return {}
         except OSError as error:
             raise unreadable(error, path) from error
-        return {name: about.st_size for name, about in found if stat.S_ISREG(about.st_mode)}
-
-    def put(self, name: str, content: bytes) -> None:
-        """As of `Place`."""
-        path = self._path / name
-        try:
-            if path.name not in files.names(path.parent):
-                files.write_file(path, content)
-        except OSError as error:
-            raise durability.explain(error, path, "copying into") from error
+        return {name: one.st_size for name, one in found.items() if stat.S_ISREG(one.st_mode)}
 
     def send(self, sent: Sending) -> None:
         """As of `Place`; goes on behind the last byte that is there."""
-        final = self._path / sent.name
-        part = final.with_name(f".{final.name}.part")
+        final, part = self._path / sent.name, self._path / sent.part
+        self._make_folders(final)
         try:
             fd = files.open_file(part, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK)
             try:
@@ -289,25 +279,35 @@ class Directory(Source):
                     files.system.truncate(fd, 0)
                     raise sent.damaged()
                 durability.sync_file(fd)
-                if digest_of(read(fd, 0, sent.file.bytes)) != sent.file.digest:
-                    raise StoreError(f"{final} did not arrive as it was sent. Copy again.")
+                if digest_of(read(fd, 0, sent.size)) != sent.digest:
+                    raise RefusedError(f"{final} did not arrive as it was sent. Copy again.")
             finally:
                 os.close(fd)
             durability.publish(part, final)
         except OSError as error:
             raise durability.explain(error, final, "copying into") from error
 
+    def _make_folders(self, path: Path) -> None:
+        """Make the folders of a file, on the disk; none may be a link."""
+        try:
+            for folder in reversed([*path.relative_to(self._path).parents][:-1]):
+                with suppress(FileExistsError):
+                    files.make_folder(self._path / folder)
+                files.sync_folder(self._path / folder.parent)
+        except OSError as error:
+            raise durability.explain(error, path, "copying into") from error
+
     def drop(self, name: str) -> None:
         """As of `Place`."""
         with suppress(OSError):
             files.unlink(self._path / name)
 
-    def is_whole(self, sent: Sending) -> bool:
+    def is_whole(self, sent: Sending, *, reads: bool = False) -> bool:
         """As of `Place`."""
         path = self._path / sent.name
         try:
             with _file(path) as fd:
-                if digest_of(read(fd, 0, sent.file.bytes)) != sent.file.digest:
+                if digest_of(read(fd, 0, sent.size)) != sent.digest:
                     return False
                 durability.sync_file(fd)
             files.sync_folder(path.parent)
@@ -335,8 +335,9 @@ class Directory(Source):
         path = self._path / name
         with ExitStack() as stack:
             try:
-                with files.folder(path.parent.parent):
-                    fd = stack.enter_context(_file(path))
+                for folder in path.relative_to(self._path).parents:
+                    stack.enter_context(files.folder(self._path / folder))  # none may be a link
+                fd = stack.enter_context(_file(path))
                 found = os.fstat(fd).st_size
             except OSError as error:
                 raise RefusedError(f"{path} cannot be copied: {error.strerror}.") from error
@@ -345,9 +346,9 @@ class Directory(Source):
             yield fd
 
     @contextmanager
-    def marked(self, recording: str) -> Iterator[str]:
-        """As of `Source`."""
-        path = self._path / RECORDINGS / recording / f".copying-{secrets.token_hex(8)}"
+    def marked(self) -> Iterator[str]:
+        """Make a small file in `manifests`, for a moment; gives its name."""
+        path = self._path / MANIFESTS / f"{MARK}{secrets.token_hex(8)}"
         try:
             os.close(files.open_file(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL))
         except OSError as error:
@@ -377,37 +378,37 @@ class BucketStore(Source):
         """As of `Place`; here several may, since all of them write the same."""
         yield
 
-    def sizes(self, folder: str) -> dict[str, int]:
-        """As of `Place`; 1,000 a request."""
-        found = {one.name: one for one in self._bucket.objects(f"{folder}/")}
-        self._found |= found
-        return {name.removeprefix(f"{folder}/"): one.size for name, one in found.items()}
-
-    def put(self, name: str, content: bytes) -> None:
+    def sees(self, name: str) -> bool:
         """As of `Place`."""
-        with suppress(ObjectExistsError):
-            self._bucket.create(name, content)
+        return False
+
+    def sizes(self, recording: str) -> dict[str, int]:
+        """As of `Place`; 1,000 a request."""
+        folder = f"{RECORDINGS}/{recording}/"
+        found = {one.name: one for one in self._bucket.objects(folder)}
+        self._found |= found
+        return {name.removeprefix(folder): one.size for name, one in found.items()}
 
     def send(self, sent: Sending) -> None:
         """As of `Place`; from its first byte on."""
-        self._found[sent.name] = self._bucket.put(sent.name, sent.file.bytes, sent.checked())
+        self._found[sent.name] = self._bucket.put(sent.name, sent.size, sent.checked())
         if not self.is_whole(sent):
-            raise StoreError(f"{self.address}/{sent.name} did not arrive as it was sent.")
+            raise RefusedError(f"{self.address}/{sent.name} did not arrive as it was sent.")
 
     def drop(self, name: str) -> None:
         """As of `Place`."""
         self._bucket.delete([name])
 
-    def is_whole(self, sent: Sending) -> bool:
+    def is_whole(self, sent: Sending, *, reads: bool = False) -> bool:
         """As of `Place`: by the checksum of the server, or it is read."""
         about = self._found[sent.name]
         self._bucket.check_conditions()  # tells whether the server has checksums
         try:
             with suppress(RefusedError):  # what is damaged here may be whole there
-                found = self._bucket.digest(about)
-                if found == digest_like(found, sent.again()):
+                found = "" if reads else self._bucket.digest(about)
+                if found and found == digest_like(found, sent.again()):
                     return True
-            return digest_of(self._bucket.pieces(about)) == sent.file.digest
+            return digest_of(self._bucket.pieces(about)) == sent.digest
         except (FileNotFoundError, ObjectChangedError):
             return False
 
@@ -426,25 +427,14 @@ class BucketStore(Source):
             except (FileNotFoundError, ObjectChangedError) as error:
                 raise RefusedError(f"{where} has changed meanwhile. Copy again.") from error
 
-    @contextmanager
-    def marked(self, recording: str) -> Iterator[str]:
-        """As of `Source`."""
-        name = f".copying-{secrets.token_hex(8)}"
-        whole = f"{RECORDINGS}/{recording}/{name}"
-        try:
-            self._bucket.put(whole, 0, ())
-            yield name
-        finally:
-            self._bucket.delete([whole])
-
 
 def _fill(fd: int, sent: Sending) -> bool:
     """Write a file behind what is there of it, or else anew; True if it has the digest."""
-    about, size = os.fstat(fd), sent.file.bytes
+    about, size = os.fstat(fd), sent.size
     if not stat.S_ISREG(about.st_mode):
         raise OSError(0, "it is not an ordinary file")
     begins = [about.st_size, 0] if 0 < about.st_size <= size else [0]  # the end may be torn
-    return any(digest_of(_written(fd, sent, at)) == sent.file.digest for at in begins)
+    return any(digest_of(_written(fd, sent, at)) == sent.digest for at in begins)
 
 
 def _written(fd: int, sent: Sending, at: int) -> Iterator[bytes]:

@@ -81,7 +81,6 @@ class Channel(Record, frozen=True):
         topic: Its topic.
         type: Name of the message type; empty without a definition.
         encoding: Of the messages, such as `cdr`.
-        schema: Digest of the definition, which is `schemas/<digest>`; empty without one.
         metadata: As the source states it.
         messages: All that the recording has had, those of files that are gone included.
         bytes: The same, of payloads.
@@ -92,7 +91,6 @@ class Channel(Record, frozen=True):
     topic: Topic
     encoding: Key | Literal[""] = ""
     type: Topic = ""
-    schema: Digest | Literal[""] = ""
     metadata: dict[Text, Text] = {}
     messages: Count = 0
     bytes: Count = 0
@@ -124,7 +122,8 @@ class File(Record, frozen=True):
         last: Of its last message.
         parts: What it has of each channel.
         gone: Why the file is no longer here; absent while it is.
-        copy: Address of a proven copy, if it is gone.
+        copy: Address of a store with a copy that has payloads which are not here: they expired
+            since it was proved, or are to be copied later.
         expired: Topics whose payloads have expired, at least some of them.
         retained: Topics that a rule was applied to; None for all; absent for none.
     """

@@ -150,7 +150,7 @@ class Manifests(ABC):
         with self.creating() as create:
             with suppress(RecordingGoneError, ManifestError):
                 return self._read(recording)[0]
-            made = replace(make(self._old(recording)), status="unproven")
+            made = replace(make(self.old(recording)), status="unproven")
             self._drop(recording)
             create(made)
             return made
@@ -236,7 +236,7 @@ class Manifests(ABC):
         """Replace a manifest. Raises ObjectChangedError if it has another version by now."""
 
     @abstractmethod
-    def _old(self, recording: str) -> Manifest | None:
+    def old(self, recording: str) -> Manifest | None:
         """The manifest before the last change; None if there is none to read."""
 
     @abstractmethod
@@ -325,7 +325,10 @@ class DiskManifests(Manifests):
                     with suppress(FileNotFoundError, HeldError), _locked(lock, 0):
                         files.unlink(path)
                 for folder in self._bare():
-                    files.remove_tree(folder)
+                    with ExitStack() as held, suppress(FileNotFoundError, HeldError):
+                        if WRITER_LOCK in files.names(folder):  # a copy may begin there
+                            held.enter_context(_locked(folder / WRITER_LOCK, 0))
+                        files.remove_tree(folder)
             except OSError as error:
                 raise durability.explain(error, self._folder, "clearing") from error
 
@@ -439,7 +442,8 @@ class DiskManifests(Manifests):
                 files.unlink(new)
             raise
 
-    def _old(self, recording: str) -> Manifest | None:
+    def old(self, recording: str) -> Manifest | None:
+        """As of `Manifests`."""
         with suppress(OSError, ValueError):
             found = decode(files.read_file(self._recordings / recording / MANIFEST_OLD, MAX_BYTES))
             return found if found.id == recording else None
@@ -521,7 +525,8 @@ class BucketManifests(Manifests):
     def _replace(self, recording: str, data: bytes, version: str) -> None:
         self._bucket.replace(_object(recording), data, version)
 
-    def _old(self, recording: str) -> Manifest | None:
+    def old(self, recording: str) -> Manifest | None:
+        """As of `Manifests`."""
         return None
 
     def _drop(self, recording: str) -> None:

@@ -28,9 +28,7 @@ EMBEDDED: Final = "embedded"
 """In place of a URI: the MongoDB that comes with hybridlog."""
 NONE: Final = "none"
 """In place of a URI: no MongoDB."""
-EXPIRED: Final = "expired"
-"""Feature of a store with messages whose payloads were deleted."""
-FEATURES: Final[frozenset[str]] = frozenset({EXPIRED})
+FEATURES: Final[frozenset[str]] = frozenset()
 """Features that a store may require of its reader."""
 
 MIN_CACHE_MB: Final = 256
@@ -38,7 +36,8 @@ MIN_CACHE_MB: Final = 256
 MAX_CACHE_MB: Final = 10_000 << 10
 """Largest one, in MiB."""
 
-_LIMIT = 1 << 20  # bytes of hybridlog.toml
+MAX_SETTINGS: Final = 1 << 20
+"""Bytes of the file."""
 _PASSWORD_LIMIT = 4096  # bytes of a file with a password
 _HOST = r"(?:\[[^\s@/\[\]]+\]|[^\s@:/?\[\]]+)(?::\d{1,5})?"
 _HOSTS = re.compile(rf"{_HOST}(?:,{_HOST})*")
@@ -83,7 +82,16 @@ def read_settings(path: Path) -> StoreSettings:
             or the settings are damaged, or hold a password.
     """
     file = path / NAME
-    values = _read(path, file)
+    return _settings(path, file, _read(path, file))
+
+
+def settings_of(content: bytes, store: str) -> StoreSettings:
+    """The settings in the content of the file; errors as of `read_settings`."""
+    file = Path(f"{store}/{NAME}")
+    return _settings(store, file, _parsed(content, file))
+
+
+def _settings(path: Path | str, file: Path, values: Mapping[str, object]) -> StoreSettings:
     version = values.get("format")
     if type(version) is not int or version < 1:
         raise StoreError(f"{file} names no format version; it should say `format = {FORMAT}`.")
@@ -347,10 +355,7 @@ def _read(path: Path, file: Path) -> dict[str, object]:
         StoreError: It cannot be read, or is not TOML.
     """
     try:
-        content = files.read_file(file, _LIMIT)
-        if len(content) > _LIMIT:
-            raise StoreError(f"{file} is too large to be settings.")
-        return tomllib.loads(content.decode())
+        content = files.read_file(file, MAX_SETTINGS)
     except FileNotFoundError:
         reason = "there is no such directory" if not path.exists() else f"it has no {NAME}"
         raise StoreError(
@@ -366,11 +371,19 @@ def _read(path: Path, file: Path) -> dict[str, object]:
                 "there."
             ) from error
         raise unreadable(error, file) from error
+    return _parsed(content, file)
+
+
+def _parsed(content: bytes, file: Path) -> dict[str, object]:
+    if len(content) > MAX_SETTINGS:
+        raise StoreError(f"{file} is too large to be settings.")
+    try:
+        return tomllib.loads(content.decode())
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise StoreError(f"{file} is damaged: {error}. Restore it or correct it.") from error
 
 
-def _names(file: Path, values: dict[str, object], key: str) -> tuple[str, ...]:
+def _names(file: Path, values: Mapping[str, object], key: str) -> tuple[str, ...]:
     """A list of names."""
     found = values.get(key, [])
     if not isinstance(found, list) or not all(isinstance(name, str) for name in found):

@@ -12,6 +12,7 @@ the server between the last look at the manifest and its replacement is lost.
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import random
 import re
@@ -21,21 +22,34 @@ import subprocess
 import tempfile
 import time
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import IO, TYPE_CHECKING, Final, Self
 from urllib.parse import unquote, urlsplit
 
-from hybridlog_storage.copy_places import MANIFESTS, RECORDINGS, SCHEMAS, Place, read, readable
+from hybridlog_storage.copy_places import (
+    MANIFESTS,
+    MARK,
+    RECORDINGS,
+    Place,
+    RefusedError,
+    read,
+    readable,
+)
+from hybridlog_storage.disk.directory import LOCK, LOCK_WAIT_S, PAYLOADS
 from hybridlog_storage.errors import (
     HeldError,
     HybridlogError,
+    ManifestError,
     ObjectChangedError,
     RecordingExistsError,
+    RecordingGoneError,
     StoreError,
     UsageError,
 )
 from hybridlog_storage.manifest import MAX_BYTES, Manifest, encode, hasher, is_id
 from hybridlog_storage.manifests import WAIT_S, Manifests
+from hybridlog_storage.settings import MAX_SETTINGS, StoreSettings, settings_of, settings_text
+from hybridlog_storage.settings import NAME as SETTINGS
 from hybridlog_storage.stopping import pause, safe_point
 
 if TYPE_CHECKING:
@@ -68,6 +82,8 @@ class Server(Place):
     Raises:
         UsageError: It is no such URL.
     """
+
+    mends = False
 
     def __init__(self, url: str, ssh: str | None = None) -> None:
         self.address = url
@@ -111,7 +127,7 @@ class Server(Place):
     @contextmanager
     def working(self, recording: str) -> Iterator[None]:
         """As of `Place`; with a shell, as of a directory there."""
-        folders = (RECORDINGS, SCHEMAS, MANIFESTS, f"{RECORDINGS}/{recording}")
+        folders = RECORDINGS, MANIFESTS, f"{RECORDINGS}/{recording}"
         self.sftp(*(f"-mkdir {folder}" for folder in folders))
         with ExitStack() as held:
             if self.has_shell:
@@ -121,38 +137,79 @@ class Server(Place):
     @contextmanager
     def _locked(self, recording: str) -> Iterator[None]:
         """Hold the lock of a recording; it goes with the connection, too."""
-        script = f"exec flock -w {WAIT_S:.0f} {RECORDINGS}/{recording} sh -c 'echo locked; cat'"
+        lock = f"{RECORDINGS}/{recording}/{LOCK}"
+        script = f"exec flock -w {LOCK_WAIT_S:.0f} {lock} sh -c 'echo locked; cat'"
         with self._ssh_process(script) as (process, said, errors):
             while not os.fstat(said.fileno()).st_size:
                 if process.poll() is not None:
                     self._check_reached(process, errors)
                     raise HeldError(
-                        f"Another process copies {recording} to {self.address} at this moment.",
+                        f"Another process writes {recording} in {self.address} at this moment.",
                         is_recording=False,
                     )
                 pause(_POLL_S)
             yield
 
-    def sizes(self, folder: str) -> dict[str, int]:
-        """As of `Place`."""
-        rows = (row.split() for row in self.sftp(f"-ls -lna {folder}"))
-        found = {
-            row[-1].rpartition("/")[2]: int(row[4])
-            for row in rows
-            if len(row) > 5 and row[0].startswith("-") and _SIZE.fullmatch(row[4])
-        }
-        self._found = {f"{folder}/{name}": size for name, size in found.items()}
-        return found
+    def begin(self) -> None:
+        """Make a store where there is none.
 
-    def put(self, name: str, content: bytes) -> None:
+        Raises:
+            StoreError: Something else is there, or a store that this hybridlog does not know.
+        """
+        content = self.fetched(SETTINGS, MAX_SETTINGS)
+        if content is not None:
+            settings_of(content, self.address)
+            return
+        if [row for row in self.sftp("-ls -1a") if row not in {".", ".."}]:
+            raise StoreError(
+                f"{self.address} holds files and is not a hybridlog store. Choose an empty or a "
+                "new directory."
+            )
+        new = StoreSettings(secrets.token_hex(16))
+        self.move(self.put_beside(settings_text(new), "."), SETTINGS)
+
+    def sees(self, name: str) -> bool:
         """As of `Place`."""
-        folder, _, last = f"./{name}".rpartition("/")
-        if last not in self.sizes(folder):
-            self.move(self.put_beside(content, folder), name)
+        return f"{MANIFESTS}/{name}" in self.listed(f"{MANIFESTS}/{name}")
+
+    def sizes(self, recording: str) -> dict[str, int]:
+        """As of `Place`."""
+        folder = f"{RECORDINGS}/{recording}"
+        found = self.listed(folder) | self.listed(f"{folder}/{PAYLOADS}/*/*")
+        self._found = {
+            name if name.startswith(folder) else f"{folder}/{name}": size
+            for name, size in found.items()
+        }
+        return {name.removeprefix(f"{folder}/"): size for name, size in self._found.items()}
+
+    def listed(self, path: str) -> dict[str, int]:
+        """Bytes of ordinary files by name, of a folder or by a pattern."""
+        rows = (row.split(maxsplit=8) for row in self.sftp(f"-ls -lna {path}"))
+        return {
+            row[8]: int(row[4])
+            for row in rows
+            if len(row) > 8 and row[0].startswith("-") and _SIZE.fullmatch(row[4])
+        }
+
+    def names(self) -> set[str]:
+        """Names of all recordings.
+
+        Raises:
+            StoreError: The server does not answer.
+        """
+        if self.has_shell:
+            pattern = r'^{"id":"[^"]*","name":"\([^"\]\|\\.\)*"'
+            _, said = self.shell(f"grep -rhao '{pattern}' {MANIFESTS}")
+            return {json.loads(f"{row}}}")["name"] for row in said.splitlines()}
+        found = set()
+        for recording in self.manifests.ids():
+            with suppress(RecordingGoneError, ManifestError):
+                found.add(self.manifests.read(recording).name)
+        return found
 
     def put_beside(self, content: bytes, folder: str) -> str:
         """Write a small file under a hidden name of its own."""
-        name = f"{folder}/.copying-{secrets.token_hex(8)}"
+        name = f"{folder}/{MARK}{secrets.token_hex(8)}"
         with tempfile.TemporaryFile() as file:
             os.fchmod(file.fileno(), 0o666)  # which it has there, less the umask
             file.write(content)
@@ -162,11 +219,11 @@ class Server(Place):
 
     def move(self, old: str, new: str) -> None:
         """Rename a file; it takes the place of another one."""
-        self.sftp(f"rename {old} {new}")
+        self.sftp(f"rename {_quoted(old)} {_quoted(new)}")
 
     def fetched(self, name: str, most: int) -> bytes | None:
         """A file, and at most one byte more than it may have; None if there is none."""
-        if not any(row.startswith("-") for row in self.sftp(f"-ls -lna {name}")):
+        if not self.listed(name):
             return None
         with self._got(name, most) as path:
             return path.read_bytes()[: most + 1]
@@ -177,62 +234,68 @@ class Server(Place):
         path = self._scratch / secrets.token_hex(8)
         try:
             with suppress(_EnoughError):
-                self.sftp(f'get {name} "{path}"', watch=lambda _: _check_size(path, most))
+                self.sftp(f'get {_quoted(name)} "{path}"', watch=lambda _: _check_size(path, most))
             yield path
         finally:
             path.unlink(missing_ok=True)
 
     def send(self, sent: Sending) -> None:
         """As of `Place`; goes on at the last byte that is there."""
-        file, part = sent.file, f"{RECORDINGS}/{sent.recording}/.{sent.file.name}.part"
-        with sent.source.opened(sent.name, file.bytes) as fd:
-            sha256, digest = _digests(fd, sent.name)
-            if digest != file.digest:
+        name, part = sent.name, sent.part
+        folders = [str(one) for one in reversed(PurePosixPath(name).parents)]
+        with sent.source.opened(name, sent.size) as fd:
+            sha256, digest = _digests(fd, name)
+            if digest != sent.digest:
                 raise sent.damaged()
+            if name not in self._found:
+                self.sftp(*(f"-mkdir {_quoted(folder)}" for folder in folders[3:]))
             there = self._found.pop(part, 0)
-            for at in [there, 0] if 0 < there <= file.bytes else [0]:  # the end may be torn
+            for at in [there, 0] if 0 < there <= sent.size else [0]:  # the end may be torn
                 sent.count(at, False)
-                if at < file.bytes or not at:
+                if at < sent.size or not at:
                     self._send(fd, part, at, sent)
                 if self._is(part, sha256, sent):
-                    self.move(part, sent.name)
+                    self.move(part, name)
                     return
         self.drop(part)
-        raise StoreError(f"{self.address}/{sent.name} did not arrive as it was sent. Copy again.")
+        raise RefusedError(f"{self.address}/{name} did not arrive as it was sent. Copy again.")
 
     def _send(self, fd: int, part: str, at: int, sent: Sending) -> None:
         done = at
 
         def watch(process: int) -> None:
             nonlocal done
-            now = max(done, min(_position(process, fd), sent.file.bytes))
+            now = max(done, min(_position(process, fd), sent.size))
             sent.count(now - done, True)
             done = now
 
         how = "reput" if at else "put"
         limit = [] if sent.limit_rate is None else ["-l", str(max(int(sent.limit_rate / 128), 1))]
         self.sftp(f"{how} -f {_handle(fd)} {part}", passed=fd, watch=watch, options=limit)
-        sent.count(sent.file.bytes - done, True)
+        sent.count(sent.size - done, True)
 
     def drop(self, name: str) -> None:
         """As of `Place`."""
-        self.sftp(f"-rm {name}")
+        self.sftp(f"-rm {_quoted(name)}")
 
-    def is_whole(self, sent: Sending) -> bool:
+    def is_whole(self, sent: Sending, *, reads: bool = False) -> bool:
         """As of `Place`."""
-        if not self.has_shell:
-            return self._is(sent.name, "", sent)
-        with sent.source.opened(sent.name, sent.file.bytes) as fd:
-            sha256, digest = _digests(fd, sent.name)
-        return digest == sent.file.digest and self._is(sent.name, sha256, sent)
+        sha256 = ""
+        if self.has_shell:
+            with suppress(RefusedError), sent.source.opened(sent.name, sent.size) as fd:
+                found, digest = _digests(fd, sent.name)
+                sha256 = found if digest == sent.digest else ""
+        return self._is(sent.name, sha256, sent)
 
     def _is(self, name: str, sha256: str, sent: Sending) -> bool:
-        """True if a file there has the bytes of one here."""
+        """True if a file there has the bytes of one here, whose SHA-256 may be known."""
         if self.has_shell:
-            code, said = self.shell(f"sha256sum < {name} && sync {name}")
-            return code == 0 and said.split()[:1] == [sha256]
-        with self._got(name, sent.file.bytes) as path, path.open("rb") as found:
-            return _digests(found.fileno(), name)[1] == sent.file.digest
+            path = shlex.quote(name)
+            code, said = self.shell(f"sha256sum < {path} && sync {path}")
+            if sha256 or code:
+                return code == 0 and said.split()[:1] == [sha256]
+        with self._got(name, sent.size) as place, place.open("rb") as file:
+            return _digests(file.fileno(), name)[1] == sent.digest
 
     def sftp(
         self,
@@ -308,9 +371,8 @@ class _ServerManifests(Manifests):
 
     def ids(self) -> list[str]:
         """Ids of all recordings that have a manifest, sorted."""
-        names = self._server.sizes(MANIFESTS)
-        ids = (name.removesuffix(".json") for name in names if name.endswith(".json"))
-        return sorted(filter(is_id, ids))
+        names = (Path(name) for name in self._server.listed(MANIFESTS))
+        return sorted(name.stem for name in names if name.suffix == ".json" and is_id(name.stem))
 
     @contextmanager
     def creating(self) -> Iterator[Callable[[Manifest], None]]:
@@ -333,7 +395,7 @@ class _ServerManifests(Manifests):
             try:
                 server.sftp(f"rename -l {new} {final}")  # not if there is one
             except StoreError:
-                if server.sizes(MANIFESTS).get(f"{manifest.id}.json") is None:
+                if not server.listed(final):
                     raise
                 raise exists from None
 
@@ -366,7 +428,7 @@ class _ServerManifests(Manifests):
 
     def _replaced(self, lock: str, script: str, changed: HybridlogError) -> None:
         """Run a script there under a lock; names of files are on the disk before and after."""
-        sync = f"{{ sync {lock.rpartition('/')[0]} {SCHEMAS} {MANIFESTS} || sync; }}"
+        sync = f"{{ sync {lock.rpartition('/')[0]} {MANIFESTS} || sync; }}"
         script = f"{sync} && {{ {script}; }} && {sync}"
         code, said = self._server.shell(
             f"exec flock -w {WAIT_S:.0f} {lock} sh -c {shlex.quote(script)} 2>&1"
@@ -393,7 +455,7 @@ class _ServerManifests(Manifests):
     @contextmanager
     def _locked(self, recording: str) -> Iterator[None]:
         """Keep other copies away, where there is no shell; for less than a second."""
-        server, lock = self._server, f"{MANIFESTS}/.copying-{recording}"
+        server, lock = self._server, f"{MANIFESTS}/{MARK}{recording}"
         end = time.monotonic() + WAIT_S
         while True:
             try:
@@ -412,7 +474,7 @@ class _ServerManifests(Manifests):
         finally:
             server.sftp(f"-rmdir {lock}")
 
-    def _old(self, recording: str) -> Manifest | None:
+    def old(self, recording: str) -> Manifest | None:
         return None
 
     def _drop(self, recording: str) -> None:
@@ -489,6 +551,18 @@ def _reason(errors: IO[bytes]) -> str:
     lines = [line.strip() for line in _text(errors).splitlines()]
     shown = [line for line in lines if line and not line.startswith("remote mkdir")][-2:]
     return "".join(one for one in "; ".join(shown).rstrip(".") if one.isprintable())[:500]
+
+
+def _quoted(name: str) -> str:
+    """A path below the store, as commands of sftp take it.
+
+    Raises:
+        RefusedError: They cannot.
+    """
+    if not name.isprintable():
+        raise RefusedError(f"sftp cannot send {name!r}: it has odd characters in its name.")
+    escaped = re.sub(r'(["\\\\])', r"\\\1", name)
+    return f'"{escaped}"'
 
 
 def _silent(line: str) -> str:

@@ -3,29 +3,27 @@
 from __future__ import annotations
 
 import hashlib
-import os
-import threading
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, suppress
+from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
-from typing import IO, Any, cast
+from typing import Any
 
 import pytest
 
 import hybridlog as hl
 from hybridlog.maintenance import expiry
-from hybridlog.maintenance.places import Place
-from hybridlog.maintenance.ssh import Server, serve
 from hybridlog.record.losses import losses_of
-from hybridlog.store import receiving
-from hybridlog_storage.errors import HybridlogError, PayloadError, StoreError
+from hybridlog_storage.errors import PayloadError
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import places
+from tests.copying.by_hand import make, pair, sshd
 from tests.payloads.logs import robot, write_log
+from tests.remote.conftest import address, moto, proxy, running_proxy
 
 SETTINGS = SegmentSettings(chunk_size=8 << 10, segment_size=14 << 10)
 STATES = ("recorded", "damaged", "calm", "driven", "expired", "noted")
-PlaceAt = Callable[[Path], AbstractContextManager[Place]]
+
+__all__ = ["address", "make", "moto", "pair", "proxy", "running_proxy", "sshd"]
 
 
 @pytest.fixture(scope="session")
@@ -53,107 +51,6 @@ def expire(store: hl.Store, name: str, segments: Sequence[int] = ()) -> None:
         numbers = segments or [*directory.listing(recording).sealed]
         expiry.expire(directory, recording, numbers, min_bytes=0)
     store.shared.catch_up()
-
-
-@contextmanager
-def directory_at(path: Path) -> Iterator[Place]:
-    """A store's directory."""
-    with hl.open(path, mongo="none", create=True) as store, receiving(store) as place:
-        yield place
-
-
-@contextmanager
-def server_at(path: Path, bytes_sent: int | None = None) -> Iterator[Place]:
-    """A store behind a connection, which may be cut.
-
-    Args:
-        path: The store.
-        bytes_sent: Bytes that arrive before the connection is cut; None for all.
-    """
-    ends = [*os.pipe(), *os.pipe()]
-    requests, to_server, answers, to_client = (
-        os.fdopen(fd, mode, 0) for fd, mode in zip(ends, ("rb", "wb", "rb", "wb"), strict=True)
-    )
-
-    def run() -> None:
-        with suppress(HybridlogError, OSError), requests, to_client, directory_at(path) as place:
-            serve(place, requests, to_client)  # type: ignore[arg-type]
-
-    thread = threading.Thread(target=run)
-    thread.start()
-    try:
-        sent = to_server if bytes_sent is None else _Cut(to_server, bytes_sent)
-        server = Server("server", cast("IO[bytes]", sent), answers)  # type: ignore[arg-type]
-        with server.beating():
-            yield server
-    finally:
-        to_server.close()
-        thread.join(60)
-        answers.close()
-
-
-class _Cut:
-    """A stream that ends after some bytes."""
-
-    def __init__(self, stream: Any, left: int) -> None:
-        self._stream = stream
-        self._left = left
-
-    def write(self, data: bytes) -> None:
-        part = memoryview(data)[: self._left]
-        self._left -= len(part)
-        self._stream.write(part)
-        if len(part) < len(data):
-            self._stream.close()
-            raise BrokenPipeError
-
-    def flush(self) -> None:
-        self._stream.flush()
-
-
-class Disturbed:
-    """A place that fails after some requests, or in the middle of bytes.
-
-    Args:
-        place: The place.
-        requests: Requests that it answers; None for all.
-        bytes_taken: Bytes that it takes; None for all.
-
-    Attributes:
-        asked: Names of the requests.
-        taken: Bytes it took.
-    """
-
-    def __init__(
-        self, place: Place, requests: int | None = None, bytes_taken: int | None = None
-    ) -> None:
-        self.name = place.name
-        self.asked: list[str] = []
-        self.taken = 0
-        self._place = place
-        self._requests = requests
-        self._bytes = bytes_taken
-
-    def __getattr__(self, what: str) -> Any:
-        ask = getattr(self._place, what)
-
-        def asked(*arguments: Any, **options: Any) -> Any:
-            if what != "leave":
-                self.asked.append(what)
-                if self._requests is not None and len(self.asked) > self._requests:
-                    raise StoreError("cut")
-            if what == "append":
-                file, at, data = arguments
-                left = len(data) if self._bytes is None else self._bytes - self.taken
-                part = memoryview(data)[:left]
-                self.taken += len(part)
-                ask(file, at, part)
-                if len(part) < len(data):
-                    raise StoreError("cut")
-                return None
-            return ask(*arguments, **options)
-
-        return asked
 
 
 def answers(path: Path, label: str) -> dict[str, Any]:

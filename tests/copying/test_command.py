@@ -1,10 +1,9 @@
-"""`hybridlog copy` as a user runs it: over a client program in the place of ssh, and watching."""
+"""`hybridlog copy` as a user runs it, over ssh and watching, too."""
 
 from __future__ import annotations
 
 import re
 import signal
-import sys
 from collections import Counter
 from pathlib import Path
 
@@ -22,42 +21,9 @@ from tests import places
 from tests.cli.running import run, started
 from tests.cli.within import answer
 from tests.copying.conftest import answers, expire
+from tests.copying.server import Sshd
 from tests.json_schemas import misfit, schema_of
 from tests.waiting import wait_for
-
-HYBRIDLOG = f"{sys.executable} -m hybridlog"
-_SSH = """
-import os, subprocess, sys
-
-words = sys.argv[1:]
-while words[0].startswith("-"):
-    words = words[2:]
-host, command = words
-assert host == "me@lab"
-os.chdir(PLACE)
-left = int(os.environ.get("CUT", 0))
-if not left:
-    os.execvp("sh", ["sh", "-c", command])
-there = subprocess.Popen(["sh", "-c", command], stdin=subprocess.PIPE)
-while left and (data := os.read(0, left)):
-    there.stdin.write(data)
-    there.stdin.flush()
-    left -= len(data)
-there.stdin.close()
-there.wait()
-"""
-
-
-@pytest.fixture
-def ssh(tmp_path: Path) -> Path:
-    """A program that is called like ssh, and runs the command here.
-
-    With CUT it passes on so many bytes only.
-    """
-    path = tmp_path / "ssh"
-    path.write_text(f"#!{sys.executable}\nPLACE = {str(tmp_path)!r}\n{_SSH}")
-    path.chmod(0o755)
-    return path
 
 
 def test_copies_to_a_directory(
@@ -179,23 +145,21 @@ def _told(path: Path) -> Counter[State]:
     return found
 
 
-def test_copies_over_ssh(robots: Path, tmp_path: Path, ssh: Path) -> None:
-    url = "ssh://me@lab:22/~/lab%20store"
-    words = ("copy", "driven", url, "--store", robots, "--ssh", f"{ssh} -x y")
-    missing = run(*words, "--program", "nosuch-program", code=5)
-    assert "Name hybridlog on the server" in missing.err
-    cut = run(*words, "--program", HYBRIDLOG, code=5, CUT="9000")
+def test_copies_over_ssh(robots: Path, tmp_path: Path, sshd: dict[str, Sshd]) -> None:
+    server, there = sshd["shell"], tmp_path / "lab store"
+    url = server.url(there).replace(" ", "%20")
+    words = ("copy", "driven", url, "--store", robots, "--ssh")
+    server.left = 20_000
+    cut = run(*words, server.ssh, code=5)
     assert "run the command again" in cut.err
-    assert run(*words, "--program", HYBRIDLOG).lines == ["copied driven"]
-    assert run(*words, "--program", HYBRIDLOG).lines == ["driven is there already"]
-    there = tmp_path / "lab store"
+    server.reset()
+    assert run(*words, server.ssh).lines == ["copied driven"]
+    assert run(*words, server.ssh).lines == ["driven is there already"]
     assert answers(there, "driven") == answers(robots, "driven")
-    away = run(*words[:-1], "sh -c 'echo no route to lab >&2; exit 255'", code=5)
-    assert "no route to lab" in away.err
-    assert f"{url} could not be reached." in away.err
-    garbage = run("copy", "ssh://me@lab/x", "--store", robots, "--ssh", str(ssh), "--program",
-                  "echo welcome to the lab;", code=5)  # fmt: skip
-    assert "does not answer as hybridlog does" in garbage.err
+    away = run(*words, "sh -c 'echo no route to lab >&2; exit 255'", code=5)
+    assert f"{url} is not reached: no route to lab" in away.err
+    missing = run(*words, "nosuch-program", code=5)
+    assert "nosuch-program" in missing.err
 
 
 def test_follows_a_store(robots: Path, tmp_path: Path) -> None:
@@ -213,19 +177,19 @@ def test_follows_a_store(robots: Path, tmp_path: Path) -> None:
 
 
 def test_a_watch_goes_on_after_a_cut(
-    robots: Path, tmp_path: Path, ssh: Path, monkeypatch: pytest.MonkeyPatch
+    robots: Path, tmp_path: Path, sshd: dict[str, Sshd], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    pauses = []
+    pauses, server = [], sshd["sftp"]
 
     def pause(seconds: float) -> None:
-        monkeypatch.delenv("CUT", raising=False)  # the connection is there again
+        server.reset()  # the connection is there again
         pauses.append(seconds)
         if len(pauses) == 2:
             raise Stopped(signal.SIGINT)
 
     monkeypatch.setattr(watching, "pause", pause)
-    monkeypatch.setenv("CUT", "9000")
-    words = ("copy", "driven", "ssh://me@lab/~/lab", "--ssh", ssh, "--program", HYBRIDLOG)
+    server.left = 20_000
+    words = ("copy", "driven", server.url(tmp_path / "lab"), "--ssh", server.ssh)
     told = answer(*words, "--watch", "--json", store=robots)
     assert pauses == [10, 2]
     assert "The next try is in 10 s." in told.err
@@ -237,7 +201,7 @@ def test_a_signal_ends_a_watch_amid_a_recording(robots: Path, tmp_path: Path) ->
     lab, told = tmp_path / "lab", tmp_path / "told"
     words = ("copy", "driven", lab, "--store", robots, "--watch")
     with started(*words, "--limit-rate", "1kB/s", output=told) as process:
-        wait_for(lambda: any(file.stat().st_size for file in lab.rglob("*.mcap*")))
+        wait_for(lambda: any(file.stat().st_size for file in lab.rglob("*.part")))
         process.terminate()
         assert process.wait(60) == 0
     assert "What arrived stays there" in told.read_text()

@@ -379,12 +379,6 @@ def test_strict_answers_need_payloads(copy: Path) -> None:
     answer("fetch", "-t", "/scan", *words, "ranges[3] > 0", store=copy, code=11)
 
 
-def test_a_store_says_that_payloads_expire(copy: Path) -> None:
-    assert "requires" not in (copy / "hybridlog.toml").read_text()
-    expire(copy, [0])
-    assert 'requires = ["expired"]' in (copy / "hybridlog.toml").read_text()
-
-
 def test_the_second_reader_tells_what_is_left(copy: Path) -> None:
     """By the specification: size, hash and document of each expired message."""
 

@@ -258,7 +258,12 @@ def coverage(entry: RecordingEntry, losses: Collection[Mapping[str, Any]]) -> st
         messages = sum(loss["count"] or 0 for loss in losses if loss["cause"] == cause)
         found += f"; {counted(messages, 'message')} {what}" if messages else ""
     gone = (without_payload(number, state) for state, number in expired_messages(entry).items())
-    return "; ".join([found, *gone])
+    return "; ".join([found, *gone, *copies_of(entry)])
+
+
+def copies_of(entry: RecordingEntry) -> list[str]:
+    """Where payloads are that a recording lacks, in words."""
+    return [f"{address} has more payloads of {entry.name}" for address in entry.copies]
 
 
 def _coverage(entry: RecordingEntry, losses: Collection[Mapping[str, Any]]) -> str:

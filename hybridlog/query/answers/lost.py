@@ -14,6 +14,7 @@ from hybridlog.query.answers.completeness import (
     NOT_LOST,
     Completeness,
     about_losses,
+    copies_of,
     left_out,
     not_indexed,
     not_written,
@@ -24,9 +25,9 @@ from hybridlog.query.planner import Planner
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.record.losses import CRASH, Cause, losses_of
 from hybridlog.schema.states import CAUSES, GONE, State
+from hybridlog.snapshot import UNFINISHED
 from hybridlog.wording import counted
 from hybridlog_storage.errors import HybridlogError, TimeError
-from hybridlog_storage.settings import EXPIRED
 from hybridlog_storage.times import BEGIN, END, span_of
 
 if TYPE_CHECKING:
@@ -84,6 +85,8 @@ def completeness_of(
     for name, rows in by_recording.items():
         sentences += about_losses(name, rows)
     expired = _expired(session, question)
+    if expired:
+        sentences += _elsewhere(session, question)
     return Completeness(
         sum(row["count"] or 0 for row in lost),
         is_exact=not unreadable
@@ -124,11 +127,18 @@ def _why_expired(session: Session, question: Question) -> str:
 
 def _expired(session: Session, question: Question) -> Counter[State]:
     """Number of messages in the range of a question whose payloads are gone, by state."""
-    if EXPIRED not in session.directory.settings.requires:
+    summaries = session.snapshot().summaries
+    if not any(one.expired or one.not_copied or one.status in UNFINISHED for one in summaries):
         return Counter()
     with suppress(TimeError):  # nothing is in the range
         return Planner(session, question, Counters()).count_expired()
     return Counter()
+
+
+def _elsewhere(session: Session, question: Question) -> list[str]:
+    """Sentences about copies with payloads that recordings of a question lack here."""
+    entries = (session.entry_of(one) for one, _, _ in RangeResolver(session, question).resolve())
+    return [f"{what}." for entry in entries for what in copies_of(entry)]
 
 
 def _rows_of(session: Session, question: Question) -> list[Mapping[str, Any]]:

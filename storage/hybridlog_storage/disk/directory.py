@@ -51,10 +51,6 @@ PAYLOADS: Final = "payloads"
 """Folder of a recording that holds the fields of its expired messages."""
 REMOVED: Final = ".removed-"
 """Prefix of the directory of a recording that is being deleted."""
-SENDING: Final = ".copying-"
-"""Prefix of the folder of a copy out of the store, while it is under way."""
-IMPORTING: Final = ".importing-"
-"""Prefix of the directory of a recording that is being imported."""
 _RECORDINGS: Final = "recordings"
 _OF_MANIFEST: Final = frozenset({MANIFEST_LOCK, MANIFEST_OLD, f".{MANIFEST_OLD}"})
 _TICK_NS: Final = 50_000_000
@@ -204,16 +200,6 @@ class StoreDirectory:
     def check_changes(self) -> None:
         """Raise if what users change by their commands cannot be changed; see `check_writable`."""
         self.check_writable()
-
-    def require(self, feature: str) -> None:
-        """Note in the settings that only readers that know a feature may read the store.
-
-        Raises:
-            StoreError: They cannot be written.
-        """
-        if feature not in self.settings.requires:
-            others = [one for one in read_settings(self.path).requires if one != feature]
-            self.change_settings(requires=(*others, feature))
 
     def change_settings(self, **changes: Any) -> None:
         """Change settings of the store.

@@ -50,8 +50,8 @@ from hybridlog_storage.remote.lists import (
     list_name,
     number_of,
 )
-from hybridlog_storage.settings import EXPIRED, NONE, StoreSettings, read_settings, settings_text
 from hybridlog_storage.settings import NAME as SETTINGS
+from hybridlog_storage.settings import NONE, StoreSettings, read_settings, settings_text
 
 LOOK_EVERY_S: Final = 5.0
 """Seconds between two looks for a newer list, unless this process changes something."""
@@ -439,9 +439,7 @@ class RemoteDirectory(StoreDirectory):
             with suppress(ObjectExistsError):  # another process makes it, too
                 bucket.create(
                     SETTINGS,
-                    settings_text(
-                        StoreSettings(os.urandom(16).hex(), mongo=NONE, requires=(EXPIRED,))
-                    ),
+                    settings_text(StoreSettings(os.urandom(16).hex(), mongo=NONE)),
                 )
         return cls(address)
 

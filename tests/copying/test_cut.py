@@ -7,15 +7,15 @@ from collections.abc import Callable
 
 import pytest
 
-from hybridlog_storage.copy import CopyOptions, copy
+from hybridlog_storage.copy import How, copy
 from hybridlog_storage.copy_places import BucketStore
 from hybridlog_storage.errors import HybridlogError
 from hybridlog_storage.manifests import BucketManifests
 from hybridlog_storage.remote.bucket import Bucket
+from tests.copying.by_hand import RECORDING, TOTAL, Makes, Store, recording
+from tests.copying.server import Sshd
+from tests.copying.test_any_place import edited
 from tests.limits import Limit
-from tests.manifest_copies.conftest import RECORDING, SIZES, Makes, Store, recording
-from tests.manifest_copies.server import Sshd
-from tests.manifest_copies.test_copy import edited
 from tests.remote.server import Proxy
 
 
@@ -30,7 +30,7 @@ def resumed(
     for attempt in range(6):
         if attempt < 5:
             cut()
-        left = sum(SIZES.values()) - arrived(target)
+        left = TOTAL - arrived(target)
         try:
             copied = copy(source.source, target.place, RECORDING)
         except (HybridlogError, CutError):
@@ -63,7 +63,7 @@ def test_a_directory_goes_on_at_the_last_byte(
 
     def cut() -> None:
         nonlocal left
-        left = rng.randrange(sum(SIZES.values()) // 2)
+        left = rng.randrange(TOTAL // 2)
 
     def pieces(name: str, at: int, size: int | None):  # type: ignore[no-untyped-def]
         nonlocal left
@@ -82,7 +82,7 @@ def test_a_directory_goes_on_at_the_last_byte(
 
     monkeypatch.setattr(source.source, "pieces", pieces)
     resumed(source, target, cut, heal)
-    assert sent[0] == sum(SIZES.values())  # none twice
+    assert sent[0] == TOTAL  # none twice
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -94,7 +94,7 @@ def test_a_server_goes_on_at_the_last_byte(
     source.begin(recording())
 
     def cut() -> None:
-        server.left = rng.randrange(10_000, sum(SIZES.values()))
+        server.left = rng.randrange(10_000, TOTAL)
 
     resumed(source, target, cut, server.reset)
 
@@ -125,7 +125,7 @@ def test_large_files_go_in_parts(make: Makes, proxy: Proxy, limit: Limit) -> Non
     copy(source.source, target.place, RECORDING)
     assert sum("uploadId" in path for _, path, _ in proxy.requests) > 10
     target.check(recording())
-    assert copy(source.source, target.place, RECORDING, CopyOptions(check=True)).sent == []
+    assert copy(source.source, target.place, RECORDING, How(check=True)).sent == []
 
 
 def test_requests_to_a_bucket(make: Makes, proxy: Proxy) -> None:
@@ -166,7 +166,7 @@ def test_a_bucket_that_changes_a_byte_is_noticed(make: Makes, proxy: Proxy) -> N
     source.begin(recording())
     assert target.bucket is not None
     target.bucket.check_conditions()
-    path = f"{RECORDING}/000001.large.mcap"
+    path = f"{RECORDING}/000001.mcap"
     proxy.spoil = lambda number: (
         "flip" if "PUT" in (now := proxy.requests[number - 1]) and path in now[1] else ""
     )
@@ -174,5 +174,5 @@ def test_a_bucket_that_changes_a_byte_is_noticed(make: Makes, proxy: Proxy) -> N
         copy(source.source, target.place, RECORDING)
     proxy.reset()
     assert not target.is_there()
-    assert "000001.large.mcap" in copy(source.source, target.place, RECORDING).sent
+    assert "000001.mcap" in copy(source.source, target.place, RECORDING).sent
     target.check(recording())

@@ -10,12 +10,12 @@ import pytest
 from hybridlog_storage.copy import copy
 from hybridlog_storage.copy_places import Directory
 from hybridlog_storage.errors import HeldError, StoreError, UsageError
-from hybridlog_storage.manifest import Manifest, Note, replace
+from hybridlog_storage.manifest import Manifest, Note, new_id, replace
 from hybridlog_storage.sftp import Server
+from tests.copying.by_hand import RECORDING, Makes, recording
+from tests.copying.server import Sshd
+from tests.copying.test_any_place import as_of
 from tests.limits import Limit
-from tests.manifest_copies.conftest import RECORDING, Makes, recording
-from tests.manifest_copies.server import Sshd
-from tests.manifest_copies.test_copy import as_of
 
 
 def test_urls(sshd: dict[str, Sshd], tmp_path: Path) -> None:
@@ -71,13 +71,13 @@ def test_a_lock_that_a_kill_has_left_is_named(make: Makes, limit: Limit) -> None
 
 
 def test_a_copy_waits_for_another_one(make: Makes, limit: Limit) -> None:
-    limit(server_wait_s=1, directory_copy_wait_s=0.2)
+    limit(copy_wait_s=0.2, server_copy_wait_s=1)
     for kind in ("directory", "shell"):
         source, target = make("directory"), make(kind)
         source.begin(recording())
         assert target.folder is not None
         with Directory(target.folder).working(RECORDING):
-            with pytest.raises(HeldError, match="Another process copies"):
+            with pytest.raises(HeldError):
                 copy(source.source, target.place, RECORDING)
         copy(source.source, target.place, RECORDING)
         target.check(recording())
@@ -99,7 +99,7 @@ def test_no_edit_is_lost_while_it_is_copied_again_and_again(make: Makes, kind: s
 
     thread = threading.Thread(target=note)
     thread.start()
-    for count in range(2, 7):
+    for count in range(2, 6):
         later = recording(count, "open")
         source.place.manifests.change(
             RECORDING, lambda now, later=later: replace(now, **as_of(later))
@@ -113,3 +113,31 @@ def test_no_edit_is_lost_while_it_is_copied_again_and_again(make: Makes, kind: s
 
 def noted(now: Manifest, at: int) -> Manifest:
     return replace(now, notes=(*now.notes, Note(at, "")))
+
+
+@pytest.mark.parametrize("kind", ["shell", "sftp"])
+def test_a_store_is_made_there(make: Makes, kind: str, tmp_path: Path) -> None:
+    target = make(kind)
+    assert isinstance(target.place, Server)
+    settings = target.read("hybridlog.toml")
+    target.place.begin()
+    assert target.read("hybridlog.toml") == settings
+    target.write("hybridlog.toml", b"format = 3\n")
+    with pytest.raises(StoreError, match="of format 3"):
+        target.place.begin()
+    target.delete("hybridlog.toml")
+    target.write("thesis.tex", b"")
+    with pytest.raises(StoreError, match="holds files and is not"):
+        target.place.begin()
+
+
+@pytest.mark.parametrize("kind", ["shell", "sftp"])
+def test_names_there(make: Makes, kind: str) -> None:
+    source, target = make("directory"), make(kind)
+    assert isinstance(target.place, Server)
+    assert target.place.names() == set()
+    for name in ('a"b', "back\\slash", "\u00e4 \U0001f916", "tab\there"):
+        one = replace(recording(), id=new_id("x"), name=name, files=(), fields=())
+        source.place.manifests.create(one)
+        copy(source.source, target.place, one.id)
+    assert target.place.names() == {'a"b', "back\\slash", "\u00e4 \U0001f916", "tab\there"}

@@ -10,29 +10,33 @@ from typing import Any, NoReturn
 
 import pytest
 
-from hybridlog_storage.copy import Copied, CopyOptions, copy
+from hybridlog_storage.copy import Copied, How, copy, known
 from hybridlog_storage.copy_places import BucketStore, Directory, Place, RefusedError
-from hybridlog_storage.errors import HybridlogError, StoreError, UsageError
+from hybridlog_storage.errors import HybridlogError, StoreError
 from hybridlog_storage.manifest import Channel, Manifest, Mark, Note, Pin, replace
 from hybridlog_storage.remote.bucket import Bucket
 from hybridlog_storage.sftp import Server
 from hybridlog_storage.stopping import at_safe_points, postpone
-from tests.manifest_copies.conftest import (
+from tests.copying.by_hand import (
     FIRST,
     MORE_PAIRS,
+    NAMES,
     RECORDING,
-    SCHEMA,
-    SIZES,
+    TOTAL,
     Makes,
     Store,
     bytes_of,
+    fields,
     listed,
     recording,
+    without_payloads,
 )
-from tests.manifest_copies.server import Sshd
+from tests.copying.server import Sshd
 
 Pair = tuple[Store, Store]
 FILE = listed("000000.mcap")
+CHECK = How(check=True)
+FIELDS_FIRST = How(prepare=without_payloads)
 
 
 @pytest.mark.parametrize("pair", MORE_PAIRS, indirect=True, ids="-".join)
@@ -40,8 +44,8 @@ def test_all_of_it_is_there_and_is_not_sent_again(pair: Pair) -> None:
     source, target = pair
     copied = copy(source.source, target.place, RECORDING)
     assert copied.is_new
-    assert copied.sent == [*SIZES]
-    assert copied.sent_bytes == sum(SIZES.values())
+    assert copied.sent == NAMES
+    assert copied.sent_bytes == TOTAL
     assert target.check(recording()) == copied.manifest
     again = copy(source.source, target.place, RECORDING)
     assert (again.is_new, again.sent, again.sent_bytes) == (False, [], 0)
@@ -50,16 +54,16 @@ def test_all_of_it_is_there_and_is_not_sent_again(pair: Pair) -> None:
 
 def test_fields_first_and_the_rest_later(pair: Pair) -> None:
     source, target = pair
-    options = CopyOptions(only_fields=True, address="s3://lab/store")
-    assert copy(source.source, target.place, RECORDING, options).sent == [*FIRST]
-    found = target.check()
-    assert [file.name for file in found.files if file.is_here] == [*FIRST]
-    others = [file for file in found.files if not file.is_here]
-    assert {(file.gone, file.copy) for file in others} == {("elsewhere", "s3://lab/store")}
-    assert copy(source.source, target.place, RECORDING, options).sent == []
+    assert copy(source.source, target.place, RECORDING, FIELDS_FIRST).sent == FIRST
+    with without_payloads(recording(), list(recording().files)) as (sent, _):
+        target.check(sent)
+    assert [log.copy for log in sent.files].count("s3://lab/store") == 3
+    assert copy(source.source, target.place, RECORDING, FIELDS_FIRST).sent == []
+    assert known(source.source, target.place, RECORDING, FIELDS_FIRST)
+    assert not known(source.source, target.place, RECORDING, How())
     copy(source.source, target.place, RECORDING)
     target.check(recording())
-    assert copy(source.source, target.place, RECORDING, options).sent == []
+    assert copy(source.source, target.place, RECORDING, FIELDS_FIRST).sent == []
     target.check(recording())
 
 
@@ -83,7 +87,7 @@ def test_a_running_recording_brings_the_rest_later(pair: Pair) -> None:
     target.check(one)
     target.manifests().change(RECORDING, edited)
     source.place.manifests.change(RECORDING, lambda now: replace(now, **as_of(recording())))
-    assert copy(source.source, target.place, RECORDING).sent == [*SIZES][3:]
+    assert copy(source.source, target.place, RECORDING).sent == NAMES[3:]
     target.check(edited(recording()))
     # An older copy of the source takes nothing back.
     source.place.manifests.change(RECORDING, lambda now: replace(now, **as_of(one)))
@@ -92,20 +96,20 @@ def test_a_running_recording_brings_the_rest_later(pair: Pair) -> None:
 
 
 def as_of(one: Manifest) -> dict[str, Any]:
-    names = ("status", "files", "channels", "losses")
+    names = ("status", "files", "fields", "channels", "losses")
     return {name: getattr(one, name) for name in names}
 
 
 def test_edits_there_stay_that_are_made_meanwhile(pair: Pair) -> None:
     source, target = pair
-    copy(source.source, target.place, RECORDING, CopyOptions(only_fields=True))
+    copy(source.source, target.place, RECORDING, FIELDS_FIRST)
     edits: list[Manifest] = []
 
     def edit(done: int, total: int) -> None:
         if done > total // 2 and not edits:
             edits.append(target.manifests().change(RECORDING, edited))
 
-    copy(source.source, target.place, RECORDING, progress=edit)
+    copy(source.source, target.place, RECORDING, How(progress=edit))
     assert edits
     target.check(edited(recording()))
 
@@ -113,22 +117,22 @@ def test_edits_there_stay_that_are_made_meanwhile(pair: Pair) -> None:
 def test_a_name_is_made_free_there(pair: Pair) -> None:
     source, target = pair
     for name in ("run-2", "run-3"):
-        copied = copy(source.source, target.place, RECORDING, named=lambda _, name=name: name)
+        copied = copy(source.source, target.place, RECORDING, How(named=lambda _, name=name: name))
         assert copied.manifest.name == "run-2"
 
 
 def test_progress_tells_all_bytes(pair: Pair) -> None:
     source, target = pair
     told: list[tuple[int, int]] = []
-    copy(source.source, target.place, RECORDING, progress=lambda *now: told.append(now))
+    copy(source.source, target.place, RECORDING, How(progress=lambda *now: told.append(now)))
     assert told == sorted(told)
-    assert told[-1] == (sum(SIZES.values()),) * 2
-    assert {total for _, total in told} == {sum(SIZES.values())}
+    assert told[-1] == (TOTAL,) * 2
+    assert {total for _, total in told} == {TOTAL}
 
 
 def test_a_damaged_file_is_refused_and_named(pair: Pair) -> None:
     source, target = pair
-    name = "000001.large.mcap"
+    name = "000001.mcap"
     path = f"recordings/{RECORDING}/{name}"
     whole = bytes_of(name)
     flipped = bytes([whole[0] ^ 1]) + whole[1:]
@@ -145,25 +149,13 @@ def test_a_damaged_file_is_refused_and_named(pair: Pair) -> None:
     target.check(recording())
 
 
-@pytest.mark.parametrize("damaged", [b"uint32 m\n", b"", None])
-def test_a_damaged_definition_is_refused(make: Makes, damaged: bytes | None) -> None:
-    source, target = make("directory"), make("directory")
-    source.begin(recording())
-    source.delete(f"schemas/{SCHEMA}")
-    if damaged is not None:
-        source.write(f"schemas/{SCHEMA}", damaged)
-    with pytest.raises(RefusedError, match=SCHEMA):
-        copy(source.source, target.place, RECORDING)
-    assert not target.is_there()
-
-
 @pytest.mark.parametrize("what", ["begin", "channel", "file"])
 def test_another_recording_of_its_id_is_refused(pair: Pair, what: str) -> None:
     source, target = pair
     other = {
         "begin": Manifest(RECORDING, "other", 2),
         "channel": Manifest(RECORDING, "other", 1, channels={0: Channel("/other")}),
-        "file": Manifest(RECORDING, "other", 1, files=(replace(FILE, digest="0" * 64, parts={}),)),
+        "file": Manifest(RECORDING, "other", 1, files=(replace(FILE, parts={}),)),
     }[what]
     with target.place.working(RECORDING):
         target.place.manifests.create(other)
@@ -174,7 +166,7 @@ def test_another_recording_of_its_id_is_refused(pair: Pair, what: str) -> None:
 
 def test_what_is_removed_meanwhile_does_not_come_back(pair: Pair) -> None:
     source, target = pair
-    copy(source.source, target.place, RECORDING, CopyOptions(only_fields=True))
+    copy(source.source, target.place, RECORDING, FIELDS_FIRST)
     removed: list[int] = []
 
     def remove(done: int, total: int) -> None:
@@ -183,69 +175,92 @@ def test_what_is_removed_meanwhile_does_not_come_back(pair: Pair) -> None:
             removed.append(done)
 
     with pytest.raises(HybridlogError):
-        copy(source.source, target.place, RECORDING, progress=remove)
+        copy(source.source, target.place, RECORDING, How(progress=remove))
     assert not target.is_there()
     assert removed
     copy(source.source, target.place, RECORDING)
     target.check(recording())
 
 
+def expire(store: Store, number: int = 1) -> Manifest:
+    """Let the payloads of a log go."""
+    name, new = f"00000{number}.mcap", f"00000{number}.x.mcap"
+    for one in (new, FIRST[-1]):
+        store.write(f"recordings/{RECORDING}/{one}", bytes_of(one))
+    rows = fields(FIRST[-1])
+
+    def how(now: Manifest) -> Manifest:
+        files = tuple(listed(new) if one.name == name else one for one in now.files)
+        return replace(now, files=files, fields=tuple({*now.fields, rows}))
+
+    found = store.manifests().change(RECORDING, how)
+    store.delete(f"recordings/{RECORDING}/{name}")
+    return found
+
+
 def test_what_has_expired_there_is_not_sent_again(pair: Pair) -> None:
     source, target = pair
     copy(source.source, target.place, RECORDING)
-    name = "000001.large.mcap"
+    expired = expire(target)
+    for how in (How(), CHECK, FIELDS_FIRST):
+        copied = copy(source.source, target.place, RECORDING, how)
+        assert (copied.sent, copied.lacking, copied.lost) == ([], [1], [])
+        target.check(expired)
 
-    def expire(now: Manifest) -> Manifest:
-        return replace(
-            now,
-            files=tuple(
-                replace(one, gone="expired") if one.name == name else one for one in now.files
-            ),
-        )
 
-    target.manifests().change(RECORDING, expire)
-    target.delete(f"recordings/{RECORDING}/{name}")
-    copied = copy(source.source, target.place, RECORDING)
-    assert (copied.sent, copied.lacking) == ([], [name])
-    target.check(expire(recording()))
+def test_what_has_expired_here_stays_there(pair: Pair) -> None:
+    source, target = pair
+    copy(source.source, target.place, RECORDING)
+    expire(source)
+    copied = copy(source.source, target.place, RECORDING, CHECK)
+    assert (copied.sent, copied.lacking, copied.lost) == ([], [], [])
+    target.check(recording())
+    target.delete(f"recordings/{RECORDING}/000001.mcap")
+    copied = copy(source.source, target.place, RECORDING, CHECK)
+    assert (copied.sent, copied.lost) == ([], ["000001.mcap"])
+
+
+def test_both_have_let_other_payloads_go(pair: Pair) -> None:
+    source, target = pair
+    copy(source.source, target.place, RECORDING)
+    expire(source, 1)
+    expired = expire(target, 4)
+    told: list[dict[int, str]] = []
+    assert copy(source.source, target.place, RECORDING, How(proved=told.append)).lacking == [4]
+    target.check(expired)
+    assert [{*one} for one in told] == [{0, 1, 2, 3}]
+    assert told[0][1] == listed("000001.x.mcap").digest
 
 
 def test_what_expires_here_meanwhile_is_no_damage(pair: Pair) -> None:
     source, target = pair
     expired: list[Manifest] = []
 
-    def expire(now: Manifest) -> Manifest:
-        files = (replace(one, gone="expired") if one.number == 4 else one for one in now.files)
-        return replace(now, files=tuple(files))
-
     def meanwhile(done: int, _: int) -> None:
         if not expired:
-            expired.append(source.place.manifests.change(RECORDING, expire))
-            source.delete(f"recordings/{RECORDING}/000004.large.mcap")
+            expired.append(expire(source, 4))
 
-    copy(source.source, target.place, RECORDING, progress=meanwhile)
+    copy(source.source, target.place, RECORDING, How(progress=meanwhile))
     target.check(expired[0])
 
 
-def test_files_that_are_gone_here_are_told_there(pair: Pair) -> None:
-    """Also where their proven copy is."""
+def test_what_expired_here_replaces_what_was_to_come(pair: Pair) -> None:
     source, target = pair
-    files = list(recording().files)
-    files[1] = replace(files[1], gone="elsewhere", copy="s3://lab/store")
-    files[2] = replace(files[2], gone="expired")
-    changed = source.place.manifests.change(RECORDING, lambda now: replace(now, files=(*files,)))
-    copy(source.source, target.place, RECORDING)
-    target.check(changed)
+    copy(source.source, target.place, RECORDING, FIELDS_FIRST)
+    expired = expire(source)
+    assert copy(source.source, target.place, RECORDING).lacking == []
+    assert target.check().fields == expired.fields
+    assert target.check().files == expired.files
 
 
 def test_what_was_lost_there_is_sent_again(pair: Pair) -> None:
     source, target = pair
     copy(source.source, target.place, RECORDING)
-    for name in ("000000.mcap", "000004.large.mcap"):
+    for name in ("000000.mcap", "000004.mcap"):
         target.delete(f"recordings/{RECORDING}/{name}")
     assert copy(source.source, target.place, RECORDING).sent == [
         "000000.mcap",
-        "000004.large.mcap",
+        "000004.mcap",
     ]
     target.check(recording())
 
@@ -253,84 +268,125 @@ def test_what_was_lost_there_is_sent_again(pair: Pair) -> None:
 def test_what_is_wrong_there_is_sent_again_if_it_is_checked(pair: Pair) -> None:
     source, target = pair
     copy(source.source, target.place, RECORDING)
-    path = f"recordings/{RECORDING}/000004.large.mcap"
+    path = f"recordings/{RECORDING}/000004.mcap"
     whole = target.read(path)
     target.write(path, whole[:-1] + b"?")
     assert copy(source.source, target.place, RECORDING).sent == []
-    copied = copy(source.source, target.place, RECORDING, CopyOptions(check=True))
-    assert copied.sent == ["000004.large.mcap"]
+    copied = copy(source.source, target.place, RECORDING, CHECK)
+    assert copied.sent == ["000004.mcap"]
     target.check(recording())
-    assert copy(source.source, target.place, RECORDING, CopyOptions(check=True)).sent == []
+    assert copy(source.source, target.place, RECORDING, CHECK).sent == []
 
 
 def test_files_expire_that_are_proved_there(pair: Pair) -> None:
     source, target = pair
-    told: list[frozenset[int]] = []
-    copy(source.source, target.place, RECORDING, then_expire=told.append)
-    assert told == [{0, 1, 2, 3, 4}]
-    path = f"recordings/{RECORDING}/000004.large.mcap"
-    target.write(path, bytes_of("000004.large.mcap")[:-1] + b"?")
-    files = list(recording().files)
-    files[1] = replace(files[1], gone="elsewhere")
-    source.place.manifests.change(RECORDING, lambda now: replace(now, files=(*files,)))
-    copied = copy(source.source, target.place, RECORDING, then_expire=told.append)
-    assert copied.sent == ["000004.large.mcap"]
-    assert told[1:] == [{0, 2, 3, 4}]
-    options = CopyOptions(only_fields=True)
-    copy(source.source, target.place, RECORDING, options, then_expire=told.append)
-    assert told[2:] == [{0, 3}]
+    told: list[dict[int, str]] = []
+    copy(source.source, target.place, RECORDING, How(proved=told.append))
+    assert told == [{number: log.digest for number, log in recording().logs.items()}]
+    path = f"recordings/{RECORDING}/000004.mcap"
+    target.write(path, bytes_of("000004.mcap")[:-1] + b"?")
+    copied = copy(source.source, target.place, RECORDING, How(proved=told.append))
+    assert copied.sent == ["000004.mcap"]
+    assert told[1:] == told[:1]
 
 
 def test_files_that_expire_there_meanwhile_are_not_told(pair: Pair) -> None:
     source, target = pair
     copy(source.source, target.place, RECORDING)
-    told: list[frozenset[int]] = []
+    told: list[dict[int, str]] = []
     expired: list[int] = []
-
-    def expire(now: Manifest) -> Manifest:
-        files = (replace(one, gone="expired") if one.number == 4 else one for one in now.files)
-        return replace(now, files=tuple(files))
 
     def meanwhile(done: int, total: int) -> None:
         if done == total and not expired:
             expired.append(done)
-            target.manifests().change(RECORDING, expire)
+            expire(target, 4)
 
-    copy(source.source, target.place, RECORDING, progress=meanwhile, then_expire=told.append)
-    assert told == [{0, 1, 2, 3}]
+    how = How(progress=meanwhile, proved=told.append)
+    copy(source.source, target.place, RECORDING, how)
+    assert [{*one} for one in told] == [{0, 1, 2, 3}]
 
 
-@pytest.mark.parametrize("kind", ["directory", "bucket", "shell"])
-def test_nothing_expires_for_a_copy_to_itself(
+@pytest.mark.parametrize("kind", ["directory", "shell", "sftp"])
+def test_a_store_is_known_by_what_was_just_made_in_it(
     make: Makes, kind: str, sshd: dict[str, Sshd], tmp_path: Path
 ) -> None:
-    source = make("directory" if kind == "shell" else kind)
+    source = make("directory")
     source.begin(recording())
-    told: list[frozenset[int]] = []
+    assert source.folder is not None
+    assert isinstance(source.place, Directory)
+    (tmp_path / "other").symlink_to(source.folder)
     with ExitStack() as held:
-        if source.bucket is not None:
-            target: Place = BucketStore(Bucket(source.bucket.address + "/"))
-        elif kind == "shell":
-            assert source.folder is not None
-            server = sshd["shell"]
+        target: Place = Directory(tmp_path / "other")
+        if kind != "directory":
+            server = sshd[kind]
             target = held.enter_context(Server(server.url(source.folder), server.ssh))
-        else:
-            assert source.folder is not None
-            (tmp_path / "other").symlink_to(source.folder)
-            target = Directory(tmp_path / "other")
-        with pytest.raises(UsageError, match="is this very store"):
-            copy(source.source, target, RECORDING, then_expire=told.append)
-    assert told == []
-    source.check(recording())
+        with source.place.marked() as mark:
+            assert target.sees(mark)
+            assert not make(kind).place.sees(mark)
+        assert not target.sees(mark)
+
+
+@pytest.mark.parametrize("kind", ["directory", "bucket"])
+@pytest.mark.parametrize("content", [b"", b"x\n", None])
+def test_a_lost_manifest_is_made_again(make: Makes, kind: str, content: bytes | None) -> None:
+    """With what people have said, if the one before has it."""
+    source, target = make("directory"), make(kind)
+    source.begin(recording())
+    copy(source.source, target.place, RECORDING)
+    target.manifests().change(RECORDING, edited)
+    target.manifests().change(RECORDING, lambda now: replace(now, notes=()))
+    name = f"manifests/{RECORDING}.json"
+    target.delete(name)
+    if content is not None:
+        target.write(name, content)
+    assert copy(source.source, target.place, RECORDING).sent == []
+    wanted = recording() if kind == "bucket" else edited(recording())
+    target.check(wanted)
+
+
+def test_payloads_that_are_only_there_are_not_replaced(make: Makes) -> None:
+    for kind in ("directory", "bucket"):
+        source, target = make("directory"), make(kind)
+        source.begin(recording())
+        copy(source.source, target.place, RECORDING)
+        expire(source)
+        target.delete(f"manifests/{RECORDING}.json")
+        if target.folder is not None:
+            (target.folder / "recordings" / RECORDING / "manifest.old").unlink(missing_ok=True)
+        before = target.names()
+        with pytest.raises(RefusedError, match=r"are not here, in 000001\.mcap"):
+            copy(source.source, target.place, RECORDING)
+        assert {*before} - {*target.names()} == set()
+
+
+@pytest.mark.parametrize("kind", ["shell", "sftp"])
+def test_a_damaged_manifest_on_a_server_is_told(make: Makes, kind: str) -> None:
+    source, target = make("directory"), make(kind)
+    source.begin(recording())
+    copy(source.source, target.place, RECORDING)
+    target.write(f"manifests/{RECORDING}.json", b"x\n")
+    with pytest.raises(RefusedError, match="verify --repair"):
+        copy(source.source, target.place, RECORDING)
+
+
+def test_one_that_was_made_again_is_made_whole(pair: Pair) -> None:
+    source, target = pair
+    copy(source.source, target.place, RECORDING)
+    changed = recording(3, "unproven")
+    target.manifests().change(RECORDING, lambda now: replace(edited(now), **as_of(changed)))
+    assert not known(source.source, target.place, RECORDING, How())
+    copy(source.source, target.place, RECORDING)
+    target.check(edited(recording()))
+    source.place.manifests.change(RECORDING, lambda now: replace(now, status="unproven"))
+    with pytest.raises(RefusedError, match="its manifest was lost and made again"):
+        copy(source.source, target.place, RECORDING)
 
 
 def test_a_limited_rate_is_kept(pair: Pair) -> None:
     source, target = pair
-    options = CopyOptions(limit_rate=500_000, only_fields=True)
     source.place.manifests.change(RECORDING, lambda now: replace(now, **as_of(recording(3))))
-    copy(source.source, target.place, RECORDING, options)
     begun = time.monotonic()
-    assert copy(source.source, target.place, RECORDING, CopyOptions(limit_rate=500_000)).sent
+    assert copy(source.source, target.place, RECORDING, How(limit_rate=500_000)).sent
     assert time.monotonic() - begun >= (200_000 + 350_000) / 500_000 * 0.9
     target.check(recording(3))
 
@@ -346,10 +402,10 @@ def test_a_signal_stops_it_and_the_next_one_goes_on(pair: Pair) -> None:
             postpone(stop)
 
     with pytest.raises(KeyboardInterrupt), at_safe_points():
-        copy(source.source, target.place, RECORDING, progress=ask)
+        copy(source.source, target.place, RECORDING, How(progress=ask))
     assert not target.is_there()
     copied = copy(source.source, target.place, RECORDING)
-    assert 0 < copied.sent_bytes < sum(SIZES.values())
+    assert 0 < copied.sent_bytes < TOTAL
     target.check(recording())
 
 
@@ -372,7 +428,7 @@ def test_ten_copies_at_once(make: Makes, sshd: dict[str, Sshd], kind: str) -> No
                 place = held.enter_context(Server(url, sshd[kind].ssh))
             with suppress(StoreError if kind == "sftp" else ()):
                 return copy(source.source, place, RECORDING)
-            return Copied(recording(), is_new=False)
+            return Copied(recording())
 
     with ThreadPoolExecutor(10) as pool:
         copied = list(pool.map(one, range(10)))
@@ -380,4 +436,4 @@ def test_ten_copies_at_once(make: Makes, sshd: dict[str, Sshd], kind: str) -> No
         copied.append(copy(source.source, target.place, RECORDING))
     target.check(recording())
     if kind in {"directory", "shell"}:
-        assert sorted(len(one.sent) for one in copied) == [0] * 9 + [len(SIZES)]
+        assert sorted(len(one.sent) for one in copied) == [0] * 9 + [len(NAMES)]

@@ -3,23 +3,34 @@
 from __future__ import annotations
 
 import random
+import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 from blake3 import blake3
 
+from hybridlog_storage.copy import files_of
 from hybridlog_storage.copy_places import BucketStore, Directory, Place, Source
-from hybridlog_storage.manifest import Channel, File, Loss, Manifest, Part, Pin, new_id, replace
+from hybridlog_storage.manifest import (
+    Channel,
+    Fields,
+    File,
+    Loss,
+    Manifest,
+    Part,
+    Pin,
+    new_id,
+    replace,
+)
 from hybridlog_storage.remote.bucket import Bucket
+from hybridlog_storage.settings import StoreSettings, write_settings
 from hybridlog_storage.sftp import Server
-from tests.manifest_copies.server import Sshd
-from tests.remote.conftest import address, moto, new_address, proxy, running_proxy
+from tests.copying.server import Sshd
+from tests.remote.conftest import new_address
 from tests.remote.server import Proxy
-
-__all__ = ["address", "moto", "proxy", "running_proxy"]
 
 PAIRS = [
     ("directory", "directory"),
@@ -29,18 +40,25 @@ PAIRS = [
     ("bucket", "directory"),
 ]
 MORE_PAIRS = [*PAIRS, ("bucket", "bucket"), ("bucket", "shell")]
-_DEFINITION = b"uint32 n\nfloat32[] ranges\n"
-SCHEMA = blake3(_DEFINITION).hexdigest()
+FIELDS = "payloads/fields=a b;\"'[/x-000000.parquet"
 SIZES = {
     "000000.mcap": 3000,
-    "000001.large.mcap": 200_000,
-    "000002.front.mcap": 350_000,
-    "000002.rows.parquet": 1000,
-    "000003.mcap": 2000,
-    "000004.large.mcap": 150_000,
+    "000001.mcap": 200_000,
+    "000002.mcap": 350_000,
+    "000003.1.mcap": 2000,
+    "000004.mcap": 150_000,
+    FIELDS: 1000,
+    "000001.x.mcap": 300,
+    "000002.x.mcap": 300,
+    "000004.x.mcap": 200,
+    "payloads/fields=x/x-000001.parquet": 900,
 }
-FIRST = ("000000.mcap", "000002.rows.parquet", "000003.mcap")
-"""What is sent of it with `only_fields`."""
+NAMES = [*SIZES][:6]
+"""Files of a whole recording."""
+TOTAL = sum(SIZES[name] for name in NAMES)
+FIRST = ["000000.mcap", "000001.x.mcap", "000002.x.mcap", "000003.1.mcap", "000004.x.mcap"]
+FIRST += [FIELDS, [*SIZES][-1]]
+"""What is sent of it if payloads are left for later."""
 
 
 def bytes_of(name: str) -> bytes:
@@ -51,20 +69,26 @@ def listed(name: str) -> File:
     content, number = bytes_of(name), int(name[:6])
     return File(
         number,
-        0 if number < 3 else 3,
+        number,
         name,
-        "rows" if name.endswith("parquet") else "log",
+        "log",
         len(content),
         blake3(content).hexdigest(),
         1,
-        parts={0: Part(10, len(content))},
+        parts={0: Part(10, 20)},
+        expired=("/scan",) if name.count(".") > 1 else (),
     )
 
 
-def recording(count: int = len(SIZES), status: str = "complete") -> Manifest:
-    """One with the first files."""
-    names = [*SIZES][:count]
-    channel = Channel("/scan", "ros1", "a/Scan", SCHEMA, messages=10 * count, bytes=100 * count)
+def fields(name: str) -> Fields:
+    content = bytes_of(name)
+    path, digest = name.removeprefix("payloads/"), blake3(content).hexdigest()
+    return Fields(path, len(content), digest, "/scan", 5)
+
+
+def recording(count: int = 5, status: str = "complete") -> Manifest:
+    """One with the first logs."""
+    channel = Channel("/scan", "ros1", "a/Scan", messages=10 * count, bytes=100 * count)
     return Manifest(
         RECORDING,
         "run",
@@ -72,10 +96,32 @@ def recording(count: int = len(SIZES), status: str = "complete") -> Manifest:
         tags={"a": "b"},
         pins=(Pin("0" * 16),),
         channels={0: channel},
-        files=tuple(map(listed, names)),
+        files=tuple(map(listed, NAMES[:5][:count])),
+        fields=(fields(FIELDS),) if count > 3 else (),
         losses=(Loss("transport", count=count),),
         status=status,  # type: ignore[arg-type]
     )
+
+
+@contextmanager
+def without_payloads(now: Manifest, logs: list[File]) -> Iterator[tuple[Manifest, Source]]:
+    """What is sent of a recording whose payloads are to come later."""
+    with tempfile.TemporaryDirectory() as place:
+        store = Store(Directory(Path(place)), Path(place), None)
+        small = {int(name[:6]): name for name in FIRST if name[7:8] == "x"}
+        made = []
+        for log in logs:
+            if log.number in small:
+                name = small[log.number]
+                store.write(f"recordings/{now.id}/{name}", bytes_of(name))
+                made.append(replace(listed(name), copy="s3://lab/store"))
+        store.write(f"recordings/{now.id}/{FIRST[-1]}", bytes_of(FIRST[-1]))
+        files = {**now.logs, **{log.number: log for log in made}}
+        new = (*now.fields, fields(FIRST[-1])) if made else now.fields
+        yield (
+            replace(now, files=tuple(files.values()), fields=new, lacks_payloads=bool(made)),
+            store.source,
+        )
 
 
 RECORDING = new_id("run")
@@ -96,9 +142,8 @@ class Store:
 
     def begin(self, manifest: Manifest) -> None:
         """Make a recording with all its files."""
-        self.write(f"schemas/{SCHEMA}", _DEFINITION)
-        for file in manifest.files:
-            self.write(f"recordings/{manifest.id}/{file.name}", bytes_of(file.name))
+        for file in files_of(manifest):
+            self.write(f"recordings/{manifest.id}/{file.path}", bytes_of(file.path))
         self.place.manifests.create(manifest)
 
     def write(self, name: str, content: bytes) -> None:
@@ -133,15 +178,15 @@ class Store:
     def check(self, wanted: Manifest | None = None) -> Manifest:
         """The recording, whose files are there whole, and nothing else if it is as wanted."""
         found = self.manifests().read(RECORDING)
-        for file in found.files:
-            if file.is_here:
-                content = self.read(f"recordings/{RECORDING}/{file.name}")
-                assert blake3(content).hexdigest() == file.digest, file.name
-        for channel in found.channels.values():
-            assert blake3(self.read(f"schemas/{channel.schema}")).hexdigest() == channel.schema
+        paths = set()
+        for file in files_of(found):
+            path = f"recordings/{RECORDING}/{file.path}"
+            assert blake3(self.read(path)).hexdigest() == file.digest, path
+            paths.add(path)
         if wanted is not None:
             assert replace(found, changes=0) == replace(wanted, changes=0)
-            assert [name for name in self.names() if name.endswith(".part")] == []
+            there = {name for name in self.names() if name.startswith("recordings")}
+            assert {name for name in there if not name.endswith((".lock", ".old"))} == paths
         return found
 
     def is_there(self) -> bool:
@@ -176,11 +221,13 @@ def make(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Makes]:
             folder = tmp_path / f'{kind} {len([*tmp_path.iterdir()])} it\'s "[*]"'
             if kind == "directory":
                 (folder / "manifests").mkdir(parents=True)
-                (folder / "hybridlog.toml").touch()
+                write_settings(folder, StoreSettings("0" * 32))
                 return Store(Directory(folder), folder, None)
             server: Sshd = request.getfixturevalue("sshd")[kind]
             server.reset()
-            return Store(held.enter_context(Server(server.url(folder), server.ssh)), folder, None)
+            place = held.enter_context(Server(server.url(folder), server.ssh))
+            place.begin()
+            return Store(place, folder, None)
 
         yield one
 

@@ -1,0 +1,334 @@
+"""Copies of stores with recordings in all states, to directories and to servers."""
+
+from __future__ import annotations
+
+import random
+import shutil
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import hybridlog as hl
+from hybridlog.maintenance.copying import CopyOptions, CopyReport
+from hybridlog_storage import copy
+from hybridlog_storage.errors import HeldError, StoreError, UsageError
+from tests import places
+from tests.copying.conftest import STATES, all_answers, answers, expire, files_in
+from tests.copying.server import Sshd
+from tests.limits import Limit
+
+ROUNDS = 6
+SEED = 20_261_128
+
+
+def _flip_a_bit(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[len(data) // 3] ^= 1
+    path.write_bytes(data)
+
+
+To = Callable[[Path], dict[str, Any]]
+"""Where a copy goes, and by what program, for the path of a store."""
+
+
+@pytest.fixture(params=["directory", "shell", "sftp"])
+def to(request: pytest.FixtureRequest) -> Iterator[To]:
+    if request.param == "directory":
+        yield lambda path: {"to": path}
+        return
+    server: Sshd = request.getfixturevalue("sshd")[request.param]
+    server.reset()
+    yield lambda path: {"to": server.url(path), "ssh": server.ssh}
+
+
+def copied(source: Path, to: dict[str, Any], *names: str, **options: Any) -> CopyReport:
+    """Copy recordings of a store; all without names."""
+    how = CopyOptions(ssh=to.get("ssh"), **options)
+    with hl.open(source, mongo="none") as store:
+        return store.copy(to["to"], [*names] or None, how)
+
+
+def names_in(path: Path) -> list[str]:
+    with hl.open(path, mongo="none") as store:
+        return sorted(one.name for one in store.summaries())
+
+
+def test_all_of_it_is_there(robots: Path, tmp_path: Path, to: To) -> None:
+    lab = tmp_path / "lab"
+    assert sorted(copied(robots, to(lab)).copied) == sorted(STATES)
+    for label in STATES:
+        there, here = places.folder(lab, label), places.folder(robots, label)
+        assert files_in(there) == files_in(here)
+    assert all_answers(lab) == all_answers(robots)
+    with hl.open(lab, mongo="none") as store:
+        assert not store.verify().findings
+    again = copied(robots, to(lab))
+    assert (again.copied, sorted(again.known), again.bytes_copied) == ([], sorted(STATES), 0)
+
+
+@pytest.mark.parametrize("kind", ["shell", "sftp"])
+def test_a_connection_is_cut_at_any_byte(
+    robots: Path, tmp_path: Path, sshd: dict[str, Sshd], kind: str
+) -> None:
+    """Nothing is seen before all of it is there."""
+    draw, server, lab = random.Random(SEED), sshd[kind], tmp_path / "lab"
+    server.reset()
+    copied(robots, {"to": server.url(lab), "ssh": server.ssh}, "calm")
+    seen = []
+    for _ in range(ROUNDS):
+        server.left = draw.randrange(20_000, 90_000)
+        with suppress(StoreError):
+            copied(robots, {"to": server.url(lab), "ssh": server.ssh}, "noted")
+        seen.append(names_in(lab))
+        with hl.open(lab, mongo="none") as store:
+            assert not store.verify().findings
+    server.reset()
+    copied(robots, {"to": server.url(lab), "ssh": server.ssh}, "noted")
+    assert all(names in (["calm"], ["calm", "noted"]) for names in seen)
+    assert answers(lab, "noted") == answers(robots, "noted")
+
+
+@pytest.mark.parametrize("expires", [False, True])
+def test_a_store_is_no_copy_of_itself(robots: Path, tmp_path: Path, to: To, expires: bool) -> None:
+    store = tmp_path / "store"
+    shutil.copytree(robots, store)
+    (tmp_path / "link").symlink_to(store)
+    before = {path: path.read_bytes() for path in places.root(store).rglob("*.mcap")}
+    for spelled in (store, tmp_path / "link", tmp_path / "link" / ".." / "store"):
+        with pytest.raises(UsageError, match="this very store"):
+            copied(store, to(spelled), then_expire=expires)
+    assert {path: path.read_bytes() for path in places.root(store).rglob("*.mcap")} == before
+    assert places.names(store) == sorted(STATES)
+    # A backup has the same id, and is another store.
+    shutil.copytree(robots, tmp_path / "backup")
+    found = copied(store, to(tmp_path / "backup"), then_expire=expires)
+    assert sorted(found.known) == sorted(STATES)
+
+
+def test_damaged_recordings_are_refused_and_others_are_copied(
+    robots: Path, tmp_path: Path, to: To
+) -> None:
+    source = tmp_path / "damaged"
+    shutil.copytree(robots, source)
+    _flip_a_bit(places.segment(source, "recorded", 1))
+    places.segment(source, "noted").unlink()
+    report = copied(source, to(tmp_path / "lab"))
+    assert sorted(report.copied) == ["calm", "damaged", "driven", "expired"]
+    assert "is damaged: its bytes do not have the digest" in report.refused["recorded"]
+    assert "cannot be copied: No such file" in report.refused["noted"]
+    assert names_in(tmp_path / "lab") == ["calm", "damaged", "driven", "expired"]
+
+
+def test_fields_come_first_and_payloads_later(robots: Path, tmp_path: Path, to: To) -> None:
+    lab = tmp_path / "lab"
+    before = sorted(path.name for path in robots.rglob("*"))
+    report = copied(robots, to(lab), "recorded", "driven", "noted", only_fields=True)
+    assert len(report.copied) == 3
+    rest = copied(robots, to(lab), only_fields=True)
+    assert (sorted(rest.copied), len(rest.known)) == (["calm", "damaged", "expired"], 3)
+    assert sorted(path.name for path in robots.rglob("*")) == before
+    right = answers(robots, "noted")
+    fields = answers(lab, "noted")
+    assert fields == {key: value for key, value in right.items() if key in fields}
+    assert len(fields) < len(right), "payloads are not there"
+    with hl.open(lab, mongo="none") as store:
+        assert not store.verify().findings
+        store.edit("noted", tag={"place": "lab"})
+        store.edit("noted", note="seen")
+        store.mark("noted", "end", "there")
+        store.edit("recorded", name="drive")
+    # What was added there stays, and the robot's own later tags do not come.
+    report = copied(robots, to(lab))
+    assert sorted(report.copied) == ["calm", "damaged", "drive", "driven", "noted"]
+    assert report.known == ["expired"]
+    for there, here in (("driven", "driven"), ("drive", "recorded"), ("noted", "noted")):
+        found, right = answers(lab, there), answers(robots, here)
+        own = {"entry", "notes", "marks"} if there == "noted" else set()
+        assert {k: v for k, v in found.items() if k not in own} == {
+            k: v for k, v in right.items() if k not in own
+        }
+    with hl.open(lab, mongo="none") as store:
+        entry = store.entry("noted")
+        assert entry.tags == {"place": "lab"}
+        assert [note["text"] for note in entry.notes] == ["it rained", "seen"]
+        assert [mark["text"] for mark in entry.marks] == ["here", "there"]
+        assert not store.verify().findings
+
+
+def test_payloads_expire_here_when_they_are_proved_there(robots: Path, tmp_path: Path) -> None:
+    """A damaged copy is mended first."""
+    robot, lab = tmp_path / "robot", tmp_path / "lab"
+    shutil.copytree(robots, robot)
+    right = {label: answers(robot, label) for label in STATES}
+    with hl.open(robot, mongo="none") as store:
+        store.copy(lab, ["calm"])
+        _flip_a_bit(places.segment(lab, "calm"))
+        report = store.copy(lab, None, CopyOptions(then_expire=True))
+        assert report.problems == []
+        assert report.freed_bytes > 0
+        with pytest.raises(UsageError, match="cannot expire"):
+            store.copy(lab, None, CopyOptions(then_expire=True, only_fields=True))
+    for label in STATES:
+        is_gone = label in {"recorded", "damaged", "driven", "calm"}  # a pin keeps the noted one
+        found = answers(robot, label)
+        assert (found != right[label]) == is_gone, label
+        assert found == {key: value for key, value in right[label].items() if key in found}
+        assert answers(lab, label) == right[label]
+
+
+def test_what_expired_before_keeps_no_other_payloads(robots: Path, tmp_path: Path) -> None:
+    robot, lab = tmp_path / "robot", tmp_path / "lab"
+    shutil.copytree(robots, robot)
+    with hl.open(robot, mongo="none") as store:
+        expire(store, "recorded", [1])
+        store.copy(lab, ["recorded"])
+        for frees in (True, False):
+            report = store.copy(lab, ["recorded"], CopyOptions(then_expire=True))
+            assert (report.known, report.problems) == (["recorded"], [])
+            assert bool(report.freed_bytes) == frees
+
+
+def test_what_the_copy_has_lost_stays(robots: Path, tmp_path: Path, to: To) -> None:
+    robot, lab = tmp_path / "robot", tmp_path / "lab"
+    shutil.copytree(robots, robot)
+    copied(robot, to(lab), "recorded")
+    with hl.open(lab, mongo="none") as store:
+        expire(store, "recorded", [0])
+    before = answers(robot, "recorded")
+    report = copied(robot, to(lab), "recorded", then_expire=True)
+    assert (report.known, report.lacking) == (["recorded"], ["recorded"])
+    assert "Payloads of 1 segment of recorded stay" in report.problems[0]
+    assert report.freed_bytes
+    with hl.open(robot, mongo="none") as store:
+        logs = places.manifest(robot, "recorded").logs
+        assert [number for number, log in logs.items() if not log.expired] == [0]
+        assert answers(robot, "recorded").items() <= before.items()
+
+
+def test_recordings_that_are_held_or_gone_keep_no_others_waiting(
+    robots: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot = tmp_path / "robot"
+    shutil.copytree(robots, robot)
+    with hl.open(robot, mongo="none") as store:
+        held, gone = store.entry("noted").id, store.entry("driven").id
+    real = copy.copy
+
+    def busy(source: Any, target: Any, recording: str, how: Any) -> Any:
+        if recording == held:
+            raise HeldError("another process copies it", is_recording=False)
+        if recording == gone:
+            source.manifests.remove(recording)
+        return real(source, target, recording, how)
+
+    monkeypatch.setattr(copy, "copy", busy)
+    report = copied(robot, {"to": tmp_path / "lab"}, "noted", "driven", "recorded")
+    assert report.copied == ["recorded"]
+    assert report.held == [held]
+    assert "is not copied: another process copies it" in report.refused["noted"]
+    assert "'driven' is no longer in the store" in report.refused["driven"]
+    assert places.names(tmp_path / "lab") == ["recorded"]
+
+
+def test_a_recording_that_is_held_there_is_left_for_later(
+    robots: Path, tmp_path: Path, limit: Limit
+) -> None:
+    limit(copy_wait_s=0.1)
+    lab = tmp_path / "lab"
+    copied(robots, {"to": lab}, "recorded", only_fields=True)
+    with hl.open(lab, mongo="none") as store:
+        recording = store.entry("recorded").id
+        with store.directory.writing(recording):
+            report = copied(robots, {"to": lab}, "recorded", "noted")
+    assert (report.copied, report.held) == (["noted"], [recording])
+    assert "is being changed by" in report.refused["recorded"]
+
+
+def test_two_copies_at_once_end_with_one(robots: Path, tmp_path: Path, to: To) -> None:
+    """And who reads there meanwhile sees it."""
+    lab = tmp_path / "lab"
+    with hl.open(lab, mongo="none", create=True) as reader:
+        barrier = threading.Barrier(2)
+
+        def one(_: int) -> CopyReport:
+            barrier.wait()
+            return copied(robots, to(lab), "driven")
+
+        with ThreadPoolExecutor(2) as pool:
+            try:
+                found = [*pool.map(one, range(2))]
+            except StoreError:  # without a shell, two that send one file are refused
+                found = [copied(robots, to(lab), "driven")] * 2
+        assert [len({*one.copied, *one.known}) for one in found] == [1, 1]
+        assert [one.name for one in reader.summaries()] == ["driven"]
+        assert reader.topic("/number").count() > 20
+    assert answers(lab, "driven") == answers(robots, "driven")
+
+
+def test_a_name_that_another_recording_has_there_gets_a_number(
+    robots: Path, tmp_path: Path, to: To
+) -> None:
+    robot, lab = tmp_path / "robot", tmp_path / "lab"
+    shutil.copytree(robots, robot)
+    assert copied(robot, to(lab), "calm", "noted").copied == ["calm", "noted"]
+    with hl.open(robot, mongo="none") as store:
+        store.edit("recorded", name="driven by hand")
+        store.edit("calm", name="hall")
+        store.edit("driven", name="calm")
+    report = copied(robot, to(lab), "driven by hand", "calm", "hall")
+    assert (sorted(report.copied), report.known) == (["calm-2", "driven by hand"], ["calm"])
+    assert names_in(lab) == ["calm", "calm-2", "driven by hand", "noted"]
+
+
+def test_damaged_copies_are_mended(robots: Path, tmp_path: Path, to: To) -> None:
+    """Unless what they have lost is not here."""
+    robot, lab = tmp_path / "robot", tmp_path / "lab"
+    shutil.copytree(robots, robot)
+    copied(robot, to(lab), "recorded")
+    _flip_a_bit(places.segment(lab, "recorded", 1))
+    assert copied(robot, to(lab), "recorded").known == ["recorded"]
+    assert copied(robot, to(lab), "recorded", check=True).copied == ["recorded"]
+    assert answers(lab, "recorded") == answers(robots, "recorded")
+    with hl.open(robot, mongo="none") as store:
+        expire(store, "recorded", [0])
+    _flip_a_bit(places.segment(lab, "recorded", 0))
+    before = files_in(places.folder(lab, "recorded"))
+    said = copied(robot, to(lab), "recorded", check=True).refused["recorded"]
+    assert "has lost 000000.mcap, which this store does not have either" in said
+    assert files_in(places.folder(lab, "recorded")) == before
+
+
+def test_what_a_stopped_copy_has_left_is_out_of_sight(robots: Path, tmp_path: Path, to: To) -> None:
+    """Also when it was whole but for its manifest; what lost its manifest is not."""
+    lab = tmp_path / "lab"
+
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(copy._Copy, "_publish", stop)
+        with pytest.raises(KeyboardInterrupt):
+            copied(robots, to(lab), "recorded")
+    with hl.open(lab, mongo="none") as store:
+        assert (store.summaries(), store.repairs.unreadable) == ([], {})
+        assert not store.verify(repair=True)
+    report = copied(robots, to(lab), "recorded")
+    assert (report.copied, report.bytes_copied) == (["recorded"], 0)
+    recording = places.id_of(lab, "recorded")
+    (lab / "manifests" / f"{recording}.json").unlink()
+    with hl.open(lab, mongo="none") as store:
+        assert [*store.repairs.unreadable] == [recording]
+
+
+def test_the_rate_is_limited(robots: Path, tmp_path: Path) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        pauses: list[float] = []
+        patch.setattr(copy, "pause", pauses.append)
+        copied(robots, {"to": tmp_path / "lab"}, "recorded", limit_rate=100_000)
+    assert sum(pauses) > 0.1
+    assert max(pauses) < 10
