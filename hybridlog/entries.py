@@ -13,7 +13,7 @@ import time
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Final, Literal, cast
 
 import numpy as np
@@ -397,6 +397,33 @@ def put_entry(
     return described.entry
 
 
+def put_said(
+    directory: StoreDirectory, catalog: Catalog, recording: str, *, is_open: bool = False
+) -> RecordingEntry:
+    """Update the catalog row of a recording of which people have said something else.
+
+    Raises:
+        SegmentError: The recording cannot be identified.
+    """
+    row, listing = catalog.recording(recording), directory.listing(recording)
+    if row is None or is_open or row[0] != listing.print:
+        return put_entry(directory, catalog, recording, is_open=is_open)
+    said = said_now(directory, row[1], listing)
+    catalog.put(said)
+    return said.entry
+
+
+def said_now(directory: StoreDirectory, entry: RecordingEntry, listing: Listing) -> Described:
+    """A recording whose files are those of its entry, with what people say of it by now.
+
+    Raises:
+        StoreError: Its manifest cannot be read.
+    """
+    manifest = directory.manifests.read(entry.id)
+    now = replace(entry, name=manifest.name, tags=dict(manifest.tags), **_said(manifest))
+    return Described(now, summary_of(now, listing.look), topic_types(now), listing.print, {})
+
+
 def read_again(directory: StoreDirectory, catalog: Catalog, entry: RecordingEntry) -> None:
     """Read the files of a recording again, after one of them was not what its entry says.
 
@@ -465,12 +492,18 @@ def _base(inventory: Inventory) -> RecordingEntry:
         source=_source_of(manifest.source),
         created=manifest.created,
         status="open",
-        notes=[{"at": note.at, "text": note.text} for note in manifest.notes],
-        marks=[mark_values(mark) for mark in manifest.marks],
-        pins=[pin_values(pin) for pin in manifest.pins],
         payloads=[to_builtins(file) for file in inventory.fields.values()],
         copies=sorted({file.copy for file in manifest.files if file.copy}),
+        **_said(manifest),
     )
+
+
+def _said(manifest: Manifest) -> dict[str, Any]:
+    return {
+        "notes": [{"at": note.at, "text": note.text} for note in manifest.notes],
+        "marks": [mark_values(mark) for mark in manifest.marks],
+        "pins": [pin_values(pin) for pin in manifest.pins],
+    }
 
 
 _SOURCE = {"path": "", "kind": "", "profile": "", "bytes": 0}

@@ -254,7 +254,7 @@ class Session:
             summary = summaries[place]
             entry = self._entries.get(summary.id) or self.shared.known_entry(summary.id)
             is_complete = not summary.has_losses and summary.status == "complete"
-            if entry is None and is_complete and not self.directory.lost_of(summary.id):
+            if entry is None and is_complete:
                 continue
             entry = entry or self.entry_of(summary)
             if entry.status != "complete" or entry.end.get("losses"):

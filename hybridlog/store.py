@@ -9,17 +9,15 @@ import time as clock
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from copy import copy
-from functools import partial, wraps
+from functools import partial
 from pathlib import Path
 from typing import (
     TYPE_CHECKING,
     Any,
     Final,
     Literal,
-    ParamSpec,
     Self,
     TypeAlias,
-    TypeVar,
     cast,
     overload,
 )
@@ -47,7 +45,6 @@ from hybridlog_storage.errors import (
     DatabaseError,
     HeldError,
     HybridlogError,
-    ObjectExistsError,
     ResourceError,
     StoreError,
     TimeError,
@@ -55,7 +52,7 @@ from hybridlog_storage.errors import (
     UsageError,
 )
 from hybridlog_storage.manifest import Manifest, Note, free_name, replace
-from hybridlog_storage.remote import TRIES, address_of, directory_of
+from hybridlog_storage.remote import address_of, directory_of
 from hybridlog_storage.settings import (
     EMBEDDED,
     NAME,
@@ -98,8 +95,6 @@ Names: TypeAlias = "Iterable[str | RecordingEntry]"
 """Recordings by name or id, or their entries."""
 _ELSEWHERE: Final = re.compile(r"(?P<host>[^/:]+):(?P<path>.*)")
 """A URL, or a place on a server as scp has it."""
-_P = ParamSpec("_P")
-_T = TypeVar("_T")
 
 
 def store_path(path: str | Path | None = None) -> Path:
@@ -190,7 +185,6 @@ def _target(to: str | Path, options: CopyOptions, store: Store) -> Iterator[Targ
     from hybridlog.maintenance import tables
     from hybridlog.maintenance.copying import Target
     from hybridlog_storage.copy_places import BucketStore, Directory
-    from hybridlog_storage.remote.bucket import Bucket
 
     source, address = store.directory, address_of(to)
     if str(to).startswith("ssh://"):
@@ -200,20 +194,28 @@ def _target(to: str | Path, options: CopyOptions, store: Store) -> Iterator[Targ
             server.begin()
             yield Target(server, lambda name: free_name(name, server.names()))
         return
-    if address is None:
-        path = _local(to)
-        if not source.is_remote and source.path.resolve() in path.resolve().parents:
-            raise UsageError(
-                f"{to} lies inside the store {source.path}: copy to another directory."
-            )
-    elif source.place == address:
-        raise UsageError(f"{address} is this very store: there is nothing to copy.")
-    with open_store(to if address is None else address, create=True) as other:
-        place = Directory(path) if address is None else BucketStore(Bucket(address))
+    if address is not None:
+        from hybridlog.maintenance.bucket_derived import bring_derived, free_name_there
+        from hybridlog_storage.remote.store import RemoteDirectory
+
+        if source.place == address:
+            raise UsageError(f"{address} is this very store: there is nothing to copy.")
+        target = RemoteDirectory.create_in(address)
+        place = BucketStore(target.bucket, target.manifests)
+        found = Target(place, partial(free_name_there, target))
+        try:
+            yield found
+        finally:
+            bring_derived(store.shared, target, found.arrived)
+        return
+    path = _local(to)
+    if not source.is_remote and source.path.resolve() in path.resolve().parents:
+        raise UsageError(f"{to} lies inside the store {source.path}: copy to another directory.")
+    with open_store(path, create=True) as other:
         _ = other.session  # the catalog then has all names
         directory, catalog = other.directory, other.catalog
         found = Target(
-            place, partial(free_name_in, catalog), partial(put_entry, directory, catalog)
+            Directory(path), partial(free_name_in, catalog), partial(put_entry, directory, catalog)
         )
         yield found
         other.shared.catch_up()
@@ -242,19 +244,6 @@ def _local(to: str | Path) -> Path:
         return Path(to).expanduser()
     except RuntimeError as error:
         raise UsageError(f"{to}: there is no such home directory.") from error
-
-
-def _again_if_overtaken(work: Callable[_P, _T]) -> Callable[_P, _T]:
-    """Do something again if another process changed the store in the bucket at the same time."""
-
-    @wraps(work)
-    def tried(*args: _P.args, **options: _P.kwargs) -> _T:
-        for _ in range(TRIES):
-            with suppress(ObjectExistsError):
-                return work(*args, **options)
-        return work(*args, **options)
-
-    return tried
 
 
 class Store:
@@ -1012,7 +1001,6 @@ class Store:
             self.refresh()
         return done
 
-    @_again_if_overtaken
     def keep(
         self,
         rules: Mapping[str, Any] | None = None,
@@ -1055,7 +1043,6 @@ class Store:
         finally:
             self.refresh()
 
-    @_again_if_overtaken
     def pin(
         self,
         recording: str | RecordingEntry,
@@ -1100,7 +1087,6 @@ class Store:
         shared.catch_up(entry.id)
         return name
 
-    @_again_if_overtaken
     def unpin(self, *names: str) -> None:
         """Remove pins.
 
@@ -1121,7 +1107,6 @@ class Store:
             change(self.directory, self.catalog, entry, how)
             shared.catch_up(entry.id)
 
-    @_again_if_overtaken
     def remove(self, recording: str) -> None:
         """Delete a recording.
 
@@ -1137,7 +1122,6 @@ class Store:
         (entry,) = self.select([recording])
         remove_if(shared, entry.id)
 
-    @_again_if_overtaken
     def edit(
         self,
         recording: str | RecordingEntry,
@@ -1195,7 +1179,6 @@ class Store:
         self._to_change().catch_up(entry.id)
         return self.entry(entry.id)
 
-    @_again_if_overtaken
     def mark(
         self,
         recording: str,
@@ -1242,7 +1225,6 @@ class Store:
         self._to_change().catch_up(entry.id)
         return self.entry(entry.id)
 
-    @_again_if_overtaken
     def unmark(self, recording: str, note: str, moment: TimeLike | None = None) -> RecordingEntry:
         """Remove marks of a recording that were set after its end.
 

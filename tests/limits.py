@@ -90,7 +90,6 @@ PLACES = {
     "foxglove_handshake_tick_s": "hybridlog.live.sources.foxglove.handshake.TICK_S",
     "foxglove_tick_s": "hybridlog.live.sources.foxglove.connection.TICK_S",
     "server_wait_s": "hybridlog_storage.sftp.WAIT_S",
-    "bucket_unlisted_days": "hybridlog_storage.remote.bucket.UNLISTED_DAYS",
     "bucket_whole_bytes": "hybridlog_storage.remote.bucket.PART_BYTES",
     "bucket_part_bytes": "hybridlog_storage.remote.bucket._PART",
     "bucket_retry_s": "hybridlog_storage.remote.bucket._RETRY_S",

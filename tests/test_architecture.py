@@ -108,7 +108,6 @@ ALLOWED = {
         "hybridlog.formats.rosbag2.sqlite",
         "hybridlog.formats.rosbag2.writer",
         "hybridlog_storage.cells",
-        "hybridlog_storage.remote.store",
     ),
     "mcp": ("hybridlog.view.tool_server",),
     "pydantic": ("hybridlog.view.tool_server",),

@@ -486,7 +486,7 @@ def show_segment(path: Path, *, as_json: bool) -> None:
     Raises:
         StoreError: It is being written, or is no segment of a store.
     """
-    from hybridlog_storage.manifests import manifests_at
+    from hybridlog_storage.manifests import DiskManifests
     from hybridlog_storage.segments.segment_reader import SegmentReader
 
     stem = path.name.split(".")[0]
@@ -501,7 +501,7 @@ def show_segment(path: Path, *, as_json: bool) -> None:
             summary = reader.summary()
             bytes_all = reader.size
     except SegmentError:
-        if not manifests_at(path.parent.absolute()).path(path.parent.name).exists():
+        if not DiskManifests(path.absolute().parents[2]).path(path.parent.name).exists():
             _refuse_log(path)
         raise
     chunks = summary.chunks

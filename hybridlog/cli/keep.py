@@ -58,7 +58,6 @@ class _Given(Choosing, InStore, AsJson, Quiet):
     reason: str = option("With --pin: why.", "TEXT", default="")
     unpin: tuple[str, ...] = option("Remove a pin.", "PIN")
     pins: bool = option("List the pins.")
-    tidy: bool = option("In a bucket: delete what no list of the last hour and no copy needs.")
 
 
 @command(_Given)
@@ -78,25 +77,12 @@ def keep_command(given: _Given) -> None:
                 output.print_json(found)
             elif not given.quiet:
                 output.say(f"{output.counted(len(found), 'pin')}: {listed(found)}")
-        elif given.tidy:
-            _tidy(store, given)
         elif given.unpin:
             store.unpin(*given.unpin)
         elif given.pins:
             _show_pins(store, given)
         else:
             _keep(store, rules, given)
-
-
-def _tidy(store: Store, given: _Given) -> None:
-    from hybridlog.maintenance.keep import tidy
-
-    count, size = tidy(store.directory, dry_run=given.dry_run)
-    if given.as_json:
-        output.print_json({"objects": count, "bytes": size, "dry_run": given.dry_run})
-    elif not given.quiet:
-        did = "would go" if given.dry_run else "deleted"
-        output.say(f"{output.counted(count, 'object')}, {output.size(size)}: {did}")
 
 
 def _rules(given: _Given) -> dict[str, Any]:
@@ -120,10 +106,10 @@ def _check(given: _Given, rules: dict[str, Any]) -> None:
     Raises:
         UsageError: They do not.
     """
-    plans, is_all = given.dry_run and not given.tidy, given.choice.is_everything
-    pinning = sum(map(bool, (given.pin, given.pins, given.unpin, given.tidy)))
-    if pinning > 1 or (pinning and (rules or given.save or plans)):
-        raise UsageError("Give --pin, --unpin, --pins, --tidy or rules, one of them at a time.")
+    is_all = given.choice.is_everything
+    pinning = sum(map(bool, (given.pin, given.pins, given.unpin)))
+    if pinning > 1 or (pinning and (rules or given.save or given.dry_run)):
+        raise UsageError("Give --pin, --unpin, --pins or rules, one of them at a time.")
     if not given.pin and (given.at or given.when or given.reason):
         raise UsageError("--at, --when and --reason are for --pin.")
     if given.pin and is_all:

@@ -12,6 +12,7 @@ from hybridlog.entries import (
     free_name_in,
     listed,
     put_entry,
+    put_said,
     recording_metadata,
     take_inventory,
 )
@@ -69,8 +70,8 @@ def change(
         StoreError: The manifest cannot be written.
         TopicError: The recording is gone.
     """
+    directory.check_changes()
     with ExitStack() as held:
-        held.enter_context(directory.changing())
         if name is not None:
             held.enter_context(directory.manifests.creating())
             free, others = free_name_in(catalog, name, entry.id), how
@@ -82,7 +83,7 @@ def change(
             directory.manifests.change(entry.id, how)
         except RecordingGoneError as error:
             raise gone(entry.name) from error
-        put_entry(directory, catalog, entry.id, is_open=directory.is_recorded(entry.id))
+        put_said(directory, catalog, entry.id, is_open=directory.is_recorded(entry.id))
 
 
 def time_of_mark(entry: RecordingEntry, moment: TimeLike) -> int:
@@ -319,8 +320,7 @@ def remove(
     """Delete a recording.
 
     Its manifest says so first, then its files go, then the manifest; who may write finishes what
-    was interrupted. In a bucket it is listed no more, and its objects stay for those who read
-    them.
+    was interrupted.
 
     Args:
         directory: The store.

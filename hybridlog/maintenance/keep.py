@@ -39,10 +39,8 @@ from hybridlog_storage.errors import (
     SegmentError,
     StoreError,
     TopicError,
-    UsageError,
 )
 from hybridlog_storage.manifest import Pin, with_file
-from hybridlog_storage.remote.store import RemoteDirectory
 from hybridlog_storage.settings import read_settings
 
 if TYPE_CHECKING:
@@ -119,9 +117,8 @@ class Keeper:
     def plan(self, rules: Rules) -> Plan:
         """The deletions that are due now."""
         path, now = self._directory.path, time.time_ns()
-        if isinstance(self._directory, RemoteDirectory):
-            used, free = self._directory.listed_bytes, None
-        else:
+        used, free = self._directory.listed_bytes(), None
+        if used is None:
             used, free = disk_bytes(path), shutil.disk_usage(path).free
         found = plan(self._held(now), rules, used=used, free=free, now=now)
         if self._unproven:
@@ -263,7 +260,7 @@ class Keeper:
 
     def _expire(self, step: Step, rules: Rules, progress: Progress | None) -> int:
         check, topics = partial(_check, step, rules), step.topics or None
-        with self._directory.at_hand(step.id, step.segments) as here:
+        with self._directory.at_hand(step.id, step.segments, check) as here:
             done = expire(
                 here,
                 step.id,
@@ -406,29 +403,3 @@ class RetentionThread:
         reasons = (f"making room: {step.reason}" for step in done.plan.steps)
         for text in (*reasons, *done.problems, *warnings):
             self._say(text)
-
-
-def tidy(directory: StoreDirectory, *, dry_run: bool = False) -> tuple[int, int]:
-    """Delete what a store in a bucket does not need any more.
-
-    That is what no list of the last hour names, such as files of removed recordings, if it
-    is a week old: what is younger may belong to a copy that is under way.
-
-    Args:
-        directory: The store.
-        dry_run: True to delete nothing.
-
-    Returns:
-        Number and bytes of the objects.
-
-    Raises:
-        UsageError: The store is a directory, which has nothing of the kind.
-    """
-    from hybridlog_storage.remote.store import RemoteDirectory
-
-    if not isinstance(directory, RemoteDirectory):
-        raise UsageError("A store on a disk is tidy: `tidy` is for stores in buckets.")
-    found = directory.unneeded()
-    if not dry_run:
-        directory.source.bucket.delete([one.name for one in found])
-    return len(found), sum(one.size for one in found)

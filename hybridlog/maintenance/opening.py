@@ -26,6 +26,7 @@ from hybridlog.entries import (
     inventory_of,
     listed,
     lost_in_crash,
+    said_now,
     take_inventory,
     unlisted,
 )
@@ -190,10 +191,14 @@ class StoreFiles:
             listing = self.directory.listing(recording)
             row = self.catalog.recording(recording)
             if row is not None and _is_current(self.directory, row[1], row[0], listing):
-                now = summary._replace(look=listing.look)
-                if now.look != summary.look:
-                    self.catalog.put_look(now)
-                return now
+                if listing.look != summary.look:
+                    said = said_now(self.directory, row[1], listing)
+                    if said.entry == row[1]:
+                        self.catalog.put_look(said.summary)
+                    else:
+                        self.catalog.put(said, waits=False)
+                    return said.summary
+                return summary
         mends = mends and self._may_mend(recording)
         described = (self._mended if mends else self._refresh)(recording)
         return described.summary if described is not None else None

@@ -14,9 +14,9 @@ from hybridlog.entries import describe, steady_inventory
 from hybridlog.index.indexing import ChunkIndexer, Documents
 from hybridlog.maintenance import tables
 from hybridlog.maintenance.index import documents_in
-from hybridlog_storage.disk import files
 from hybridlog_storage.disk.directory import LOCK, PAYLOADS
 from hybridlog_storage.errors import ManifestError, SegmentError, StoreError
+from hybridlog_storage.manifest import encode
 from hybridlog_storage.mongo.index_documents import recording_key, with_prefix
 from hybridlog_storage.mongo.index_state import IndexState
 from hybridlog_storage.mongo.topic_places import TopicPlaces
@@ -98,7 +98,6 @@ def verify(
     """
     result = Verification(index=database is not None)
     chosen = None if recordings is None else [*recordings]
-    directory.look_closely()
     index = None if database is None else _Index(database, count_all=chosen is None)
     checker = tables.TableChecker(directory)
     if chosen is None:
@@ -109,7 +108,8 @@ def verify(
             check = _Check(directory, catalog, index, recording, result, checker=checker)
             check.run(progress)
         except ManifestError as error:
-            result.findings.append(Finding(recording, "manifest", str(error), _REPAIR))
+            cure = _COPY_AGAIN if directory.is_remote else _REPAIR
+            result.findings.append(Finding(recording, "manifest", str(error), cure))
         except StoreError as error:
             cure = "restore its files"
             result.findings.append(Finding(recording, "recording", str(error), cure))
@@ -199,7 +199,6 @@ class _Check:
         self._contents = RecordingPayloads(self._path)
         self._expected: Counter[str] = Counter()  # documents by collection
         self._indexer = ChunkIndexer("")
-        self._lost: set[str] = set()  # files that were found to be lost
         self._is_damaged = False
         self._has_index = False
 
@@ -207,8 +206,7 @@ class _Check:
         """Add a problem."""
         if self._directory.is_remote:
             cure = _COPY_AGAIN
-        if place not in self._lost:
-            self._result.findings.append(Finding(self._name, place, problem, cure))
+        self._result.findings.append(Finding(self._name, place, problem, cure))
 
     def run(self, progress: Progress | None) -> None:
         """Check the whole recording.
@@ -219,13 +217,9 @@ class _Check:
         holder = self._directory.holder(self._recording)
         is_held = holder is not None
         self._has_index = not is_held
+        self._directory.look_closely(self._recording)
         inventory = steady_inventory(self._directory, self._recording)
         self._name = inventory.name
-        found = self._directory.lost_of(self._recording)
-        lost = {"manifest" if path == "manifest.json" else path for path in found}
-        for place in sorted(lost):
-            self.found(place, "its object is missing or was changed", _COPY_AGAIN)
-        self._lost = lost
         self._indexer = ChunkIndexer(inventory.id)
         self._manifest(inventory.manifest)
         self._files(inventory, is_held=is_held)
@@ -260,7 +254,7 @@ class _Check:
         if manifest is None:
             self.found("manifest", "it is missing, so other losses are unknown", _REPAIR)
             return
-        self._result.bytes_read += files.status(self._directory.manifests.path(manifest.id)).st_size
+        self._result.bytes_read += len(encode(manifest))
         if manifest.status == "unproven":
             self.found(
                 "manifest",
@@ -271,11 +265,6 @@ class _Check:
     def _files(self, inventory: Inventory, *, is_held: bool) -> None:
         for misfit in inventory.misfits:
             place = misfit.file or f"segment {misfit.segment}"
-            if (
-                misfit.segment in inventory.logs
-                and inventory.logs[misfit.segment].name in self._lost
-            ):
-                continue
             can_mend = misfit.is_unlisted or misfit.belongs is not None
             self.found(place, misfit.reason, _REPAIR if can_mend or misfit.file else _RESTORE_LOST)
         for name in inventory.listing.open.values():

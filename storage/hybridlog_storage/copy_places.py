@@ -365,11 +365,12 @@ class BucketStore(Source):
 
     Args:
         bucket: The objects below its address.
+        manifests: Its manifests; None to ask for each of them.
     """
 
-    def __init__(self, bucket: Bucket) -> None:
+    def __init__(self, bucket: Bucket, manifests: Manifests | None = None) -> None:
         self.address = bucket.address
-        self.manifests = BucketManifests(bucket)
+        self.manifests = manifests or BucketManifests(bucket)
         self._bucket = bucket
         self._found: dict[str, Object] = {}
 

@@ -25,7 +25,7 @@ import stat
 import time
 from abc import ABC, abstractmethod
 from contextlib import ExitStack, contextmanager, suppress
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, ClassVar, Final
 
 from hybridlog_storage.disk import durability, files
 from hybridlog_storage.errors import (
@@ -69,6 +69,8 @@ MANIFEST_OLD: Final = "manifest.old"
 class Manifests(ABC):
     """The manifests of a store, in a directory or in a bucket."""
 
+    cure: ClassVar[str] = "`hybridlog verify --repair` makes it again."
+
     @abstractmethod
     def ids(self) -> list[str]:
         """Ids of all recordings that have a manifest, sorted; also of those being removed.
@@ -76,6 +78,28 @@ class Manifests(ABC):
         Raises:
             HybridlogError: The store does not answer.
         """
+
+    def without(self) -> list[str]:
+        """Ids of recordings that have lost their manifest, sorted; of none by default.
+
+        Raises:
+            HybridlogError: The store does not answer.
+        """
+        return []
+
+    def clear(self) -> None:
+        """Remove what is left of beginnings and removals of processes that were killed.
+
+        Raises:
+            HybridlogError: Something cannot be removed.
+        """
+        for one in self.ids():
+            try:
+                self.find(one)
+            except RecordingGoneError:
+                self.remove(one)
+            except ManifestError:
+                continue  # it is told where it is asked about
 
     def read(self, recording: str) -> Manifest:
         """The newest manifest of a recording.
@@ -218,8 +242,7 @@ class Manifests(ABC):
                 raise ValueError(f"it is the one of {found.id}")
         except ValueError as error:
             raise ManifestError(
-                f"The manifest of {recording} is damaged: {error}. `hybridlog verify --repair` "
-                "makes it again."
+                f"The manifest of {recording} is damaged: {error}. {self.cure}"
             ) from error
         return found, version
 
@@ -495,13 +518,27 @@ class BucketManifests(Manifests):
         bucket: The objects below the address of the store.
     """
 
+    cure = "`hybridlog copy` from a store that has it brings it back."
+
     def __init__(self, bucket: Bucket) -> None:
         self._bucket = bucket
 
     def ids(self) -> list[str]:
         """Ids of all recordings that have a manifest, sorted; 1,000 a request."""
-        about = self._bucket.objects(f"{MANIFESTS}/")
-        return _ids(one.name.removeprefix(f"{MANIFESTS}/") for one in about)
+        return self.ids_of(one.name for one in self._bucket.objects(f"{MANIFESTS}/"))
+
+    @staticmethod
+    def ids_of(names: Iterable[str]) -> list[str]:
+        """Ids of the recordings whose manifests are among objects, by their names."""
+        return _ids(one.removeprefix(f"{MANIFESTS}/") for one in names)
+
+    @staticmethod
+    def name_of(recording: str) -> str:
+        """Name of the object of a manifest."""
+        return f"{MANIFESTS}/{recording}{_SUFFIX}"
+
+    def _noted(self, recording: str, data: bytes, version: str) -> None:
+        """Called with each manifest that was read or written, and its version."""
 
     @contextmanager
     def creating(self) -> Iterator[Callable[[Manifest], None]]:
@@ -509,13 +546,16 @@ class BucketManifests(Manifests):
         yield self._create
 
     def _create(self, manifest: Manifest) -> None:
+        data = encode(manifest)
         try:
-            self._bucket.create(_object(manifest.id), encode(manifest))
+            version = self._bucket.create(self.name_of(manifest.id), data)
         except ObjectExistsError:
             raise RecordingExistsError(f"There is a recording {manifest.id} already.") from None
+        self._noted(manifest.id, data, version)
 
     def _get(self, recording: str) -> tuple[bytes, str]:
-        about, data = self._bucket.read_whole(_object(recording), MAX_BYTES)
+        about, data = self._bucket.read_whole(self.name_of(recording), MAX_BYTES)
+        self._noted(recording, data, about.version)
         return data, about.version
 
     @contextmanager
@@ -523,14 +563,14 @@ class BucketManifests(Manifests):
         yield
 
     def _replace(self, recording: str, data: bytes, version: str) -> None:
-        self._bucket.replace(_object(recording), data, version)
+        self._noted(recording, data, self._bucket.replace(self.name_of(recording), data, version))
 
     def old(self, recording: str) -> Manifest | None:
         """As of `Manifests`."""
         return None
 
     def _drop(self, recording: str) -> None:
-        self._bucket.delete([_object(recording)])
+        self._bucket.delete([self.name_of(recording)])
 
     def _delete_files(self, recording: str) -> None:
         names = [one.name for one in self._bucket.objects(f"{_RECORDINGS}/{recording}/")]
@@ -543,9 +583,10 @@ class BucketManifests(Manifests):
                 self._drop(recording)
 
 
-def manifests_at(folder: Path) -> DiskManifests:
+def manifests_at(folder: Path) -> Manifests:
     """The manifests of the store in which the folder of a recording lies."""
-    return DiskManifests(folder.parent.parent)
+    store = folder.parent.parent
+    return files.mounted[store].manifests if store in files.mounted else DiskManifests(store)
 
 
 def _keep_old(path: Path, folder: Path) -> None:
@@ -557,10 +598,6 @@ def _keep_old(path: Path, folder: Path) -> None:
         files.link(path, new)
         files.rename(new, folder / MANIFEST_OLD)
         files.unlink(new)  # a change that was killed has kept this one already
-
-
-def _object(recording: str) -> str:
-    return f"{MANIFESTS}/{recording}{_SUFFIX}"
 
 
 def _ids(names: Iterable[str]) -> list[str]:

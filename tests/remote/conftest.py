@@ -90,6 +90,7 @@ def here(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def publish_all(here: Path, address: str, names: tuple[str, ...] = RECORDINGS) -> None:
     with hl.open(here, mongo="none") as store:
         assert sorted(store.copy(address, [*names]).copied) == sorted(names)
+    files.mounted.clear()
 
 
 @pytest.fixture(scope="session")

@@ -22,7 +22,7 @@ import secrets
 import stat
 import sys
 import time
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from itertools import takewhile
@@ -32,12 +32,14 @@ from typing import Any, ClassVar, Final
 from hybridlog_storage.cells import Cells
 from hybridlog_storage.disk import durability, files
 from hybridlog_storage.errors import HeldError, StoreError, TopicError, unreadable
+from hybridlog_storage.manifest import Manifest
 from hybridlog_storage.manifests import (
     MANIFEST_LOCK,
     MANIFEST_OLD,
     MANIFESTS,
     WRITER_LOCK,
     DiskManifests,
+    Manifests,
 )
 from hybridlog_storage.segments.segment_file import OPEN_SUFFIX, SEALED_SUFFIX, number_of
 from hybridlog_storage.settings import NAME as SETTINGS
@@ -121,7 +123,7 @@ class StoreDirectory:
 
     def __init__(self, path: Path, *, read_only: bool = False) -> None:
         self.path = path
-        self.manifests = DiskManifests(path)
+        self.manifests: Manifests = DiskManifests(path)
         self.read_only = read_only
         self.settings = read_settings(path)
 
@@ -291,18 +293,28 @@ class StoreDirectory:
         return None
 
     @contextmanager
-    def changing(self) -> Iterator[None]:
-        """Change a manifest and its row of the catalog at once; here nobody needs that."""
-        yield
+    def at_hand(
+        self,
+        recording: str,
+        segments: Collection[int] = (),
+        check: Callable[[Manifest], object] = lambda _: None,
+    ) -> Iterator[StoreDirectory]:
+        """A directory where files of a recording can be changed, within `writing`: this one.
 
-    @contextmanager
-    def at_hand(self, recording: str, segments: Collection[int] = ()) -> Iterator[StoreDirectory]:
-        """A directory where files of a recording can be changed, within `writing`: this one."""
+        Args:
+            recording: Its id.
+            segments: Numbers of the segments that are changed.
+            check: Called with the newest manifest before it is changed; raises to leave it.
+        """
         yield self
+
+    def listed_bytes(self) -> int | None:
+        """Bytes of all files, by manifests alone; None where the disk says it."""
+        return None
 
     def has(self, recording: str) -> bool:
         """True if there is a manifest or a folder of a recording."""
-        for path in (self.manifests.path(recording), self.recording(recording)):
+        for path in (self.path / MANIFESTS / f"{recording}.json", self.recording(recording)):
             try:
                 files.status(path)
             except FileNotFoundError:
@@ -312,13 +324,13 @@ class StoreDirectory:
             return True
         return False
 
-    def look_closely(self) -> bool:
-        """Compare a list of files with the files; True if some are missing. Here is no list."""
-        return False
+    def look_closely(self, recording: str | None = None) -> bool:
+        """Look whether files are there; True if some are not. Here each question does.
 
-    def lost_of(self, recording: str) -> Collection[str]:
-        """Files that a list says to be there, and are not; here nothing says so."""
-        return ()
+        Args:
+            recording: Id of one recording, all of which is read anew from then on; None for all.
+        """
+        return False
 
     def listing(self, recording: str) -> Listing:
         """Read the content of a recording's directory.

@@ -24,7 +24,7 @@ import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Final, Protocol, cast
+from typing import Any, Final, Protocol, cast
 
 from hybridlog_storage.errors import StoreError
 from hybridlog_storage.stopping import pause
@@ -41,11 +41,10 @@ Identity = tuple[int, int]
 class Mounted(Protocol):
     """A store that is no directory, to which the functions here lead."""
 
-    def status(self, inner: tuple[str, ...]) -> os.stat_result:
-        """The status of a file or folder, by the names on the way to it."""
+    manifests: Any
 
-    def names(self, inner: tuple[str, ...]) -> dict[str, os.stat_result]:
-        """The status of each entry of a folder, by name."""
+    def names(self, inner: tuple[str, ...]) -> tuple[int, dict[str, os.stat_result]]:
+        """The status of each entry of a folder, and a number that changes with them."""
 
     def open(self, inner: tuple[str, ...]) -> int:
         """A handle for reading a file."""
@@ -256,8 +255,6 @@ def status(path: Path) -> os.stat_result:
     Raises:
         OSError: It does not exist.
     """
-    if (found := _mounted(path)) is not None:
-        return found[0].status(found[1])
     with folder(path.parent) as fd:
         return os.stat(path.name, dir_fd=fd, follow_symlinks=False)
 
@@ -269,7 +266,7 @@ def names(path: Path) -> dict[str, os.stat_result]:
         OSError: It cannot be read.
     """
     if (found := _mounted(path)) is not None:
-        return found[0].names(found[1])
+        return found[0].names(found[1])[1]
     with folder(path) as fd:
         return names_in(fd)
 
@@ -290,9 +287,8 @@ def changed_names(
         OSError: It cannot be read.
     """
     if (found := _mounted(path)) is not None:
-        about = found[0].status(found[1])
-        now = about.st_ino, about.st_mtime_ns
-        return now, None if now == before else found[0].names(found[1])
+        number, entries = found[0].names(found[1])
+        return (number, 0), None if (number, 0) == before else entries
     with folder(path) as fd:
         about = os.fstat(fd)
         now = about.st_ino, about.st_mtime_ns

@@ -8,8 +8,6 @@ from typing import Final
 
 from hybridlog_storage.disk.directory import StoreDirectory
 
-TRIES: Final = 10
-"""How often a change begins again if another process was faster."""
 _ADDRESS: Final = re.compile(r"(s3|gs|az):/{1,2}([^/].*)")
 
 

@@ -4,7 +4,7 @@ Each object has a sparse file of its full size, and beside it a file with the ch
 block that is there. So a file is opened, measured and read like any other; blocks that are
 missing are fetched before. Blocks are believed only with their checksum, so it does not matter
 who removes a file meanwhile, or what a crash leaves. Objects never change: a file is named by
-the address, the name and the version of its object.
+the address, the name, the size and the digest or version of its object.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from hybridlog_storage.disk.files import user_directory
 from hybridlog_storage.errors import ObjectChangedError, ResourceError
 from hybridlog_storage.remote.bucket import Bucket, Object, joined_ranges
 
+LOST: Final = "its object in the bucket is missing or was changed"
 MAX_CACHED: Final = 16 << 30
 """Bytes that the cached blocks of a user may take."""
 BLOCK: Final = 64 << 10
@@ -88,11 +89,17 @@ class Blocks:
             os.close(fd)
             raise
 
+    def forget(self) -> None:
+        """Remove what was kept of it, but for those who have opened it."""
+        for suffix in (_DATA, _SUMS):
+            with suppress(OSError):
+                self._path.with_suffix(suffix).unlink()
+
     def fetch(self, fd: int, ranges: Iterable[tuple[int, int]]) -> None:
         """Fetch the missing blocks of some ranges of bytes.
 
         Raises:
-            OSError: The object is missing, or has another version, as a disk says of a bad sector.
+            OSError: The object is missing, or has another size, as a disk says of a bad sector.
             BucketError: The server does not answer.
             ResourceError: The cache cannot be written.
         """
@@ -122,13 +129,12 @@ class Blocks:
             missing += self._ahead_of(missing)
             for piece in _pieces(joined_ranges([self._range(number) for number in missing])):
                 try:
-                    found = self._bucket.read(self.about.name, piece, self.about.version)
+                    found = self._bucket.read(self.about.name, piece, size=self.about.size)
                 except (FileNotFoundError, ObjectChangedError) as error:
-                    self._bucket.lost.add(self.about)
+                    self._bucket.lost.add(self.about.name)
+                    self.forget()  # so that others notice it when they begin to read
                     place = f"{self._bucket.address}/{self.about.name}"
-                    raise OSError(
-                        errno.EIO, "its object in the bucket is missing or was changed", place
-                    ) from error
+                    raise OSError(errno.EIO, LOST, place) from error
                 with self._cache.writing():
                     for (begin, _), data in zip(piece, found, strict=True):
                         self._keep(fd, sums, begin, data)
@@ -191,14 +197,22 @@ class BlockCache:
         Raises:
             ResourceError: The file cannot be made.
         """
+        blocks = self._blocks(bucket, about)
+        with self.writing():
+            self.path.mkdir(mode=0o700, parents=True, exist_ok=True)
+            return blocks.open()
+
+    def forget(self, bucket: Bucket, about: Object) -> None:
+        """Remove what was kept of an object, so that it is read from the server again."""
+        self._blocks(bucket, about).forget()
+
+    def _blocks(self, bucket: Bucket, about: Object) -> Blocks:
         with self._lock:
             key = bucket.address, about
             blocks = self._known.get(key)
             if blocks is None:
                 blocks = self._known[key] = Blocks(self, bucket, about)
-        with self.writing():
-            self.path.mkdir(mode=0o700, parents=True, exist_ok=True)
-            return blocks.open()
+            return blocks
 
     @contextmanager
     def writing(self) -> Iterator[None]:

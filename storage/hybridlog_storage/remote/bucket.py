@@ -15,11 +15,10 @@ import hashlib
 import os
 import re
 import secrets
-import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import timedelta
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, TypeVar, cast
@@ -46,10 +45,6 @@ JOINED_GAP: Final = 1 << 20
 PART_BYTES: Final = 64 << 20
 """Size from which an object is uploaded in parts."""
 _PART: Final = 16 << 20
-UNLISTED_DAYS: Final = 7
-"""Age in days from which an object that no list names may be deleted. `create` takes one that is
-there for its own only if it is a day younger: a copy that is under way needs it for a while."""
-_DAY_NS: Final = 86_400 * 10**9
 _PAGE: Final = 1000  # names that servers list at once
 _PARALLEL: Final = 8
 _TRIES: Final = 4
@@ -61,7 +56,6 @@ _NO_BUCKET = re.compile(r"NoSuchBucket|ContainerNotFound|bucket does not exist")
 _ROLES = re.compile(r"169\.254\.|metadata\.google")  # asked if the environment has no key
 _MD5: Final = re.compile(r"[0-9a-f]{32}(-[0-9]{1,5})?")  # of the whole, or of parts
 _ANY_MD5: Final = "0" * 32
-_SUFFIX: Final = re.compile(r"~[0-9a-f]{8}$")
 _HOST = re.compile(r"https?://[^/\s]+")
 _SECRETS = re.compile(r"(?i)(signature|credential|token|sig|key)=[^&\s\"]+")
 
@@ -79,13 +73,11 @@ class Object:
         name: Its name below the address of the bucket.
         size: Its bytes.
         version: The entity tag; another one after every change.
-        modified: When it was written, by the server's clock, ns.
     """
 
     name: str
     size: int
     version: str
-    modified: int
 
 
 def is_bucket(address: object) -> bool:
@@ -100,7 +92,7 @@ class Bucket:
         address: Such as `s3://lab/store`.
 
     Attributes:
-        lost: Objects that are missing here, or have another version by now.
+        lost: Names of objects that were looked for, and are missing or have another size.
 
     Raises:
         UsageError: It is not the address of a bucket.
@@ -111,7 +103,7 @@ class Bucket:
         if not is_bucket(address) or not address.partition("://")[2].strip("/"):
             raise UsageError(f"{address!r} is not the address of a bucket, as s3://lab/store is.")
         self.address = address.rstrip("/")
-        self.lost: set[Object] = set()
+        self.lost: set[str] = set()
         self._has_conditions = self._replaces = False
         self._has_digests = True
         self._reading = _opened(self.address, _READ_S)
@@ -144,12 +136,12 @@ class Bucket:
         found = [_object(about, str(about["path"])) for about in next(pages, ())]
         return found, len(found) < _PAGE
 
-    def first(self, prefix: str) -> Object | None:
-        """The first object of a folder, in one request; None if there is none."""
-        return next(self.objects(prefix), None)
-
     def read(
-        self, name: str, ranges: Sequence[tuple[int, int]], version: str | None = None
+        self,
+        name: str,
+        ranges: Sequence[tuple[int, int]],
+        version: str | None = None,
+        size: int | None = None,
     ) -> list[bytes]:
         """Parts of an object; ranges are joined where the gap costs less than a request.
 
@@ -157,18 +149,19 @@ class Bucket:
             name: The object.
             ranges: Begin and end of each part, in any order.
             version: The version it must have, if one is known.
+            size: The bytes it must have in all, if they are known.
 
         Raises:
             FileNotFoundError: It does not exist.
-            ObjectChangedError: It has another version, or is too short.
+            ObjectChangedError: It has another version or size.
             BucketError: The server does not answer, or refuses.
         """
         joined = joined_ranges(ranges)
         if len(joined) > 1:
             with ThreadPoolExecutor(min(len(joined), _PARALLEL)) as pool:
-                found = list(pool.map(lambda r: self._range(name, r, version), joined))
+                found = list(pool.map(lambda r: self._range(name, r, version, size), joined))
         else:
-            found = [self._range(name, one, version) for one in joined]
+            found = [self._range(name, one, version, size) for one in joined]
         parts = []
         for begin, end in ranges:
             place = next(n for n, (low, high) in enumerate(joined) if low <= begin and end <= high)
@@ -176,13 +169,15 @@ class Bucket:
             parts.append(bytes(memoryview(found[place])[begin - low : end - low]))
         return parts
 
-    def _range(self, name: str, wanted: tuple[int, int], version: str | None) -> bytes:
+    def _range(
+        self, name: str, wanted: tuple[int, int], version: str | None, size: int | None
+    ) -> bytes:
         begin, end = wanted
         if begin == end:
             return b""
-        _, data = self._get(name, {"range": (begin, end)}, version, end - begin)
-        if len(data) != end - begin:
-            raise ObjectChangedError(f"{self._place(name)} is shorter than it was.")
+        about, data = self._get(name, {"range": (begin, end)}, version, end - begin)
+        if len(data) != end - begin or size not in {None, about.size}:
+            raise ObjectChangedError(f"{self._place(name)} has another size than it had.")
         return data
 
     def read_whole(self, name: str, most: int) -> tuple[Object, bytes]:
@@ -225,7 +220,7 @@ class Bucket:
             return None
 
     def create(self, name: str, content: bytes) -> str:
-        """Create an object of a free name. A young one of this very content counts as created.
+        """Create an object of a free name. One that has this very content counts as created.
 
         Returns:
             Its version.
@@ -239,31 +234,30 @@ class Bucket:
         self.check_conditions()
         with suppress(AlreadyExistsError):  # by another writer, or by this one whose answer is lost
             return self._put(name, content, "create")
-        about = self.head(name)
-        if about is None or not self.is_young(about) or not self._holds(about, content):
-            raise ObjectExistsError(f"{self._place(name)} exists, with other content.")
-        return about.version
-
-    def _holds(self, about: Object, content: bytes) -> bool:
-        tag = _tag(about)  # some servers have others that look like an MD5
-        if about.size != len(content) or digest_like(tag, [content]) == tag:
-            return about.size == len(content)
-        return b"".join(self.pieces(about)) == content
+        with suppress(FileNotFoundError):
+            about, found = self.read_whole(name, len(content))
+            if found == content:
+                return about.version
+        raise ObjectExistsError(f"{self._place(name)} exists, with other content.")
 
     def pieces(self, about: Object) -> Iterator[bytes]:
         """The content of an object, some megabytes at a time; errors as of `read`."""
         for at in range(0, about.size, _PART):
-            yield self._range(about.name, (at, min(at + _PART, about.size)), about.version)
+            end = min(at + _PART, about.size)
+            yield self._range(about.name, (at, end), about.version, about.size)
 
-    def replace(self, name: str, content: bytes, version: str) -> None:
+    def replace(self, name: str, content: bytes, version: str) -> str:
         """Replace an object that has still a version.
+
+        Returns:
+            Its new version.
 
         Raises:
             ObjectChangedError: It has another one.
             BucketError: The server does not answer, refuses, or ignores conditions.
         """
         self._check_replaces()
-        self._put(name, content, {"e_tag": version})
+        return self._put(name, content, {"e_tag": version})
 
     def _check_replaces(self) -> None:
         """Try once, in one request, whether the server honours the condition of `replace`."""
@@ -282,22 +276,6 @@ class Bucket:
             pass
         self.check_conditions()
 
-    def create_beside(self, name: str, content: bytes) -> Object:
-        """Create an object, under another name if this one is taken by other content.
-
-        Raises:
-            BucketError: The server does not answer, refuses, or ignores conditions.
-        """
-        try:
-            return Object(name, len(content), self.create(name, content), 0)
-        except ObjectExistsError:
-            other = other_name(name)
-            return Object(other, len(content), self.create(other, content), 0)
-
-    def is_young(self, about: Object) -> bool:
-        """True if an object that no list names is safe from being tidied away for a day."""
-        return time.time_ns() - about.modified <= (UNLISTED_DAYS - 1) * _DAY_NS
-
     def digest(self, about: Object) -> str:
         """A digest of the content of an object: the server's, or it is read; see `digest_like`.
 
@@ -308,17 +286,6 @@ class Bucket:
         """
         tag = _tag(about) if self._has_digests else ""
         return tag or digest_like("", self.pieces(about))
-
-    def send(self, name: str, size: int, pieces: Iterable[Buffer]) -> Object:
-        """Create an object from pieces of its content; see `Upload`.
-
-        Raises:
-            BucketError: The server does not answer, refuses, or ignores conditions.
-        """
-        upload = Upload(self, name, size)
-        for piece in pieces:
-            upload.write(piece)
-        return upload.close()
 
     def put(self, name: str, size: int, pieces: Iterable[Buffer]) -> Object:
         """Write an object, which takes the place of one of its name; not if `pieces` raises.
@@ -334,8 +301,10 @@ class Bucket:
         self.check_conditions()
         if size <= PART_BYTES:
             content = b"".join(pieces)
-            return Object(name, size, self._put(name, content, "overwrite"), 0)
-        writer = self.in_parts(name)
+            return Object(name, size, self._put(name, content, "overwrite"))
+        import obstore
+
+        writer = obstore.open_writer(self._writing, name, buffer_size=_PART, max_concurrency=4)
         try:
             with self.explained(name):
                 for piece in pieces:
@@ -351,13 +320,6 @@ class Bucket:
         if about is None or about.size != size:
             raise BucketError(f"{self._place(name)} did not arrive.")
         return about
-
-    def in_parts(self, name: str) -> Any:
-        """A writer of an object, which takes the place of one of its name."""
-        import obstore
-
-        self.check_conditions()
-        return obstore.open_writer(self._writing, name, buffer_size=_PART, max_concurrency=4)
 
     def delete(self, names: Sequence[str]) -> None:
         """Delete objects; those that do not exist are left out.
@@ -411,16 +373,6 @@ class Bucket:
                 "them, or copy to a directory."
             )
         self._has_conditions = True
-
-    def now(self) -> int:
-        """The time by the server's clock, ns."""
-        name = f"probe-{secrets.token_hex(8)}"
-        try:
-            self._put(name, b"hybridlog", "overwrite")
-            about = self.head(name)
-        finally:
-            self.delete([name])
-        return time.time_ns() if about is None else about.modified
 
     def _put(self, name: str, content: bytes, mode: PutMode) -> str:
         import obstore
@@ -496,67 +448,6 @@ class Bucket:
                 "AWS_ENDPOINT_URL its address?"
             )
         return f"{self._place(name)}: {reason}"
-
-
-class Upload:
-    """An object whose content arrives in pieces. It exists when all of it has arrived.
-
-    One of more than `PART_BYTES` goes in parts, where servers know no conditions: only a look
-    before keeps another writer of the same name away.
-
-    Args:
-        bucket: Where it is to be.
-        name: Its name. It gets a suffix if the name is taken, by other content.
-        size: Its bytes.
-    """
-
-    def __init__(self, bucket: Bucket, name: str, size: int) -> None:
-        self._bucket = bucket
-        self._name = name
-        self._size = size
-        self._held = bytearray()
-        self._parts: Any = None
-
-    def write(self, data: Buffer) -> None:
-        """Take the next piece.
-
-        Raises:
-            BucketError: The server does not answer, refuses, or ignores conditions.
-        """
-        if self._size <= PART_BYTES:
-            self._held += data
-            return
-        if self._parts is None:
-            if self._bucket.head(self._name) is not None:
-                self._name = other_name(self._name)
-            self._parts = self._bucket.in_parts(self._name)
-        with self._bucket.explained(self._name):
-            self._parts.write(bytes(data))
-
-    def close(self) -> Object:
-        """End it, after its last byte.
-
-        Raises:
-            BucketError: The server does not answer, or refuses.
-        """
-        if self._parts is None:
-            return self._bucket.create_beside(self._name, bytes(self._held))
-        with self._bucket.explained(self._name):
-            self._parts.close()
-        about = self._bucket.head(self._name)
-        if about is None or about.size != self._size:
-            raise BucketError(f"{self._bucket.address}/{self._name} did not arrive.")
-        return replace(about, modified=0)
-
-
-def other_name(name: str) -> str:
-    """A name for an object whose name is taken; see `path_of`."""
-    return f"{name}~{secrets.token_hex(4)}"
-
-
-def path_of(name: str) -> str:
-    """The name of an object without the suffix of `other_name`."""
-    return _SUFFIX.sub("", name)
 
 
 def digest_like(found: str, pieces: Iterable[Buffer]) -> str:
@@ -643,8 +534,7 @@ def _content(answer: GetResult, most: int) -> bytes:
 
 
 def _object(about: Any, name: str) -> Object:
-    modified = int(about["last_modified"].timestamp() * 1e9)
-    return Object(name, int(about["size"]), _version(about), modified)
+    return Object(name, int(about["size"]), _version(about))
 
 
 def _version(about: Any) -> str:

@@ -1,21 +1,26 @@
 """A store in a bucket, as a directory that others read.
 
-Nothing above this knows where files lie: `StoreDirectory` answers from the newest list, and
-`files` opens what the list names. Changes create objects and then the next list; who comes
-second begins again with what the first one left.
+Its objects have the names of the files of a directory. A recording is its manifest, as this
+process has seen it last, and the files that it lists; nobody asks which others there are. What
+is derived may be missing:
+
+    tables/<type>~<shape>/<id>-<number>.parquet   fields; no file has two recordings
+    manifests/catalog                             the catalog, manifests with their versions, and
+                                                  the names of tables: an opening reads it alone
 """
 
 from __future__ import annotations
 
 import errno
-import hashlib
+import json
 import os
 import re
-import sqlite3
+import secrets
 import stat
 import tempfile
 import threading
 import time
+import zlib
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
@@ -24,287 +29,333 @@ from pathlib import Path
 from typing import Any, ClassVar, Final
 
 from hybridlog_storage import manifest as truth
-from hybridlog_storage.cells import Cells
+from hybridlog_storage.cells import Cells, drop, put
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk import files
-from hybridlog_storage.disk.directory import LOCK, PAYLOADS, Listing, StoreDirectory, gone
+from hybridlog_storage.disk.directory import PAYLOADS, Listing, StoreDirectory, gone
 from hybridlog_storage.errors import (
+    BucketError,
     ManifestError,
     ObjectChangedError,
     ObjectExistsError,
     RecordingGoneError,
     StoreError,
 )
-from hybridlog_storage.manifest import Manifest, encode
-from hybridlog_storage.manifests import MANIFEST_LOCK, MANIFEST_OLD, MANIFESTS, DiskManifests
-from hybridlog_storage.remote import TRIES
-from hybridlog_storage.remote.blocks import BlockCache, inode_of
-from hybridlog_storage.remote.bucket import UNLISTED_DAYS, Bucket, Object, other_name
-from hybridlog_storage.remote.lists import (
-    LISTS,
-    MANIFEST,
-    MAX_LIST,
-    RECORDINGS,
-    TABLES,
-    StoreList,
-    list_name,
-    number_of,
-)
+from hybridlog_storage.manifest import Manifest, decode, encode, with_file
+from hybridlog_storage.manifests import BucketManifests
+from hybridlog_storage.remote.blocks import LOST, BlockCache, inode_of
+from hybridlog_storage.remote.bucket import Bucket, Object
+from hybridlog_storage.segments.segment_file import sealed_name
 from hybridlog_storage.settings import NAME as SETTINGS
 from hybridlog_storage.settings import NONE, StoreSettings, read_settings, settings_text
 
 LOOK_EVERY_S: Final = 5.0
-"""Seconds between two looks for a newer list, unless this process changes something."""
-_READ_NS: Final = 3600 * 10**9  # for so long a reader may need what a newer list has not
-_DAY_NS: Final = 86_400 * 10**9
-_ALONE: Final = 4  # recordings that are compared with the bucket one by one; then all at once
+"""Seconds between two looks for changes of others, for each thousand recordings."""
+CATALOG: Final = "manifests/catalog"
+"""Name of the object with the catalog; where manifests lie, so that one listing tells of it."""
+RECORDINGS: Final = "recordings"
+TABLES: Final = "tables"
+_MANIFEST: Final = "manifest"
+_TABLES: Final = "tables"
+"""Kinds of cells, by recording: its manifest with its version, and the objects of its tables."""
+_FEW: Final = 4  # manifests that are read one by one, even if there is a newer catalog
+_MAX_CATALOG: Final = 1 << 30  # bytes, packed and unpacked
 _MAX_SETTINGS: Final = 1 << 20
-_PIECE: Final = 1 << 20  # bytes of a file that are sent at once
-_NOT_LISTED: Final = frozenset({LOCK, MANIFEST_LOCK, MANIFEST_OLD})
+_PIECE: Final = 16 << 20  # bytes of a file that are fetched or sent at once
+_TABLE: Final = re.compile(rf"{TABLES}/[^/\x00]{{1,255}}/[^/\x00]{{1,255}}")
 _FOLDER: Final = stat.S_IFDIR | 0o555
 _FILE: Final = stat.S_IFREG | 0o444
-_Node = Mapping[str, Any]
-"""A folder: an `Object`, bytes, or another folder, by name."""
+
+
+class CatalogCells(Cells):
+    """The cells of the catalog, which lie in an object; changes stay in memory until `save`.
+
+    Attributes:
+        about: The object; None before there is one.
+        has_changes: Whether this process has changed the store since it was saved.
+        is_behind: Whether another process has saved its own meanwhile.
+    """
+
+    def __init__(self, bucket: Bucket, cache: BlockCache) -> None:
+        self._bucket = bucket
+        self._blocks = cache
+        self.about: Object | None = None
+        self.has_changes = self.is_behind = False
+        self._tables: tuple[tuple[int, ...], dict[str, dict[str, Object]]] = (), {}
+        super().__init__(None, "")
+
+    def load(self, about: Object | None) -> None:
+        """Take the cells of an object; none of one that is damaged, or is another one by now."""
+        content = b""
+        with suppress(zlib.error, OSError):
+            if about is not None and about.size <= _MAX_CATALOG:
+                handle = self._blocks.open(self._bucket, about)
+                try:
+                    packed = files.pread(handle, about.size, 0)
+                finally:
+                    os.close(handle)
+                content = zlib.decompressobj().decompress(packed, _MAX_CATALOG)
+        with self._lock:
+            self._close()
+            self._db = self._in_memory(None, content)
+            self.about, self.is_behind = about, False
+
+    def save(self) -> bool:
+        """Write the object; False if another process has written it since it was read."""
+        content = zlib.compress(self.to_bytes(), 1)
+        try:
+            if self.about is None:
+                version = self._bucket.create(CATALOG, content)
+            else:
+                version = self._bucket.replace(CATALOG, content, self.about.version)
+        except (ObjectExistsError, ObjectChangedError, FileNotFoundError):
+            self.is_behind = True
+            return False
+        self.about, self.has_changes = Object(CATALOG, len(content), version), False
+        return True
+
+    def tables(self) -> dict[str, dict[str, Object]]:
+        """The objects of tables by folder and name, without those that were lost."""
+        state = (*self.state(), len(self._bucket.lost))
+        if self._tables[0] != state:
+            found: dict[str, dict[str, Object]] = {}
+            for body in self.each(_TABLES).values():
+                for one in _objects(body):
+                    if one.name not in self._bucket.lost:
+                        _, folder, name = one.name.split("/")
+                        found.setdefault(folder, {})[name] = one
+            self._tables = state, found
+        return self._tables[1]
+
+    def put_tables(self, recording: str, objects: Collection[Object] = ()) -> None:
+        """List the tables of a recording; those that were listed before are deleted."""
+        before = _objects(self.read(_TABLES, recording) or b"")
+        body = json.dumps([[one.name, one.size, one.version] for one in objects]).encode()
+        cell = put(_TABLES, recording, body) if objects else drop(_TABLES, recording)
+        self.write(lambda: [cell], 0)
+        self._bucket.delete(sorted({one.name for one in before} - {one.name for one in objects}))
+
+    def close(self, wait_s: float) -> None:
+        """Save what this process has changed. The cells stay: others here use them, too."""
+        if self.has_changes:
+            with suppress(BucketError):  # who opens the store reads a few manifests more
+                self.save()
+
+
+class SeenManifests(BucketManifests):
+    """The manifests of a bucket as they were at the last look; a change asks for the newest.
+
+    Attributes:
+        objects: Their objects by id.
+        number: Counts the looks that found something new.
+    """
+
+    def __init__(self, bucket: Bucket, cells: CatalogCells) -> None:
+        super().__init__(bucket)
+        self.objects: dict[str, Object] = {}
+        self.number = 0
+        self._cells = cells
+        self._known: dict[str, tuple[Manifest, str]] = {}
+        self._look_at = 0.0
+        self._lock = threading.RLock()
+
+    def look(self, *, now: bool = False) -> None:
+        """See what others have changed, `now` or if the last look is a while ago."""
+        with self._lock:
+            if self.number and not now and time.monotonic() < self._look_at:
+                return
+            found = {one.name: one for one in self._bucket.objects("manifests/")}
+            before = self.objects
+            self.objects = {one: found[self.name_of(one)] for one in self.ids_of(found)}
+            changed = {
+                one
+                for one in before.keys() | self.objects.keys()
+                if _version(before.get(one)) != _version(self.objects.get(one))
+            }
+            catalog = found.get(CATALOG)
+            is_other = len(changed) > _FEW and _version(catalog) != _version(self._cells.about)
+            if not self.number or self._cells.is_behind or is_other:
+                self._cells.load(catalog)
+            if changed or not self.number:
+                self.number += 1
+                lost = self._bucket.lost
+                lost -= {name for name in lost if name.split("/")[1] in changed}
+            self._look_at = time.monotonic() + LOOK_EVERY_S * (1 + len(found) // 1000)
+
+    def ids(self) -> list[str]:
+        """Ids of all recordings, sorted; also of those being removed."""
+        return sorted(self.objects)
+
+    def without(self) -> list[str]:
+        """Ids of recordings that the catalog has, and that have files and no manifest."""
+        known = sorted(self._cells.each(_MANIFEST).keys() - self.objects.keys())
+        return [one for one in known if any(self._bucket.objects(f"{RECORDINGS}/{one}/"))]
+
+    def remove(
+        self, recording: str, check: Callable[[Manifest], object] = lambda _: None
+    ) -> Manifest:
+        """Remove a recording with all its objects, and those of others whose removal was cut."""
+        removed = super().remove(recording, check)
+        for one in [*self.objects]:
+            with suppress(ManifestError):  # it is told where it is asked about
+                if self._read(one)[0].status == "removed":
+                    super().remove(one)
+        return removed
+
+    def _read(self, recording: str) -> tuple[Manifest, str]:
+        with self._lock:
+            version = _version(self.objects.get(recording))
+            known = self._known.get(recording) or self._catalogued(recording)
+            if known is None or known[1] != version:
+                known = super()._read(recording)
+            self._known[recording] = known
+            return known
+
+    def old(self, recording: str) -> Manifest | None:
+        """The manifest as the catalog has it."""
+        found = self._catalogued(recording)
+        return None if found is None else found[0]
+
+    def _catalogued(self, recording: str) -> tuple[Manifest, str] | None:
+        version, _, data = (self._cells.read(_MANIFEST, recording) or b"").partition(b"\n")
+        with suppress(ValueError):
+            manifest = decode(data)
+            if manifest.id == recording:
+                return manifest, version.decode()
+        return None
+
+    @contextmanager
+    def _alone(self, recording: str) -> Iterator[None]:
+        self._doubt(recording)  # a change is decided from the newest one
+        yield
+
+    def _doubt(self, recording: str) -> None:
+        with self._lock:
+            if recording in self.objects:
+                self.objects[recording] = Object(self.name_of(recording), 0, "")
+
+    def _replace(self, recording: str, data: bytes, version: str) -> None:
+        self._doubt(recording)
+        super()._replace(recording, data, version)
+        self._cells.has_changes = True
+
+    def _create(self, manifest: Manifest) -> None:
+        super()._create(manifest)
+        self._cells.has_changes = True
+
+    def _delete_files(self, recording: str) -> None:
+        super()._delete_files(recording)
+        self._cells.put_tables(recording)
+
+    def _forget(self, recording: str) -> None:
+        self._doubt(recording)
+        super()._forget(recording)
+        with self._lock:
+            self.objects.pop(recording, None)
+            self._cells.write(lambda: [drop(_MANIFEST, recording)], 0)
+            self._cells.has_changes = True
+
+    def _noted(self, recording: str, data: bytes, version: str) -> None:
+        with self._lock:
+            self.objects[recording] = Object(self.name_of(recording), len(data), version)
+            self._known.pop(recording, None)
+            cell = put(_MANIFEST, recording, version.encode() + b"\n" + data)
+            self._cells.write(lambda: [cell], 0)
 
 
 class BucketFiles:
-    """The files of a store in a bucket, by the newest list that was seen.
+    """A store in a bucket, by the paths of its files; see `files.mounted`.
+
+    Args:
+        bucket: The bucket.
+        cache: Of its blocks.
 
     Attributes:
         path: What stands for it among paths.
-        list: What the store holds; replaced whole.
-        lock: Held while the list changes.
-        is_changing: True during a change, whose list is not created yet.
+        cells: Of its catalog.
+        manifests: Its manifests.
     """
 
     def __init__(self, bucket: Bucket, cache: BlockCache) -> None:
         self.bucket = bucket
         self.path = Path(bucket.address)
-        self.list = StoreList("")
-        self._cache = cache
-        self._settings: tuple[bytes, str] | None = None  # and their version
-        self._looked_at = 0.0
-        self._tables: tuple[Any, _Node] = None, {}  # of what list, and as folders
-        self._compared: set[str] = set()
-        self.lock = threading.RLock()
-        self.is_changing = False
-
-    # Lists.
-
-    def look(self, store: str, *, now: bool = False) -> None:
-        """Look for a newer list, `now` or if the last look is a while ago.
-
-        Raises:
-            StoreError: It is damaged.
-        """
-        with self.lock:
-            is_due = now or time.monotonic() - self._looked_at >= LOOK_EVERY_S
-            if not is_due or self.is_changing:
-                return
-            found = self.bucket.first(LISTS)
-            number = 0 if found is None else number_of(found.name)
-            if number is None:
-                raise StoreError(f"{self.bucket.address}/{LISTS} has other objects than lists.")
-            if found is None or number <= self.list.number:  # an old answer changes nothing
-                self.list = self.list if self.list.store == store else StoreList(store)
-            else:
-                self.list = self.read_list(store, found)
-                self._compared.clear()
-                self.bucket.lost.clear()
-            self._looked_at = time.monotonic()
-
-    def read_list(self, store: str, about: Object) -> StoreList:
-        """One state of the store, by the object of its list.
-
-        Raises:
-            StoreError: It is damaged.
-        """
-        place = f"{self.bucket.address}/{about.name}"
-        number = number_of(about.name)
-        if number is None:
-            raise StoreError(f"{place} is no list.")
-        return StoreList.from_bytes(store, number, self.read(about), place)
-
-    def commit(self, before: StoreList, after: StoreList) -> None:
-        """Create the next list.
-
-        Raises:
-            ObjectExistsError: Another process was faster; `list` has its change.
-        """
-        with self.lock:
-            number = before.number + 1
-            after = replace(after, number=number)
-            name = list_name(number)
-            try:
-                self.bucket.create(name, after.to_bytes())
-            except ObjectExistsError:
-                about = self.bucket.head(name)
-                if about is not None:
-                    self.list = self.read_list(before.store, about)
-                raise
-            self.list = after
-            self._looked_at = time.monotonic()
-
-    def compare(self, recording: str = "") -> None:
-        """Leave out files whose objects are missing, or are not those that the list names.
-
-        Args:
-            recording: Id of the recording whose files are compared, once for each list; without
-                one all are, and those of fields.
-        """
-        with self.lock:
-            if recording in self._compared or (recording and "" in self._compared):
-                return
-            listed = self.list
-            everything = [one for files_ in listed.recordings.values() for one in files_.values()]
-            place = f"{RECORDINGS}/{recording}" if recording else ""
-            if len(self._compared) >= _ALONE:  # 1,000 objects are listed at once
-                recording, place = "", RECORDINGS
-            elif not recording:
-                everything += listed.tables.values()
-            there = {one.name: (one.size, one.version) for one in self.bucket.objects(place)}
-            self.bucket.lost.update(
-                one
-                for one in everything
-                if one.name.startswith(place) and there.get(one.name) != (one.size, one.version)
-            )
-            self._compared.add(recording)
-
-    def files_of(self, recording: str) -> dict[str, Object]:
-        """The object of each file of a recording, without those that are lost."""
-        lost = self.bucket.lost
-        return {p: o for p, o in self.list.recordings[recording].items() if o not in lost}
-
-    # Files.
-
-    def status(self, inner: tuple[str, ...]) -> os.stat_result:
-        """The status of a file or folder, by the names on the way to it."""
-        return self._status(self._node(inner), inner)
-
-    def names(self, inner: tuple[str, ...]) -> dict[str, os.stat_result]:
-        """The status of each entry of a folder, by name."""
-        node = self._node(inner)
-        if not isinstance(node, Mapping):
-            raise NotADirectoryError(errno.ENOTDIR, "it is not a folder", self._place(inner))
-        return {name: self._status(one, (*inner, name)) for name, one in node.items()}
+        self.cache = cache
+        self.cells = CatalogCells(bucket, cache)
+        self.manifests = SeenManifests(bucket, self.cells)
+        self._settings: tuple[Object, bytes] | None = None
+        self._files: dict[str, tuple[Manifest, dict[str, Object]]] = {}
 
     def open(self, inner: tuple[str, ...]) -> int:
-        """A handle for reading a file."""
-        node = self._node(inner)
-        if isinstance(node, Object):
-            return self._cache.open(self.bucket, node)
-        if isinstance(node, Mapping):
-            raise IsADirectoryError(errno.EISDIR, "it is a folder", self._place(inner))
-        with tempfile.TemporaryFile() as file:
-            file.write(node)
-            file.seek(0)
-            return os.dup(file.fileno())
+        """A handle for reading a file that a manifest or the catalog lists."""
+        if inner == (SETTINGS,):
+            with tempfile.TemporaryFile() as file:
+                file.write(self.settings())
+                file.seek(0)
+                return os.dup(file.fileno())
+        listed: Mapping[str, Object] = {}
+        if len(inner) > 2 and inner[0] == RECORDINGS:
+            with suppress(RecordingGoneError):
+                listed = self.files_of(self.manifests.read(inner[1]))
+        elif len(inner) == 3 and inner[0] == TABLES:
+            listed = self.cells.tables().get(inner[1], {})
+        about = listed.get(inner[-1] if inner[0] == TABLES else "/".join(inner[2:]))
+        if about is None or about.name in self.bucket.lost:
+            problem = "there is no such object" if about is None else LOST
+            place = "/".join([self.bucket.address, *inner])
+            raise FileNotFoundError(errno.ENOENT, problem, place)
+        return self.cache.open(self.bucket, about)
 
-    def read(self, about: Object) -> bytes:
-        """A small object."""
-        if about.size > MAX_LIST:
-            raise StoreError(f"{self.bucket.address}/{about.name} is too large.")
-        handle = self._cache.open(self.bucket, about)
-        try:
-            return files.pread(handle, about.size, 0)
-        finally:
-            os.close(handle)
+    def names(self, inner: tuple[str, ...]) -> tuple[int, dict[str, os.stat_result]]:
+        """The entries of a folder of tables, and a number that changes with them."""
+        found = self.cells.tables()
+        if inner == (TABLES,):
+            return self.number, dict.fromkeys(found, _stat(_FOLDER, 0, 0))
+        if len(inner) != 2 or inner[0] != TABLES or inner[1] not in found:
+            place = "/".join([self.bucket.address, *inner])
+            raise FileNotFoundError(errno.ENOENT, "there is no such folder", place)
+        entries = found[inner[1]].items()
+        return self.number, {name: _stat(_FILE, inode_of(o), o.size) for name, o in entries}
 
-    def _status(self, node: Any, inner: tuple[str, ...]) -> os.stat_result:
-        if isinstance(node, Mapping):
-            listed = self.list.number
-            return _stat(_FOLDER, listed, 0, listed)
-        if isinstance(node, bytes):
-            return _stat(_FILE, crc32(node), len(node))
-        return _stat(_FILE, inode_of(node), node.size)
+    @property
+    def number(self) -> int:
+        """Changes with what was seen of the store."""
+        return self.manifests.number + len(self.bucket.lost)
 
-    def _node(self, inner: tuple[str, ...]) -> Any:
-        found: Any = self._root(inner)
-        for name in inner:
-            if not isinstance(found, Mapping) or name not in found:
-                problem = "there is no such object"
-                if self._is_lost(inner):
-                    problem = "its object in the bucket is missing or was changed"
-                raise FileNotFoundError(errno.ENOENT, problem, self._place(inner))
-            found = found[name]
-        return found
+    def files_of(self, manifest: Manifest) -> dict[str, Object]:
+        """The objects of the files that a manifest lists, by path below the recording."""
+        known = self._files.get(manifest.id)
+        if known is None or known[0] is not manifest:
+            place = f"{RECORDINGS}/{manifest.id}"
+            here = {
+                one.name: Object(f"{place}/{one.name}", one.bytes, one.digest)
+                for one in manifest.files
+                if one.is_here
+            }
+            fields = {
+                path: Object(f"{place}/{path}", one.bytes, one.digest)
+                for one in manifest.fields
+                for path in [f"{PAYLOADS}/{one.file}"]
+            }
+            known = self._files[manifest.id] = manifest, here | fields
+        return known[1]
 
-    def _is_lost(self, inner: tuple[str, ...]) -> bool:
-        """True if the list names a file of a recording whose object is not there."""
-        if len(inner) < 3 or inner[0] != RECORDINGS:
-            return False
-        listed = self.list.recordings.get(inner[1], {})
-        return listed.get("/".join(inner[2:])) in self.bucket.lost
-
-    def _root(self, inner: tuple[str, ...]) -> _Node:
-        """The folders on the way to a file; others are left out."""
-        listed = self.list
-        top = inner[0] if inner else ""
-        recordings: dict[str, _Node] = {}
-        if top == RECORDINGS and len(inner) == 1:
-            recordings = {recording: {} for recording in listed.recordings}
-        elif top == RECORDINGS and inner[1] in listed.recordings:
-            found = {p: o for p, o in self.files_of(inner[1]).items() if p != MANIFEST}
-            recordings = {inner[1]: _folder(found)}
-        return {
-            MANIFESTS: self._manifests(inner[-1]) if top == MANIFESTS else {},
-            RECORDINGS: recordings,
-            TABLES: self._tables_of(listed) if top == TABLES else {},
-            SETTINGS: self.read_settings(),
-        }
-
-    def _manifests(self, name: str) -> _Node:
-        """The manifest of a recording, by the name of its file."""
-        recording = name.removesuffix(".json")
-        if recording not in self.list.recordings:
-            return {}
-        found = self.files_of(recording).get(MANIFEST)
-        return {} if found is None else {name: found}
-
-    def _tables_of(self, listed: StoreList) -> _Node:
-        known, folders = self._tables
-        lost = self.bucket.lost
-        if known != (now := (id(listed.tables), len(lost))):
-            folders = _folder({path: o for path, o in listed.tables.items() if o not in lost})
-            self._tables = now, folders
-        return folders
-
-    def read_settings(self) -> bytes:
-        """The file of settings, read once.
-
-        Raises:
-            FileNotFoundError: There is no store here.
-            BucketError: The server does not answer, or refuses.
-        """
-        with self.lock:
-            if self._settings is None:
-                about, data = self.bucket.read_whole(SETTINGS, _MAX_SETTINGS)
-                self._settings = data, about.version
-            return self._settings[0]
+    def settings(self) -> bytes:
+        """The file of settings, read once."""
+        if self._settings is None:
+            self._settings = self.bucket.read_whole(SETTINGS, _MAX_SETTINGS)
+        return self._settings[1]
 
     def change_settings(self, change: Callable[[], bytes]) -> None:
         """Replace the file of settings by what is made of the newest one.
 
         Raises:
-            BucketError: The server does not answer, or refuses; or they change all the time.
+            BucketError: The server does not answer, or refuses; or they have just been changed.
         """
-        with self.lock:
-            for left in reversed(range(TRIES)):
-                self._settings = None
-                self.read_settings()
-                assert self._settings is not None
-                _, version = self._settings
-                try:
-                    self.bucket.replace(SETTINGS, change(), version)
-                    return
-                except ObjectChangedError:
-                    if not left:
-                        raise
-                finally:
-                    self._settings = None
-
-    def _place(self, inner: tuple[str, ...]) -> str:
-        return "/".join([self.bucket.address, *inner])
+        self._settings = self.bucket.read_whole(SETTINGS, _MAX_SETTINGS)
+        try:
+            self.bucket.replace(SETTINGS, change(), self._settings[0].version)
+        finally:
+            self._settings = None
 
 
 _mounting = threading.Lock()
@@ -320,85 +371,8 @@ def mount(address: str) -> BucketFiles:
         return found
 
 
-class ListedCells(Cells):
-    """The cells of the catalog in the newest list; changes stay in memory until the next one."""
-
-    def __init__(self, source: BucketFiles, store: str) -> None:
-        self._source = source
-        self._base: StoreList | None = None
-        self._is_changing = False
-        super().__init__(None, store)
-
-    def _use(self) -> sqlite3.Connection:
-        now = self._source.list
-        if now is not self._base and not self._is_changing:
-            self._base = now
-            self._close()
-            self._db = self._in_memory(None, now.catalog)
-        return super()._use()
-
-    def begin(self) -> None:
-        """Begin a change: what is in memory stays there until its end."""
-        with self._lock:
-            self._use()
-            self._is_changing = True
-
-    def end(self) -> None:
-        """End a change: the newest list has the cells again."""
-        self._is_changing = False
-        self._base = None
-
-    def close(self, wait_s: float) -> None:
-        """Do nothing: others use the cells, too."""
-
-
-class ListedManifests(DiskManifests):
-    """The manifests of a store in a bucket, by its newest list."""
-
-    def __init__(self, directory: RemoteDirectory) -> None:
-        super().__init__(directory.path)
-        self._directory = directory
-
-    def ids(self) -> list[str]:
-        """All ids, sorted."""
-        return self._directory.ids()
-
-    def without(self) -> list[str]:
-        """None: a list names all."""
-        return []
-
-    def clear(self) -> None:
-        """Nothing: what no list names is not there."""
-
-    @contextmanager
-    def creating(self) -> Iterator[Callable[[Manifest], None]]:
-        """Nothing: who is second begins again; files are not written here one by one."""
-        yield lambda _: self._directory.check_writable()
-
-    def change(
-        self, recording: str, how: Callable[[Manifest], Manifest], *, sync: bool = True
-    ) -> Manifest:
-        """The list names a new object in the place of the one before.
-
-        Raises:
-            RecordingGoneError: The recording is gone.
-            ManifestError: The manifest is damaged or lost.
-            ObjectExistsError: Another process was faster: begin again.
-        """
-        return self._directory.change(recording, how)
-
-    def remove(
-        self, recording: str, check: Callable[[Manifest], object] = lambda _: None
-    ) -> Manifest:
-        """List a recording no more, within `writing`; its objects stay."""
-        found = self.read(recording)
-        check(found)
-        self._directory.drop(recording)
-        return found
-
-
 class RemoteDirectory(StoreDirectory):
-    """A store in a bucket. It is read like a directory, and changed by a list at a time.
+    """A store in a bucket: read like a directory, changed by its manifests.
 
     Args:
         address: Such as `s3://lab/store`.
@@ -414,18 +388,17 @@ class RemoteDirectory(StoreDirectory):
     def __init__(self, address: str, *, read_only: bool = False) -> None:
         self.source = mount(address)
         try:
-            self.source.read_settings()
+            self.source.settings()
         except FileNotFoundError as error:
             raise StoreError(
                 f"There is no store at {address}. `hybridlog copy {address}` makes one from a "
                 "store on a disk."
             ) from error
         super().__init__(self.source.path, read_only=read_only)
+        # No server that a bucket names is asked.
         self.settings = replace(self.settings, mongo=NONE)
-        self.source.look(self.settings.store_id, now=True)
-        self.manifests = ListedManifests(self)
-        self._cells = ListedCells(self.source, self.settings.store_id)
-        self._after: StoreList | None = None
+        self.manifests = self.seen = self.source.manifests
+        self.seen.look(now=True)
 
     @classmethod
     def create_in(cls, address: str) -> RemoteDirectory:
@@ -434,24 +407,28 @@ class RemoteDirectory(StoreDirectory):
         Raises:
             BucketError: The server does not answer, refuses, or ignores conditions.
         """
-        bucket = mount(address).bucket
-        if bucket.head(SETTINGS) is None:
+        try:
+            mount(address).settings()
+        except FileNotFoundError:
+            settings = settings_text(StoreSettings(os.urandom(16).hex(), mongo=NONE))
             with suppress(ObjectExistsError):  # another process makes it, too
-                bucket.create(
-                    SETTINGS,
-                    settings_text(StoreSettings(os.urandom(16).hex(), mongo=NONE)),
-                )
+                mount(address).bucket.create(SETTINGS, settings)
         return cls(address)
+
+    @property
+    def bucket(self) -> Bucket:
+        """Its objects."""
+        return self.source.bucket
 
     @property
     def address(self) -> str:
         """The address by which another process opens it."""
-        return self.source.bucket.address
+        return self.bucket.address
 
     @property
     def place(self) -> str:
         """Its address."""
-        return self.source.bucket.address
+        return self.bucket.address
 
     @property
     def when_empty(self) -> str:
@@ -466,9 +443,14 @@ class RemoteDirectory(StoreDirectory):
     def check_writable(self) -> None:
         """Raise: files are not written here one by one."""
         raise StoreError(
-            f"{self.source.bucket.address} is a store in a bucket, where this cannot be done. Do "
-            "it in a store on a disk, and bring that here with `hybridlog copy`."
+            f"{self.place} is a store in a bucket, where this cannot be done. Do it in a store on "
+            "a disk, and bring that here with `hybridlog copy`."
         )
+
+    def check_changes(self) -> None:
+        """Raise if the store was opened for reading only."""
+        if self.read_only:
+            raise StoreError(f"The store {self.place} was opened for reading only.")
 
     def change_settings(self, **changes: Any) -> None:
         """Change settings of the store."""
@@ -483,318 +465,212 @@ class RemoteDirectory(StoreDirectory):
     def make_folder(self, recording: str) -> None:
         """Raise: nothing is recorded into a bucket."""
         self.check_writable()
-        raise AssertionError(recording)
 
-    def catalog_cells(self) -> Cells | None:
-        """The cells of the catalog, from the newest list."""
-        return self._cells
-
-    @property
-    def _now(self) -> StoreList:
-        return self.source.list
-
-    def ids(self) -> list[str]:
-        """All ids, sorted."""
-        return sorted(self._now.recordings)
+    def catalog_cells(self) -> Cells:
+        """The cells of the catalog, from its object."""
+        return self.source.cells
 
     def changed(self) -> tuple[int, bool]:
-        """The number of the newest list, and True."""
-        self.source.look(self.settings.store_id)
-        return self._now.number, True
+        """A number that changes with what is seen of the store, and True."""
+        self.seen.look()
+        return self.source.number, True
 
     def looks(self, ids: Sequence[str]) -> dict[str, str]:
-        """The look of each recording, by id: it changes whenever any file does."""
-        listed = self._now.recordings
-        return {one: _look(self.files_of(one)) for one in ids if one in listed}
+        """The look of each recording, by id: the version of its manifest, and what was lost."""
+        return {one: self._look_of(one) for one in ids if one in self.seen.objects}
 
-    def look_closely(self) -> bool:
-        """Compare all files with their objects; True if some were lost."""
-        self.source.compare()
-        return bool(self.source.bucket.lost)
+    def _look_of(self, recording: str) -> str:
+        about = self.seen.objects.get(recording)
+        if about is None:
+            return ""
+        lost = sorted(self._lost(recording))
+        return f"{about.version} {crc32(repr(lost).encode()):08x}" if lost else about.version
+
+    def _lost(self, recording: str) -> list[str]:
+        """Paths of the files of a recording that were found to be missing."""
+        place = f"{RECORDINGS}/{recording}/"
+        names = [*self.bucket.lost]  # which other threads add to
+        return [one.removeprefix(place) for one in names if one.startswith(place)]
+
+    def has(self, recording: str) -> bool:
+        """True if there is a manifest of a recording."""
+        return recording in self.seen.objects
+
+    def look_closely(self, recording: str | None = None) -> bool:
+        """Compare files with their objects; True if some are missing.
+
+        Args:
+            recording: Id of the one whose files are compared, and from then on read from the
+                server again; None for all.
+        """
+        place = f"{RECORDINGS}/{recording}/" if recording else f"{RECORDINGS}/"
+        there = {one.name: one.size for one in self.bucket.objects(place)}
+        lost = {one for one in self.bucket.lost if not one.startswith(place)}
+        for one in self.ids() if recording is None else [recording]:
+            with suppress(StoreError):  # it is named where it is asked about
+                for about in self.source.files_of(self.manifests.read(one)).values():
+                    is_lost = there.get(about.name) != about.size
+                    if is_lost:
+                        lost.add(about.name)
+                    if is_lost or recording is not None:  # others are to notice it, too
+                        self.source.cache.forget(self.bucket, about)
+        self.bucket.lost.clear()
+        self.bucket.lost.update(lost)
+        return bool(lost)
 
     def listing(self, recording: str) -> Listing:
-        """As of a directory; files count whose objects are there."""
-        self.source.compare(recording)
-        return super().listing(recording)
+        """As of a directory: what the manifest lists, without what was lost."""
+        look, lost = self._look_of(recording), {*self._lost(recording)}
+        manifest = self.manifests.find(recording)
+        if manifest is None:
+            raise ManifestError(f"{recording} has no manifest. {BucketManifests.cure}")
+        logs = (one for _, one in sorted(manifest.logs.items()) if one.is_here)
+        sealed = {one.number: one.name for one in logs if one.name not in lost}
+        fields = (one for one in manifest.fields if f"{PAYLOADS}/{one.file}" not in lost)
+        payloads = {one.file: one.bytes for one in fields}
+        # What people say of a recording makes no other files of it.
+        plain = truth.replace(manifest, name="-", tags={}, notes=(), marks=(), pins=(), changes=0)
+        state = truth.hasher(encode(plain) + repr(sorted(lost)).encode()).hexdigest()
+        return Listing(sealed, {}, (PAYLOADS,) if payloads else (), payloads, look, state)
+
+    def listed_bytes(self) -> int:
+        """Bytes of all files that manifests list, and of tables."""
+        found = sum(o.size for own in self.source.cells.tables().values() for o in own.values())
+        for one in self.ids():
+            with suppress(StoreError):
+                found += sum(
+                    o.size for o in self.source.files_of(self.manifests.read(one)).values()
+                )
+        return found
 
     @contextmanager
     def retaining(self) -> Iterator[bool]:
-        """Always true: of two changes at once, the second begins again."""
+        """Always true: a step of which another process has made a part is refused."""
         yield True
-
-    @property
-    def listed_bytes(self) -> int:
-        """Bytes of all files that the newest list names."""
-        everything = (*self._now.recordings.values(), self._now.tables)
-        return sum(o.size for files_ in everything for o in files_.values())
 
     @contextmanager
     def writing(
         self, recording: str, name: str = "", *, wait_s: float = 0.0, records: bool = False
     ) -> Iterator[None]:
-        """A change of a recording, which counts at the end of the block.
+        """Nothing is locked: a change is made of the newest manifest, and made again.
 
         Raises:
-            StoreError: This process would record.
+            StoreError: This process would record, or the store was opened for reading only.
             TopicError: The recording is gone.
-            ObjectExistsError: Another process was faster: begin again.
-        """
-        if records:
-            self.check_writable()
-        with self.changing():
-            if recording not in self._now.recordings:
-                raise gone(name or recording)
-            yield
-
-    @contextmanager
-    def changing(self) -> Iterator[None]:
-        """A change of the store, which counts at the end of the block, or of the outer one.
-
-        Raises:
-            ObjectExistsError: Another process was faster: begin again.
         """
         self.check_changes()
-        with self.source.lock:
-            if self.source.is_changing:
-                yield
-                return
-            self.source.look(self.settings.store_id, now=True)
-            before = self._now
-            self._cells.begin()
-            self.source.is_changing = True
-            try:
-                yield
-                if self._now is not before:
-                    self.source.commit(before, replace(self._now, catalog=self._cells.to_bytes()))
-            except BaseException:
-                if self._now.number == before.number:
-                    self.source.list = before
-                raise
-            finally:
-                self.source.is_changing = False
-                self._cells.end()
-
-    def check_changes(self) -> None:
-        """Raise if the store was opened for reading only."""
-        if self.read_only:
-            raise StoreError(f"The store {self.place} was opened for reading only.")
-
-    def change(self, recording: str, how: Callable[[Manifest], Manifest]) -> Manifest:
-        """See `ListedManifests.change`."""
-        with self.changing():
-            if recording not in self._now.recordings:
-                raise RecordingGoneError(f"There is no recording {recording!r}.")
-            now = self._manifest(recording)
-            made = how(now)
-            if made == now:
-                return now
-            made = truth.replace(made, id=now.id, created=now.created, changes=now.changes + 1)
-            self._list_manifest(recording, made)
-            return made
-
-    def _manifest(self, recording: str) -> Manifest:
-        found = self.manifests.find(recording)
-        if found is None:
-            raise ManifestError(
-                f"{self.recording(recording)} has lost its manifest: `hybridlog copy` brings it "
-                "back."
-            )
-        return found
-
-    def _list_manifest(self, recording: str, manifest: Manifest) -> None:
-        data = encode(manifest)
-        name = other_name(f"{RECORDINGS}/{recording}/{MANIFEST}")
-        about = Object(name, len(data), self.source.bucket.create(name, data), 0)
-        self._relist(recording, {**self._now.recordings[recording], MANIFEST: about})
+        if records:
+            self.check_writable()
+        if not self.has(recording):
+            raise gone(name or recording)
+        yield
 
     @contextmanager
-    def at_hand(self, recording: str, segments: Collection[int] = ()) -> Iterator[StoreDirectory]:
-        """As of a directory; what the block leaves on the disk becomes objects.
+    def at_hand(
+        self,
+        recording: str,
+        segments: Collection[int] = (),
+        check: Callable[[Manifest], object] = lambda _: None,
+    ) -> Iterator[StoreDirectory]:
+        """As of a directory: a hidden one on the disk, of which all that is new becomes objects.
 
         Raises:
-            StoreError: An object that is needed is lost.
+            StoreError: An object that is needed is lost; or another process was faster.
         """
-        objects, bucket = self.files_of(recording), self.source.bucket
-        manifest = self._manifest(recording)
-        wanted = {manifest.logs[number].name for number in segments}
-        if wanted:  # fields of expired messages belong to all segments
-            wanted |= {path for path in objects if path.startswith(f"{PAYLOADS}/")}
+        before = self.manifests.read(recording)
+        objects = self.source.files_of(before)
+        logs = {number: before.logs[number] for number in segments}
+        # Others may do the same, so all that is made here has names of its own.
+        own = 1 + secrets.randbelow(9 * 10**8)
+        names = {number: sealed_name(number, own) for number in logs}
         with tempfile.TemporaryDirectory(prefix="hybridlog-") as place:
-            there = StoreDirectory.create(Path(place) / "store")
-            folder = there.recording(recording)
-            there.manifests.create(manifest)
-            for path in wanted:
-                try:
-                    self.fetch(objects[path], folder / path)
-                except (KeyError, FileNotFoundError, ObjectChangedError) as error:
-                    raise StoreError(f"{self.recording(recording) / path} is lost.") from error
-            before = _files_below(folder)
-            yield there
-            after = _files_below(folder)
-            listed = dict(self._now.recordings[recording])
-            for path, about in after.items():
-                if before.get(path) != about:
-                    name = f"{RECORDINGS}/{recording}/{path}"
-                    with (folder / path).open("rb") as file:
-                        pieces = iter(partial(file.read, _PIECE), b"")
-                        listed[path] = bucket.send(name, about[0], pieces)
-            for path in before.keys() - after.keys():
-                del listed[path]
-            self._relist(recording, listed)
-            changed = there.manifests.read(recording)
-            if changed != manifest:
-                self._list_manifest(recording, changed)
+            here = StoreDirectory.create(Path(place) / "store")
+            begun = truth.replace(before, deleted=(f"-/-{own}.parquet",))
+            for number, name in names.items():
+                begun = with_file(begun, number, name=name)
+            here.manifests.create(begun)
+            folder = here.recording(recording)
+            for number, log in logs.items():
+                self._fetch(objects[log.name], folder / names[number])
+            for one in before.fields:
+                path = f"{PAYLOADS}/{one.file}"
+                self._fetch(objects[path], folder / path)
+            yield here
+            after = here.manifests.read(recording)
+            for number, name in names.items():
+                if after.logs[number].name == name:  # it has stayed
+                    after = with_file(after, number, name=logs[number].name)
+            made = self.source.files_of(after)
+            new = [path for path in made if path not in objects]
+            try:
+                for path in new:
+                    self._send(folder / path, made[path])
+                self.manifests.change(recording, partial(_brought, before, after, check))
+            except BaseException:
+                with suppress(BucketError):
+                    self.bucket.delete([made[path].name for path in new])
+                raise
+        self.bucket.delete([one.name for path, one in objects.items() if path not in made])
 
-    def fetch(self, about: Object, path: Path) -> None:
-        """Write an object to a file, past the cache.
-
-        Raises:
-            FileNotFoundError: It does not exist.
-            ObjectChangedError: It has another version.
-            BucketError: The server does not answer, or refuses.
-        """
+    def _fetch(self, about: Object, path: Path) -> None:
+        """Write an object to a file, past the cache; it has the digest that the manifest states."""
         path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("wb") as file:
-            for piece in self.source.bucket.pieces(about):
-                file.write(piece)
+        found = truth.hasher()
+        try:
+            with path.open("wb") as file:
+                for at in range(0, about.size, _PIECE):
+                    part = at, min(at + _PIECE, about.size)
+                    (piece,) = self.bucket.read(about.name, [part], size=about.size)
+                    found.update(piece)
+                    file.write(piece)
+        except (FileNotFoundError, ObjectChangedError) as error:
+            self.bucket.lost.add(about.name)
+            raise StoreError(f"{self.place}/{about.name}: {LOST}.") from error
+        if found.hexdigest() != about.version:
+            raise StoreError(f"{self.place}/{about.name} is damaged.")
 
-    def refresh(self) -> None:
-        """See what the newest list has."""
-        self.source.look(self.settings.store_id, now=True)
-
-    def files_of(self, recording: str) -> Mapping[str, Object]:
-        """The object of each file of a recording, without those that are lost."""
-        return self.source.files_of(recording)
-
-    def lost_of(self, recording: str) -> dict[str, Object]:
-        """The files of a recording, which is compared with its objects, that were lost.
-
-        After `look_closely` its fields are among them, with `tables/` before their paths.
-        """
-        lost = self.source.bucket.lost
-        self.source.compare(recording)
-        mine = _tables_of(recording)
-        tables = {f"{TABLES}/{p}": o for p, o in self._now.tables.items() if mine.fullmatch(p)}
-        return {p: o for p, o in {**self._now.recordings[recording], **tables}.items() if o in lost}
-
-    def add_recording(
-        self, recording: str, found: Mapping[str, Object], tables: Mapping[str, Object]
-    ) -> None:
-        """List a recording whose objects are there, within `changing`."""
-        self.source.bucket.lost.difference_update(found.values(), tables.values())
-        self._relist(recording, found)
-        self._replace_tables(recording, tables)
-
-    def mend(
-        self, recording: str, found: Mapping[str, Object], tables: Mapping[str, Object] | None
-    ) -> None:
-        """List objects of a recording in the place of lost ones, within `changing`.
-
-        Args:
-            recording: Its id.
-            found: Its files that were lost.
-            tables: All files of its fields; None to leave them as they are.
-        """
-        self.source.bucket.lost.difference_update(found.values(), (tables or {}).values())
-        self._relist(recording, {**self._now.recordings[recording], **found})
-        if tables is not None:
-            self._replace_tables(recording, tables)
-
-    def drop(self, recording: str) -> None:
-        """List a recording no more, within `writing`; its objects stay."""
-        others = dict(self._now.recordings)
-        del others[recording]
-        self.source.list = replace(self._now, recordings=others)
-        self._replace_tables(recording, {})
-
-    def unneeded(self, now: int | None = None) -> list[Object]:
-        """Objects that may be deleted: what neither a list of the last hour nor a copy needs.
-
-        Args:
-            now: The time, ns; None for the server's.
-
-        Raises:
-            StoreError: A list is damaged.
-            BucketError: The server does not answer, or refuses.
-        """
-        bucket = self.source.bucket
-        now = bucket.now() if now is None else now
-        self.refresh()
-        found = [one for one in bucket.objects() if one.name != SETTINGS]
-        lists = [one for one in found if number_of(one.name) is not None]
-        newest = next((n for n, one in enumerate(lists) if one.name == self._listed), None)
-        if newest is None:
-            return []
-        # A list was the newest until the one after it was created.
-        kept = [
-            one
-            for n, one in enumerate(lists)
-            if n <= newest or now - lists[n - 1].modified < _READ_NS
-        ]
-        named = {one.name for one in kept}
-        for one in kept:
-            listed = self.source.read_list(self.settings.store_id, one)
-            named.update(o.name for r in listed.recordings.values() for o in r.values())
-            named.update(o.name for o in listed.tables.values())
-        old = {one.name for one in lists}
-        return [
-            one
-            for one in found
-            if one.name not in named
-            and (one.name in old or now - one.modified > UNLISTED_DAYS * _DAY_NS)
-        ]
-
-    @property
-    def _listed(self) -> str:
-        return list_name(self._now.number)
-
-    def _replace_tables(self, recording: str, tables: Mapping[str, Object]) -> None:
-        mine = _tables_of(recording)
-        others = {path: o for path, o in self._now.tables.items() if not mine.fullmatch(path)}
-        self.source.list = replace(self._now, tables={**others, **tables})
-
-    def _relist(self, recording: str, found: Mapping[str, Object]) -> None:
-        recordings = {**self._now.recordings, recording: found}
-        self.source.list = replace(self._now, recordings=recordings)
+    def _send(self, path: Path, about: Object) -> None:
+        with path.open("rb") as file:
+            self.bucket.put(about.name, about.size, iter(partial(file.read, _PIECE), b""))
 
 
-def _tables_of(recording: str) -> re.Pattern[str]:
-    """The paths of the fields of a recording, below `tables`."""
-    return re.compile(rf"[^/]+/{recording}-\d+\.parquet")
+def _brought(
+    before: Manifest, after: Manifest, check: Callable[[Manifest], object], now: Manifest
+) -> Manifest:
+    """The newest manifest with what was changed in a copy of an older one.
+
+    Raises:
+        StoreError: Files that were changed are others by now.
+    """
+    check(now)
+    logs = {n: one for n, one in after.logs.items() if one != before.logs[n]}
+    gone = [one for one in before.fields if one not in after.fields]
+    if any(now.logs.get(n) != before.logs[n] for n in logs) or any(
+        one not in now.fields for one in gone
+    ):
+        raise StoreError(f"Files of {now.name} were replaced meanwhile. Try again.")
+    fields = [one for one in now.fields if one not in gone]
+    return truth.replace(
+        now,
+        files=tuple(logs.get(one.number, one) if one.kind == "log" else one for one in now.files),
+        fields=(*fields, *(one for one in after.fields if one not in before.fields)),
+    )
 
 
-def _files_below(folder: Path) -> dict[str, tuple[int, int]]:
-    """Size and inode of the files of a recording, by path; without its manifest and locks."""
-    found = {}
-    for path in folder.rglob("[!.]*"):
-        if path.is_file() and path.name not in _NOT_LISTED:
-            about = path.stat()
-            found[path.relative_to(folder).as_posix()] = about.st_size, about.st_ino
+def _objects(body: bytes) -> list[Object]:
+    """Objects of tables, of which nothing is believed that does not fit."""
+    found = []
+    with suppress(ValueError, TypeError, RecursionError):
+        for name, size, version in json.loads(body):
+            is_sound = type(size) is int and 0 <= size < 1 << 50 and isinstance(version, str)
+            if is_sound and _TABLE.fullmatch(name) and ".." not in name.split("/"):
+                found.append(Object(name, size, version))
     return found
 
 
-def _folder(objects: Mapping[str, Object]) -> dict[str, Any]:
-    """Files below a folder."""
-    found: dict[str, Any] = {}
-    for path, about in objects.items():
-        *folders, name = path.split("/")
-        place = found
-        for part in folders:
-            place = place.setdefault(part, {})
-            if not isinstance(place, dict):
-                raise StoreError(f"The list names {path!r} both as a file and as a folder.")
-        place[name] = about
-    return found
+def _version(about: Object | None) -> str:
+    return "" if about is None else about.version
 
 
-def _look(objects: Mapping[str, Object]) -> str:
-    digest = hashlib.sha256()
-    for path, one in sorted(objects.items()):
-        digest.update(f"{path}\n{one.name}\n{one.size}\n{one.version}\n".encode())
-    return f"0 0 0 {digest.hexdigest()[:32]} 0 0 0"
-
-
-def _stat(mode: int, inode: int, size: int, changed: int = 0) -> os.stat_result:
-    plain = (mode, inode, 0, 1, os.getuid(), os.getgid(), size, 0, 0, 0)
-    times = {"st_atime_ns": 0, "st_mtime_ns": changed, "st_ctime_ns": 0}
-    return os.stat_result(plain, times)
+def _stat(mode: int, inode: int, size: int) -> os.stat_result:
+    return os.stat_result((mode, inode, 0, 1, os.getuid(), os.getgid(), size, 0, 0, 0))
