@@ -215,7 +215,9 @@ def _target(to: str | Path, options: CopyOptions, store: Store) -> Iterator[Targ
         _ = other.session  # the catalog then has all names
         directory, catalog = other.directory, other.catalog
         found = Target(
-            Directory(path), partial(free_name_in, catalog), partial(put_entry, directory, catalog)
+            Directory(path.absolute()),
+            partial(free_name_in, catalog),
+            partial(put_entry, directory, catalog),
         )
         yield found
         other.shared.catch_up()

@@ -32,11 +32,7 @@ HEAVY = ("mcap", "numpy", "pandas", "pyarrow", "pymongo", "rich", "rosbags", "zs
 ALLOWED = {
     "PIL": ("hybridlog.arrays.message_arrays", "hybridlog.drawing.images"),
     "av": ("hybridlog.arrays.video",),
-    "blake3": (
-        "hybridlog_storage.disk.append_file",
-        "hybridlog_storage.manifest",
-        "hybridlog_storage.schemas",
-    ),
+    "blake3": ("hybridlog_storage.disk.append_file", "hybridlog_storage.manifest"),
     "bson": (
         "hybridlog.schema.index_bodies",
         "hybridlog.schema.objects",

@@ -158,7 +158,8 @@ class _Copying:
     def run(self, chosen: list[RecordingSummary]) -> CopyReport:
         if self._is_same():
             raise UsageError(f"{self._place.address} is this very store: there is nothing to copy.")
-        wanted = [one for one in chosen if not self._is_known(one)]
+        there = {*self._place.manifests.ids()}
+        wanted = [one for one in chosen if one.id not in there or not self._is_known(one)]
         self._left = sum(one.stored_bytes for one in wanted)
         for one in wanted:
             self._left -= one.stored_bytes

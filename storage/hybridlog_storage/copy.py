@@ -296,9 +296,12 @@ class _Copy:
     def _clear(self, there: Manifest | None, now: Manifest, sizes: Mapping[str, int]) -> None:
         """Delete files that others have replaced, and what has arrived of those not to come."""
         before = [] if there is None else files_of(there)
-        left = {one.path for one in before} - {one.path for one in files_of(now)}
-        if self._how.prepare is None:  # the next copy may go on with them
-            left |= {path for path in sizes if path.endswith(".part")}
+        listed = {one.path for one in files_of(now)}
+        left = {one.path for one in before} - listed
+        if self._how.prepare is None:  # or else the next copy goes on with them
+            arrived = {path for path in sizes if path.endswith(".part")}
+            all_else = sizes.keys() - {MANIFEST_LOCK, WRITER_LOCK} - listed
+            left |= all_else if there is None else arrived
         for path in left:
             self._target.drop(f"{RECORDINGS}/{now.id}/{path}")
 

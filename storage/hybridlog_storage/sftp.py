@@ -143,6 +143,8 @@ class Server(Place):
             while not os.fstat(said.fileno()).st_size:
                 if process.poll() is not None:
                     self._check_reached(process, errors)
+                    if process.returncode != 1:
+                        raise StoreError(f"{self.address}: {_reason(errors)}.")
                     raise HeldError(
                         f"Another process writes {recording} in {self.address} at this moment.",
                         is_recording=False,
@@ -223,18 +225,21 @@ class Server(Place):
 
     def fetched(self, name: str, most: int) -> bytes | None:
         """A file, and at most one byte more than it may have; None if there is none."""
-        if not self.listed(name):
-            return None
-        with self._got(name, most) as path:
-            return path.read_bytes()[: most + 1]
+        with self._got(name, most, may_lack=True) as path:
+            if path.exists():
+                return path.read_bytes()[: most + 1]
+        if self.listed(name):
+            raise StoreError(f"{self.address}/{name} cannot be read.")
+        return None
 
     @contextmanager
-    def _got(self, name: str, most: int) -> Iterator[Path]:
+    def _got(self, name: str, most: int, *, may_lack: bool = False) -> Iterator[Path]:
         """A file that was fetched; one that has more bytes is not fetched to its end."""
         path = self._scratch / secrets.token_hex(8)
         try:
             with suppress(_EnoughError):
-                self.sftp(f'get {_quoted(name)} "{path}"', watch=lambda _: _check_size(path, most))
+                line = f'{"-" if may_lack else ""}get {_quoted(name)} "{path}"'
+                self.sftp(line, watch=lambda _: _check_size(path, most))
             yield path
         finally:
             path.unlink(missing_ok=True)

@@ -18,6 +18,7 @@ from hybridlog.maintenance.copying import CopyOptions, CopyReport
 from hybridlog_storage import copy
 from hybridlog_storage.errors import HeldError, StoreError, UsageError
 from tests import places
+from tests.cli.within import answer
 from tests.copying.conftest import STATES, all_answers, answers, expire, files_in
 from tests.copying.server import Sshd
 from tests.limits import Limit
@@ -179,6 +180,11 @@ def test_payloads_expire_here_when_they_are_proved_there(robots: Path, tmp_path:
         assert (found != right[label]) == is_gone, label
         assert found == {key: value for key, value in right[label].items() if key in found}
         assert answers(lab, label) == right[label]
+    told = f"{lab} has more payloads of recorded"
+    assert told in " ".join(answer("info", "recorded", store=robot).out.split())
+    said = answer("fetch", "-t", "/cloud", "-r", "recorded", "--count", "--where", "data[0] > 0",
+                  store=robot).err  # fmt: skip
+    assert f"{told}." in " ".join(said.split())
 
 
 def test_what_expired_before_keeps_no_other_payloads(robots: Path, tmp_path: Path) -> None:
