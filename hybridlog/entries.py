@@ -21,6 +21,7 @@ from msgspec import ValidationError, convert, to_builtins
 
 from hybridlog.columns.layout import PAYLOAD_PARTS
 from hybridlog.record.losses import Cause, extent_of, joined, topics_of
+from hybridlog.record.marks_log import with_marks
 from hybridlog.schema.states import State, expired_messages
 from hybridlog_storage import manifest as truth
 from hybridlog_storage.catalog import (
@@ -201,10 +202,7 @@ def inventory_of(
     listed = manifest.logs if manifest is not None else {}
     listing = listing.choosing(file.name for file in listed.values())
     found = Inventory(folder, path, listing, manifest)
-    unmarked = manifest.unmarked if manifest is not None else ()
     for number, name in listing.sealed.items():
-        if number in unmarked:
-            continue  # it is about to be removed
         try:
             found.summaries[number] = read_summary(path / name, number)
         except SegmentError as error:
@@ -359,10 +357,11 @@ def describe(catalog: Catalog, inventory: Inventory, *, is_open: bool = False) -
         for channel_id, channel in sorted(channels.items())
     ]
     _fill_stats(entry, inventory, catalog)
+    shown = with_marks(entry)
     return Described(
         entry,
-        summary_of(entry, inventory.listing.look),
-        topic_types(entry),
+        summary_of(shown, inventory.listing.look),
+        topic_types(shown),
         inventory.listing.print,
         channels,
     )
@@ -581,7 +580,7 @@ def mark_values(mark: truth.Mark) -> dict[str, Any]:
     """A mark as entries have it."""
     until = {} if mark.end is None else {"end": mark.end}
     tags = dict(mark.tags)
-    return {"time": mark.time, "text": mark.text, "tags": tags, "segment": mark.segment, **until}
+    return {"id": mark.id, "time": mark.time, "text": mark.text, "tags": tags, **until}
 
 
 def pin_values(pin: truth.Pin) -> dict[str, Any]:
@@ -745,9 +744,7 @@ def listed(sealed: Sealed) -> Callable[[Manifest], Manifest]:
             one for one in now.files if (one.kind, one.number) != (file.kind, file.number)
         )
         known = {**channels, **now.channels}
-        numbers = tuple(one for one in now.unmarked if one != file.number)
-        made = truth.replace(now, files=(*others, file), channels=known, unmarked=numbers)
-        return truth.with_totals(made)
+        return truth.with_totals(truth.replace(now, files=(*others, file), channels=known))
 
     return how
 

@@ -21,6 +21,8 @@ from hybridlog.query.chunk_columns import ChunkColumns
 from hybridlog.query.chunk_counts import Parts, part_rows
 from hybridlog.query.question import RecordedChannel, field_types
 from hybridlog.query.topics import resolve
+from hybridlog.record.marks import MARKS
+from hybridlog.record.marks_log import MARKS_SEGMENT
 from hybridlog.snapshot import UNFINISHED
 from hybridlog.wording import counted, listed
 from hybridlog_storage.catalog import ChannelStats, file_of, schema_hash
@@ -105,7 +107,6 @@ class Session:
         self._recordings = recordings
         self._meanings: dict[Any, Any] = {} if meanings is None else meanings
         self._entries: dict[str, RecordingEntry] = {}  # that were asked about, by id
-        self._open: dict[tuple[str, int], SegmentReader] = {}  # segments that were not sealed
         self._newer: dict[str, Session] = {}  # has the files of a recording, by its id
 
     def now(self) -> Session:
@@ -166,7 +167,6 @@ class Session:
             entry = running.entry
             if entry is None:
                 return None
-            self._open.update({(recording, n): reader for n, reader in running.readers().items()})
             self._entries[recording] = entry
             now = summary_of(entry, summary.look)
             if now != summary:
@@ -209,6 +209,10 @@ class Session:
         if found is not None:
             self._entries[summary.id] = found
         return found
+
+    def show(self, entry: RecordingEntry) -> None:
+        """Let an entry stand for its recording at this moment."""
+        self._entries[entry.id] = entry
 
     def entry_if_there(self, recording: str) -> RecordingEntry | None:
         """The entry of a recording, by its id; None if it is gone."""
@@ -666,7 +670,7 @@ class Session:
             count(chunk)
             return chunk
 
-        key = recording.id, segment, place.number, file_of(recording, segment)
+        key = recording.id, segment, place.number, place.offset, file_of(recording, segment)
         return self.cache.made("chunk", *key, make=read, size_of=_size_of)
 
     def segment(self, recording: str, number: int) -> SegmentReader:
@@ -676,12 +680,11 @@ class Session:
             SegmentError: It cannot be opened.
             TopicError: The recording is gone.
         """
-        if recording in self._newer:
+        if recording in self._newer and number != MARKS_SEGMENT:
             return self._newer[recording].segment(recording, number)
         entry = self.entry(recording)
-        opened = self._open.get((recording, number))
-        if opened is not None:
-            return opened
+        if number in entry.flushed:
+            return entry.flushed[number].reader
         try:
             return self.shared.segment(entry, number)
         except SegmentError:
@@ -738,7 +741,7 @@ class Session:
 
     def table(self, recording: RecordingEntry, topic: str) -> TopicTable | None:
         """The table of a topic; None without one. `Shared.mend` creates a missing one again."""
-        if recording.status in UNFINISHED:
+        if recording.status in UNFINISHED or (topic == MARKS and recording.marks):
             return None
         found = self.tables.of(recording, topic)
         if found is None:

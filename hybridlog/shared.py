@@ -12,9 +12,11 @@ from typing import TYPE_CHECKING, Any
 from hybridlog.columns.payload_files import RecordingPayloads, open_segment
 from hybridlog.maintenance.opening import StoreFiles, open_catalog
 from hybridlog.maintenance.report import RepairReport
+from hybridlog.record.marks import MARK_SCHEMA
+from hybridlog.record.marks_log import with_marks
 from hybridlog.snapshot import UNFINISHED
 from hybridlog_storage.cache import Cache
-from hybridlog_storage.catalog import file_of
+from hybridlog_storage.catalog import file_of, schema_hash
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import StoreError, UsageError
 from hybridlog_storage.lazy import lazy
@@ -29,7 +31,6 @@ if TYPE_CHECKING:
     from hybridlog.snapshot import Snapshot
     from hybridlog_storage.catalog import Catalog, RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
-    from hybridlog_storage.messages import Schema
     from hybridlog_storage.segments.chunk_table import ChunkTable
     from hybridlog_storage.segments.segment_reader import SegmentReader
     from hybridlog_storage.summary import RecordingSummary
@@ -65,7 +66,7 @@ class Shared(ABC):
         self.following = threading.RLock()
         self._running: dict[str, RunningRecording] = {}
         self._entries: dict[str, RecordingEntry] = {}  # compared with their files, by id
-        self.schemas: dict[str, Schema] = {}
+        self.schemas = {schema_hash(MARK_SCHEMA): MARK_SCHEMA}
         self.channels: dict[str, tuple[RecordingEntry, dict[str, list[RecordedChannel]]]] = {}
         self.columns: dict[tuple[str, int, frozenset[int]], tuple[ChunkTable, ChunkColumns]] = {}
         self._segments: dict[tuple[str, str], SegmentReader] = {}
@@ -180,9 +181,10 @@ class Shared(ABC):
             entry = self._current(summary)
             if entry is None:
                 return None
+            found = with_marks(entry)
             if entry.status in UNFINISHED:
-                return entry
-            found = self._entries.setdefault(summary.id, entry)
+                return found
+            found = self._entries.setdefault(summary.id, found)
         return found
 
     def _current(self, summary: RecordingSummary) -> RecordingEntry | None:

@@ -1146,7 +1146,7 @@ class Store:
             UsageError: A tag to remove does not exist; a name, note or key is empty; or
                 something is no text.
         """
-        from hybridlog.maintenance import edit, index
+        from hybridlog.maintenance import edit
 
         for what, given in (("name", name), ("note", note)):
             if given is not None and not (isinstance(given, str) and given.strip()):
@@ -1174,12 +1174,18 @@ class Store:
             return replace(now, tags={**left, **new}, notes=(*now.notes, *notes))
 
         edit.change(self.directory, self.catalog, entry, change, name)
+        return self._mirrored(entry.id)
+
+    def _mirrored(self, recording: str) -> RecordingEntry:
+        """A recording whose manifest was changed, after its mirror in the index is."""
+        from hybridlog.maintenance import index
+
         connected = self.shared.index.connected
         if connected is not None and self.shared.index.connection.may_write:
             with suppress(ConnectionLostError):  # the next connection mirrors it
-                index.mirror(self.catalog, connected, entry.id)
-        self._to_change().catch_up(entry.id)
-        return self.entry(entry.id)
+                index.mirror(self.catalog, connected, recording)
+        self._to_change().catch_up(recording)
+        return self.entry(recording)
 
     def mark(
         self,
@@ -1190,7 +1196,9 @@ class Store:
         *,
         until: TimeLike | None = None,
     ) -> RecordingEntry:
-        """Set a mark at a time of a recording that has ended.
+        """Set a mark at a time of a recording, also of one that is being written.
+
+        A mark is a line of the manifest. It answers like a message on `/hybridlog/marks`.
 
         Args:
             recording: Name or id.
@@ -1202,7 +1210,7 @@ class Store:
         Raises:
             TimeError: `moment` or `until` is invalid or outside the recording, or `until` is
                 before `moment`.
-            StoreError: The recording is being written; use `hybridlog mark` without `--at`.
+            StoreError: It has 10,000 marks already, or the store cannot be written.
         """
         from hybridlog.maintenance import edit
 
@@ -1210,25 +1218,12 @@ class Store:
         (entry,) = self.select([recording])
         time = edit.time_of_mark(entry, moment)
         last = None if until is None else edit.time_of_mark(entry, until)
-        try:
-            edit.mark(
-                self.directory,
-                self.catalog,
-                entry,
-                time,
-                text=text(note),
-                tags=tags or {},
-                end=last,
-            )
-        except HeldError as error:
-            if error.is_recording:
-                raise StoreError(f"{error} To mark it now, mark it without --at.") from error
-            raise
-        self._to_change().catch_up(entry.id)
-        return self.entry(entry.id)
+        said = {text(key): text(value) for key, value in (tags or {}).items()}
+        edit.mark(self.directory, self.catalog, entry, time, text=text(note), tags=said, end=last)
+        return self._mirrored(entry.id)
 
     def unmark(self, recording: str, note: str, moment: TimeLike | None = None) -> RecordingEntry:
-        """Remove marks of a recording that were set after its end.
+        """Remove marks that somebody set; those that a recorder noted are messages, and stay.
 
         Args:
             recording: Name or id.
@@ -1246,8 +1241,7 @@ class Store:
         start, end = extent_of(entry)
         time = None if moment is None else parse_time(moment, start=start, end=end)
         edit.unmark(self.directory, self.catalog, entry, time, text=text(note))
-        self._to_change().catch_up(entry.id)
-        return self.entry(entry.id)
+        return self._mirrored(entry.id)
 
     def copy(
         self,

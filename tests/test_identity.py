@@ -52,6 +52,7 @@ from tests.cli.within import answer
 from tests.copies import bring
 from tests.faults import logs
 from tests.limits import Limit
+from tests.waiting import wait_for
 
 pytestmark = pytest.mark.mongo("embedded")
 
@@ -350,16 +351,43 @@ def test_marks_need_no_mongodb(place: Path, uri: str) -> None:
         assert [m.fields["text"] for m in store.topic("marks")] == ["seen"]
     with hl.open(place, mongo=uri) as store:
         assert store.topic("marks").where("text == 'seen'").count() == 1
-        store.connect()
-        assert store.repairs.indexed == {"one": 1}
+        database = store.shared.index.database_for("This")
+        assert store.repairs.indexed == {}
+        (mirrored,) = database.find("hybridlog.recordings", {}, {"marks": 1})
+        assert [mark["text"] for mark in mirrored["marks"]] == ["seen"]
+        assert store.verify().findings == []
+        with pytest.raises(TopicError, match="marks that somebody set are not in MongoDB"):
+            store.topic("marks").where({"text": "seen"}).count()
 
 
 def test_a_running_recording_is_marked_while_it_runs(tmp_path: Path) -> None:
-    with hl.open(tmp_path / "store", create=True) as store, store.start("live") as recording:
-        with pytest.raises(StoreError, match="without --at"):
-            store.mark(recording.id, "100", "x")
-        with pytest.raises(StoreError, match="being written"):
-            store.remove(recording.id)
+    channel = Channel("/n", "json", None)
+    with hl.open(tmp_path / "store", create=True) as store:
+        with store.start("live") as recording:
+            recording.write(channel, b"{}", log_time=SECOND)
+            wait_for(lambda: "/n" in store.topics())
+            with hl.open(tmp_path / "store") as other:
+                other.mark("live", "+0s", "begun", {"by": "lab"}, until="3")
+                other.mark(recording.id, SECOND, "wrong")
+                other.unmark("live", "wrong")
+                with pytest.raises(TimeError, match="begins at"):
+                    other.mark("live", SECOND - 1, "before")
+                with pytest.raises(TimeError, match="ends at"):
+                    other.mark("live", "2199-01-01", "in the future")
+            marks = store.topic("/hybridlog/marks")
+            assert [(m.log_time_ns, m.fields["text"]) for m in marks] == [(SECOND, "begun")]
+            # It is on the disk: a recorder that is killed now costs nothing of it.
+            shutil.copytree(tmp_path / "store", tmp_path / "killed")
+            with pytest.raises(StoreError, match="being written"):
+                store.remove(recording.id)
+            recording.write(channel, b"{}", log_time=2 * SECOND)
+        entry = store.entry("live")
+        assert (entry.status, entry.messages, entry.span) == ("complete", 3, (SECOND, 2 * SECOND))
+        assert [m.fields["text"] for m in store.topic("/hybridlog/marks")] == ["begun"]
+        assert not store.verify().findings
+    with hl.open(tmp_path / "killed", mongo="none") as store:
+        assert store.entry("live").status == "recovered"
+        assert [m.fields["text"] for m in store.topic("/hybridlog/marks")] == ["begun"]
 
 
 def test_a_running_recording_is_edited_while_it_runs(tmp_path: Path) -> None:

@@ -360,7 +360,6 @@ class Recording:
     status: str = "complete"
     notes: list[str] = field(default_factory=list)
     marks: list[tuple[int, str]] = field(default_factory=list)
-    mark_segments: int = 0
     lost: dict[int, Lost] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -586,7 +585,6 @@ class Machine(RuleBasedStateMachine):
             return
         self.store.mark(recording, moment, text, {"k": text})
         known.marks.append((moment, text))
-        known.mark_segments += 1
         known.kinds |= {Kind(MARKS, has_header=False, has_publish_time=True)}
         content = {"text": text, "tags": {"k": text}}
         payload = json.dumps(content, ensure_ascii=False).encode()
@@ -663,6 +661,7 @@ class Machine(RuleBasedStateMachine):
             known.tags = dict(known.first_tags)
             known.notes.clear()
             known.marks.clear()
+            known.messages = [m for m in known.messages if m.topic != MARKS]
         self.open_again()
         assert self.store.repairs.unreadable.keys() == {recording}
         assert recording not in {one.id for one in self.store.recordings()}
@@ -671,6 +670,7 @@ class Machine(RuleBasedStateMachine):
         self.open_again()
         assert not self.store.repairs.unreadable
         assert not self.store.repairs.removed
+        self.take_kinds(recording)
         self.changed = True
 
     # What is drawn must not depend on file sizes: they vary with random ids and times.
@@ -731,10 +731,11 @@ class Machine(RuleBasedStateMachine):
                 index = Index(client[self.store.database.name], recording, number)
                 new = index.arrivals()[chunk]
             assert new == list(range(new[0], new[0] + len(new)))
-            assert new[0] > max(survivors, default=-1)
+            in_files = (seq for seq, m in survivors.items() if m.topic != MARKS)
+            assert new[0] > max(in_files, default=-1)
             for seq, old in zip(new, arrivals[chunk], strict=True):
                 survivors[seq] = replace(by_seq[old], seq=seq)
-        if number == 0 and laid.described > cut:
+        if number == 0 and laid.described > cut and not known.marks:
             assert recording not in self.store.directory.ids()
             del self.model[recording]
             return
@@ -742,30 +743,6 @@ class Machine(RuleBasedStateMachine):
         self.take_kinds(recording)
         # What was sealed says itself how the recording ended.
         known.status = known.status if part == "sealed" else "recovered"
-
-    @precondition(lambda self: any(map(has_late_mark, self.model.values())))
-    @rule(which=st.integers(0, 9), spot=st.integers(0, SPOTS), is_listed=st.booleans())
-    def crash_while_marking(self, which: int, spot: int, is_listed: bool) -> None:
-        """A mark is there, or it is not; its recording is what it was."""
-        recording = self.chosen(which, has_late_mark)
-        known = self.model[recording]
-        number, path = self.store.directory.segments(recording)[-1]
-        content = path.read_bytes()
-        last = max(known.messages, key=lambda m: m.seq)
-        assert last.topic == MARKS
-        self.store.close()
-        if not is_listed:
-            content = content[: len(content) * spot // SPOTS]
-            change_manifest(path.parent, number)
-            known.messages.remove(last)
-            known.mark_segments -= 1
-            if known.marks:
-                known.marks.pop()
-        path.with_name(path.name + ".open").write_bytes(content)
-        path.unlink()
-        self.store = hl.open(self.path, require_database=True)
-        self.take_kinds(recording)
-        self.changed = True
 
     def take_kinds(self, recording: str) -> None:
         """Of the channels that there are, all that have messages must be known."""
@@ -861,21 +838,15 @@ def mended(store: hl.Store) -> set[str]:
 
 def can_crash(known: Recording) -> bool:
     """Whether it can be as if its recorder had been killed: it lacks nothing else."""
-    return not known.lost and not known.mark_segments and known.status != "unproven"
-
-
-def has_late_mark(known: Recording) -> bool:
-    """Whether its last segment is a mark's."""
-    return bool(known.mark_segments) and not known.lost and known.status != "unproven"
+    return not known.lost and known.status != "unproven"
 
 
 def change_manifest(folder: Path, without: int | None, **values: Any) -> None:
-    """As it was before a segment was listed, with its mark if it is one's."""
+    """As it was before a segment was listed."""
 
     def how(now: Manifest) -> Manifest:
         files = tuple(one for one in now.files if one.number != without)
-        marks = tuple(one for one in now.marks if one.segment != without or without is None)
-        return changed(now, files=files, marks=marks, **values)
+        return changed(now, files=files, **values)
 
     places.change_in(folder, how)
 
@@ -1120,9 +1091,7 @@ def test_whatever_happens_happens(machine: type[Machine], is_bag: bool) -> None:
         lambda: model.restore_a_segment(0),
         model.rebuild,
         lambda: model.restore_a_segment(0),
-        lambda: model.crash_while_marking(0, SPOTS // 2, is_listed=False),
         lambda: model.mark(0, 5, "\u00e9"),
-        lambda: model.crash_while_marking(0, 0, is_listed=True),
         lambda: model.record_log(drafts_of(12, 60), small(), is_bag=not is_bag),
         lambda: model.crash(0, SPOTS // 3, "trailer", **again),  # type: ignore[arg-type]
         lambda: model.crash(0, SPOTS // 2, "chunk", **again),  # type: ignore[arg-type]

@@ -116,11 +116,11 @@ class _Mark(Running):
     text: str = argument("What happened.", "TEXT")
     tags: tuple[str, ...] = option("Add KEY=VALUE to it.", "K=V", name="--set-tag")
     at: str | None = option(
-        "Mark a recording that has ended, at this time, written as for --between.", "T"
+        "Mark a recording, also a running one, at this time, written as for --between.", "T"
     )
     until: str | None = option("The mark lasts from --at to this time.", "T2")
     remove: bool = option(
-        "Remove what --at has set with this text; with --at only what begins at this time."
+        "Remove the marks with this text; with --at only what begins at this time."
     )
 
 
@@ -128,7 +128,7 @@ class _Mark(Running):
 def mark_command(given: _Mark) -> None:
     """Set a mark that queries can use, now or at a past time.
 
-    A mark is a message on /hybridlog/marks: `hybridlog fetch scan --where
+    A mark answers as a message on /hybridlog/marks: `hybridlog fetch scan --where
     "/hybridlog/marks: text = 'gripper slipped'" --within 5s`.
     """
     tags, at = options.parse_tags(given.tags), given.at

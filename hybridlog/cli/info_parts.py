@@ -364,6 +364,7 @@ def show_tables(store: Store, query: Query, *, as_json: bool) -> None:
     """Print the Parquet files with the rows of a topic, and SQL for DuckDB."""
     from hybridlog.maintenance.tables import missing
     from hybridlog.query.asked import channels_of
+    from hybridlog.record.marks import MARKS
     from hybridlog.snapshot import UNFINISHED
 
     (topic,) = query.topics
@@ -390,6 +391,10 @@ def show_tables(store: Store, query: Query, *, as_json: bool) -> None:
     if others := len(recordings) - len(ended):
         left = output.counted(others, "unfinished recording")
         output.note(f"Without {left}: rows are added when a recording ends.")
+    marks = sum(len(one.marks) for one in recordings) if topic == MARKS else 0
+    if marks:
+        left = output.counted(marks, "mark")
+        output.note(f"Without {left} that somebody set: no table has them, `hybridlog sql` has.")
 
 
 def _tables_of(store: Store, channels: Collection[RecordedChannel]) -> list[dict[str, Any]]:

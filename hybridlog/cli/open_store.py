@@ -153,12 +153,7 @@ def _print_rebuilt(store: Store, doing: str) -> None:
     """
     repairs = store.repairs
     if repairs.tables:
-        from hybridlog.record.marks import MARKS
-
-        # A mark is set without its table, which the first question makes: nothing was damaged.
-        tables = [topic for _, topic in repairs.tables if topic != MARKS]
-        if tables:
-            note(f"{counted(len(tables), 'table')} made again: missing or damaged.")
+        note(f"{counted(len(repairs.tables), 'table')} made again: missing or damaged.")
     indexed = {r: n for r, n in repairs.indexed.items() if n and r not in repairs.recovered}
     added = f"{counted(sum(indexed.values()), 'chunk')} added to the index"
     if repairs.damage:

@@ -39,7 +39,7 @@ from hybridlog.columns.topic_table import TopicTable
 from hybridlog_storage.cache import Cache
 from hybridlog_storage.errors import StoreError
 from hybridlog_storage.lazy import lazy
-from hybridlog_storage.messages import EXPIRED_IDS
+from hybridlog_storage.messages import EXPIRED_IDS, MARKS_CHANNEL
 
 if TYPE_CHECKING:
     from hybridlog_storage.catalog import ChannelEntry, RecordingEntry
@@ -445,6 +445,7 @@ class Tables:
         if found is None or found[0] is not recording:
             by_topic: dict[str, list[ChannelEntry]] = defaultdict(list)
             for channel in recording.channels:
-                by_topic[channel.topic].append(channel)
+                if channel.id != MARKS_CHANNEL:  # marks that somebody set are in no table
+                    by_topic[channel.topic].append(channel)
             found = self._channels = recording, dict(by_topic)
         return found[1].get(topic, [])

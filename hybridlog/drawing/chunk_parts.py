@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hybridlog.query.chunk_counts import Parts, part_rows
-from hybridlog_storage.messages import EXPIRED_IDS
+from hybridlog_storage.messages import MARKS_CHANNEL
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.segments.chunk_table import ChunkTable
 
-_CHANNELS = 3 * EXPIRED_IDS  # ids of channels
+_CHANNELS = MARKS_CHANNEL + 1  # ids of channels
 
 
 class RecordedChunks:

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 from hybridlog_storage.disk import files
 from hybridlog_storage.disk.socket_directory import is_our_socket, new_socket
 from hybridlog_storage.errors import HybridlogError, StoreError, UsageError
+from hybridlog_storage.manifests import DiskManifests
 from hybridlog_storage.remote import address_of
 from hybridlog_storage.settings import NAME
 from hybridlog_storage.stopping import pause
@@ -152,7 +153,7 @@ def running(store: Path) -> dict[str, str]:
         # A recorder that was killed leaves its socket file behind.
         with suppress(OSError, StoreError):
             _connect(store, recorder).close()
-            found.append((about.st_mtime, recorder, _read(store, recorder)[1]))
+            found.append((about.st_mtime, recorder, _name_now(store, recorder)))
     return {recorder: name for _, recorder, name in sorted(found)}
 
 
@@ -198,6 +199,13 @@ def _read(store: Path, recorder: str) -> tuple[str, str]:
     if not (isinstance(path, str) and isinstance(name, str) and is_our_socket(path)):
         raise StoreError(_gone(recorder))
     return path, name
+
+
+def _name_now(store: Path, recorder: str) -> str:
+    """The name of a recorder's recording, which may have another one by now."""
+    with suppress(HybridlogError):  # one with a ring has none, or another one
+        return DiskManifests(store).read(recorder).name
+    return _read(store, recorder)[1]
 
 
 def _connect(store: Path, recorder: str) -> socket.socket:
@@ -247,8 +255,8 @@ def choose(store: Path, named: Sequence[str]) -> list[str]:
 
     Args:
         store: The store's directory.
-        named: Names by the user: id or name of a recording, or the beginning of one. A
-            recorder with a ring has the name of its future snapshots.
+        named: Names by the user: id or name of a recording, the beginning of one, or that of
+            the digits of its id. A recorder with a ring has the name of its future snapshots.
 
     Raises:
         UsageError: No recorder runs, several run and no name is given, or a name matches
@@ -285,7 +293,11 @@ def _resolve(name: str, recorders: Mapping[str, str]) -> str:
         [one for one, known in recorders.items() if name in {one, known}]
         or [one for one, known in recorders.items() if ring.fullmatch(known)]
         or [one for one, known in recorders.items() if name and known.startswith(name)]
-        or [one for one in recorders if name and one.startswith(name)]
+        or [
+            one
+            for one in recorders
+            if name and (one.startswith(name) or one[-16:].startswith(name))
+        ]
     )
     if len(fitting) > 1:
         found = ", ".join(recorders[one] for one in fitting)

@@ -12,11 +12,13 @@ import shutil
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
+from hybridlog.entries import text as as_text
 from hybridlog.live.clocks import CLOCK, MachineClock, SimulatedTime
 from hybridlog.live.control_server import ControlServer
 from hybridlog.live.memory import default_budget, resident_bytes
@@ -39,7 +41,7 @@ from hybridlog.live.recording import (
 from hybridlog.live.silence import RULE, Commands, SilenceWatch
 from hybridlog.live.snapshots import SnapshotOptions, Snapshots
 from hybridlog.live.statistics import Lateness, Tally, TopicRates, TopicState
-from hybridlog.maintenance.edit import remove_if
+from hybridlog.maintenance.edit import remove_if, too_many_marks
 from hybridlog.maintenance.keep import Own, RetentionThread
 from hybridlog.query.times import format_duration, format_time
 from hybridlog.record.losses import Cause, Loss
@@ -47,7 +49,8 @@ from hybridlog.record.marks import CLOCK_SET, CONTRACT, mark_channel, mark_paylo
 from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.completion import completed
 from hybridlog.schema.reduced_codec import reduce, reduced_channel
-from hybridlog_storage.errors import DiskFullError, HybridlogError, UsageError
+from hybridlog_storage.errors import DiskFullError, HybridlogError, StoreError, UsageError
+from hybridlog_storage.manifest import Mark, new_random, with_mark
 from hybridlog_storage.messages import Channel
 
 if TYPE_CHECKING:
@@ -218,7 +221,7 @@ class Recorder:
         self._sources = sources
         self._options = options
         self._say = say
-        self._store_path = store.directory.path
+        self._directory = store.directory
         self._recorded: dict[Channel, _RecordedChannel] = {}
         self._recorded_by_content: dict[tuple[object, ...], _RecordedChannel] = {}
         self._topics: dict[str, TopicRates] = {}
@@ -261,7 +264,7 @@ class Recorder:
                 options.snapshots,
                 options.budget_bytes,
                 lambda reason: self._begin(store, {"trigger": reason}),
-                lambda reason: self.mark(reason, {"trigger": reason}),
+                lambda reason: self._note(reason, {"trigger": reason}, self._clock.now()),
                 self._say,
                 clock=self._clock,
             )
@@ -369,8 +372,9 @@ class Recorder:
         self._retention.stop()
         if isinstance(self._target, Snapshots):
             reports = self._target.close()
-        elif not (self.stopped_for_disk and self._target.is_empty) and (
-            self._recorded_by_content or any(source.was_reached for source in self._sources)
+        elif self._is_marked(self._target.id) or (
+            not (self.stopped_for_disk and self._target.is_empty)
+            and (self._recorded_by_content or any(source.was_reached for source in self._sources))
         ):
             reports = [self._target.close()]
         else:
@@ -432,7 +436,7 @@ class Recorder:
             lag,
             self._lateness.late(now, stored, lag),
             "" if failure is None else str(failure),
-            shutil.disk_usage(self._store_path).free,
+            shutil.disk_usage(self._directory.path).free,
             stored_bytes,
             self._stalled_s(now),
             snapshots=None if ring is None else ring.count,
@@ -453,24 +457,42 @@ class Recorder:
         waited = now - self._written_at - self._options.flush_interval_s
         return waited if waited > _SLOW_WRITE_S else 0.0
 
-    def mark(
-        self,
-        text: str,
-        tags: Mapping[str, str],
-        *,
-        begin: int | None = None,
-        end: int | None = None,
-    ) -> None:
-        """Set a mark: a message on the topic of marks, for queries and triggers.
+    def mark(self, text: str, tags: Mapping[str, str]) -> str:
+        """Set a mark, at this time, in the manifest; with a ring it is a message in it.
 
         Args:
             text: What happened.
             tags: Tags of the mark.
-            begin: Its log time, ns; None for now.
-            end: Log time of its end, ns; None for a moment.
+
+        Returns:
+            The name of the recording, or of the recorder with a ring.
+
+        Raises:
+            StoreError: The manifest cannot be written, or has as many marks as it can have.
+            UsageError: There is no time of `/clock` yet.
         """
-        received = self._clock.now() if begin is None else begin
-        self._sink.take(self._marks, mark_payload(text, tags, end), received=received)
+        target = self._target
+        if isinstance(target, Snapshots):
+            self._note(text, tags, self._clock.now())
+            return self.name
+        if self._simulated is not None and self._simulated.is_waiting:
+            raise UsageError(f"There is no time of {CLOCK} yet: mark again when it has come.")
+        at = self._clock.now() if self._simulated is None else self._now()
+        said = {as_text(key): as_text(value) for key, value in tags.items()}
+        made = Mark(new_random(), at, as_text(text), said)
+        now = self._directory.manifests.change(target.id, lambda known: with_mark(known, made))
+        if made not in now.marks:
+            raise too_many_marks(now.name)
+        return now.name
+
+    def _note(self, text: str, tags: Mapping[str, str], at: int) -> None:
+        """Note something as a message on the topic of marks, at a log time, ns."""
+        self._sink.take(self._marks, mark_payload(text, tags), received=at)
+
+    def _is_marked(self, recording: str) -> bool:
+        with suppress(StoreError):
+            return bool(self._directory.manifests.read(recording).marks)
+        return False
 
     def _now(self) -> int:
         """The present as a steady time, ns."""
@@ -651,8 +673,7 @@ class Recorder:
             raise UsageError("a mark needs a text and tags")
         if not all(isinstance(word, str) for pair in tags.items() for word in pair):
             raise UsageError("names and values of tags must be texts")
-        self.mark(text, tags)
-        return {"recording": self.name}
+        return {"recording": self.mark(text, tags)}
 
     def _ask_trigger(self, request: Mapping[str, Any]) -> Mapping[str, Any]:
         reason = request.get("reason")
@@ -852,7 +873,7 @@ class Recorder:
         """Mark what is noted of the clock; alone it makes no recording."""
         while self._clock_marks and self._recorded_by_content and not self._over.is_set():
             text, tags, at = self._clock_marks.pop(0)
-            self.mark(text, tags, begin=at)
+            self._note(text, tags, at)
 
 
 def _cause_of(error: HybridlogError) -> Cause:

@@ -41,11 +41,9 @@ from hybridlog_storage.errors import (
     TopicError,
 )
 from hybridlog_storage.manifest import Manifest, replace
-from hybridlog_storage.segments.segment_file import number_of, sealed_name
+from hybridlog_storage.segments.segment_file import number_of
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from hybridlog.entries import Inventory
     from hybridlog.maintenance.report import RepairReport
     from hybridlog_storage.catalog import Described, RecordingEntry
@@ -359,12 +357,10 @@ def recover(directory: StoreDirectory, recording: str, report: RepairReport) -> 
     listing = directory.listing(recording)
     if PAYLOAD_PARTS in listing.others or manifest.deleted:
         payload_files.publish(path, manifest)
-    if {*manifest.unmarked} & listing.sealed.keys():
-        remove_marks(path, manifest)
     payload_files.remove_replaced(path, (*listing.sealed.values(), *listing.others), manifest)
     recovered = recover_segments(directory, recording, listing, manifest)
     inventory = take_inventory(directory, recording)
-    is_empty = not inventory.listing.sealed and not manifest.logs
+    is_empty = not (inventory.listing.sealed or manifest.logs or manifest.marks)
     if is_empty and not manifest.is_ended:
         directory.manifests.remove(recording)
         report.recovered[inventory.name] = recovered
@@ -482,32 +478,8 @@ def recover_segments(
 
             directory.manifests.change(recording, change)
 
-    recovered = []
-    for number, name in listing.open.items():
-        if manifest is not None and manifest.is_ended and number not in manifest.logs:
-            # An unfinished mark of a recording that had ended.
-            try:
-                files.unlink(path / name)
-            except OSError as error:
-                raise durability.explain(error, path / name, "removing") from error
-        else:
-            recovered.append(recover_segment(path / name, announce, recording=said))
-    return recovered
-
-
-def remove_marks(path: Path, manifest: Manifest) -> None:
-    """Remove the segments of removed marks of a recording that this process has locked.
-
-    Raises:
-        HybridlogError: One cannot be removed.
-    """
-    try:
-        for number in manifest.unmarked:
-            with suppress(FileNotFoundError):
-                files.unlink(path / sealed_name(number))
-        files.sync_folder(path)
-    except OSError as error:
-        raise durability.explain(error, path, "removing marks of") from error
+    names = listing.open.values()
+    return [recover_segment(path / name, announce, recording=said) for name in names]
 
 
 def _end_of(inventory: Inventory) -> dict[str, Any]:

@@ -255,6 +255,7 @@ class _Check:
             self.found("manifest", "it is missing, so other losses are unknown", _REPAIR)
             return
         self._result.bytes_read += len(encode(manifest))
+        self._result.messages += len(manifest.marks)
         if manifest.status == "unproven":
             self.found(
                 "manifest",

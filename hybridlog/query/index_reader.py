@@ -11,6 +11,7 @@ import numpy as np
 
 from hybridlog.query.predicate.mongo_filter import misjudged
 from hybridlog.query.predicate.tree import And, Field, Member, MongoFilter, Predicate
+from hybridlog.record.marks import MARKS
 from hybridlog.schema.column import STAMP
 from hybridlog_storage.errors import (
     ConnectionLostError,
@@ -133,9 +134,12 @@ class IndexReader:
         """An answer during which no other process has removed documents."""
         for part in parts:
             if not part.is_indexed:
+                why = "it was recorded with --no-index"
+                if part.topic == MARKS:
+                    why = "marks that somebody set are not in MongoDB"
                 raise TopicError(
-                    f"{part.topic} has no index documents: it was recorded with --no-index. Write "
-                    "a predicate, such as 'x > 1', instead of a MongoDB filter."
+                    f"{part.topic} has no index documents: {why}. Write a predicate, such as "
+                    "'x > 1', instead of a MongoDB filter."
                 )
         failure: Exception | None = None
         for _ in range(_TRIES):

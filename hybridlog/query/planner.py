@@ -22,6 +22,7 @@ from hybridlog.query.engines.chunk_index import ChunkIndex, Statistics
 from hybridlog.query.engines.payload_scan import PayloadScan
 from hybridlog.query.question import Part
 from hybridlog.query.ranges import RangeResolver
+from hybridlog.record.marks import MARKS
 from hybridlog.schema.column import STAMP
 from hybridlog.schema.states import GONE
 from hybridlog.snapshot import UNFINISHED
@@ -129,6 +130,8 @@ class Planner:
         predicate = self.question.predicate
         if predicate is None or predicate.filters or len(found) < MIN_RECORDINGS:
             return found
+        if MARKS in self.question.topics:
+            return found  # those that somebody set are not among what bounds are known of
         self._has_many_recordings = True
         return within_bounds(self.session, self.question, found)
 
@@ -293,6 +296,7 @@ class Planner:
         """The messages of the answer, in order."""
         question = self.question
         if question.limit == 0:
+            self._ranges.resolve()  # a range that is outside is refused all the same
             return
         runs = self._runs()
         for run in runs if question.returns_all else _decimated(runs, question):

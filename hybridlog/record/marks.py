@@ -16,16 +16,18 @@ CONTRACT: Final = "contract"
 """Tag `cause` of marks that a recorder sets while a contract is broken."""
 MARK: Final = "hybridlog.Mark"
 """Type of marks."""
-_SCHEMA: Final = (
+MARK_SCHEMA: Final = Schema(
+    MARK,
+    "jsonschema",
     b'{"type":"object","properties":{"text":{"type":"string"},'
     b'"tags":{"type":"object","additionalProperties":{"type":"string"}},'
-    b'"end":{"type":"integer"}}}'
+    b'"end":{"type":"integer"}}}',
 )
 
 
 def mark_channel() -> Channel:
     """The channel of marks."""
-    return Channel(MARKS, "json", Schema(MARK, "jsonschema", _SCHEMA), {})
+    return Channel(MARKS, "json", MARK_SCHEMA, {})
 
 
 def mark_payload(text: str, tags: Mapping[str, str], end: int | None = None) -> bytes:

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.messages import Schema
-    from hybridlog_storage.segments.segment_reader import SegmentReader
     from hybridlog_storage.summary import TopicType
 
 
@@ -88,10 +87,6 @@ class RunningRecording:
         self.topics = set() if self.entry is None else topic_types(self.entry)
         return True
 
-    def readers(self) -> dict[int, SegmentReader]:
-        """The readers of segments that are not sealed, by number."""
-        return {number: segment.reader for number, segment in self._segments.items()}
-
     @contextmanager
     def _noting(self, number: int) -> Iterator[None]:
         """Note why a segment cannot be read; the other ones answer."""
@@ -123,9 +118,10 @@ class RunningRecording:
         """The entry with what is flushed besides."""
         channels = {channel.id: replace(channel) for channel in sealed.channels}
         found = replace(sealed, end=dict(sealed.end), spans=list(sealed.spans))
-        found.flushed = {number: one.flushed for number, one in self._segments.items()}
-        for number, (table, attachments, metadata) in found.flushed.items():
-            segment = self._segments[number]
+        found.flushed = dict(sealed.flushed)  # marks
+        for number, segment in self._segments.items():
+            found.flushed[number] = segment.flushed
+            table, attachments, metadata, _ = segment.flushed
             self._add_channels(channels, segment)
             silent = {channel.id for channel in channels.values() if not channel.has_publish_time}
             for channel_id, stats in channel_totals(table, None, silent).items():

@@ -32,7 +32,7 @@ from hybridlog_storage.cells import Cells, Statement, drop, put
 from hybridlog_storage.disk import durability, files
 from hybridlog_storage.errors import CatalogError, SegmentError
 from hybridlog_storage.lazy import RowType
-from hybridlog_storage.messages import Channel, Schema
+from hybridlog_storage.messages import MARKS_CHANNEL, Channel, Schema
 from hybridlog_storage.ordering import run_starts
 from hybridlog_storage.segments.chunk_table import ChunkTable
 from hybridlog_storage.segments.segment_file import sealed_name
@@ -159,6 +159,8 @@ class ChannelEntry:
     @property
     def unindexed(self) -> str | None:
         """Reason why MongoDB has no fields of its messages, None if it has."""
+        if self.id == MARKS_CHANNEL:
+            return "marks that somebody set"
         return self.reason if self.is_indexed else "recorded with --no-index"
 
 
@@ -183,7 +185,8 @@ class RecordingEntry:
         attachments: Number of attachments of its log.
         metadata_records: Number of metadata records of its log.
         notes: Notes of users: `at` (ns) and `text`.
-        marks: Marks set after it ended: `time` (ns), `text`, `tags`; those that last, `end` (ns).
+        marks: Marks that somebody set: `id`, `time` (ns), `text`, `tags`; those that last, `end`
+            (ns).
         pins: What is never deleted to make room: `id`, `from`, `to`, `topics`, `reason`.
         spans: Number, first and last log time (ns) of each segment that has messages.
         digests: Digest of each valid segment as it was sealed, by its number as text.
@@ -193,8 +196,8 @@ class RecordingEntry:
         payloads: Files with fields of expired messages: `file`, `bytes`, `digest`, `topic`,
             `messages`.
         copies: Addresses of stores with copies that have more payloads.
-        flushed: Content of segments that are not sealed, by number, at one moment; the
-            catalog's file does not have it.
+        flushed: Content of segments that are not sealed, and of marks, by number, at one moment;
+            the catalog's file does not have it.
     """
 
     id: str
@@ -873,7 +876,8 @@ def file_of(entry: RecordingEntry, number: int) -> str:
 
 def files_of(entry: RecordingEntry) -> dict[int, str]:
     """Names of the files of all sealed segments with messages, by number."""
-    return {number: file_of(entry, number) for number, _, _ in entry.spans}
+    numbers = [number for number, _, _ in entry.spans if str(number) in entry.digests]
+    return {number: file_of(entry, number) for number in numbers}
 
 
 def spans_of(number: int, table: ChunkTable) -> list[tuple[int, int, int]]:

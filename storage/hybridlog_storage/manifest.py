@@ -183,7 +183,6 @@ class Mark(Record, frozen=True):
         text: What was said of it.
         tags: Its tags.
         end: Log time of its end; None for a moment.
-        segment: Number of the log that holds it as a message.
     """
 
     id: Random
@@ -191,7 +190,6 @@ class Mark(Record, frozen=True):
     text: Text
     tags: Tags = {}
     end: Nanoseconds | None = None
-    segment: Number | None = None
 
 
 class Pin(Record, frozen=True):
@@ -251,8 +249,8 @@ class Manifest(Record, frozen=True):
         source: Where it comes from.
         tags: Its tags.
         notes: Its notes, in the order of writing.
-        marks: Its marks.
-        uncounted_marks: Marks beyond `MAX_MARKS`.
+        marks: Marks that somebody set, in this order; those of its recorder are messages.
+        uncounted_marks: How many more there would be beyond `MAX_MARKS`.
         pins: Its pins.
         channels: Its channels by number.
         files: Its files, in the order of writing.
@@ -261,7 +259,6 @@ class Manifest(Record, frozen=True):
         damage: What else was wrong then, in words.
         fields: Files with the fields of messages whose payloads have expired.
         deleted: Such files that others have replaced.
-        unmarked: Numbers of the logs of marks that were removed.
         lacks_payloads: Whether it is a copy whose payloads have not been copied yet.
     """
 
@@ -283,7 +280,6 @@ class Manifest(Record, frozen=True):
     damage: tuple[Text, ...] = ()
     fields: tuple[Fields, ...] = ()
     deleted: tuple[FieldsName, ...] = ()
-    unmarked: tuple[Number, ...] = ()
     lacks_payloads: bool = False
 
     @property
@@ -308,8 +304,6 @@ class Manifest(Record, frozen=True):
             raise ValueError("a file has the number of another one")
         if len({(file.kind, file.number) for file in self.files}) < len(self.files):
             raise ValueError("two files have one number")
-        if not {file.number for file in self.files}.isdisjoint(self.unmarked):
-            raise ValueError("a file is both listed and removed")
         paths = {file.file for file in self.fields}
         if len(paths) < len(self.fields) or not paths.isdisjoint(self.deleted):
             raise ValueError("a file of fields is listed twice, or was replaced")
@@ -416,6 +410,13 @@ def with_totals(manifest: Manifest) -> Manifest:
         for number, channel in sorted(manifest.channels.items())
     }
     return replace(manifest, channels=channels)
+
+
+def with_mark(manifest: Manifest, mark: Mark) -> Manifest:
+    """The manifest with a mark; if it has `MAX_MARKS`, one more is counted."""
+    if len(manifest.marks) < MAX_MARKS:
+        return replace(manifest, marks=(*manifest.marks, mark))
+    return replace(manifest, uncounted_marks=manifest.uncounted_marks + 1)
 
 
 def with_file(manifest: Manifest, number: int, **values: object) -> Manifest:

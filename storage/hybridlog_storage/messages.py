@@ -37,6 +37,8 @@ NOT_COPIED = "hybridlog.not_copied"
 EXPIRED_IDS = 1 << 16
 """Added to the id of a channel: the channel of its expired messages; twice this: of those that
 were not copied. No file has such ids."""
+MARKS_CHANNEL = 3 * EXPIRED_IDS
+"""Id of the channel of marks that somebody set: the manifest has them, and no file."""
 _ENCODINGS = {1: EXPIRED, 2: NOT_COPIED}
 
 

@@ -39,7 +39,6 @@ OPENINGS: Final = {
     "open with an unlisted segment": 40,
     "open while removing": 65,
     "open after removing": 55,
-    "open after a mark": 110,
     "open without a segment": 125,
 }
 BESIDE: Final = {

@@ -142,16 +142,6 @@ def _crashed(bench: Bench, name: str, step: str, number: int) -> Prepared:
     return Prepared(path, prepared.documents)
 
 
-def _marked(bench: Bench) -> Prepared:
-    """A store with a mark that is not in the index yet."""
-    with _two(bench).copy(bench.server, bench.path / "case") as case:
-        command = ["mark", "a", "+0.1s", "here"]
-        assert bench.stepper.run(command, case.path, case.uri, Point("none")).outcome == "done"
-        prepared = Prepared.of(bench.server, case.path, case.uri)
-        prepared.duplicate(bench.path / "marked")
-    return Prepared(bench.path / "marked", prepared.documents)
-
-
 def _says_more(state: State, before: State, outcome: str) -> bool:
     """A recovery that was killed may say of what it wrote last that it was cut short."""
     if outcome != "killed" or state.findings or state.recordings.keys() != before.recordings.keys():
@@ -218,7 +208,6 @@ SCENARIOS: Mapping[str, Callable[[Bench], Scenario]] = {
         lambda bench: _changed(bench, "unlisted", _forget_segment), a=FIRST, b=SECOND
     ),
     "open while removing": _opening(lambda bench: _changed(bench, "removing", _announce), b=SECOND),
-    "open after a mark": _opening(_marked, b=SECOND),
     "open without a segment": _opening(
         lambda bench: _changed(bench, "lost", _lose_segment), b=SECOND
     ),

@@ -112,6 +112,24 @@ def test_each_message_comes_once_whenever_it_was_sent(path: Path) -> None:
         assert [message.fields["data"] for message in following] == ["last"]
 
 
+def test_each_mark_comes_once_whatever_is_removed_meanwhile(path: Path) -> None:
+    with talking(path) as (one, store), hl.open(path) as other:
+        (name,) = [found.name for found in store.summaries()]
+        for number in range(3):
+            other.mark(name, "start", f"before {number}")
+        following = store.topic("marks").follow()
+        other.unmark(name, "before 1")
+        other.mark(name, "start", "first")
+        assert next(following).fields["text"] == "first"
+        other.unmark(name, "before 0")
+        other.mark(name, "+0s", "second")
+        one.say("/a", "later", time=2_000_000_000)
+        other.mark(name, "+1s", "third")
+        assert [m.fields["text"] for m in islice(following, 2)] == ["second", "third"]
+        one.end()
+        assert [*following] == []
+
+
 def test_it_goes_on_while_segments_are_sealed(path: Path) -> None:
     said = [str(number) for number in range(60)]
     with talking(path, segment_s=0.3, flush_s=0.1) as (one, store):

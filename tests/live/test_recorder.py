@@ -584,11 +584,7 @@ def test_a_mark_that_is_no_text(store: hl.Store) -> None:
     robot.recorder.mark("bad\udcff\udcfebytes", {"a": "\udc80"})
     robot.rows()
     (message,) = store.topic(MARKS)
-    assert json.loads(bytes(message.raw)) == {
-        "text": "bad\udcff\udcfebytes",
-        "tags": {"a": "\udc80"},
-    }
-    assert robot.recorder.look().messages == 1
+    assert json.loads(bytes(message.raw)) == {"text": r"bad\xff\xfebytes", "tags": {"a": r"\x80"}}
 
 
 def test_the_bytes_wanted_are_counted_as_they_come(store: hl.Store) -> None:

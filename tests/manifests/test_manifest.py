@@ -143,7 +143,6 @@ FIELDS = {"file": "fields=a/1-000000.parquet", "bytes": 1, "digest": DIGEST, "to
         {"files": [FILE, FILE]},
         {"files": [FILE, {**FILE, "name": "000000.1.mcap"}]},
         {"files": [{**FILE, "digest": f"sha256:{DIGEST}"}]},
-        {"files": [FILE], "unmarked": [0]},
         {"fields": [FIELDS, FIELDS]},
         {"fields": [FIELDS], "deleted": [FIELDS["file"]]},
         {"files": [{**FILE, "parts": {"3": [1, 1]}}]},

@@ -12,16 +12,19 @@ import foxglove
 import pytest
 from foxglove.channels import EventChannel, LogChannel
 from foxglove.messages import Event, KeyValuePair, Log, Timestamp
+from mcap.reader import make_reader
 from msgspec import structs
 from starlette.testclient import TestClient
 
 import hybridlog as hl
 from hybridlog.query.answers.marks import marks_in
 from hybridlog.query.counters import Counters
+from hybridlog.record.marks import mark_channel, mark_payload
 from hybridlog.view.loopback import Admission
 from hybridlog.view.server import make_app
-from hybridlog_storage.errors import TimeError, UsageError
-from hybridlog_storage.manifest import replace
+from hybridlog_storage.errors import StoreError, TimeError, UsageError
+from hybridlog_storage.manifest import MAX_MARKS, Mark, replace
+from hybridlog_storage.messages import Channel
 from tests import places
 from tests.cli.within import answer
 
@@ -93,25 +96,92 @@ def test_a_mark_is_removed(store: hl.Store, tmp_path: Path) -> None:
     answer("mark", "carpet", "-r", "drive", "--at", "+70s", "--remove", store=path)
     answer("mark", "carpet", "-r", "drive", "--until", "+70s", "--remove", store=path, code=2)
     marks = "/hybridlog/marks"
-    folder = places.folder(path, "drive")
     with hl.open(path, mongo="none") as opened:
         assert [m["text"] for m in opened.entry("drive").marks] == ["carpet", "stairs"]
         assert times(opened.topic(marks)) == [60, 80]
         opened.unmark("drive", "carpet")
-        # A crash has left the segment; nothing answers from it, and it goes.
-        number = opened.entry("drive").marks[0]["segment"]
-        left = (folder / f"{number:06d}.mcap").read_bytes()
+        assert times(opened.topic(marks)) == [80]
         opened.unmark("drive", "stairs")
         assert marks not in opened.topics()
-        assert opened.verify().findings == []
-    (folder / f"{number:06d}.mcap").write_bytes(left)
-    with hl.open(path, mongo="none") as opened:
-        opened.verify(repair=True)
-        assert marks not in opened.topics()
-        opened.mark("drive", "+90s", "end")  # in a segment of the same number
+        opened.mark("drive", "+90s", "end")
         assert times(opened.topic(marks)) == [90]
         assert opened.verify().findings == []
         assert len(opened.topic("log").to_arrow()) == 100
+
+
+def test_marks_answer_as_messages_do(tmp_path: Path) -> None:
+    """Those that a recorder noted, and those that were set, in every format and count."""
+    said = [(BEGIN + 3, "b", {"k": "1"}, None), (BEGIN + 2, "a", {}, BEGIN + 7)]
+    answers = []
+    for are_set in (False, True):
+        path = tmp_path / str(are_set)
+        with hl.open(path, create=True, mongo="none") as store:
+            with store.start("drive") as recording:
+                for number in range(10):
+                    time = (BEGIN + number) * S
+                    recording.write(NUMBERS, b'{"n": %d}' % number, log_time=time)
+                for begin, text, tags, end in [] if are_set else said:
+                    payload = mark_payload(text, tags, None if end is None else end * S)
+                    recording.write(mark_channel(), payload, log_time=begin * S)
+            for begin, text, tags, end in said if are_set else []:
+                until = None if end is None else f"+{end - BEGIN}s"
+                store.mark("drive", f"+{begin - BEGIN}s", text, tags, until=until)
+        answers.append([*_answers(path)])
+    messages, marks = answers
+    assert marks == messages
+
+
+NUMBERS = Channel("/n", "json", None)
+
+
+def _answers(path: Path) -> Iterator[object]:
+    for form in ("jsonl", "csv", "json", "table"):
+        yield answer("fetch", "-t", "marks", "-F", form, store=path).out
+    yield answer("fetch", "-t", "*", "--reverse", "--limit", "8", "-F", "jsonl", store=path).out
+    yield answer("fetch", "-t", "marks", "--between", "+2.5s", "end", "--count", store=path).out
+    yield answer("stats", "-t", "marks", store=path).out
+    for question in (
+        ("intervals", "-t", "marks", "--where", "text = 'a'"),
+        ("fetch", "-t", "/n", "--where", "/hybridlog/marks: tags.k = '1'", "--within", "1s"),
+        ("sql", "select t, end_t, text, tags from marks order by t"),
+        ("sql", 'select t, pub, text, "end", tags_.k from hybridlog__marks order by seq % 2'),
+    ):
+        yield answer(*question, store=path).out
+    out = path.with_suffix(".mcap")
+    answer("fetch", "-t", "*", "-F", "mcap", "-o", str(out), store=path)
+    with out.open("rb") as file:
+        yield [
+            (channel.topic, schema and schema.name, message.log_time, message.data)
+            for schema, channel, message in make_reader(file).iter_messages()
+        ]
+    with hl.open(path, mongo="none") as store:
+        marks = store.topic("marks")
+        yield store.topics(), store.entry("drive").messages, store.entry("drive").span
+        yield [(m.log_time_ns, m.publish_time_ns, m.fields) for m in marks.reverse()]
+        yield marks.between("+2s", "+3s").count(), marks.where("text = 'b'").count()
+        yield marks.to_arrow().to_pylist(), marks.remarks()
+        yield [(one.begin_ns, one.end_ns) for one in marks.windows()]
+        yield store.topic("*").count(), marks.at("+4s").fields, marks.at("+2.5s").fields
+        yield str(marks.completeness()), store.verify().findings
+
+
+def test_a_recording_has_ten_thousand_marks(store: hl.Store, tmp_path: Path) -> None:
+    path = Path(shutil.copytree(store.directory.path, tmp_path / "store"))
+    many = [Mark(f"{n:016x}", (BEGIN + n % 90) * S + n, f"mark {n}") for n in range(MAX_MARKS)]
+    with hl.open(path, mongo="none") as opened:
+        manifests, (entry,) = opened.directory.manifests, opened.recordings()
+        manifests.change(entry.id, lambda now: replace(now, marks=tuple(many)))
+        with pytest.raises(StoreError, match="10,000 marks, the most that a recording can have"):
+            opened.mark("drive", "+5s", "too much")
+    answer("mark", "again", "-r", "drive", "--at", "+5s", store=path, code=5)
+    with hl.open(path, mongo="none") as opened:
+        assert opened.directory.manifests.read(entry.id).uncounted_marks == 2
+        marks = opened.topic("/hybridlog/marks")
+        assert marks.count() == len(marks.to_arrow()) == MAX_MARKS
+        assert [m.fields["text"] for m in marks.where("text = 'mark 777'")] == ["mark 777"]
+        opened.unmark("drive", "mark 777")
+        opened.mark("drive", "+5s", "room again")
+        assert marks.where("text = 'mark 777' or text = 'room again'").count() == 1
 
 
 def test_marks_in_sql_and_in_the_timeline(store: hl.Store) -> None:

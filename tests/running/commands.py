@@ -384,7 +384,7 @@ COMMANDS: dict[str, list[Asked]] = {
         refused(f"tag {LABEL} --remove nothing", 2),
         asked(f"tag {LABEL}", lambda a, _: a.lines, lambda _: ["robot=7"]),
     ],
-    "mark": [refused(f"mark here -r {LABEL} --at +1s", 5)],
+    "mark": [refused(f"mark here -r {LABEL} --remove", 2)],
     "rm": [refused(f"rm {LABEL} --yes", 5)],
 }
 """By name of the command."""

@@ -58,7 +58,7 @@ def recording(of: str = ONE, topics: tuple[str, ...] = ("/ä b", "/b")) -> Recor
         segments=3,
         chunks=2,
         notes=[{"at": 5, "text": "ö"}],
-        marks=[{"time": 1, "text": "m", "tags": {"k": "v"}, "segment": 1}],
+        marks=[{"time": 1, "text": "m", "tags": {"k": "v"}, "id": "0" * 16}],
         spans=[(0, 5, 7), (1, 8, 9)],
         digests=dict(DIGESTS),
     )

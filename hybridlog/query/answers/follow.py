@@ -20,6 +20,7 @@ from hybridlog.query.engines.payload_scan import PayloadScan
 from hybridlog.query.planner import Planner
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.topics import later
+from hybridlog.record.marks_log import MARKS_SEGMENT, without
 from hybridlog_storage.errors import UsageError
 from hybridlog_storage.stopping import pause, safe_point
 
@@ -61,6 +62,7 @@ class Following(Planner, Iterator["Message"]):
         session = source.now()
         if session is source:
             raise UsageError("In a snapshot nothing new is seen: follow in the store itself.")
+        session = session.again()
         running = [
             session.entry_of(one)
             for one in session.look(wanted).summaries
@@ -80,8 +82,9 @@ class Following(Planner, Iterator["Message"]):
         self._takes = later(names)
         self._bounds: dict[str, Span] = {}
         self._read = dict.fromkeys(ids, (0, 0))  # the last segment, and how many of its chunks
+        self._marks: set[str] = set()  # ids of those that were read
         for entry in running if question.bounds is None else ():
-            self._read[entry.id] = max([0, *map(int, entry.digests), *entry.flushed]), 0
+            self._read[entry.id] = max([0, *_segments(entry)]), 0
             _ = [*self._arrivals(entry, None)]
         _ = self.examples, self.ranks  # of this moment
         self._messages = (
@@ -96,7 +99,7 @@ class Following(Planner, Iterator["Message"]):
         goes_on = True
         while goes_on:
             started = time.monotonic()
-            self.session = self._arrived.session = self._source.now()
+            self.session = self._arrived.session = self._source.now().again()
             plan, goes_on = self._look()
             for run in ChunkScan(plan, self.session).runs():
                 yield run
@@ -135,14 +138,20 @@ class Following(Planner, Iterator["Message"]):
         """The chunks that have come since the last call, and may have messages in bounds."""
         clock = self.question.clock
         last, read = self._read[entry.id]
-        for segment in sorted({*map(int, entry.digests), *entry.flushed} - {*range(last)}):
+        timed = [c.id for c in entry.channels if c.has_publish_time]
+        for segment in sorted(_segments(entry) - {*range(last)}):
             flushed = entry.flushed.get(segment)
             table = flushed.table if flushed else self.session.chunk_table(entry, segment)
             columns = ChunkColumns(segment, table)
-            timed = [c.id for c in entry.channels if c.has_publish_time]
             is_new = columns.number >= (read if segment == last else 0)
             yield from columns.chunks(is_new & columns.within(bounds, clock, timed=timed))
             self._read[entry.id] = segment, len(table.chunks)
+        if entry.marks:
+            entry = without(entry, self._marks)
+            self.session.show(entry)
+            self._marks.update(mark["id"] for mark in entry.marks)
+            columns = ChunkColumns(MARKS_SEGMENT, entry.flushed[MARKS_SEGMENT].table)
+            yield from columns.chunks(columns.within(bounds, clock, timed=timed))
 
     def _selecting(self, part: Part) -> Engine:
         return self._scan
@@ -162,6 +171,11 @@ class _Arrived(PayloadScan):
 
     def _scan(self, part: Part, indexes: dict[int, int]) -> RecordingScan:
         return RecordingScan(part.recording, indexes, part.bounds, self.chunks[part.recording.id])
+
+
+def _segments(entry: RecordingEntry) -> set[int]:
+    """Numbers of the segments of a running recording."""
+    return {*map(int, entry.digests), *entry.flushed} - {MARKS_SEGMENT}
 
 
 def _checked(question: Question) -> Question:

@@ -247,9 +247,9 @@ class SeenManifests(BucketManifests):
         super()._delete_files(recording)
         self._cells.put_tables(recording)
 
-    def _forget(self, recording: str) -> None:
+    def _forget(self, recording: str, *, is_said: bool) -> None:
         self._doubt(recording)
-        super()._forget(recording)
+        super()._forget(recording, is_said=is_said)
         with self._lock:
             self.objects.pop(recording, None)
             self._cells.write(lambda: [drop(_MANIFEST, recording)], 0)

@@ -86,11 +86,13 @@ class Flushed(NamedTuple):
         table: Its chunks.
         attachments: Attachments of the source, in file order.
         metadata: Metadata records of the source, in file order.
+        reader: Reads its chunks.
     """
 
     table: ChunkTable
     attachments: Sequence[AttachmentIndex]
     metadata: Sequence[MetadataIndex]
+    reader: SegmentReader
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,7 +166,9 @@ class OpenSegment:
             self._parts_so_far = [parts]
             chunks, others = np.array(self._chunks, CHUNK), np.array(self._others, OTHER)
             table = ChunkTable(chunks, parts, others, is_flushed=True)
-            self._flushed = Flushed(table, tuple(self._attachments), tuple(self._metadata))
+            self._flushed = Flushed(
+                table, tuple(self._attachments), tuple(self._metadata), self.reader
+            )
         return self._flushed
 
     def follow(self) -> bool:
