@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import errno
-import os
 import re
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import NoReturn
 
 import psutil
 import pytest
 
 from benchmarks import __main__ as command
-from benchmarks.__main__ import PARTS, Piece, main, pieces
+from benchmarks.__main__ import PARTS, Piece, main
 from benchmarks.backends.base import BackendMissingError
 from benchmarks.backends.nothing import Nothing
 from benchmarks.backends.registry import BACKENDS
@@ -27,6 +23,7 @@ from benchmarks.studies import tasks
 from benchmarks.studies.runs import Context
 from hybridlog.cli.signals import Stopped
 from tests.imports import ROOT
+from tests.waiting import wait_for
 
 pytestmark = pytest.mark.mongo("embedded")
 
@@ -34,8 +31,6 @@ MINUTES = {"full": 1.0, "quick": 1.0, "tiny": 1.0}
 
 
 class Absent(Nothing):
-    """A backend that cannot run here."""
-
     @classmethod
     def check(cls) -> None:
         raise BackendMissingError("absent is not installed: install it")
@@ -129,26 +124,6 @@ def test_ctrl_c_keeps_what_is_done_and_the_same_command_goes_on(
     assert len(Journal(tmp_path).headers) == 2
 
 
-def test_a_search_is_repeated_where_the_time_allows_it(
-    made: Pieces, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    made.extra = ("two",)
-    for budget, ran in ((0.5, ["one", "three"]), (2.0, ["one", "three", "two"])):
-        monkeypatch.setattr(command, "BUDGET", {"full": budget})
-        assert main(["--out", str(tmp_path)]) == 0
-        assert made.ran == ran
-
-
-def test_a_failure_is_told_by_the_exit_code(
-    made: Pieces, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    made.status = "failed"
-    assert main(["--out", str(tmp_path)]) == 1
-    assert main(["--render", "--out", str(tmp_path)]) == 1
-    assert "FAILED live, hybridlog: why" in capsys.readouterr().out
-    assert "why" in (tmp_path / "benchmarks.md").read_text("utf-8")
-
-
 @pytest.mark.parametrize(
     ("more", "words"), [(["--quick"], "scale full, now it is quick"), (["--seed", "2"], "seed 1")]
 )
@@ -187,31 +162,6 @@ def test_what_will_not_do_has_a_cure(
     assert "absent is left out: absent is not installed: install it" in capsys.readouterr().err
 
 
-def test_a_full_disk_is_told_with_the_file(
-    made: Pieces,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def full(_: int) -> NoReturn:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(os, "fsync", full)
-    assert main(["--out", str(tmp_path)]) == 7
-    told = capsys.readouterr().err
-    assert f"No space left on device: '{tmp_path / 'samples.jsonl'}'" in told
-
-
-def test_two_runs_do_not_write_into_one_directory(
-    made: Pieces, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    codes: list[int] = []
-    made.during = lambda name: None if codes else codes.append(main(["--out", str(tmp_path)]))
-    assert main(["--out", str(tmp_path)]) == 0
-    assert codes == [2]
-    assert "Another run is writing" in capsys.readouterr().err
-
-
 def test_the_page_goes_into_the_checkout(
     made: Pieces, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -228,47 +178,6 @@ def test_the_page_goes_into_the_checkout(
     assert Journal(root / "docs" / "benchmarks-results").samples.keys() == (
         Journal(tmp_path / "out").samples.keys()
     )
-
-
-def test_a_line_that_is_being_written_is_left_to_its_writer(tmp_path: Path) -> None:
-    path, sample = tmp_path / "samples.jsonl", Sample("record", {}, "mcap", 0)
-    writing = Journal(tmp_path)
-    writing.begin({"seed": 1})
-    assert not path.exists()
-    writing.add(sample)
-    with path.open("ab") as file:
-        file.write(b'{"kind": "run", "seed"')
-    half = path.read_bytes()
-    going_on = Journal(tmp_path)
-    assert going_on.headers == [{"seed": 1}]
-    assert path.read_bytes() == half
-    # Only who writes next takes away what nobody has ended.
-    for seed in (2, 3):
-        going_on.begin({"seed": seed})
-        going_on.add(sample)
-    assert [header["seed"] for header in Journal(tmp_path).headers] == [1, 2, 3]
-
-
-def test_a_run_takes_less_than_an_hour() -> None:
-    found = pieces()
-    assert {piece.part for piece in found} == set(PARTS)
-    for scale, minutes in (("full", 55), ("quick", 20)):
-        usual = sum(piece.minutes[scale] for piece in found if not piece.is_extra)  # type: ignore[index]
-        assert usual <= minutes, scale
-
-
-def test_help_loads_nothing_heavy() -> None:
-    script = (
-        "import sys\nfrom benchmarks.__main__ import main\n"
-        "try:\n    main(['--help'])\nexcept SystemExit:\n    pass\n"
-        "heavy = {'numpy', 'pandas', 'pyarrow', 'pymongo', 'rosbags', 'psycopg'}\n"
-        "sys.exit(' '.join(sorted(heavy & set(sys.modules))) or 0)\n"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr
-    assert all(re.search(rf"^  {part} ", done.stdout, re.MULTILINE) for part in PARTS)
 
 
 def run(out: Path, *arguments: str) -> subprocess.Popen[bytes]:
@@ -326,11 +235,8 @@ def test_ctrl_c_ends_a_real_run(tmp_path: Path) -> None:
     """Signals, processes and the journal of the harness itself."""
     with run(tmp_path / "out", "--only", "record", "-b", "nothing,bagfile") as process:
         here = psutil.Process(process.pid)
-        deadline = time.monotonic() + 60
-        while len(here.children(recursive=True)) < 2:  # the logger, the publisher
-            assert process.poll() is None
-            assert time.monotonic() < deadline
-            time.sleep(0.01)
+        # The logger, and the publisher.
+        wait_for(lambda: len(here.children(recursive=True)) == 2 or process.poll() is not None)
         started = here.children(recursive=True)
         process.send_signal(signal.SIGINT)
         assert process.wait(60) == 130

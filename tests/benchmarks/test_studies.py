@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,10 +13,14 @@ from hypothesis import strategies as st
 from benchmarks.backends.base import Backend
 from benchmarks.backends.nothing import Nothing
 from benchmarks.harness.run import Outcome, Setting
+from benchmarks.live import cases
+from benchmarks.live.cases import CASES, Case, Row, _recorded
+from benchmarks.live.recorders import Kept
+from benchmarks.live.talker import Load as Talk
 from benchmarks.loads.base import Load
 from benchmarks.samples import Journal, Sample
 from benchmarks.studies import record, runs, search
-from benchmarks.studies.runs import Context, run_directory
+from benchmarks.studies.runs import Context
 from tests.benchmarks.test_harness import Dying, make_load
 
 pytestmark = pytest.mark.mongo("embedded")
@@ -38,9 +40,6 @@ def context(directory: Path, **settings: Any) -> Context:
     )
 
 
-# --- the search -----------------------------------------------------------------------
-
-
 def tried(truth: float, **bounds: float) -> dict[float, bool]:
     """Trials of a backend that keeps all up to a rate."""
     kept: dict[float, bool] = {}
@@ -49,14 +48,6 @@ def tried(truth: float, **bounds: float) -> dict[float, bool]:
         kept[rate] = rate <= truth
         assert len(kept) < 30
     return kept
-
-
-def test_the_search_doubles_then_halves_the_gap() -> None:
-    assert list(tried(300)) == [64, 128, 256, 512, 384, 320]
-    assert list(tried(400)) == [64, 128, 256, 512, 384, 448]
-    assert list(tried(10)) == [64, 32, 16, 8, 12, 10]
-    assert list(tried(0.5)) == [64, 32, 16, 8, 4, 2, 1]
-    assert list(tried(1e9, highest=512)) == [64, 128, 256, 512]
 
 
 @given(truth=st.floats(1, 16384), start=st.sampled_from([4.0, 50.0, 64.0, 100.0]))
@@ -71,44 +62,6 @@ def test_the_search_comes_within_a_quarter(truth: float, start: float) -> None:
         assert best * 2 > 16384
     else:
         assert best <= truth < lost <= best * 1.2501
-
-
-def trial(backend: str, rate: float, repetition: int = 0, **values: float) -> Sample:
-    usual = {"published": 100, "persisted": 100, "due_s": 1.0, "publish_s": 1.0}
-    return Sample("record", {"rate": rate}, backend, repetition, values={**usual, **values})
-
-
-def test_ends_of_searches_are_computed_from_samples() -> None:
-    lost, late = {"persisted": 99}, {"publish_s": 1.5}
-    samples = [
-        trial("nothing", 1024),
-        trial("nothing", 2048, **late),
-        trial("low", 64, **lost),
-        trial("middle", 64),
-        trial("middle", 96),
-        trial("middle", 128, **lost),
-        trial("middle", 256),  # luck above a loss does not count
-        trial("high", 1024),
-        trial("high", 2048, **lost),
-        trial("late", 64),
-        trial("late", 128, **late),
-        trial("open", 64),
-        trial("crashed", 64),
-        replace(trial("crashed", 128), status="failed", values={}),
-        replace(trial("absent", 64), status="missing", values={}),
-        trial("middle", 64, 1),
-        trial("middle", 128, 1, **lost),
-    ]
-    found = search.searches(samples, "rate", "nothing")
-    assert {n: [(one.rate, one.is_above) for one in ends] for n, ends in found.items()} == {
-        "nothing": [(1024, True)],
-        "low": [(None, False)],
-        "middle": [(96, False), (64, False)],
-        "high": [(1024, True)],  # the harness could do no more
-        "late": [(64, True)],
-        "open": [(64, True)],
-        "crashed": [(64, False)],
-    }
 
 
 TRUTH = {"Dying": 100.0, "Nothing": 1e9}
@@ -163,9 +116,6 @@ def test_a_stream_is_recorded_and_nothing_of_its_data_stays(tmp_path: Path) -> N
     assert [name.rsplit("-", 1)[0] for name in loads] == ["pool-200-140", "stream-200-64"]
 
 
-# --- runs and loads -------------------------------------------------------------------
-
-
 def test_a_failure_is_noted_and_tried_again(tmp_path: Path) -> None:
     load = make_load(tmp_path / "load", messages=100)
     wanted = Sample("record", {"size": 1}, "it", 0)
@@ -174,40 +124,6 @@ def test_a_failure_is_noted_and_tried_again(tmp_path: Path) -> None:
         (sample,) = Journal(tmp_path / "out").samples.values()
         assert sample.status == status
         assert sample.reason == ("the disk is full" if status == "failed" else "")
-
-
-def test_a_load_that_was_not_finished_is_made_again(tmp_path: Path) -> None:
-    where = context(tmp_path)
-    made: list[Path] = []
-
-    def broken(directory: Path) -> Load:
-        (directory / "payloads.bin").write_bytes(b"half")
-        raise OSError("no space")
-
-    def whole(directory: Path) -> Load:
-        made.append(directory)
-        shutil.rmtree(directory)
-        return make_load(directory, messages=2)
-
-    with pytest.raises(OSError, match="no space"):
-        where.load("name", {"seed": 1}, broken)
-    assert list((where.work / "loads").iterdir()) == []
-    for seed in (1, 1, 2):
-        assert len(where.load("name", {"seed": seed}, whole)) == 6
-    assert len(made) == 2
-
-
-def test_directories_of_killed_runs_are_removed_and_others_are_not(tmp_path: Path) -> None:
-    left = tmp_path / "runs" / "999999999-abc"
-    other = tmp_path / "runs" / f"{os.getppid()}-abc"
-    for place in (left, other):
-        place.mkdir(parents=True)
-        (place / "data").write_bytes(b"data")
-    with run_directory(tmp_path) as directory:
-        assert directory.is_dir()
-        assert not left.exists()
-        assert other.is_dir()
-    assert not directory.exists()
 
 
 @pytest.mark.parametrize("scale", ["full", "quick"])
@@ -225,3 +141,44 @@ def test_a_disturbed_run_is_repeated_and_the_best_counts(
     where = context(tmp_path, scale=scale)
     found = where.run(Sample("record", {"size": 1}, "nothing", 0), lambda: load)
     assert found.values["steal_s"] == (0.5 if scale == "full" else 1.9)
+
+
+def test_a_load_is_counted_to_the_last_message(tmp_path: Path) -> None:
+    row = _recorded("tiny", Talk(3, 700, 200, 1.0, burst=2), tmp_path / "work", "hybridlog")
+    assert row.values["sent"] == row.values["stored"] == 600
+    assert row.holds
+    assert "600 of 600 stored whole (100 %), nothing in the ledger, 0 missing" in row.text
+    assert not (tmp_path / "work").exists()
+
+
+@pytest.mark.parametrize(
+    ("stored", "told", "indexed", "holds"),
+    [(90, 10, 90, True), (90, 9, 90, False), (100, 0, 99, False), (100, 0, 100, True)],
+)
+def test_what_is_missing_without_a_word_is_found(
+    stored: int, told: int, indexed: int, *, holds: bool
+) -> None:
+    kept = Kept(stored, told, 7, indexed, {"transport": told, "degrade": 7}, 1.0)
+    did = {"sent": 100, "dropped": 3, "late_ms": 0.1, "seconds": 1.0}
+    recorded = cases._Recorded(Talk(1, 500, 100, 1.0), did, kept, 0.0)
+    row = cases._row("x", "hybridlog", recorded)
+    assert row.holds is holds
+    assert row.values["missing"] == 100 - stored - told
+    assert row.values["dropped_by_talker"] == 3
+    assert row.text.startswith(f"{stored - 7} of 100 stored whole")
+
+
+def test_messages_are_counted_in_whole_bursts() -> None:
+    assert Talk(2, 500, 100, 1.05, burst=10).messages == 2 * 110
+    assert Talk(20, 640_000, 64, 30).megabytes_per_s == pytest.approx(819.2)
+
+
+def test_every_case_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What does not hold is a failure, and its row is kept."""
+    row = Row("small", "hybridlog", {"missing": 1}, "one is missing", holds=False)
+    monkeypatch.setitem(CASES, "small", Case("one topic", lambda work, quick: iter([row])))
+    told = context(tmp_path)
+    cases.run(told, "small")
+    (sample,) = told.journal.samples.values()
+    assert (sample.status, sample.reason) == ("failed", "one is missing")
+    assert sample.values["rows"] == [row._asdict()]

@@ -165,7 +165,6 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Drive]:
 
 @pytest.fixture(scope="session")
 def odd(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
-    """A store with a recording of odd messages."""
     with hl.open(tmp_path_factory.mktemp("odd") / "store", create=True) as store:
         write_odd(store)
         yield store

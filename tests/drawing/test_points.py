@@ -22,15 +22,17 @@ from hybridlog.message import Message
 from hybridlog_storage.errors import PayloadError
 from hybridlog_storage.messages import Channel, Schema
 from tests.data import needs_data
-from tests.ros_values import ROS1
 from tests.test_arrays import decoded
 
 CODES = "?bBhHiIfd"
 
 
 def points_of(kind: str, fields: Any, **options: Any) -> Points:
-    """The points of a message that is decoded already."""
     return points(cast(Message, SimpleNamespace(type=kind, decode=lambda: fields)), **options)
+
+
+def field(name: str, offset: int = 0, kind: int = 7, count: int = 1) -> SimpleNamespace:
+    return SimpleNamespace(name=name, offset=offset, datatype=kind, count=count)
 
 
 def cloud(
@@ -41,11 +43,7 @@ def cloud(
     row_padding: int = 0,
     is_big: bool = False,
 ) -> SimpleNamespace:
-    """A PointCloud2 of rows of points, which are bytes already.
-
-    Args:
-        described: Name, offset, datatype and count of each field.
-    """
+    """A PointCloud2 of rows of points, which are bytes already."""
     data = b"".join(b"".join(row) + b"\xa5" * row_padding for row in rows)
     return SimpleNamespace(
         header=SimpleNamespace(frame_id="lidar"),
@@ -54,10 +52,7 @@ def cloud(
         point_step=step,
         row_step=step * len(rows[0]) + row_padding,
         is_bigendian=is_big,
-        fields=[
-            SimpleNamespace(name=name, offset=offset, datatype=kind, count=count)
-            for name, offset, kind, count in described
-        ],
+        fields=[field(*one) for one in described],
         data=np.frombuffer(data, np.uint8),
     )
 
@@ -80,9 +75,6 @@ def simple(xyz: list[tuple[float, ...]], **more: Any) -> SimpleNamespace:
     )
     made.__dict__.update(more)
     return made
-
-
-# Clouds
 
 
 @st.composite
@@ -254,23 +246,9 @@ def test_values_that_float32_cannot_hold_are_not_finite() -> None:
         ({"width": 2**32 - 1, "row_step": 2**32 - 1}, "needs"),
         ({"fields": []}, "has no x, y and z"),
         ({"fields": "x"}, "unusual fields"),
-        (
-            {"fields": [SimpleNamespace(name="x", offset=0, datatype=7, count=1)]},
-            "no x, y and z; its fields are x",
-        ),
-        (
-            {
-                "fields": [
-                    SimpleNamespace(name="x", offset=0, datatype=7, count=2),
-                    SimpleNamespace(name="y", offset=0, datatype=7, count=1),
-                ]
-            },
-            "not single numbers",
-        ),
-        (
-            {"fields": [SimpleNamespace(name="x", offset=0, datatype=2, count=1)] * 257},
-            "more than 256 fields",
-        ),
+        ({"fields": [field("x")]}, "no x, y and z; its fields are x"),
+        ({"fields": [field("x", count=2), field("y")]}, "not single numbers"),
+        ({"fields": [field("x", kind=2)] * 257}, "more than 256 fields"),
     ],
 )
 def test_damaged_clouds(change: dict[str, Any], message: str) -> None:
@@ -280,9 +258,8 @@ def test_damaged_clouds(change: dict[str, Any], message: str) -> None:
 
 
 def test_256_fields_of_one_name() -> None:
-    one = SimpleNamespace(name="x", offset=0, datatype=2, count=1)
-    y = SimpleNamespace(name="y", offset=4, datatype=7, count=1)
-    got = points_of("sensor_msgs/PointCloud2", simple([(1, 2, 3)], fields=[one] * 255 + [y]))
+    fields = [field("x", kind=2)] * 255 + [field("y", 4)]
+    got = points_of("sensor_msgs/PointCloud2", simple([(1, 2, 3)], fields=fields))
     assert got.names[:2] == ("x_", "x__")
     assert len(got.names) == 64
     assert got.xyz[0, 1] == 2
@@ -307,9 +284,6 @@ def test_old_clouds() -> None:
     message.channels *= 257
     with pytest.raises(PayloadError, match="more than 256 channels"):
         points_of("sensor_msgs/PointCloud", message)
-
-
-# Scans
 
 
 def scan(ranges: list[float], intensities: list[float] | None = None, **more: Any) -> Any:
@@ -379,9 +353,6 @@ def test_scans_with_several_echoes() -> None:
 def test_an_empty_scan() -> None:
     got = points_of("sensor_msgs/LaserScan", scan([]))
     assert (got.total, got.dropped, got.is_flat) == (0, {}, True)
-
-
-# Foxglove
 
 
 POSE = {
@@ -515,9 +486,6 @@ def test_bounds() -> None:
     assert 98 < high <= 100
 
 
-# Real logs
-
-
 @needs_data
 def test_a_real_scan_and_the_cloud_that_its_driver_made_of_it() -> None:
     path = "real/sick_laser_radar.bag"
@@ -536,31 +504,3 @@ def test_a_real_scan_and_the_cloud_that_its_driver_made_of_it() -> None:
 
 def _stamp(message: Any) -> int:
     return int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec)
-
-
-def test_the_ros1_payload_of_a_cloud(tmp_path: Path) -> None:
-    """Through a store, from bytes that rosbags wrote."""
-    rng = np.random.default_rng(3)
-    xyz = rng.normal(size=(50, 3)).astype(np.float32)
-    types = ROS1.types
-    name = "sensor_msgs/msg/PointCloud2"
-    stamp = types["builtin_interfaces/msg/Time"](1, 2)
-    message = types[name](
-        types["std_msgs/msg/Header"](0, stamp, "map"),
-        1,
-        50,
-        [types["sensor_msgs/msg/PointField"](axis, 4 * at, 7, 1) for at, axis in enumerate("xyz")],
-        False,
-        12,
-        600,
-        xyz.view(np.uint8).reshape(-1),
-        True,
-    )
-    text = ROS1.generate_msgdef(name, ros_version=1)[0].encode()
-    channel = Channel("/cloud", "ros1", Schema("sensor_msgs/PointCloud2", "ros1msg", text))
-    with hl.open(tmp_path / "store", create=True) as store:
-        with store.start("one") as recorder:
-            recorder.write(channel, bytes(ROS1.serialize_ros1(message, name)), log_time=10**18)
-        got = points(store.topic("cloud").at("+0s"))
-    assert np.array_equal(got.xyz, xyz)
-    assert (got.frame, got.names, got.is_flat) == ("map", (), False)

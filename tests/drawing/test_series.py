@@ -13,7 +13,6 @@ from hybridlog_storage.errors import TopicError, UsageError
 from .conftest import BASE, MS, Drive
 
 PAUSES = (1500, 4000)
-NAN = float("nan")
 
 
 def by_pixel(
@@ -216,17 +215,6 @@ def test_questions_without_a_picture(drive: Drive) -> None:
     with pytest.raises(UsageError, match="2 topics in 1 recordings"):
         series(drive.store.topic("drive", "loose"), ["y"], pixels=9)
     assert numbers_of(query) == ["linear.x", "linear.z", "y", "ticks", "on", "age"]
-
-
-def test_pixels_are_filled_block_by_block() -> None:
-    grid = _Grid(100, 10, 3)
-    grid.add(np.array([100, 105]), {"x": np.array([3.0, 1.0])})
-    grid.add(np.array([107, 112]), {"x": np.array([2.0, 9.0]), "y": np.array([5.0, NAN])})
-    grid.add(np.array([113, 999]), {"x": np.array([8.0, 4.0])})
-    x, y = grid.series(["x", "y"])
-    assert x.times.tolist() == y.times.tolist() == [100, 112, 999]
-    assert (x.least.tolist(), x.greatest.tolist()) == ([1, 8, 4], [3, 9, 4])
-    assert np.array_equal(y.least, [5, NAN, NAN], equal_nan=True)
 
 
 @pytest.mark.parametrize(

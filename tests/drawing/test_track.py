@@ -6,7 +6,6 @@ import json
 import math
 from collections.abc import Iterator
 from pathlib import Path
-from time import monotonic, sleep
 from typing import Any
 
 import numpy as np
@@ -18,13 +17,9 @@ import hybridlog as hl
 from benchmarks.simulator.write import write_bag
 from hybridlog.drawing.track import Grid, Position, fix_of, pose_of, position_of, track
 from hybridlog.query.asked import field_types
-from hybridlog.query.topics import TopicMatcher
 from hybridlog_storage.errors import UsageError
 from hybridlog_storage.messages import Channel, Schema
-from hybridlog_storage.segments.segment_writer import SegmentSettings
-from tests.data import DATA, needs_data
 from tests.ros_values import ROS1
-from tests.test_arrays import decoded
 
 MS = 10**6
 BASE = 1_700_000_000 * 10**9
@@ -167,37 +162,6 @@ def test_messages_that_arrive_in_pairs_have_no_gaps(tmp_path: Path) -> None:
     assert np.flatnonzero(np.isnan(got.xy[:, 0])).tolist() == [20]
 
 
-def test_a_recording_that_goes_on(tmp_path: Path) -> None:
-    """Its track is that of all that is flushed, and stays the same when it ends."""
-    path = tmp_path / "store"
-    count = 60
-    with hl.open(path, create=True) as writing, hl.open(path) as store:
-        settings = SegmentSettings(chunk_size=1024, segment_size=4096, compression="none")
-        with writing.start("live", settings=settings, flush_interval_s=0.05) as recorder:
-            for at in range(count):
-                place = payload(48 + at / 1000, 11.0, -1 if at == 50 else 0)
-                recorder.write(channel("/fix"), place, log_time=BASE + at * MS)
-            until = monotonic() + 60
-            while not store.topics() or store.topic("fix").count() < count:
-                assert monotonic() < until
-                sleep(0.02)
-            assert store.entry("live").flushed
-            assert store.entry("live").digests
-            got = track(store.topic("fix"), pixels=1000)
-            part = track(store.topic("fix"), pixels=1000, span=(BASE + 40 * MS, BASE + 55 * MS))
-        whole = track(store.topic("fix"), pixels=1000)
-    assert (got.messages, got.fixes, got.exact) == (count, count - 1, True)
-    assert got.times.tolist() == whole.times.tolist() == [BASE + at * MS for at in range(count)]
-    assert np.array_equal(got.xy, whole.xy, equal_nan=True)
-    assert np.flatnonzero(np.isnan(got.xy[:, 0])).tolist() == [50]
-    assert part.times.tolist() == whole.times[40:55].tolist()
-
-
-def test_a_span_without_messages_has_no_track(store: hl.Store) -> None:
-    nothing = track(store.topic("json"), pixels=5, span=(0, 1))
-    assert (nothing.messages, nothing.grid) == (0, None)
-
-
 def test_json_without_a_definition(store: hl.Store) -> None:
     got = track(store.topic("json"), pixels=10)
     assert got.fixes == 5
@@ -260,21 +224,6 @@ def test_topics_without_positions(store: hl.Store) -> None:
         track(store.topic("fix").reverse(), pixels=10)
     with pytest.raises(UsageError, match="at least one pixel"):
         track(store.topic("fix"), pixels=0)
-
-
-@needs_data
-def test_real_fixes(tmp_path: Path) -> None:
-    """Against the messages as rosbags reads them."""
-    path = "real/robot_localization_test1.bag"
-    wanted = [(m.latitude, m.longitude) for _, m in decoded(path, "NavSatFix")]
-    with hl.open(tmp_path / "store", create=True) as store:
-        store.record(DATA / path, matcher=TopicMatcher(["/fix"]))
-        got = track(store.topic("fix"), pixels=1000)
-    assert got.fixes == len(wanted) == 989
-    assert got.grid is not None
-    there = got.xy[~np.isnan(got.xy[:, 0])] / (got.grid.east, got.grid.north)
-    back = np.stack([there[:, 1] + got.grid.latitude, there[:, 0] + got.grid.longitude], axis=1)
-    assert np.abs(back - wanted).max() < 1e-9
 
 
 def test_poses_of_a_robot(tmp_path: Path) -> None:

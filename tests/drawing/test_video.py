@@ -68,23 +68,17 @@ JSON = b'{"type":"object","properties":{"data":{"type":"string","contentEncoding
 
 @cache
 def drawn() -> list[NDArray[np.uint8]]:
-    """A pattern that moves."""
     blocks = np.random.default_rng(1).integers(30, 220, (HEIGHT // 8, WIDTH // 8, 3), np.uint8)
     pattern = blocks.repeat(8, 0).repeat(8, 1)
     return [np.roll(pattern, 3 * n, axis=1) for n in range(COUNT)]
 
 
-@cache
-def encoded(form: str) -> list[bytes]:
-    """Frames of a format, a key frame every `GROUP`."""
-    name, settings = ENCODERS[form]
-    try:
-        context: Any = av.CodecContext.create(name, "w")
-    except av.FFmpegError:
-        pytest.skip(f"this PyAV cannot encode {form}")
+def encode(name: str, settings: dict[str, str], between: int = 0) -> list[bytes]:
+    """Frames, a key frame every `GROUP`; those between others may refer to later ones."""
+    context: Any = av.CodecContext.create(name, "w")
     context.width, context.height, context.pix_fmt = WIDTH, HEIGHT, "yuv420p"
     context.time_base, context.framerate = Fraction(1, 10), Fraction(10)
-    context.gop_size, context.max_b_frames, context.options = GROUP, 0, settings
+    context.gop_size, context.max_b_frames, context.options = GROUP, between, settings
     frames: list[bytes] = []
     for number, pixels in enumerate(drawn()):
         picture = av.VideoFrame.from_ndarray(pixels, format="rgb24").reformat(format="yuv420p")
@@ -93,6 +87,15 @@ def encoded(form: str) -> list[bytes]:
     frames += [bytes(packet) for packet in context.encode(None)]
     assert len(frames) == COUNT
     return frames
+
+
+@cache
+def encoded(form: str) -> list[bytes]:
+    """Frames of a format, none of which refers to a later one."""
+    try:
+        return encode(*ENCODERS[form])
+    except av.FFmpegError:
+        pytest.skip(f"this PyAV cannot encode {form}")
 
 
 @cache

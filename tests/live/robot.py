@@ -20,32 +20,25 @@ from tests.live.speaker import Speaker, text, text_channel
 
 
 class Robot:
-    """A recorder in another process; its messages are texts.
-
-    Args:
-        process: The process.
-    """
+    """A recorder in another process; its messages are texts."""
 
     def __init__(self, process: subprocess.Popen[str]) -> None:
         self._process = process
+        self.pid = process.pid
 
     def say(self, topic: str, *texts: str, time: int | None = None) -> None:
-        """Record messages; each is taken when this returns."""
         for content in texts:
             self._tell([topic, content, time])
 
     def hold(self) -> None:
-        """Write nothing from now on, until the end."""
         self._tell("hold")
 
     def end(self) -> None:
-        """End the recording."""
         self._tell(None)
         assert self._process.wait(60) == 0
 
     def kill(self) -> None:
-        """`kill -9`."""
-        os.kill(self._process.pid, signal.SIGKILL)
+        os.kill(self.pid, signal.SIGKILL)
         self._process.wait(60)
 
     def _tell(self, line: object) -> None:
@@ -60,7 +53,6 @@ class Robot:
 def robot(
     store: Path, name: str = "live", segment_s: float = 600, flush_s: float = 0.2
 ) -> Iterator[Robot]:
-    """A recorder of a store, which it makes if there is none."""
     process = subprocess.Popen(
         [sys.executable, "-m", "tests.live.robot", str(store), name, str(segment_s), str(flush_s)],
         stdin=subprocess.PIPE,

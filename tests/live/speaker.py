@@ -5,6 +5,9 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
+import hybridlog as hl
+from hybridlog.live.clocks import MachineClock
+from hybridlog.live.recorder import Recorder, RecorderOptions
 from hybridlog.live.sources.base import LiveSource, Sink
 from hybridlog_storage.messages import Channel, Schema
 
@@ -53,3 +56,19 @@ class Speaker(LiveSource):
     def say(self, channel: Channel, payload: bytes, received: int | None = None) -> None:
         assert self.sink is not None
         self.sink.take(channel, payload, received=time.time_ns() if received is None else received)
+
+
+class Recorded:
+    """A recorder with one speaker, and what it has said."""
+
+    def __init__(
+        self,
+        store: hl.Store,
+        options: RecorderOptions,
+        speaker: Speaker | None = None,
+        *clock: MachineClock,
+    ) -> None:
+        self.speaker = speaker or Speaker()
+        self.said: list[str] = []
+        self.recorder = Recorder(store, [self.speaker], options, self.said.append, *clock)
+        self.recorder.start()

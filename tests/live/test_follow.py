@@ -27,12 +27,10 @@ NOWHERE = "mongodb://127.0.0.1:9/?serverSelectionTimeoutMS=200"
 
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
-    """Where a store may be made."""
     return tmp_path / "store"
 
 
 def wait_until_flushed(store: hl.Store, count: int) -> None:
-    """Wait until so many messages are flushed."""
     wait_for(lambda: sum(one.messages for one in store.summaries()) >= count)
 
 
@@ -51,11 +49,9 @@ class Followed:
         self.lines.extend(iter(self.process.stdout.readline, ""))
 
     def join(self) -> None:
-        """Wait until all lines are read."""
         self._reader.join(60)
 
     def wait(self, lines: int) -> list[str]:
-        """Wait until so many lines have come."""
         wait_for(lambda: len(self.lines) >= lines)
         return self.lines
 
@@ -74,7 +70,6 @@ class Followed:
 
 @contextmanager
 def follow(store: Path, *arguments: object) -> Iterator[Followed]:
-    """`hybridlog fetch --follow`."""
     command = [*forked(), "fetch", "--store", str(store), "--follow", *map(str, arguments)]
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment()

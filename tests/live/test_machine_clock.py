@@ -12,13 +12,13 @@ import hybridlog as hl
 from hybridlog.contract import Contract, TopicRules
 from hybridlog.live.clocks import MachineClock
 from hybridlog.live.policy import throttle_rule
-from hybridlog.live.recorder import Recorder, RecorderOptions
+from hybridlog.live.recorder import RecorderOptions
 from hybridlog.live.snapshots import SnapshotOptions
 from hybridlog.query.times import format_duration
 from hybridlog.record.losses import Cause, Loss
 from hybridlog.record.marks import MARKS
 from hybridlog_storage.messages import Channel
-from tests.live.speaker import TEXT, Speaker, text, text_channel
+from tests.live.speaker import TEXT, Recorded, Speaker, text, text_channel
 from tests.waiting import wait_for
 
 SECOND = 10**9
@@ -29,8 +29,6 @@ LATCHED = Channel("/map", "ros1", TEXT, {"latching": "1"}, has_publish_time=Fals
 
 
 class Clock(MachineClock):
-    """A clock that the test sets."""
-
     def __init__(self, now: int) -> None:
         self.time = now
         self.up = 77 * SECOND
@@ -42,24 +40,17 @@ class Clock(MachineClock):
 
 
 class Absent(Speaker):
-    """A robot that is not there."""
-
     @property
     def was_reached(self) -> bool:
         return False
 
 
-class Robot:
-    """A recorder whose clock can be set."""
-
+class Robot(Recorded):
     def __init__(
         self, store: hl.Store, now: int, options: RecorderOptions, speaker: Speaker | None = None
     ) -> None:
         self.clock = Clock(now)
-        self.said: list[str] = []
-        self.speaker = speaker or Speaker()
-        self.recorder = Recorder(store, [self.speaker], options, self.said.append, self.clock)
-        self.recorder.start()
+        super().__init__(store, options, speaker, self.clock)
 
     def play(self, channel: Channel, *words: str, step: int = SECOND // 10) -> None:
         for word in words:

@@ -8,10 +8,7 @@ import json
 import os
 import random
 import shutil
-import signal
 import socket
-import subprocess
-import sys
 import threading
 import time
 from collections import Counter
@@ -48,7 +45,7 @@ from tests import places
 from tests.calls import Calls
 from tests.indexed import documents_of
 from tests.limits import Limit
-from tests.live.speaker import Speaker, scan, scan_channel, text, text_channel
+from tests.live.speaker import Recorded, Speaker, scan, scan_channel, text, text_channel
 from tests.waiting import wait_for
 
 pytestmark = pytest.mark.mongo
@@ -57,17 +54,11 @@ SECOND = 1_000_000_000
 FREE = RecorderOptions(reserve_bytes=0)
 
 
-class Running:
-    """A recorder with one speaker."""
-
+class Running(Recorded):
     def __init__(self, store: hl.Store, options: RecorderOptions = FREE) -> None:
-        self.speaker = Speaker()
-        self.said: list[str] = []
-        self.recorder = Recorder(store, [self.speaker], options, self.said.append)
-        self.recorder.start()
+        super().__init__(store, options)
 
     def rows(self) -> Counter[tuple[str, str]]:
-        """What the ledger of the ended recording says, by topic and cause."""
         (report,) = self.recorder.stop()
         found: Counter[tuple[str, str]] = Counter()
         for row in report.entry.end["losses"]:
@@ -199,29 +190,6 @@ def test_when_the_budget_is_spent_the_rest_is_counted(store: hl.Store, calls: Ca
     assert rows == {("/chatter", "queue"): 1000 - kept["/chatter", "ros1"]}
 
 
-def test_a_full_disk_ends_it_and_what_comes_is_counted(store: hl.Store) -> None:
-    robot = Running(store)
-    channel = scan_channel()
-    robot.speaker.say(channel, scan(1, 3_000_000))
-
-    def full(*_: object) -> int:
-        raise OSError(errno.ENOSPC, "full")
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(append_file.os, "pwritev", full)
-        patch.setattr("hybridlog_storage.disk.files.os.writev", full)
-        for number in range(200):
-            robot.speaker.say(channel, scan(number, 3_000_000))
-            if robot.recorder.wait(0.01):
-                break
-        assert "no space" in robot.recorder.reason.lower()
-        robot.speaker.say(channel, scan(1, 100))
-        state = robot.recorder.look()
-        assert state.lost["disk"] >= 2
-        with pytest.raises(DiskFullError):
-            robot.recorder.stop()
-
-
 def test_a_disk_that_has_room_for_little_more(
     store: hl.Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -247,6 +215,7 @@ def test_a_disk_that_has_room_for_little_more(
     robot.speaker.say(channel, scan(1, 100))
     (report,) = robot.recorder.stop()
     assert robot.recorder.stopped_for_disk
+    assert "no space" in robot.recorder.reason.lower()
     state = robot.recorder.look()
     assert report.failure is None
     assert report.entry.status == "complete"
@@ -294,16 +263,6 @@ def test_a_recorder_that_is_refused_at_once_leaves_no_recording(store: hl.Store)
     assert not store.directory.names()
 
 
-def test_it_stops_before_the_disk_is_full(store: hl.Store) -> None:
-    robot = Running(store, RecorderOptions(reserve_bytes=1 << 62))
-    robot.speaker.say(text_channel(), text("a"))
-    robot.recorder.look()
-    assert robot.recorder.wait(0)
-    assert "--reserve" in robot.recorder.reason
-    robot.speaker.say(text_channel(), text("b"))
-    assert robot.rows() == {("/chatter", "disk"): 1}
-
-
 def test_as_many_messages_as_wanted_and_not_one_more(store: hl.Store) -> None:
     robot = Running(store, RecorderOptions(reserve_bytes=0, max_messages=5))
     channel = text_channel()
@@ -315,37 +274,17 @@ def test_as_many_messages_as_wanted_and_not_one_more(store: hl.Store) -> None:
 
 
 def test_bounds_of_time_and_size(store: hl.Store) -> None:
-    for options in (
-        RecorderOptions(reserve_bytes=0, duration_s=0.05),
-        RecorderOptions(reserve_bytes=0, max_bytes=1000),
-    ):
-        robot = Running(store, options)
-        robot.speaker.say(text_channel(), text("x" * 5000))
-
-        def over(robot: Running = robot) -> bool:
-            robot.recorder.look()
-            return robot.recorder.wait(0)
-
-        wait_for(over)
-        assert robot.recorder.stop()[0].entry.messages == 1
+    robot = Running(store, RecorderOptions(reserve_bytes=0, duration_s=0.05))
+    robot.speaker.say(text_channel(), text("x"))
+    wait_for(lambda: robot.recorder.look() and robot.recorder.wait(0))
+    assert robot.recorder.stop()[0].entry.messages == 1
+    robot = Running(store, RecorderOptions(reserve_bytes=0, max_bytes=1000))
+    for number in range(100):
+        robot.speaker.say(scan_channel(), scan(number, 288))  # 300 bytes
+    assert robot.recorder.wait(0)
+    assert robot.recorder.stop()[0].entry.messages == 4
     with pytest.raises(UsageError, match="duration must be above 0"):
         RecorderOptions(duration_s=0)
-
-
-def test_segments_are_split_by_time(store: hl.Store) -> None:
-    options = RecorderOptions(
-        reserve_bytes=0, flush_interval_s=0.05, settings=SegmentSettings(segment_span_s=0.1)
-    )
-    robot = Running(store, options)
-    until = time.monotonic() + 1.0
-    sent = 0
-    while time.monotonic() < until:
-        robot.speaker.say(text_channel(), text(str(sent)))
-        sent += 1
-        time.sleep(0.01)
-    (report,) = robot.recorder.stop()
-    assert 3 <= report.entry.segments <= 12
-    assert store.topic("/chatter").count() == sent
 
 
 def test_topics_are_chosen_before_they_are_subscribed_to(store: hl.Store) -> None:
@@ -417,21 +356,6 @@ def test_a_recorder_that_writes_nothing_is_stalled(
     assert store.topic("/chatter").count() == 30
 
 
-@pytest.mark.parametrize(
-    ("arguments", "size"),
-    [
-        (["--budget", "1GiB"], 2 << 20),
-        (["--budget", "256MiB"], 1 << 20),
-        (["--budget", "4MiB"], 512 << 10),
-        (["--budget", "4MiB", "--chunk-size", "4MiB"], 4 << 20),
-    ],
-)
-def test_a_small_budget_has_small_chunks(arguments: list[str], size: int) -> None:
-    with record_command.make_context("record", ["--ros2", *arguments]) as context:
-        choices = RecordChoices(**context.params)
-    assert recorder_options(choices).settings.chunk_size == size
-
-
 def test_a_source_that_cannot_work_leaves_nothing(store: hl.Store) -> None:
     def fail(_: object) -> None:
         raise SourceError("no such robot")
@@ -461,13 +385,6 @@ def test_a_try_that_reached_nobody_leaves_nothing(
     store.refresh()
     assert len(store.recordings()) == recordings
     assert len(places.folders(store.directory.path)) == recordings
-
-
-def test_sources_that_end_end_it(store: hl.Store) -> None:
-    robot = Running(store)
-    robot.recorder.ended()
-    assert robot.recorder.wait(0)
-    robot.recorder.stop()
 
 
 def test_marks_are_messages_that_questions_use(store: hl.Store) -> None:
@@ -527,38 +444,23 @@ def test_visitors(store: hl.Store) -> None:
     other.recorder.stop()
 
 
-KILLED = """
-import os, signal, sys, time
-import hybridlog as hl
-from hybridlog.record.losses import Cause, Loss
-from hybridlog.live.recorder import Recorder, RecorderOptions
-from tests.live.speaker import Speaker, text, text_channel
-with hl.open(sys.argv[1], create=True, require_database=True) as store:
-    speaker = Speaker()
-    options = RecorderOptions(reserve_bytes=0, flush_interval_s=0.2)
-    recorder = Recorder(store, [speaker], options, print)
-    recorder.start()
-    channel = text_channel()
+def test_a_crash_loses_no_more_rows_than_messages(store: hl.Store, tmp_path: Path) -> None:
+    """What lies on the disk at a moment is what a `kill -9` leaves."""
+    robot = Running(store, RecorderOptions(reserve_bytes=0, flush_interval_s=0.2))
     for number in range(60):
         now = time.time_ns()
-        speaker.say(channel, text(str(number)), now)
-        recorder.lost(Loss("/scan", Cause.TRANSPORT, 1, now, now))
+        robot.speaker.say(text_channel(), text(str(number)), now)
+        robot.recorder.lost(Loss("/scan", Cause.TRANSPORT, 1, now, now))
         time.sleep(0.02)
-    os.kill(os.getpid(), signal.SIGKILL)
-"""
-
-
-def test_a_killed_recorder_loses_no_more_rows_than_messages(tmp_path: Path) -> None:
-    path = tmp_path / "store"
-    done = subprocess.run([sys.executable, "-c", KILLED, str(path)], check=False)
-    assert done.returncode == -signal.SIGKILL
-    with hl.open(path) as store:
-        (recording,) = store.recordings()
+    left = shutil.ignore_patterns("mongod*", "*.sock")
+    shutil.copytree(store.directory.path, tmp_path / "left", ignore=left)
+    robot.rows()
+    with hl.open(tmp_path / "left") as crashed:
+        (recording,) = crashed.recordings()
         assert recording.status == "recovered"
         # 0.2 s are ten messages and ten rows; the machine may be slow.
         assert recording.messages >= 40
         assert sum(row["count"] for row in recording.end["losses"]) >= 40
-        assert running(path) == {}
 
 
 def test_fields_land_when_no_payload_finds_room(store: hl.Store, calls: Calls) -> None:
@@ -585,15 +487,6 @@ def test_a_mark_that_is_no_text(store: hl.Store) -> None:
     robot.rows()
     (message,) = store.topic(MARKS)
     assert json.loads(bytes(message.raw)) == {"text": r"bad\xff\xfebytes", "tags": {"a": r"\x80"}}
-
-
-def test_the_bytes_wanted_are_counted_as_they_come(store: hl.Store) -> None:
-    robot = Running(store, RecorderOptions(reserve_bytes=0, max_bytes=1000))
-    for number in range(100):
-        robot.speaker.say(scan_channel(), scan(number, 288))  # 300 bytes
-    assert robot.recorder.wait(0)
-    robot.rows()
-    assert store.topic("/scan").count() == 4
 
 
 def test_the_reserve_holds_for_what_waits_in_memory(
@@ -657,14 +550,26 @@ def test_a_standard_type_without_its_definition(store: hl.Store) -> None:
     assert "no definition in the source" in str(channels["/odd"].reason)
 
 
-def test_live_segments_are_short_by_default() -> None:
-    context = record_command.make_context("record", ["--ros1"])
-    chosen = recorder_options(RecordChoices(**context.params))
-    for settings in (LiveOptions().settings, FREE.settings, chosen.settings):
-        assert (settings.segment_size, settings.segment_span_s) == (1 << 30, 600)
-    other = ["--ros1", "--split-size", "2MiB", "--split-duration", "5s"]
-    context = record_command.make_context("record", other)
-    chosen = recorder_options(RecordChoices(**context.params))
-    assert (chosen.settings.segment_size, chosen.settings.segment_span_s) == (2 << 20, 5)
-    # Those of logs are not.
+@pytest.mark.parametrize(
+    ("arguments", "chunk", "segment", "span_s"),
+    [
+        (["--budget", "1GiB"], 2 << 20, 1 << 30, 600),
+        (["--budget", "256MiB"], 1 << 20, 1 << 30, 600),
+        (["--budget", "4MiB"], 512 << 10, 1 << 30, 600),
+        (["--budget", "4MiB", "--chunk-size", "4MiB"], 4 << 20, 1 << 30, 600),
+        (["--budget", "1GiB", "--split-size", "2MiB", "--split-duration", "5s"],
+         2 << 20, 2 << 20, 5),
+    ],
+)  # fmt: skip
+def test_a_small_budget_has_small_chunks_and_live_segments_are_short(
+    arguments: list[str], chunk: int, segment: int, span_s: int
+) -> None:
+    with record_command.make_context("record", ["--ros2", *arguments]) as context:
+        chosen = recorder_options(RecordChoices(**context.params)).settings
+    assert (chosen.chunk_size, chosen.segment_size, chosen.segment_span_s) == (
+        *(chunk, segment, span_s),
+    )
+    for usual in (LiveOptions().settings, FREE.settings):
+        assert (usual.segment_size, usual.segment_span_s) == (1 << 30, 600)
+    # Those of logs are not short.
     assert (SegmentSettings().segment_size, SegmentSettings().segment_span_s) == (4 << 30, None)

@@ -12,7 +12,7 @@ import pytest
 import hybridlog as hl
 from hybridlog.live.clocks import clock_time
 from hybridlog.live.policy import throttle_rule
-from hybridlog.live.recorder import Recorder, RecorderOptions
+from hybridlog.live.recorder import RecorderOptions
 from hybridlog.live.snapshots import SnapshotOptions
 from hybridlog.query.topics import matcher
 from hybridlog.record.losses import Cause, Loss
@@ -20,7 +20,7 @@ from hybridlog_storage.errors import UsageError
 from hybridlog_storage.messages import Channel, Schema
 from tests.calls import Calls
 from tests.limits import Limit
-from tests.live.speaker import Speaker, text, text_channel
+from tests.live.speaker import Recorded, text, text_channel
 
 SECOND = 1_000_000_000
 CLOCK = Channel(
@@ -37,16 +37,13 @@ def clock(seconds: float) -> bytes:
     return struct.pack("<II", int(seconds), round(seconds % 1 * SECOND))
 
 
-class Simulation:
+class Simulation(Recorded):
     """A recorder by `/clock`, and what it records from a simulated robot."""
 
     def __init__(self, store: hl.Store, **options: object) -> None:
         self.store = store
-        self.speaker = Speaker()
-        self.said: list[str] = []
         chosen = RecorderOptions(reserve_bytes=0, use_sim_time=True, **options)  # type: ignore[arg-type]
-        self.recorder = Recorder(store, [self.speaker], chosen, self.said.append)
-        self.recorder.start()
+        super().__init__(store, chosen)
         self.now = time.time_ns()
 
     def tick(self, seconds: float) -> None:

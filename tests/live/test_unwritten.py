@@ -9,13 +9,14 @@ from pathlib import Path
 import pytest
 
 import hybridlog as hl
-from hybridlog_storage.errors import IncompleteError
+from hybridlog_storage.errors import HeldError, IncompleteError
 from tests.cli.running import run
 from tests.indexed import documents_of
 from tests.limits import Limit
 from tests.live.robot import robot
 from tests.live.speaker import text, text_channel
 from tests.live.test_follow import NOWHERE, wait_until_flushed
+from tests.waiting import wait_for
 
 SECOND = 1_000_000_000
 CHANNEL = text_channel("/a")
@@ -77,8 +78,7 @@ def test_it_is_told_only_where_the_time_reaches_past_the_last_flush(tmp_path: Pa
         assert "3 messages not written yet" in run(*options, "end", store=path, code=11).err
 
 
-@pytest.mark.parametrize("mongo", [pytest.param((), marks=pytest.mark.mongo), ("--mongo", NOWHERE)])
-def test_every_command_tells_it(tmp_path: Path, mongo: tuple[str, ...]) -> None:
+def test_every_command_tells_it(tmp_path: Path) -> None:
     path = tmp_path / "store"
     with half_written(path):
         told = "live is being recorded: 3 messages not written yet"
@@ -92,7 +92,7 @@ def test_every_command_tells_it(tmp_path: Path, mongo: tuple[str, ...]) -> None:
             ["export", tmp_path / "a.mcap", "-t", "/a", "--force"],
             ["sql", "select count(*) from a"],
         ):
-            done = run(*words, *mongo, store=path)
+            done = run(*words, "--mongo", NOWHERE, store=path)
             assert told in done.err, (words, done.err)
             assert "lost" not in done.err
         ended = run("fetch", "-t", "/a", "--count", "--between", "start", "-1s", store=path)
@@ -183,3 +183,25 @@ def test_what_the_index_lacks_is_told_where_mongodb_answers(tmp_path: Path, limi
         recording.close()
         assert raw.count() == 5
         assert raw.counters.unindexed == 0
+
+
+def test_a_killed_recording_is_not_said_to_go_on(tmp_path: Path) -> None:
+    path = tmp_path / "store"
+    with robot(path, "load", flush_s=0.05) as killed:
+        killed.say("/a", "x")
+        before = hl.open(path)
+        wait_for(lambda: before.summaries()[0].messages)
+        assert [entry.status for entry in before.recordings()] == ["open"]
+        with pytest.raises(HeldError, match=f"is being written by process {killed.pid} "):
+            before.remove("load")
+        killed.kill()
+    with before:
+        # Another process is about to recover it, so nobody else can.
+        with before.directory.writing(before.entry("load").id), hl.open(path) as after:
+            for store in (before, after):
+                assert [one.status for one in store.summaries()] == ["unfinished"]
+                assert [entry.status for entry in store.recordings()] == ["unfinished"]
+                assert store.recordings()[0].messages > 0
+        with hl.open(path) as after:
+            for store in (after, before):
+                assert [entry.status for entry in store.recordings()] == ["recovered"]

@@ -8,7 +8,6 @@ import json
 import subprocess
 import sys
 from collections import defaultdict
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -18,27 +17,11 @@ from PIL import Image
 
 from benchmarks.simulator.robot import Robot
 from benchmarks.simulator.topics import TOPICS, RobotConfig, Types
-from benchmarks.simulator.write import BagSummary, write_bag, write_demo
+from benchmarks.simulator.write import write_bag, write_demo
 from hybridlog_storage.errors import TopicError, UsageError
 
 ROOT = Path(__file__).parents[2]
-DURATION = 17.0
 SMALL = RobotConfig(image_size=(48, 32), cloud_columns=40, scan_beams=180)
-RATES = {
-    "/base/scan": 20,
-    "/camera/front/image_raw": 5,
-    "/camera/front/camera_info": 5,
-    "/camera/rear/image_raw": 2.5,
-    "/lidar/points": 0.5,
-    "/odom": 50,
-    "/tf": 50,
-    "/joint_states": 50,
-    "/imu/data": 100,
-    "/cmd_vel": 20,
-    "/rviz_camera_publisher/camera_pose": 10,
-    "/battery": 1,
-    "/diagnostics": 1,
-}
 
 
 def read(path: Path, ros: int) -> tuple[dict[str, list[tuple[int, Any]]], dict[str, Any]]:
@@ -61,70 +44,11 @@ def read(path: Path, ros: int) -> tuple[dict[str, list[tuple[int, Any]]], dict[s
     return messages, connections
 
 
-def closings_of(robot: Robot) -> int:
-    return sum(command.position == 0 for command in robot.gripper_commands)
-
-
-def stamps(messages: list[tuple[int, Any]]) -> np.ndarray[Any, Any]:
-    return np.array(
-        [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for _, m in messages], np.int64
-    )
-
-
-@pytest.fixture(scope="module")
-def bag(tmp_path_factory: pytest.TempPathFactory) -> BagSummary:
-    path = tmp_path_factory.mktemp("bag") / "robot.bag"
-    return write_bag(path, duration_s=DURATION, seed=5, config=SMALL)
-
-
-@pytest.fixture(scope="module")
-def log(bag: BagSummary) -> dict[str, list[tuple[int, Any]]]:
-    return read(bag.path, 1)[0]
-
-
-def test_counts_rates_and_order(bag: BagSummary, log: dict[str, list[tuple[int, Any]]]) -> None:
+def test_truth_is_what_the_bag_says(tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "robot.bag", duration_s=17, seed=5, config=SMALL)
+    log, _ = read(bag.path, 1)
     assert {t: n for t, n in bag.messages.items() if n} == {t: len(m) for t, m in log.items()}
-    for topic, hz in RATES.items():
-        assert abs(len(log[topic]) - hz * DURATION) <= 1 + 0.06 * hz, topic
-    for topic, messages in log.items():
-        times = np.array([t for t, _ in messages])
-        assert (np.diff(times) >= 0).all(), topic
-        assert times[0] >= bag.start_ns
-        assert times[-1] < bag.start_ns + DURATION * 10**9
     assert bag.size == bag.path.stat().st_size
-
-
-def test_the_file_is_in_log_time_order(bag: BagSummary) -> None:
-    from rosbags.rosbag1 import Reader
-
-    with Reader(bag.path) as reader:
-        ranges = [(c.start_time, c.end_time) for c in reader.chunk_infos]
-        assert len(ranges) >= 2
-        assert all(a[1] <= b[0] for a, b in pairwise(ranges))
-        assert reader.duration < DURATION * 1e9 <= reader.duration + 10**9
-
-
-def test_headers_lag_behind_and_count_up(log: dict[str, list[tuple[int, Any]]]) -> None:
-    for topic in ("/base/scan", "/camera/front/image_raw", "/odom", "/imu/data", "/lidar/points"):
-        times = np.array([t for t, _ in log[topic]])
-        delay = times - stamps(log[topic])
-        assert delay.min() > 500_000, topic
-        assert delay.max() < 200_000_000, topic
-        assert [m.header.seq for _, m in log[topic]] == list(range(len(times)))
-    assert np.mean(np.array([t for t, _ in log["/base/scan"]]) - stamps(log["/base/scan"])) > 1e7
-
-
-def test_connections_name_their_nodes_and_latch(bag: BagSummary) -> None:
-    _, connections = read(bag.path, 1)
-    assert connections["/tf_static"].ext.latching == 1
-    assert connections["/map"].ext.latching == 1
-    assert connections["/base/scan"].ext.callerid == "/hokuyo_node"
-    command = connections["/r_gripper_controller/command"]
-    assert command.msgtype == "pr2_controllers_msgs/msg/Pr2GripperCommand"
-    assert "float64 max_effort" in command.msgdef.data
-
-
-def test_truth_is_what_the_bag_says(bag: BagSummary, log: dict[str, list[tuple[int, Any]]]) -> None:
     closings = [m for _, m in log["/r_gripper_controller/command"] if m.position == 0.0]
     near = [m for _, m in log["/base/scan"] if m.ranges.min() < 0.5]
     errors = [m for _, m in log["/diagnostics"] if any(s.level >= 2 for s in m.status)]
@@ -133,59 +57,8 @@ def test_truth_is_what_the_bag_says(bag: BagSummary, log: dict[str, list[tuple[i
         "near_scans": len(near),
         "errors": len(errors),
     }
-    assert len(closings) == closings_of(Robot(DURATION, 5)) > 0
+    assert len(closings) == sum(c.position == 0 for c in Robot(17, 5).gripper_commands) > 0
     assert near
-
-
-def test_errors_are_in_the_diagnostics(tmp_path: Path) -> None:
-    robot = Robot(60.0, 2)
-    topics = ["/diagnostics", "/r_gripper_controller/command", "/rosout", "/r_cart/command_pose"]
-    bag = write_bag(tmp_path / "few.bag", duration_s=60, seed=2, topics=topics)
-    messages, _ = read(bag.path, 1)
-    assert set(messages) == set(topics)
-    errors = [m for _, m in messages["/diagnostics"] if m.status[0].level == 2]
-    assert bag.truth["errors"] == len(errors) > 0
-    seconds = np.arange(0.4, 60, 1.0)
-    assert len(errors) == np.count_nonzero(robot.motor_temperature(seconds) >= 80)
-    assert bag.truth["gripper_closings"] == closings_of(robot) >= 3
-    assert {m.level for _, m in messages["/rosout"]} == {2, 4, 8}
-
-
-def test_odometry_integrates_twist_and_commands(log: dict[str, list[tuple[int, Any]]]) -> None:
-    seconds = (stamps(log["/odom"]) - stamps(log["/odom"])[0]) / 1e9
-    odom = [m for _, m in log["/odom"]]
-    speed = np.array([m.twist.twist.linear.x for m in odom])
-    turn = np.array([m.twist.twist.angular.z for m in odom])
-    x = np.array([m.pose.pose.position.x for m in odom])
-    y = np.array([m.pose.pose.position.y for m in odom])
-    yaw = np.array(
-        [2 * np.arctan2(m.pose.pose.orientation.z, m.pose.pose.orientation.w) for m in odom]
-    )
-    step = np.diff(seconds)
-    heading = np.concatenate(([0], np.cumsum((turn[1:] + turn[:-1]) / 2 * step)))
-    driven = (speed[1:] + speed[:-1]) / 2 * step
-    middle = (heading[1:] + heading[:-1]) / 2
-    assert abs(np.unwrap(yaw) - yaw[0] - heading).max() < 0.05
-    assert abs(np.cumsum(driven * np.cos(middle)) - x[1:]).max() < 0.1
-    assert abs(np.cumsum(driven * np.sin(middle)) - y[1:]).max() < 0.1
-    commands = np.array([m.linear.x for _, m in log["/cmd_vel"]])
-    assert commands.sum() / 20 == pytest.approx(driven.sum(), abs=0.2)
-    # The wheels roll as far as the robot drives.
-    wheels = np.array([m.position[:2] for _, m in log["/joint_states"]])
-    assert wheels[-1].mean() * 0.1 == pytest.approx(driven.sum(), rel=0.02, abs=0.05)
-
-
-def test_transforms_chain_to_the_truth(log: dict[str, list[tuple[int, Any]]]) -> None:
-    robot = Robot(DURATION, 5)
-    for _, message in log["/tf"][:: len(log["/tf"]) // 20]:
-        a, b = (t.transform for t in message.transforms)
-        stamp = message.transforms[1].header.stamp
-        turn = 2 * np.arctan2(a.rotation.z, a.rotation.w)
-        x = a.translation.x + np.cos(turn) * b.translation.x - np.sin(turn) * b.translation.y
-        y = a.translation.y + np.sin(turn) * b.translation.x + np.cos(turn) * b.translation.y
-        seconds = (stamp.sec * 10**9 + stamp.nanosec - robot.start_ns) / 1e9
-        truth = robot.at(np.array([seconds]))
-        assert (x, y) == pytest.approx((float(truth.x[0]), float(truth.y[0])), abs=1e-3)
 
 
 def digest(path: Path) -> str:
@@ -315,24 +188,23 @@ def test_the_bag_in_the_package_is_what_the_simulator_writes(tmp_path: Path) -> 
         assert not any(differs(one, other) for (_, one), (_, other) in pairs), topic
 
 
-def test_images_are_compressed(tmp_path: Path) -> None:
-    config = SMALL._replace(jpeg=90, intensity_step=50.0)
-    plain = write_bag(tmp_path / "a.bag", duration_s=1, config=SMALL)
-    small = write_bag(tmp_path / "b.bag", duration_s=1, config=config)
-    raw, packed = (read(summary.path, 1)[0] for summary in (plain, small))
-    assert "/camera/rear/image_raw" not in small.messages
-    for name, shape in (("front", (32, 48, 3)), ("rear", (32, 48))):
-        topic = f"/camera/{name}/image_raw"
-        (_, image), (_, message) = raw[topic][0], packed[f"{topic}/compressed"][0]
-        assert image.header.stamp == message.header.stamp
-        pixels = np.asarray(Image.open(io.BytesIO(message.data)), np.float32)
-        assert pixels.shape == shape
-        # The noise in a picture depends on its topic.
-        wanted = (
-            image.data.reshape(shape)[..., ::-1] if name == "front" else image.data.reshape(shape)
-        )
-        assert abs(pixels - wanted).mean() < 5
-    for (_, one), (_, other) in zip(raw["/base/scan"], packed["/base/scan"], strict=True):
-        assert np.array_equal(one.ranges, other.ranges)
-        assert not (other.intensities % 50).any()
-        assert abs(one.intensities - other.intensities).max() <= 25
+@pytest.mark.parametrize("seed", range(8))
+def test_every_seed_drives_clear_and_stands_at_its_stops(seed: int) -> None:
+    robot = Robot(70.0, seed)
+    state = robot.at(np.arange(0.0, min(robot.duration_s, robot.period), 0.02))
+    assert robot.plan.clearance(state.x, state.y).min() > 0.3
+    for stop in robot.stops:
+        middle = (stop.start + stop.end) / 2
+        assert robot.at(np.array([middle])).speed[0] < 1e-9
+    assert 3 <= sum(c.position == 0 for c in robot.gripper_commands) <= 6
+    for braked in (stop.start for stop in robot.stops if stop.kind == "brake"):
+        near = np.array([braked - 0.15, braked, braked + 0.1])
+        assert robot.at(near).acceleration.min() < -1.5
+
+
+@pytest.mark.parametrize(
+    ("duration_s", "seed"), [(0, 1), (-1, 1), (float("nan"), 1), (float("inf"), 1), (5, -1)]
+)
+def test_impossible_robots_are_refused(duration_s: float, seed: int) -> None:
+    with pytest.raises(UsageError):
+        Robot(duration_s, seed)

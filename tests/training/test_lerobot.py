@@ -1,4 +1,4 @@
-"""Training sets, read by pyarrow and PyAV, against the log; and by `lerobot-doctor`."""
+"""Training sets, read by pyarrow and PyAV, against the log; also of real and damaged logs."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import os
 import shutil
 import subprocess
 import sys
+from bisect import bisect_right
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from time import monotonic
 from typing import Any
 
 import av
@@ -20,12 +20,19 @@ import pyarrow.parquet as pq
 import pytest
 
 import hybridlog as hl
+from benchmarks.simulator.topics import RobotConfig
+from benchmarks.simulator.write import write_bag
+from hybridlog.drawing.images import shown_pixels
 from hybridlog.training.feature_map import FeatureMap
 from hybridlog.training.lerobot import LerobotReport
 from hybridlog_storage.errors import PayloadError, TopicError, UsageError
 from hybridlog_storage.messages import Channel, Schema
+from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests import places
 from tests.cli.within import answer
+from tests.data import DATA, needs_data
 from tests.drawing.conftest import IMAGE, image
+from tests.waiting import wait_for
 
 MS = 10**6
 SECOND = 10**9
@@ -49,12 +56,10 @@ ARM_STEP, GO_STEP, CAMERA_STEP = 10 * MS, 50 * MS, 100 * MS
 
 
 def arm(time: int) -> list[float]:
-    """State of the arm that is told at a time."""
     return [time / SECOND, -time / SECOND, time / SECOND / 2]
 
 
 def grey(time: int) -> int:
-    """Brightness of the picture that is told at a time."""
     return time // CAMERA_STEP * 9 % 220 + 16
 
 
@@ -128,7 +133,6 @@ def episodes_of(path: Path) -> list[dict[str, Any]]:
 
 
 def greys_of(path: Path) -> list[tuple[float, float]]:
-    """Time and brightness of each picture."""
     found = []
     for file in sorted((path / "videos/observation.images.front").rglob("*.mp4")):
         with av.open(str(file)) as opened:
@@ -147,14 +151,7 @@ def about(path: Path) -> dict[str, Any]:
 def check(
     path: Path, begins: dict[int, int], lengths: list[int], *, is_silent: bool = False
 ) -> None:
-    """Every frame is that of the log.
-
-    Args:
-        path: The set.
-        begins: Offset of the first frame of each episode.
-        lengths: Frames of each episode.
-        is_silent: Whether /go is silent for a second.
-    """
+    """Every frame is that of the log."""
     rows, pictures = rows_of(path), greys_of(path)
     assert [one["length"] for one in episodes_of(path)] == lengths
     assert len(rows) == len(pictures) == sum(lengths)
@@ -240,15 +237,6 @@ def digests(path: Path) -> dict[str, str]:
     }
 
 
-def test_the_same_command_gives_the_same_bytes(plain: Path, tmp_path: Path) -> None:
-    with hl.open(plain, mongo="none") as store:
-        for name in ("one", "two"):
-            export(store, tmp_path / name)
-        assert digests(tmp_path / "one") == digests(tmp_path / "two")
-        with pytest.raises(UsageError, match="is there already"):
-            export(store, tmp_path / "one")
-
-
 def test_an_interrupted_export_goes_on(plain: Path, tmp_path: Path) -> None:
     told: list[str] = []
 
@@ -269,6 +257,8 @@ def test_an_interrupted_export_goes_on(plain: Path, tmp_path: Path) -> None:
         for name, resumed in (("set", 1), ("cut", 0)):
             assert export(store, tmp_path / name).resumed == resumed
             assert digests(tmp_path / name) == digests(tmp_path / "whole")
+        with pytest.raises(UsageError, match="is there already"):
+            export(store, tmp_path / "whole")
 
 
 def test_episodes_are_marks_and_intervals(make: Make, tmp_path: Path) -> None:
@@ -329,6 +319,14 @@ def test_a_picture_that_cannot_be_shown(make: Make, tmp_path: Path) -> None:
         assert abs(shown[20] - grey(9 * CAMERA_STEP)) < 3
 
 
+def test_the_first_pictures_may_be_missing(make: Make, tmp_path: Path) -> None:
+    with make(Log(broken=0)) as store:
+        report = export(store, tmp_path / "set", on_gap="hold")
+    shown = [one for _, one in greys_of(tmp_path / "set")]
+    assert (report.frames, report.missing, len(shown)) == (80, 2, 80)
+    assert max(abs(one - grey(CAMERA_STEP)) for one in shown[:4]) < 3
+
+
 def test_what_does_not_fit_is_refused(make: Make, tmp_path: Path) -> None:
     def refused(values: dict[str, Any], error: type[Exception], match: str) -> None:
         with pytest.raises(error, match=match):
@@ -342,15 +340,6 @@ def test_what_does_not_fit_is_refused(make: Make, tmp_path: Path) -> None:
         refused({"images": {"front": "arm"}}, (PayloadError, UsageError), "picture")  # type: ignore[arg-type]
         refused({"features": {"action": {"nowhere": "x"}}}, TopicError, "nowhere")
         refused({"features": {"action": {"*": "x"}}}, TopicError, "means several topics")
-
-
-def test_the_first_pictures_may_be_missing(make: Make, tmp_path: Path) -> None:
-    with make(Log(broken=0)) as store:
-        report = export(store, tmp_path / "set", on_gap="hold")
-    assert (report.frames, report.missing) == (80, 2)
-    shown = [one for _, one in greys_of(tmp_path / "set")]
-    assert len(shown) == 80
-    assert [abs(one - grey(CAMERA_STEP)) < 3 for one in shown[:4]] == [True] * 4
 
 
 @pytest.mark.parametrize(
@@ -375,9 +364,7 @@ def test_a_recording_in_progress_is_read_as_of_one_moment(make: Make, tmp_path: 
     with make() as store, store.start("now", flush_interval_s=0.05) as recording:
         for time in range(0, SECOND, GO_STEP):
             recording.write(GO, json.dumps({"x": time / MS}).encode(), log_time=START + time)
-        deadline = monotonic() + 60
-        while not store.topics() or store.topic("go").count() < 20:
-            assert monotonic() < deadline
+        wait_for(lambda: store.topics() and store.topic("go").count() == 20)
         features = {"features": {"action": {"go": "x"}}}
         store.to_lerobot(store.topic("go"), features, tmp_path / "set", fps=FPS, task="go")
     assert [row["action"] for row in rows_of(tmp_path / "set")] == [50.0 * n for n in range(20)]
@@ -420,3 +407,126 @@ def test_the_doctor_finds_nothing_wrong(plain: Path, tmp_path: Path) -> None:
     assert "[FAIL]" not in done.stdout, done.stdout
     for part in ("Metadata & Format", "Temporal Consistency", "Video Integrity"):
         assert f"[PASS] {part}" in done.stdout, done.stdout
+
+
+RATE = 10
+FRONT = "/camera/front/image_raw"
+ROBOT = RobotConfig(image_size=(64, 48), scan_beams=30, cloud_columns=20)
+ALIKE = 12
+"""Greatest mean difference of the colours of a picture and the one in the log, of 255."""
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    place = tmp_path_factory.mktemp("demo")
+    write_bag(place / "robot.bag", duration_s=8, config=ROBOT)
+    with hl.open(place / "store", create=True, mongo="none") as store:
+        store.record(place / "robot.bag", settings=SegmentSettings(chunk_size=96 << 10))
+    return place / "store"
+
+
+def proposed(store: Path, place: Path) -> str:
+    answer("export", str(place), "-F", "lerobot", "--propose-map", "-q", store=store)
+    return place.read_text()
+
+
+def check_pictures(store: hl.Store, path: Path, features: FeatureMap, fps: int) -> int:
+    """Each frame shows the last picture that is not later; returns the number of frames."""
+    frames = 0
+    for name, topic in features.images.items():
+        messages = list(store.topic(topic))
+        times = [one.log_time_ns for one in messages]
+        files = sorted((path / f"videos/observation.images.{name}").rglob("*.mp4"))
+        shown = [
+            frame.to_ndarray(format="rgb24")
+            for file in files
+            for frame in av.open(str(file)).decode(video=0)
+        ]
+        number = 0
+        lengths = [one["length"] for one in episodes_of(path)]
+        for episode, length in zip(about(path)["episodes"], lengths, strict=True):
+            for frame in range(length):
+                time = episode["begin_ns"] + frame * 10**9 // fps
+                wanted = shown_pixels(messages[bisect_right(times, time) - 1])
+                wanted = np.atleast_3d(wanted)[:, :, :3].astype(np.int16)
+                found = shown[number][: wanted.shape[0], : wanted.shape[1]]
+                assert np.abs(found - wanted).mean() < ALIKE, (topic, frame)
+                number += 1
+        assert number == len(shown)
+        frames += number
+    return frames
+
+
+@needs_data
+@pytest.mark.parametrize(("log", "cameras"), [("ouster.mcap", 3), ("compressed_image.bag", 1)])
+def test_real_logs_with_cameras(tmp_path: Path, log: str, cameras: int) -> None:
+    with hl.open(tmp_path / "store", create=True, mongo="none") as store:
+        store.record(DATA / "real" / log)
+        text = proposed(tmp_path / "store", tmp_path / "map.yaml")
+        features = FeatureMap.read(tmp_path / "map.yaml")
+        assert len(features.images) == cameras, text
+        names = [*features.images.values()]
+        query, path = store.topic(*names), tmp_path / "set"
+        report = store.to_lerobot(query, tmp_path / "map.yaml", path, fps=30, task="x")
+        assert check_pictures(store, path, features, 30) == report.frames * cameras > 0
+
+
+def test_a_damaged_recording(demo: Path, tmp_path: Path) -> None:
+    """What is lost is in the set's description; a gap is refused unless it is asked for."""
+    (segment,) = places.files(demo)
+    data = bytearray(segment.read_bytes())
+    with hl.open(demo, mongo="none") as store:
+        (entry,) = store.recordings()
+        ids = [
+            one.channel_id for one in store.session.channels(entry) if one.channel.topic == FRONT
+        ]
+        (_, (chunk, _), *_) = store.session.chunks_before(entry, ids, 2**62)
+        data[chunk.place.offset + chunk.place.length // 2] ^= 0xFF
+    (tmp_path / "damaged.mcap").write_bytes(data)
+    features = {"images": {"front": FRONT}}
+    with hl.open(tmp_path / "store", create=True, mongo="none") as store:
+        store.record(tmp_path / "damaged.mcap")
+
+        def export(name: str, on_gap: Any) -> dict[str, Any]:
+            query = store.topic(FRONT)
+            store.to_lerobot(query, features, tmp_path / name, fps=RATE, task="x", on_gap=on_gap)
+            return about(tmp_path / name)
+
+        with pytest.raises(UsageError, match=f"{FRONT} has a gap of"):
+            export("refused", "refuse")
+        held = export("held", "hold")["episodes"]
+        assert [one["held"][FRONT] > 0 for one in held] == [True]
+        assert all(one["lost"] > 0 or not one["is_lost_exact"] for one in held)
+        cut = export("cut", "drop")["episodes"]
+        assert len(cut) == 2
+        assert not any(one["held"] for one in cut)
+
+
+def test_a_recording_whose_pictures_have_expired_is_refused(demo: Path, tmp_path: Path) -> None:
+    path = tmp_path / "store"
+    shutil.copytree(demo, path)
+    features = {"images": {"front": FRONT}}
+    with hl.open(path, mongo="none") as store:
+        store.keep({"topic": {FRONT: "0s"}})
+        with pytest.raises(UsageError, match="cannot be shown, or has no payload"):
+            store.to_lerobot(
+                store.topic("odom"), features, tmp_path / "expired", fps=RATE, task="x"
+            )
+
+
+def test_nearly_empty_topics_are_not_proposed(tmp_path: Path) -> None:
+    joy = Schema("sensor_msgs/Joy", "ros1msg", b"float32[] axes\n")
+    payload = (1).to_bytes(4, "little") + np.float32(1).tobytes()
+    with hl.open(tmp_path / "store", create=True, mongo="none") as store:
+        with store.start("one") as recording:
+            for time in range(20):
+                for name in ("/often", *(["/seldom"] if time == 7 else [])):
+                    channel = Channel(name, "ros1", joy, {})
+                    recording.write(channel, payload, log_time=10**18 + time * 10**9 // 2)
+    text_of_map = proposed(tmp_path / "store", tmp_path / "map.yaml")
+    assert FeatureMap.read(tmp_path / "map.yaml").topics == ("/often",)
+    assert text_of_map.endswith("# left out: /seldom has 1 message\n")
+    words = ("export", str(tmp_path / "set"), "-F", "lerobot", "--map", str(tmp_path / "map.yaml"))
+    done = answer(*words, "--task", "x", store=tmp_path / "store")
+    assert "Without --fps there are 30 frames a second." in done.err
+    assert json.loads((tmp_path / "set/meta/info.json").read_text())["fps"] == 30

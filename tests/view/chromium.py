@@ -15,12 +15,7 @@ PACKAGES = ("chromium", "fonts-dejavu-core")
 
 
 class Chromium(NamedTuple):
-    """Where chromium lies.
-
-    Attributes:
-        path: The program.
-        environment: Variables that it needs.
-    """
+    """Where chromium lies."""
 
     path: str
     environment: dict[str, str | float | bool]

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import io
+import json
 import os
-import shutil
+import struct
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from pathlib import Path
-from typing import TYPE_CHECKING
+from contextlib import contextmanager, redirect_stdout
+from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
 
+import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
@@ -42,6 +45,14 @@ def demo_store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
 
 
 @pytest.fixture(scope="session")
+def start(demo_store: hl.Store) -> int:
+    """The first log time of `demo_store`."""
+    (entry,) = demo_store.recordings()
+    assert entry.span is not None
+    return entry.span[0]
+
+
+@pytest.fixture(scope="session")
 def asking() -> Asking:
     """Makes a client of the view of a store, without a server; paths are below the token."""
 
@@ -71,6 +82,31 @@ def odd_store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
 def odd(odd_store: hl.Store, asking: Asking) -> TestClient:
     """A client of the view of `odd_store`."""
     return asking(odd_store)
+
+
+def printed_by(program: str) -> str:
+    """What a program prints that the page has given."""
+    said = io.StringIO()
+    names: dict[str, Any] = {"__name__": "copied"}
+    with redirect_stdout(said):
+        exec(compile(program, "copied", "exec"), names)
+    if "store" in names:
+        names["store"].close()
+    return said.getvalue()
+
+
+def unpacked(body: bytes) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Header and arrays of an answer."""
+    (size,) = struct.unpack_from("<I", body)
+    found = json.loads(body[4 : 4 + size])
+    arrays, place = {}, 4 + size
+    for one in found["arrays"]:
+        kind = np.dtype(one["type"])
+        assert place % kind.itemsize == 0
+        arrays[one["name"]] = np.frombuffer(body, kind, one["count"], place)
+        place += kind.itemsize * one["count"]
+    assert place == len(body)
+    return found, arrays
 
 
 @contextmanager
@@ -147,16 +183,11 @@ def page(browser: Browser) -> Iterator[Page]:
     assert not problems
 
 
-@pytest.fixture
-def picture_of(tmp_path: Path) -> Callable[[Page, str], Path]:
-    """Takes a picture of a page; kept in the directory HYBRIDLOG_TEST_PICTURES, if that is set."""
-
-    def take(page: Page, name: str) -> Path:
-        path = tmp_path / f"{name}.png"
-        page.screenshot(path=path)
-        kept = os.environ.get("HYBRIDLOG_TEST_PICTURES")
-        if kept:
-            shutil.copy(path, kept)
-        return path
-
-    return take
+def opened(
+    page: Page, url: str, recording: str, *panels: tuple[str, str, Any], at: int = 0
+) -> None:
+    """Open a recording with some panels: kind, topic and options."""
+    shown = [{"kind": k, "topic": t, "options": options} for k, t, options in panels]
+    page.goto("about:blank")
+    page.goto(f"{url}#recording={recording}&at={at}&panels={quote(json.dumps(shown))}")
+    page.wait_for_selector(".panels > article")

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
-import io
 import json
 import shlex
 import threading
-import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -24,12 +21,11 @@ from hybridlog.cli import fetch
 from hybridlog.view.loopback import Admission
 from hybridlog.view.routes import ask, export
 from hybridlog.view.server import make_app
-from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import places
 from tests.limits import Limit
 
-from .conftest import PORT, TOKEN
+from .conftest import PORT, TOKEN, printed_by
 
 if TYPE_CHECKING:
     from httpx2 import Response
@@ -40,12 +36,6 @@ NEAR = {"recording": "robot", "topic": "/base/scan", "where": "ranges.min < 0.8"
 BOTH = {**NEAR, "where": "ranges.min < 0.8 and /odom: twist.twist.linear.x > 0.3", "within": "50ms"}
 ENDLESS = "select sum(a.range * b.range) from range(10000000) a, range(1000000) b"
 S = 10**9
-
-
-def start_of(store: hl.Store) -> int:
-    (entry,) = store.recordings()
-    assert entry.span is not None
-    return entry.span[0]
 
 
 def times(query: hl.Query) -> list[int]:
@@ -60,27 +50,19 @@ def sql(client: TestClient, text: str) -> Response:
     return client.get("sql", params={"recording": "robot", "text": text})
 
 
-def run_program(text: str) -> list[str]:
-    said = io.StringIO()
-    with contextlib.redirect_stdout(said):
-        exec(compile(text, "copied", "exec"), {"__name__": "copied"})
-    return said.getvalue().splitlines()
-
-
 def test_a_predicate_is_counted(client: TestClient, demo_store: hl.Store) -> None:
     answer = client.get("ask", params=NEAR).json()
     want = near(demo_store).count()
     assert want > 20
     assert (answer["count"], answer["lost"], answer["remarks"]) == (want, None, [])
-    assert run_program(answer["python"])[0] == str(want)
+    assert printed_by(answer["python"]).split()[0] == str(want)
     both = client.get("ask", params=BOTH).json()
     want = demo_store.topic("scan").where(BOTH["where"], within="50ms").count()
     assert both["count"] == want > 0
-    assert run_program(both["python"])[0] == str(want)
+    assert printed_by(both["python"]).split()[0] == str(want)
 
 
-def test_matches_by_pixel(client: TestClient, demo_store: hl.Store) -> None:
-    start = start_of(demo_store)
+def test_matches_by_pixel(client: TestClient, demo_store: hl.Store, start: int) -> None:
     asked = {**NEAR, "begin": 2 * S, "end": 19 * S, "pixels": 400}
     answer = client.get("matches", params=asked).json()
     seen = [t - start for t in times(near(demo_store)) if 2 * S <= t - start < 19 * S]
@@ -92,8 +74,7 @@ def test_matches_by_pixel(client: TestClient, demo_store: hl.Store) -> None:
     assert none["counts"] == none["bands"] == []
 
 
-def test_matches_are_stepped_through(client: TestClient, demo_store: hl.Store) -> None:
-    start = start_of(demo_store)
+def test_matches_are_stepped_through(client: TestClient, demo_store: hl.Store, start: int) -> None:
     want = [str(t - start) for t in times(near(demo_store))]
     page = client.get("match-list", params={**NEAR, "at": 0, "count": 5}).json()
     assert ([at for at, _ in page["rows"]], page["before"]) == (want[:5], 0)
@@ -130,12 +111,7 @@ def test_matches_are_stepped_through(client: TestClient, demo_store: hl.Store) -
         ("complete", {"text": "x" * 10_001, "place": 1}, "too long"),
         ("sql", {"text": "select 1; drop table x"}, "Only queries"),
         ("sql", {"text": "selec 1"}, "LINE 1"),
-        ("sql", {"text": "select * from '/etc/passwd'"}, "no view"),
         ("sql", {"text": "select * from read_text('/etc/passwd')"}, "files"),
-        ("sql", {"text": "select * from glob('/etc/*')"}, "files"),
-        ("sql", {"text": "select * from query('create table a as select 1')"}, "single SELECT"),
-        ("sql", {"text": "copy (select 1) to '/tmp/x'"}, "Only queries"),
-        ("sql", {"text": "set memory_limit='9GB'"}, "Only queries"),
         ("sql", {"text": "select " + "(" * 3000 + "1" + ")" * 3000}, ""),
         ("export", {"begin": 5, "end": 5}, "greater"),
         ("export", {"begin": 100 * S, "end": 101 * S}, "Nothing was recorded"),
@@ -169,18 +145,19 @@ def test_completion(client: TestClient) -> None:
     assert offered("select nearest from sca", language="sql") == ["select nearest from scan"]
 
 
-def test_sql_gives_rows_that_lead_to_their_time(client: TestClient, demo_store: hl.Store) -> None:
+def test_sql_gives_rows_that_lead_to_their_time(
+    client: TestClient, demo_store: hl.Store, start: int
+) -> None:
     text = "select t, recording, ranges_summary.min as near from scan where near < 0.8 order by t"
     answer = sql(client, text).json()
     want = times(near(demo_store))
-    start = start_of(demo_store)
     exact = [str(time - start) for time in want]
     assert answer["at"] == exact
     assert set(answer["recordings"]) == {"robot"}
     assert answer["columns"] == [["t", True], ["recording", False], ["near", True]]
     assert [row[0] for row in answer["rows"]] == [str(time) for time in want]
     assert (answer["more"], answer["remarks"], answer["columns_left_out"]) == (False, [], 0)
-    assert str(len(want)) in run_program(answer["python"])[-1]
+    assert str(len(want)) in printed_by(answer["python"]).splitlines()[-1]
     by_log_time = text.replace("select t,", "select log_time,")
     answer = sql(client, by_log_time).json()
     assert answer["at"] == exact
@@ -294,18 +271,23 @@ def test_odd_names(
     monkeypatch: pytest.MonkeyPatch,
     asked: dict[str, Any],
 ) -> None:
-    client = asking(odd)
     monkeypatch.chdir(tmp_path)
     for label in ("x [1]", "x [1]-2"):
-        params = {"recording": label, **asked}
-        told = client.get("export-command", params=params).json()
-        done = CliRunner().invoke(
-            fetch.fetch_command, shlex.split(told["command"])[2:], catch_exceptions=False
-        )
-        assert done.exit_code == 0, done.output
-        sent = client.get("export", params=params).content
-        assert (tmp_path / told["name"]).read_bytes() == sent
-        assert run_program(told["python"])[0] == str(told["count"])
+        check_command(asking(odd), {"recording": label, **asked})
+
+
+def check_command(client: TestClient, params: dict[str, Any]) -> None:
+    """The command line and Python give what is sent; files go into the current directory."""
+    told = client.get("export-command", params=params).json()
+    sent = client.get("export", params=params)
+    assert sent.headers["content-disposition"].startswith("attachment; filename")
+    words = shlex.split(told["command"])
+    assert words[:2] == ["hybridlog", "fetch"]
+    done = CliRunner().invoke(fetch.fetch_command, words[2:], catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    assert Path(told["name"]).read_bytes() == sent.content
+    assert told["count"] > 0
+    assert printed_by(told["python"]).split()[0] == str(told["count"])
 
 
 def test_a_name_that_no_predicate_has_is_refused(
@@ -327,31 +309,6 @@ def test_losses_are_told(odd: hl.Store, asking: Callable[[hl.Store], TestClient]
     assert client.get("export-command", params=asked).json()["lost"] == want
     answer = client.get("sql", params={**asked, "text": "select count(*) from large"}).json()
     assert any(f"{lost.messages} messages lost in" in line for line in answer["remarks"])
-
-
-def test_a_running_recording(odd: hl.Store, asking: Callable[[hl.Store], TestClient]) -> None:
-    client = asking(odd)
-    text = "select count(*) from fresh where n % 2 = 0"
-    fresh = Channel("/fresh", "json", None, {})
-    with odd.start("runs", settings=SegmentSettings(chunk_size=1024)) as recording:
-        asked = {"recording": "runs", "topic": "/fresh", "where": "n < 90"}
-        for n in range(100):
-            payload = json.dumps({"n": n, "pad": "-" * 200}).encode()
-            recording.write(fresh, payload, log_time=n * S)
-        for _ in range(3000):  # until all is flushed
-            found = client.get("recordings", params={"name": "runs"}).json()["messages"]
-            if found == 100:
-                break
-            time.sleep(0.02)
-        assert found == 100
-        answer = client.get("ask", params=asked).json()
-        assert (answer["count"], answer["lost"]) == (90, None)
-        answer = client.get("sql", params={**asked, "text": text}).json()
-        assert answer["rows"] == [["50"]]
-        assert all(remark.startswith("runs is being recorded") for remark in answer["remarks"])
-        times = {**asked, "begin": 0, "end": 100 * S, "pixels": 100}
-        assert sum(client.get("matches", params=times).json()["counts"]) == 90
-    assert client.get("ask", params=asked).json()["count"] == 90
 
 
 def test_observed_fields_are_offered(
@@ -411,25 +368,18 @@ def test_the_command_line_writes_the_same_file(
     asked: dict[str, Any],
 ) -> None:
     params = {"recording": "robot", **asked}
-    told = client.get("export-command", params=params).json()
-    sent = client.get("export", params=params)
-    assert sent.headers["content-disposition"] == f'attachment; filename="{told["name"]}"'
-    assert told["name"].startswith("robot_")
-    words = shlex.split(told["command"])
-    assert words[:2] == ["hybridlog", "fetch"]
     monkeypatch.chdir(tmp_path)
-    done = CliRunner().invoke(fetch.fetch_command, words[2:], catch_exceptions=False)
-    assert done.exit_code == 0, done.output
-    assert (tmp_path / told["name"]).read_bytes() == sent.content
-    assert told["count"] > 0
-    assert run_program(told["python"])[0] == str(told["count"])
+    check_command(client, params)
+    (made,) = tmp_path.iterdir()
+    assert made.name.startswith("robot_")
+    head = client.get("export", params=params).headers["content-disposition"]
+    assert head == f'attachment; filename="{made.name}"'
 
 
 @pytest.mark.peer("browser")
 def test_a_question_is_asked_and_its_matches_become_a_file(
-    page: Page, demo_url: str, demo_store: hl.Store, client: TestClient, tmp_path: Path
+    page: Page, demo_url: str, demo_store: hl.Store, start: int, client: TestClient, tmp_path: Path
 ) -> None:
-    start = start_of(demo_store)
     want = [time - start for time in times(demo_store.topic("scan").where("ranges.min < 0.8"))]
     page.goto(f"{demo_url}#recording=robot")
     page.get_by_label("Topic of the question").select_option("/base/scan")

@@ -1,10 +1,10 @@
-"""Times and integers that numbers of a page are too coarse for: clocks that jump from 1970, ids."""
+"""Times and integers that numbers of a page are too coarse for; clocks that jump, or are wrong."""
 
 from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlencode
 
@@ -13,7 +13,8 @@ import pytest
 
 import hybridlog as hl
 from hybridlog_storage.messages import Channel, Schema
-from tests.view.conftest import Asking, served
+from tests.view.conftest import Asking, served, unpacked
+from tests.view.test_timeline import picture_of
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page
@@ -33,7 +34,6 @@ MATCHES = {**NUMBERS, "where": "longitude > 13"}
 
 
 def row(n: int) -> dict[str, Any]:
-    """Exact values of a message."""
     return {
         "id": 2**64 - 1 - n,
         "sid": -(2**63) + n,
@@ -117,14 +117,7 @@ def test_values_of_a_plot_are_exact(client: TestClient) -> None:
 
 
 def test_times_of_a_track_are_exact(client: TestClient) -> None:
-    content = client.get("track", params={**NUMBERS, "pixels": 1000}).content
-    (length,) = struct.unpack("<I", content[:4])
-    head = json.loads(content[4 : 4 + length])
-    place, found = 4 + length, {}
-    for one in head["arrays"]:
-        kind = np.dtype(one["type"])
-        found[one["name"]] = np.frombuffer(content, kind, one["count"], place).tolist()
-        place += kind.itemsize * one["count"]
+    _, found = unpacked(client.get("track", params={**NUMBERS, "pixels": 1000}).content)
     times = [int(a) + int(b) for a, b in zip(found["times"], found["rests"], strict=True)]
     assert [str(time) for time in times] == OFFSETS
 
@@ -180,21 +173,105 @@ def test_a_row_of_sql_leads_into_its_recording(client: TestClient) -> None:
     assert sorted(boots["recordings"]) == ["jump", "other"]
 
 
+MS = 10**6
+LAST = 2**63 - 1
+"""The last time that can be written."""
+FAR = 2 * 10**18 + 2**62
+SENT = 300
+WRONG: Mapping[str, list[int]] = {
+    "zero": [n * MS for n in range(SENT)],
+    "far": [FAR + n * MS for n in range(SENT)],
+    "last": [LAST - SENT + n + 1 for n in range(SENT)],
+    "all": [0, *(LAST - (SENT - n) * MS for n in range(1, SENT))],
+}
+EVERYTHING = {"begin": -LAST, "end": LAST}
+
+
+@pytest.fixture(scope="module")
+def clocks(tmp_path_factory: pytest.TempPathFactory, asking: Asking) -> Iterator[TestClient]:
+    channel = Channel("/v", "ros1", Schema("own/V", "ros1msg", b"float64 v\nfloat64[] a\n"))
+    with hl.open(tmp_path_factory.mktemp("times") / "store", create=True) as store:
+        for label, times in WRONG.items():
+            with store.start(label) as recording:
+                for n, time in enumerate(times):
+                    payload = struct.pack("<dI2d", n, 2, n, -n)
+                    recording.write(channel, payload, log_time=time)
+        yield asking(store)
+
+
+@pytest.mark.parametrize("label", WRONG)
+def test_pictures_at_the_ends_of_time(clocks: TestClient, label: str) -> None:
+    times = WRONG[label]
+    start, behind = times[0], times[-1] - times[0] + 1
+    asked = {"recording": label, "topic": "/v", "pixels": 100}
+    for span in (EVERYTHING, {"begin": -start, "end": min(behind, LAST)}):
+        drawn = picture_of(clocks, {**asked, **span})
+        assert int(drawn.lanes[0].counts.sum()) == SENT
+        rest = {**asked, **span, "pixels": 20}
+        (series,) = clocks.get("series", params={**rest, "field": "v"}).json()["fields"]
+        assert min(v for v in series["least"] if v is not None) == 0
+        assert max(v for v in series["greatest"] if v is not None) == SENT - 1
+        for where in ("v > 9", "a[1] < -9"):
+            found = clocks.get("matches", params={**rest, "where": where})
+            assert sum(found.json()["counts"]) == SENT - 10
+        found = clocks.get("export-command", params={**span, "recording": label})
+        assert found.json()["count"] == SENT
+
+
+def test_pixels_of_late_years(clocks: TestClient) -> None:
+    asked = {"recording": "far", "topic": "/v", "begin": 0, "end": SENT * MS, "pixels": 30}
+    found = clocks.get("series", params={**asked, "field": "v"}).json()
+    assert found["times"] == [str(n * 10 * MS) for n in range(30)]
+    (one,) = found["fields"]
+    assert one["least"] == [n * 10 for n in range(30)]
+    assert one["greatest"] == [n * 10 + 9 for n in range(30)]
+
+
+@pytest.mark.parametrize("label", WRONG)
+def test_messages_at_the_ends_of_time(clocks: TestClient, label: str) -> None:
+    times = WRONG[label]
+    asked = {"recording": label, "topic": "/v"}
+    at = [time - times[0] for time in times]
+    for n in (0, 7, SENT - 2):
+        found = clocks.get("message", params={**asked, "at": at[n]}).json()
+        assert (found["time"], found["until"]) == (str(at[n]), str(at[n + 1]))
+    rows = clocks.get("match-list", params={**asked, "where": "v > 5", "at": at[-2], "count": 9})
+    assert [int(time) for time, _ in rows.json()["rows"]] == at[-2:]
+    assert rows.json()["before"] == SENT - 8
+    asked = {**asked, "where": "v > 5", "at": at[-1], "seq": 2**62, "direction": "earlier"}
+    rows = clocks.get("match-list", params={**asked, "count": 1}).json()
+    assert (rows["rows"][0][0], rows["before"]) == (str(at[-1]), SENT - 7)
+    text = f"select t, v from v where recording = '{label}' order by t desc limit 2"
+    found = clocks.get("sql", params={"text": text}).json()
+    assert found["at"] == [str(at[-1]), str(at[-2])]
+
+
+def asked_on(page: Page, url: str, recording: str, *panels: dict[str, Any]) -> None:
+    """Open a recording with panels and the question for matches."""
+    ask = {"kind": "predicate", "topic": "/num", "text": MATCHES["where"], "within": ""}
+    shown = {"recording": recording, "panels": json.dumps(panels), "ask": json.dumps(ask)}
+    page.goto(f"{url}#{urlencode(shown)}")
+
+
+def click(page: Page, n: int) -> None:
+    page.get_by_role("complementary").get_by_role("button", name=f"#{n + 1} ").first.click()
+
+
+def is_shown(page: Page, n: int) -> None:
+    page.locator("li[aria-current]", has_text=f"#{n + 1} ").wait_for()
+    page.locator(".tree .leaf", has_text=f"id{row(n)['id']}").first.wait_for()
+
+
 @pytest.mark.peer("browser")
 def test_the_page_shows_the_match_of_several_at_one_time(page: Page, store: hl.Store) -> None:
-    panels = [{"kind": "message", "topic": "/num", "options": {}}]
-    ask = {"kind": "predicate", "topic": "/num", "text": MATCHES["where"], "within": ""}
-    shown = {"recording": "twins", "panels": json.dumps(panels), "ask": json.dumps(ask)}
-
     def check(n: int) -> None:
-        page.locator("li[aria-current]", has_text=f"#{n + 1} ").wait_for()
-        page.locator(".tree .leaf", has_text=f"id{row(n)['id']}").first.wait_for()
+        is_shown(page, n)
         assert page.locator("li[aria-current]").count() == 1
 
     with served(store) as url:
-        page.goto(f"{url}#{urlencode(shown)}")
+        asked_on(page, url, "twins", {"kind": "message", "topic": "/num", "options": {}})
         for n in (4, 5, 3, 0):
-            page.get_by_role("complementary").get_by_role("button", name=f"#{n + 1} ").first.click()
+            click(page, n)
             check(n)
         for n in range(1, 9):
             page.keyboard.press("n")
@@ -211,12 +288,9 @@ def test_the_page_shows_what_is_clicked(page: Page, store: hl.Store) -> None:
         {"kind": "message", "topic": "/num", "options": {}},
         {"kind": "plot", "topic": "/num", "options": {"fields": fields}},
     ]
-    ask = {"kind": "predicate", "topic": "/num", "text": MATCHES["where"], "within": ""}
-    shown = {"recording": "jump", "panels": json.dumps(panels), "ask": json.dumps(ask)}
 
     def check(n: int) -> None:
-        page.locator("li[aria-current]", has_text=f"#{n + 1} ").wait_for()
-        page.locator(".tree .leaf", has_text=f"id{row(n)['id']}").first.wait_for()
+        is_shown(page, n)
         assert f"at={OFFSETS[n]}" in page.evaluate(
             "import('./state.js').then(s => `at=${s.get('at')}`)"
         )
@@ -226,9 +300,9 @@ def test_the_page_shows_what_is_clicked(page: Page, store: hl.Store) -> None:
             assert output.inner_text() == (str(np.float32(value)) if field == "f" else str(value))
 
     with served(store) as url:
-        page.goto(f"{url}#{urlencode(shown)}")
+        asked_on(page, url, "jump", *panels)
         for n in (2, 99, 50):
-            page.get_by_role("complementary").get_by_role("button", name=f"#{n + 1} ").first.click()
+            click(page, n)
             check(n)
         page.locator("body").press("n")
         check(51)

@@ -124,44 +124,6 @@ def test_a_question_that_is_given_up_waits_for_nothing(demo_store: hl.Store) -> 
     assert said[0]["status"] == 200
 
 
-@pytest.mark.peer("browser")
-def test_an_update_waits_for_the_answer_before(page: Page, demo_url: str) -> None:
-    page.goto(demo_url)
-    said = page.evaluate(
-        """async () => {
-            const { Question } = await import("./api.js");
-            const said = [], answers = [];
-            const by = (path, asked, { signal }) => new Promise((resolve, reject) => {
-                said.push(path);
-                answers.push(() => resolve(path));
-                signal.addEventListener("abort", () => reject(new DOMException("", "AbortError")));
-            });
-            const question = new Question();
-            const hear = (one) =>
-                one.then((text) => said.push(`= ${text}`), ({ name }) => said.push(name));
-            const later = () => new Promise((resolve) => setTimeout(resolve, 10));
-            const run = async (...steps) => {
-                for (const step of steps) { step(); await later(); }
-            };
-            await run(
-                () => hear(question.ask("a", {}, by)),
-                () => hear(question.update("b", {}, by)),
-                () => hear(question.update("c", {}, by)),
-                () => answers[0](),
-                () => answers[1](),
-                () => hear(question.update("d", {}, by)),
-                () => hear(question.update("e", {}, by)),
-                () => hear(question.ask("f", {}, by)),
-                () => question.stop(),
-            );
-            return said;
-        }"""
-    )
-    aborted = "AbortError"
-    assert [one for one in said if len(one) == 1] == ["a", "c", "d", "f"]
-    assert [one for one in said if len(one) > 1] == ["= a", aborted, "= c", *[aborted] * 3]
-
-
 @pytest.fixture
 def running(tmp_path: Path) -> Iterator[hl.Store]:
     """A store, as another process has it open, with a recording that goes on."""

@@ -31,23 +31,22 @@ STATIC = Path(loopback.__file__).parent / "static"
 
 
 class Answer(NamedTuple):
-    """What the server says."""
-
     status: int
     headers: dict[str, str]
     body: bytes
 
 
 class Door(NamedTuple):
-    """Where the server is.
-
-    Attributes:
-        port: Its port.
-        token: Its token.
-    """
+    """Where the server is."""
 
     port: int
     token: str
+
+    @classmethod
+    def of(cls, url: str) -> Door:
+        parts = urlsplit(url)
+        assert parts.port is not None
+        return cls(parts.port, parts.path.strip("/"))
 
     def ask(
         self,
@@ -73,7 +72,6 @@ class Door(NamedTuple):
             connection.close()
 
     def below(self, path: str, headers: dict[str, str] | None = None, **options: Any) -> Answer:
-        """Ask for a path below the token."""
         return self.ask(f"/{self.token}/{path}", headers, **options)
 
     def say(self, raw: bytes) -> bytes:
@@ -89,9 +87,7 @@ class Door(NamedTuple):
 @pytest.fixture(scope="module")
 def door(demo_store: hl.Store) -> Iterator[Door]:
     with served(demo_store) as url:
-        parts = urlsplit(url)
-        assert parts.port is not None
-        yield Door(parts.port, parts.path.strip("/"))
+        yield Door.of(url)
 
 
 def test_the_page_itself_is_let_in(door: Door) -> None:
@@ -210,9 +206,7 @@ def test_other_origins_are_refused(door: Door, headers: dict[str, str]) -> None:
 def test_pages_of_other_viewers_read_only_selections(demo_store: hl.Store) -> None:
     viewer = {"Origin": "https://viewer.example", "Sec-Fetch-Site": "cross-site"}
     with served(demo_store, viewer["Origin"]) as url:
-        parts = urlsplit(url)
-        assert parts.port is not None
-        door = Door(parts.port, parts.path.strip("/"))
+        door = Door.of(url)
         assert door.below("mcap/manifest?recording=robot", viewer).status == 200
         refused = ["recordings", "app.js", "", "mcap", "Mcap/manifest", "%6dcap2/manifest"]
         for path in refused:
@@ -295,14 +289,10 @@ def test_paths_do_not_leave_the_page(door: Door) -> None:
 ABSURD = (
     "",
     "-1",
-    "0",
     "1e9",
-    "1000000000",
     "-9223372036854775809",
     "9" * 400,
     "NaN",
-    "Infinity",
-    "0x10",
     "١٢",
     "\x00",
     "💥" * 300,
@@ -407,9 +397,8 @@ def test_connections_that_only_wait_are_closed(demo_store: hl.Store, limit: Limi
     """Those without a request, with part of one, and with an endless body after the answer."""
     limit(connection_patience_s=0.5)
     with served(demo_store) as url:
-        parts = urlsplit(url)
-        assert parts.port is not None
-        path, host = parts.path, f"Host: {parts.netloc}\r\n"
+        door = Door.of(url)
+        path, host = f"/{door.token}/", f"Host: 127.0.0.1:{door.port}\r\n"
         begun = [
             "",
             "GET /",
@@ -419,7 +408,7 @@ def test_connections_that_only_wait_are_closed(demo_store: hl.Store, limit: Limi
         ]
         waiting = []
         for text in begun * 60:
-            one = socket.create_connection(("127.0.0.1", parts.port), timeout=60)
+            one = socket.create_connection(("127.0.0.1", door.port), timeout=60)
             one.sendall(text.encode())
             waiting.append(one)
         # More than are served at once; as they go, the page is served again.
@@ -427,7 +416,6 @@ def test_connections_that_only_wait_are_closed(demo_store: hl.Store, limit: Limi
         for one in waiting:
             assert _drip(one)
             one.close()
-        door = Door(parts.port, path.strip("/"))
         for _ in range(100):
             statuses.add(door.below("").status)
             if 200 in statuses:
@@ -441,25 +429,23 @@ def test_connections_that_only_wait_are_closed(demo_store: hl.Store, limit: Limi
 def test_strangers_do_not_keep_the_page_out(demo_store: hl.Store, shown: str) -> None:
     """More connections without the token than are served at once, held open."""
     with served(demo_store) as url, ExitStack() as opened:
-        parts = urlsplit(url)
-        assert parts.port is not None
-        host = f"Host: {parts.netloc}\r\n"
+        door = Door.of(url)
+        path, host = f"/{door.token}/", f"Host: 127.0.0.1:{door.port}\r\n"
         said = {
             "nothing": "",
-            "part": f"GET {parts.path} HTTP/1.1\r\n{host}X: ",
+            "part": f"GET {path} HTTP/1.1\r\n{host}X: ",
             "refused": f"GET /no-token/ HTTP/1.1\r\n{host}\r\n",
         }[shown]
-        kept = http.client.HTTPConnection("127.0.0.1", parts.port, timeout=60)
+        kept = http.client.HTTPConnection("127.0.0.1", door.port, timeout=60)
         for n in range(300):
             if n % 50 == 0:  # a connection of the page, which is older than most strangers
-                kept.request("GET", f"{parts.path}recordings")
+                kept.request("GET", f"{path}recordings")
                 answer = kept.getresponse()
                 assert (answer.status, bool(answer.read())) == (200, True)
-            stranger = socket.create_connection(("127.0.0.1", parts.port), timeout=60)
+            stranger = socket.create_connection(("127.0.0.1", door.port), timeout=60)
             opened.enter_context(stranger).sendall(said.encode())
-        door = Door(parts.port, parts.path.strip("/"))
         assert {door.below("recordings").status for _ in range(20)} == {200}
-        kept.request("GET", f"{parts.path}recordings")
+        kept.request("GET", f"{path}recordings")
         assert kept.getresponse().status == 200
         kept.close()
 

@@ -24,6 +24,7 @@ from hybridlog_storage.errors import UsageError
 from hybridlog_storage.messages import Channel
 from tests.independent import Seen, read_bag, read_mcap
 from tests.view.conftest import PORT, TOKEN, served
+from tests.waiting import at_once
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page
@@ -314,11 +315,7 @@ def test_a_slice_is_written_once_and_wholly(demo_store: hl.Store, tmp_path: Path
         together.wait()
         slices.get(copy(query), "odom", write)
 
-    threads = [threading.Thread(target=get) for _ in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    at_once(*[get] * 4)
     assert len(writers) == 1
     assert len(read_mcap(writers[0])) == query.count()
 

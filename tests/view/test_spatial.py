@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 import io
 import json
 import math
 import struct
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from urllib.parse import urlencode
 
 import numpy as np
 import pytest
@@ -21,7 +18,7 @@ from hybridlog.drawing.points import points
 from hybridlog.drawing.track import track
 from hybridlog_storage.messages import Channel, Schema
 from tests.ros_values import ROS1
-from tests.view.conftest import Asking, served
+from tests.view.conftest import Asking, opened, printed_by, served, unpacked
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
@@ -93,27 +90,10 @@ def asked(store: hl.Store, asking: Asking) -> TestClient:
     return asking(store)
 
 
-def unpacked(body: bytes) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Header and arrays of an answer."""
-    (size,) = struct.unpack_from("<I", body)
-    found = json.loads(body[4 : 4 + size])
-    arrays, place = {}, 4 + size
-    for one in found["arrays"]:
-        kind = np.dtype({"float32": "<f4", "float64": "<f8"}[one["type"]])
-        assert place % kind.itemsize == 0
-        arrays[one["name"]] = np.frombuffer(body, kind, one["count"], place)
-        place += kind.itemsize * one["count"]
-    assert place == len(body)
-    return found, arrays
-
-
 def points_at(client: TestClient, **parameters: Any) -> tuple[dict[str, Any], dict[str, Any]]:
     response = client.get("points", params={"recording": "yard", **parameters})
     assert response.status_code == 200, response.text
     return unpacked(response.content)
-
-
-# Routes
 
 
 def test_points_of_a_scan(asked: TestClient) -> None:
@@ -189,13 +169,9 @@ def test_a_fix(asked: TestClient) -> None:
     [
         ("points", {"limit": 0}, 400),
         ("points", {"limit": 500_001}, 400),
-        ("points", {"at": "NaN"}, 400),
-        ("points", {"at": 10**30}, 400),
         ("points", {"at": None}, 400),
         ("points", {"topic": "/none"}, 404),
         ("points", {"value": "x" * 1025}, 400),
-        ("track", {"pixels": 0}, 400),
-        ("track", {"pixels": 10**9}, 400),
         ("track", {"begin": 0}, 400),
         ("track", {"topic": "/scan"}, 400),
         ("fix", {"topic": "/scan"}, 400),
@@ -211,30 +187,19 @@ def test_what_cannot_be_asked(
     assert response.json()["error"]
 
 
-# The page
-
-
 @pytest.fixture(scope="module")
 def url(store: hl.Store) -> Iterator[str]:
     with served(store) as address:
         yield address
 
 
-def opened(page: Page, url: str, at: int, *panels: tuple[str, str, dict[str, Any]]) -> None:
-    shown = [{"kind": kind, "topic": topic, "options": options} for kind, topic, options in panels]
-    state = {"recording": "yard", "at": at, "panels": json.dumps(shown)}
-    page.goto(f"{url}#{urlencode(state)}")
-
-
 def data(page: Page, topic: str) -> dict[str, Any]:
-    """What a panel says that it draws."""
     place = page.locator(f'article[aria-label$="{topic}"] .space')
     found: dict[str, Any] = place.evaluate("one => ({...one.dataset})")
     return found
 
 
 def until(page: Page, holds: Callable[[], bool]) -> None:
-    """Wait until something holds."""
     for _ in range(300):
         if holds():
             return
@@ -248,8 +213,8 @@ def view(page: Page, kind: str) -> list[float]:
 
 
 @pytest.mark.peer("browser")
-def test_a_scan_is_drawn(page: Page, url: str, picture_of: Callable[[Page, str], Path]) -> None:
-    opened(page, url, S, ("points", "/scan", {}))
+def test_a_scan_is_drawn(page: Page, url: str) -> None:
+    opened(page, url, "yard", ("points", "/scan", {}), at=S)
     page.wait_for_selector(".space[data-points='3']")
     shown = data(page, "/scan")
     assert (shown["drawing"], shown["total"], shown["value"]) == ("flat", "6", "intensity")
@@ -262,7 +227,6 @@ def test_a_scan_is_drawn(page: Page, url: str, picture_of: Callable[[Page, str],
     before = view(page, "plane")
     assert colour_at(page, before, (2, 0))[2] > 150 > colour_at(page, before, (2, 0))[0]
     assert colour_at(page, before, (4 * math.cos(5 * math.pi / 6), 2))[0] > 150
-    picture_of(page, "scan")
     canvas = page.locator("canvas.plane")
     canvas.focus()
     canvas.press("+")
@@ -277,7 +241,6 @@ def test_a_scan_is_drawn(page: Page, url: str, picture_of: Callable[[Page, str],
 
 
 def colour_at(page: Page, seen: list[float], place: tuple[float, float]) -> list[int]:
-    """Red, green and blue of a place on the plane, metres."""
     script = """([right, up, scale, x, y]) => {
         const canvas = document.querySelector("canvas.plane");
         const { width, height } = canvas.getBoundingClientRect();
@@ -292,7 +255,7 @@ def colour_at(page: Page, seen: list[float], place: tuple[float, float]) -> list
 
 @pytest.mark.peer("browser")
 def test_a_cloud_is_drawn_in_space(page: Page, url: str) -> None:
-    opened(page, url, 0, ("points", "/cloud", {}))
+    opened(page, url, "yard", ("points", "/cloud", {}), at=0)
     page.wait_for_selector(".space[data-drawing='space']")
     shown = data(page, "/cloud")
     assert (shown["points"], shown["value"], shown["frame"]) == ("800", "rgb", "lidar")
@@ -324,7 +287,6 @@ def test_a_cloud_is_drawn_in_space(page: Page, url: str) -> None:
 
 
 def pixels(png: bytes, colour: tuple[int, int, int]) -> int:
-    """Number of pixels that have about a colour."""
     array = np.asarray(Image.open(io.BytesIO(png)).convert("RGB")).astype(int)
     return int((np.abs(array - colour).max(axis=2) < 40).sum())
 
@@ -336,7 +298,9 @@ def test_without_webgl_clouds_are_seen_from_above(page: Page, url: str) -> None:
         "HTMLCanvasElement.prototype.getContext = function (kind, ...more) {"
         "  return kind.startsWith('webgl') ? null : real.call(this, kind, ...more); };"
     )
-    opened(page, url, 0, ("points", "/cloud", {"colour": "ring"}), ("points", "/broken", {}))
+    opened(
+        page, url, "yard", ("points", "/cloud", {"colour": "ring"}), ("points", "/broken", {}), at=0
+    )
     page.wait_for_selector(".space[data-drawing='flat']")
     assert data(page, "/cloud")["points"] == "800"
     words = page.locator("article[aria-label$='/cloud'] .facts").inner_text()
@@ -347,8 +311,8 @@ def test_without_webgl_clouds_are_seen_from_above(page: Page, url: str) -> None:
 
 
 @pytest.mark.peer("browser")
-def test_a_track_is_drawn(page: Page, url: str, picture_of: Callable[[Page, str], Path]) -> None:
-    opened(page, url, 2 * S, ("map", "/fix", {}))
+def test_a_track_is_drawn(page: Page, url: str) -> None:
+    opened(page, url, "yard", ("map", "/fix", {}), at=2 * S)
     page.wait_for_selector(".space[data-fixes='28'][data-fix]")
     shown = data(page, "/fix")
     assert (shown["points"], shown["messages"], shown["exact"]) == ("31", "31", "true")
@@ -364,7 +328,6 @@ def test_a_track_is_drawn(page: Page, url: str, picture_of: Callable[[Page, str]
     line, gap, ground = (colour_at(page, seen, (x, y)) for x, y in ((37, 0), (82, 0), (20, 33)))
     assert line != gap
     assert gap != ground  # the line of the grid
-    picture_of(page, "track")
     # A click on the track moves the cursor there.
     canvas = page.locator("canvas.plane")
     box_of = canvas.bounding_box()
@@ -380,18 +343,13 @@ def test_python_that_gets_the_same(browser: Browser, url: str) -> None:
     context = browser.new_context(permissions=["clipboard-read", "clipboard-write"])
     page = context.new_page()
     try:
-        opened(page, url, S, ("points", "/scan", {}), ("map", "/fix", {}))
+        opened(page, url, "yard", ("points", "/scan", {}), ("map", "/fix", {}), at=S)
         said = []
         for topic in ("/scan", "/fix"):
             panel = page.locator(f"article[aria-label$='{topic}']")
             panel.get_by_role("button", name="Copy as Python").click()
             page.wait_for_selector("text=Copied as Python")
-            text = page.evaluate("navigator.clipboard.readText()")
-            with contextlib.redirect_stdout(io.StringIO()) as output:
-                names: dict[str, Any] = {}
-                exec(text, names)
-                names["store"].close()
-            said.append(output.getvalue())
+            said.append(printed_by(page.evaluate("navigator.clipboard.readText()")))
         assert said[0] == "(6,) ('range', 'intensity', 'angle')\n"
         assert said[1].split()[:2] == ["latitude", "longitude"]
     finally:

@@ -43,9 +43,6 @@ if __name__ == "__main__":
 """
 
 
-# In the process.
-
-
 def pid(_context: object) -> int:
     return os.getpid()
 
@@ -71,9 +68,6 @@ def end(_context: object) -> None:
 
 def refuse(_context: object) -> None:
     raise HybridlogError("no")
-
-
-# In the page.
 
 
 @pytest.fixture

@@ -11,7 +11,6 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from time import monotonic
 from typing import Any, NamedTuple
 
 import pytest
@@ -24,6 +23,7 @@ from hybridlog.view import tools
 from hybridlog.view.tool_server import make_server
 from hybridlog_storage.messages import Channel
 from tests import places
+from tests.waiting import wait_for
 
 ASK = Path(__file__).parents[2] / "docs" / "ask.md"
 
@@ -60,7 +60,6 @@ def asking(server: Any) -> Iterator[Ask]:
 
 @pytest.fixture(scope="module")
 def ask(demo_store: hl.Store) -> Iterator[Ask]:
-    """Asks the demo's robot, through the program."""
     path = str(demo_store.directory.path)
     words = ["-m", "hybridlog", "mcp", "--store", path]
     with asking(StdioServerParameters(command=sys.executable, args=words)) as found:
@@ -68,7 +67,6 @@ def ask(demo_store: hl.Store) -> Iterator[Ask]:
 
 
 def queries_of_the_page() -> list[str]:
-    """The questions in SQL of `ask.md`."""
     text = ASK.read_text().replace("\\\n", "")
     return [re.sub(r"\s+", " ", one) for one in re.findall(r'hybridlog sql "(.*?)"', text)]
 
@@ -116,12 +114,7 @@ def test_messages_pictures_and_plots(demo_store: hl.Store, ask: Ask) -> None:
 
 ESCAPES = [
     ("sql", {"query": "select * from read_csv('/etc/passwd')"}),
-    ("sql", {"query": "select * from '/etc/passwd'"}),
-    ("sql", {"query": "select * from glob('/*')"}),
     ("sql", {"query": "copy (select 1) to '/tmp/x.csv'"}),
-    ("sql", {"query": "attach '/tmp/x.db' as x"}),
-    ("sql", {"query": "install httpfs"}),
-    ("sql", {"query": "create table x as select 1"}),
     ("sql", {"query": "select 1; set enable_external_access = true"}),
     ("sql", {"query": "select * from range(1000000000) a, range(1000000000) b order by 1"}),
     ("sql", {"query": "select repeat('x', 10000000)"}),
@@ -194,9 +187,7 @@ def test_no_byte_is_written_and_losses_are_told(demo_store: hl.Store, tmp_path: 
         with store.start("cut", flush_interval_s=0.05) as recording:
             channel = Channel(text, "json", None, {})
             recording.write(channel, json.dumps({"text": text}).encode(), log_time=10**18)
-            deadline = monotonic() + 60
-            while text not in store.topics() or not store.topic(text).count():
-                assert monotonic() < deadline
+            wait_for(lambda: text in store.topics() and store.topic(text).count())
             shutil.copytree(store.directory.path, path)
             with asking(make_server(store)) as ask:  # it counts all, although it gives one
                 (told, *_) = ask("fetch", topic=text, limit=1).values["lacks"]

@@ -28,13 +28,7 @@ _OF_ROS = re.compile("^Source: ros-", re.MULTILINE)
 
 
 class Ros1(NamedTuple):
-    """Where ROS 1 lies.
-
-    Attributes:
-        python: The Python that its modules are for.
-        tools: Folder of the commands `record` and `play`, which are written in C++.
-        environment: Variables that all of them need.
-    """
+    """Where ROS 1 lies."""
 
     python: str
     tools: Path
@@ -59,7 +53,6 @@ def _made(place: Path) -> str:
 
 
 def _in(root: Path) -> Ros1:
-    """ROS 1 as it would be in a tree."""
     own_python = root / "usr/bin/python3"
     environment = {"PYTHONPATH": ""}
     if root != _SYSTEM:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import socket
 import threading
 import xmlrpc.client
@@ -13,7 +12,7 @@ from xmlrpc.server import SimpleXMLRPCRequestHandler, SimpleXMLRPCServer
 
 from hybridlog.live.sources.ros1.handshake import decode_header, encode_header
 from hybridlog_storage.messages import Channel
-from tests.live.sources.heard import Heard
+from tests.live.sources.heard import Heard, Listening
 
 STRING = {"type": "std_msgs/String", "md5sum": "992ce8a1687cec8c8bd883ec73ca41d1"}
 
@@ -141,30 +140,18 @@ class FakePublisher:
         self.greets, self.offer = greets, offer
         self.asked: list[dict[str, str]] = []
         self.connections = 0
-        self._open: list[socket.socket] = []
-        self._threads: list[threading.Thread] = []
 
     def __enter__(self) -> FakePublisher:
         self.server = _Server(self.host)
         self.server.register_function(self._request_topic, "requestTopic")
         self.server.__enter__()
-        family = socket.AF_INET6 if ":" in self.host else socket.AF_INET
-        self.listening = socket.create_server((self.host, 0), family=family)
-        self._accepting = threading.Thread(target=self._accept)
-        self._accepting.start()
+        self.listening = Listening(self._serve, self.host)
+        self.listening.__enter__()
         return self
 
     def __exit__(self, *_: object) -> None:
         self.server.__exit__()
-        with contextlib.suppress(OSError):
-            self.listening.shutdown(socket.SHUT_RDWR)
-        self._accepting.join()
-        self.listening.close()
-        for connection in self._open:
-            with contextlib.suppress(OSError):
-                connection.shutdown(socket.SHUT_RDWR)
-        for thread in self._threads:
-            thread.join()
+        self.listening.__exit__()
 
     @property
     def uri(self) -> str:
@@ -181,36 +168,22 @@ class FakePublisher:
             return [0, f"not a publisher of {topic}", []]
         if self.offer is not None:
             return [1, "", self.offer]
-        return [1, "", ["TCPROS", self.host, self.listening.getsockname()[1]]]
-
-    def _accept(self) -> None:
-        while True:
-            try:
-                connection, _ = self.listening.accept()
-            except OSError:
-                return
-            self._open.append(connection)
-            thread = threading.Thread(target=self._serve, args=(connection,))
-            self._threads.append(thread)
-            thread.start()
+        return [1, "", ["TCPROS", self.host, self.listening.port]]
 
     def _serve(self, connection: socket.socket) -> None:
-        with connection, contextlib.suppress(ConnectionError):
-            length = int.from_bytes(connection.recv(4, socket.MSG_WAITALL), "little")
-            self.asked.append(decode_header(connection.recv(length, socket.MSG_WAITALL)))
-            if self.greets:
-                connection.sendall(encode_header(self.fields))
-            self.connections += 1
-            self.script(connection)
+        length = int.from_bytes(connection.recv(4, socket.MSG_WAITALL), "little")
+        self.asked.append(decode_header(connection.recv(length, socket.MSG_WAITALL)))
+        if self.greets:
+            connection.sendall(encode_header(self.fields))
+        self.connections += 1
+        self.script(connection)
 
 
 def framed(*payloads: bytes) -> bytes:
-    """Messages as they go over the wire."""
     return b"".join(len(payload).to_bytes(4, "little") + payload for payload in payloads)
 
 
 def until_closed(connection: socket.socket) -> None:
-    """Waits until the subscriber hangs up."""
     while connection.recv(4096):
         pass
 
@@ -226,8 +199,6 @@ def sends(*payloads: bytes) -> Callable[[socket.socket], None]:
 
 
 class Collector(Heard):
-    """A sink that keeps everything, and lets a test wait for it."""
-
     def take(self, channel: Channel, payload: bytes, **about: Any) -> None:
         assert type(payload) is bytes
         assert about.get("sent") is None
@@ -240,17 +211,11 @@ class Collector(Heard):
     def payloads(self, topic: str = "/topic") -> list[bytes]:
         return super().payloads(topic)
 
-    def wait(self, condition: Callable[[], bool]) -> None:
-        """Waits until something holds, which can change with any call."""
-        self.until(lambda _: condition())
-
     def wait_for(self, *payloads: bytes, topic: str = "/topic") -> None:
-        """Waits until just these messages have come."""
         self.wait(lambda: len(self.payloads(topic)) >= len(payloads))
         assert self.payloads(topic) == list(payloads)
 
     def wait_said(self, *parts: str) -> str:
-        """Waits for a line with all of some words in it."""
 
         def found() -> list[str]:
             return [line for line in self.said if all(part in line for part in parts)]

@@ -13,11 +13,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tests.live.sources.heard import Heard
 from tests.peer_cache import made_once
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Iterator
 
 WHEELS = (
     "ros-rclpy==9.1.2",
@@ -26,27 +25,6 @@ WHEELS = (
     "ros-sensor-msgs==5.5.1",
     "ros-geometry-msgs==5.5.1",
 )
-PATIENCE_S = 30.0
-
-
-class Memory(Heard):
-    """A sink that keeps all it is told, in order."""
-
-    @property
-    def came(self) -> list[tuple[Any, ...]]:
-        """Topics that came: name, type, publishers."""
-        return [told for told in self.topics if len(told) > 1]
-
-    @property
-    def gone(self) -> list[str]:
-        """Topics that went."""
-        return [told[0] for told in self.topics if len(told) == 1]
-
-    def wait(self, condition: Callable[[], object], what: str) -> None:
-        """Until something is so."""
-        with self._changed:
-            done = self._changed.wait_for(condition, PATIENCE_S)
-        assert done, f"{what}; said {self.said}, lost {self.losses}, gone {self.gone}"
 
 
 def ros2_python() -> str | None:
@@ -60,7 +38,6 @@ def ros2_python() -> str | None:
 
 
 def _make_ros2(place: Path) -> str:
-    """An environment with the wheels; returns why it could not be made."""
     commands = (
         [sys.executable, "-m", "venv", str(place)],
         [str(place / "bin" / "python"), "-m", "pip", "install", "--quiet", *WHEELS],
@@ -203,7 +180,6 @@ def robot(python: str, name: str) -> Iterator[Robot]:
 
 
 def domain() -> dict[str, str]:
-    """Environment in which nobody else is heard."""
     return {
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
         # Domains up to 101 have ports that nobody else takes.
@@ -236,6 +212,12 @@ def channel(number=0, topic="/a", **more):
                  offered="- durability: 2", hash="")
     event(event="channel", number=number, topic=topic, **{{**known, **more}})
 
+def lost(**what):
+    event(event="lost", topic="/a", first=1, last=1, detail="", **what)
+
+def raw(kind, size, body=b""):
+    peer.sendall(HEADER.pack(kind, size) + body)
+
 def message(number, payload, sequence=1):
     entry = ENTRY.pack(number, len(payload), 1_700_000_000_000_000_000, 0, sequence)
     peer.sendall(HEADER.pack(MESSAGE, len(entry) + len(payload)) + entry + payload)
@@ -258,7 +240,6 @@ def fake_child(folder: Path, body: str) -> str:
 
 
 def starts(folder: Path) -> list[int]:
-    """Ids of the fake children that have run."""
     path = folder / "starts"
     return [int(line) for line in path.read_text().split()] if path.exists() else []
 

@@ -29,7 +29,7 @@ from hybridlog_storage.errors import MissingDependencyError, UsageError
 from hybridlog_storage.messages import Schema
 from tests.calls import Calls
 from tests.limits import Limit
-from tests.live.sources.heard import DEADLINE_S, Heard, must_return
+from tests.live.sources.heard import DEADLINE_S, Heard, Listening, must_return
 from tests.waiting import wait_for
 
 pytest.importorskip(
@@ -84,8 +84,6 @@ def advertise(*channels: object) -> bytes:
 
 
 class Peer:
-    """One connection as the server sees it."""
-
     def __init__(self, made: socket.socket) -> None:
         self.socket = made
         self.socket.settimeout(DEADLINE_S)
@@ -125,7 +123,6 @@ class Peer:
         return self.subscribed()
 
     def wait(self) -> None:
-        """Until the client says goodbye, or just goes."""
         try:
             while (heard := self.hear()).opcode is not Opcode.CLOSE:
                 pass
@@ -137,76 +134,54 @@ class Peer:
 Script = Callable[[Peer], None]
 
 
-class Server:
-    """Listens on loopback, and plays a script for each connection, the last one for ever."""
+class Server(Listening):
+    """Plays a script for each connection, the last one for ever."""
 
     def __init__(self, *scripts: Script, port: int = 0, is_raw: bool = False) -> None:
+        super().__init__(self._serve_one, port=port)
         self.scripts = list(scripts)
         self.is_raw = is_raw
         self.tls: ssl.SSLContext | None = None
         self.failures: list[BaseException] = []
-        self._peers: list[socket.socket] = []
-        self._listening = socket.create_server(("127.0.0.1", port))
-        self.port = self._listening.getsockname()[1]
         self.url = f"ws://127.0.0.1:{self.port}"
-        self._threads = [threading.Thread(target=self._accept)]
-
-    def __enter__(self) -> Server:
-        self._threads[0].start()
-        return self
 
     def __exit__(self, *_: object) -> None:
-        self._listening.shutdown(socket.SHUT_RDWR)
-        self._listening.close()
-        for peer in self._peers:
-            try:
-                peer.shutdown(socket.SHUT_RDWR)
-            except OSError:
-                pass
-        for thread in self._threads:
-            thread.join(DEADLINE_S)
-            assert not thread.is_alive()
+        super().__exit__()
         if self.failures:
             raise self.failures[0]
 
-    def _accept(self) -> None:
-        while True:
-            try:
-                made, _ = self._listening.accept()
-            except OSError:
-                return
-            self._peers.append(made)
-            script = self.scripts.pop(0) if len(self.scripts) > 1 else self.scripts[0]
-            self._threads.append(threading.Thread(target=self._serve, args=(made, script)))
-            self._threads[-1].start()
-
-    def _serve(self, made: socket.socket, script: Script) -> None:
+    def _serve_one(self, made: socket.socket) -> None:
+        script = self.scripts.pop(0) if len(self.scripts) > 1 else self.scripts[0]
+        if self.tls is not None:
+            made = self.tls.wrap_socket(made, server_side=True)
         with made:
+            peer = Peer(made)
             try:
-                if self.tls is not None:
-                    made = self.tls.wrap_socket(made, server_side=True)
-                with made:
-                    peer = Peer(made)
-                    if not self.is_raw:
-                        peer.shake_hands()
-                    script(peer)
+                if not self.is_raw:
+                    peer.shake_hands()
+                script(peer)
             except (OSError, EOFError):
-                pass  # the client is gone, which each test looks for at its own end
+                raise  # the client is gone, which each test looks for at its own end
             except BaseException as error:
                 self.failures.append(error)
 
 
-def hear(until: Callable[[Heard], object], *scripts: Script) -> Heard:
+def hear(
+    until: Callable[[Heard], object],
+    *scripts: Script,
+    heard: Heard | None = None,
+    server: Server | None = None,
+    **options: int,
+) -> Heard:
     """What a source hears of a server, until something has come."""
-    heard = Heard()
-    with Server(*scripts) as server, FoxgloveSource(server.url) as source:
+    heard = heard or Heard()
+    with server or Server(*scripts) as server, FoxgloveSource(server.url, **options) as source:
         source.start(heard)
         heard.until(until)
     return heard
 
 
 def saying(payload: bytes, time: int = 0, number: int = 1) -> Script:
-    """Plays one message on one channel."""
 
     def script(peer: Peer) -> None:
         peer.send(message(peer.offer(channel(number))[number], time, payload))
@@ -222,9 +197,6 @@ def _quick(limit: Limit) -> Iterator[None]:
     limit(foxglove_pauses_s=(0.02, 0.05))
     yield
     assert [t.name for t in threading.enumerate() if t.name == "hybridlog-foxglove"] == []
-
-
-# Without a server.
 
 
 @pytest.mark.parametrize(
@@ -272,47 +244,38 @@ def test_without_websockets_the_message_says_how_to_install_it(
         FoxgloveSource("ws://127.0.0.1:1").start(Heard())
 
 
+TEXT, OCTETS = "string data", b"\0\xff\n"
+IN_BASE64 = base64.b64encode(OCTETS).decode()
+
+
 @pytest.mark.parametrize(
-    ("entry", "expected"),
+    ("encoding", "said", "schema", "expected"),
     [
-        (
-            {"encoding": "ros1", "schema": "string data", "schemaEncoding": "ros1msg"},
-            Schema("T", "ros1msg", b"string data"),
-        ),
-        ({"encoding": "ros1", "schema": "string data"}, Schema("T", "ros1msg", b"string data")),
-        ({"encoding": "cdr", "schema": "string data"}, Schema("T", "ros2msg", b"string data")),
-        (
-            {"encoding": "cdr", "schema": "module {}", "schemaEncoding": "ros2idl"},
-            Schema("T", "ros2idl", b"module {}"),
-        ),
-        (
-            {"encoding": "json", "schema": '{"\u00e9": 1}'},
-            Schema("T", "jsonschema", '{"\u00e9": 1}'.encode()),
-        ),
-        (
-            {"encoding": "protobuf", "schema": base64.b64encode(b"\0\xff\n").decode()},
-            Schema("T", "protobuf", b"\0\xff\n"),
-        ),
-        (
-            {
-                "encoding": "flatbuffer",
-                "schema": base64.b64encode(b"\0\xfe").decode(),
-                "schemaEncoding": "flatbuffer",
-            },
-            Schema("T", "flatbuffer", b"\0\xfe"),
-        ),
-        ({"encoding": "own", "schema": "x", "schemaEncoding": "mine"}, Schema("T", "mine", b"x")),
-        ({"encoding": "json", "schema": ""}, Schema("T", "", b"")),
-        ({"encoding": "json", "schema": "", "schemaName": ""}, None),
-        ({"encoding": "json", "schemaName": None}, None),
+        ("ros1", "ros1msg", TEXT, Schema("T", "ros1msg", TEXT.encode())),
+        ("ros1", None, TEXT, Schema("T", "ros1msg", TEXT.encode())),
+        ("cdr", None, TEXT, Schema("T", "ros2msg", TEXT.encode())),
+        ("cdr", "ros2idl", "module {}", Schema("T", "ros2idl", b"module {}")),
+        ("json", None, '{"\u00e9": 1}', Schema("T", "jsonschema", '{"\u00e9": 1}'.encode())),
+        ("protobuf", None, IN_BASE64, Schema("T", "protobuf", OCTETS)),
+        ("flatbuffer", "flatbuffer", IN_BASE64, Schema("T", "flatbuffer", OCTETS)),
+        ("own", "mine", "x", Schema("T", "mine", b"x")),
+        ("json", None, "", Schema("T", "", b"")),
     ],
-)  # fmt: skip
-def test_definitions_become_schemas(entry: dict[str, object], expected: Schema | None) -> None:
-    found = parse_channel({**channel(), **entry})
+)
+def test_definitions_become_schemas(
+    encoding: str, said: str | None, schema: str, expected: Schema
+) -> None:
+    more = {} if said is None else {"schemaEncoding": said}
+    found = parse_channel(channel(encoding=encoding, schema=schema, **more))
     assert found.problem == ""
     assert found.channel.schema == expected
-    assert found.channel.message_encoding == entry["encoding"]
+    assert found.channel.message_encoding == encoding
     assert found.channel.has_publish_time
+
+
+@pytest.mark.parametrize("unnamed", [{"schema": "", "schemaName": ""}, {"schemaName": None}])
+def test_a_channel_may_have_no_schema(unnamed: dict[str, object]) -> None:
+    assert parse_channel(channel(**unnamed)).channel.schema is None
 
 
 @pytest.mark.parametrize(
@@ -353,8 +316,6 @@ def test_a_broken_definition_leaves_a_channel_without(
     assert found.channel.schema == Schema("T", "", b"")
     assert problem in found.problem
 
-
-# With a server that sends what a test wants.
 
 SIZES = [0, 1, 99, 112, 113, 125, 126, 65522, 65523, 65536, 70_000, 131_072, 300_000, 3_000_001]
 
@@ -431,10 +392,7 @@ def test_only_what_is_wanted_is_subscribed_to() -> None:
         peer.send(*(message(number, 0, b"x") for number in asked[0].values()))
         peer.wait()
 
-    heard = Heard(lambda topic, _: topic == "/a")
-    with Server(script) as server, FoxgloveSource(server.url) as source:
-        source.start(heard)
-        heard.until(lambda h: len(h.taken) == 2)
+    heard = hear(lambda h: len(h.taken) == 2, script, heard=Heard(lambda topic, _: topic == "/a"))
     assert set(asked[0]) == {1, 3}
     assert heard.topics[:2] == [("/a", "T", 1), ("/a", "U", 2)]
     types = [taken.channel.schema.name for taken in heard.taken if taken.channel.schema]
@@ -580,11 +538,7 @@ def test_a_message_over_the_limit_is_passed_over_and_counted() -> None:
         peer.send(message(number, 0, bytes(1 << 20)))
         peer.wait()
 
-    heard = Heard()
-    with Server(script) as server:
-        with FoxgloveSource(server.url, max_message_bytes=1 << 20) as source:
-            source.start(heard)
-            heard.until(lambda h: len(h.taken) == 2)
+    heard = hear(lambda h: len(h.taken) == 2, script, max_message_bytes=1 << 20)
     assert heard.payloads() == [b"small", bytes(1 << 20)]
     (lost,) = heard.losses
     assert (lost.topic, lost.cause, lost.count) == ("/a", Cause.UNREADABLE, 1)
@@ -648,14 +602,9 @@ def test_a_connection_that_breaks_in_a_message_is_a_row(*, size: int, is_in_piec
 
 
 def test_the_first_address_of_a_host_that_answers_is_taken() -> None:
-    heard = Heard()
-    with (
-        Server(saying(b"1")) as server,
-        FoxgloveSource(f"ws://localhost:{server.port}/x?y") as source,
-    ):
-        source.start(heard)
-        heard.until(lambda h: h.taken)
-    assert heard.said == []
+    server = Server(saying(b"1"))
+    server.url = f"ws://localhost:{server.port}/x?y"
+    assert hear(lambda h: h.taken, server=server).said == []
 
 
 def test_a_server_that_falls_silent_is_asked_and_then_left(
@@ -678,8 +627,8 @@ def test_a_server_that_falls_silent_is_asked_and_then_left(
 
     heard = hear(lambda h: h.taken, first, second)
     assert asked == [Opcode.PING]
-    assert [line for line in heard.said if "has been silent for" in line] == heard.said
-    assert len(heard.said) == 1
+    (line,) = heard.said
+    assert "has been silent for" in line
 
 
 def test_whatever_bytes_come_the_reader_ends_in_order() -> None:
@@ -719,32 +668,6 @@ def test_whatever_bytes_come_the_reader_ends_in_order() -> None:
             session.end(is_stopped=True)
 
 
-@pytest.mark.parametrize("after", [100, 2])
-def test_gaps_of_header_numbers_are_rows(after: int) -> None:
-    """Also those that too few messages followed, when the server leaves."""
-    numbers = [*range(100), *range(105, 105 + after)]
-    definition = "Header header\nfloat32 x"
-
-    def script(peer: Peer) -> None:
-        number = peer.offer(channel(encoding="ros1", schema=definition, topic="/scan"))[1]
-        peer.send(*(message(number, 0, struct.pack("<Id", n, 0.5)) for n in numbers))
-        if after > 8:
-            peer.wait()
-
-    heard = Heard()
-    with Server(script) as server, FoxgloveSource(server.url) as source:
-        source.start(heard)
-        heard.until(lambda h: len(h.taken) == len(numbers) and h.losses)
-        lost = heard.losses[0]
-        assert (lost.topic, lost.cause, lost.count) == ("/scan", Cause.TRANSPORT, 5)
-        assert lost.detail == "header.seq went from 99 to 105"
-        assert (lost.first, lost.last) == (heard.taken[99].received, heard.taken[100].received)
-    assert [loss.cause for loss in heard.losses].count(Cause.TRANSPORT) == 1
-
-
-# Those that are no Foxglove server.
-
-
 def answer(data: bytes) -> Script:
     def script(peer: Peer) -> None:
         peer.socket.recv(1 << 16)
@@ -775,10 +698,8 @@ def other_subprotocol(peer: Peer) -> None:
     ],
 )  # fmt: skip
 def test_somebody_elses_server_is_told_and_tried_again(script: Script, words: str) -> None:
-    heard = Heard()
-    with Server(script, is_raw=True) as server, FoxgloveSource(server.url) as source:
-        source.start(heard)
-        heard.until(lambda h: any(h.said_of(word) for word in words.split("|")))
+    server = Server(script, is_raw=True)
+    heard = hear(lambda h: any(h.said_of(word) for word in words.split("|")), server=server)
     assert all(line.isprintable() and line.endswith("; trying again") for line in heard.said)
     assert heard.taken == []
 
@@ -801,9 +722,6 @@ def test_a_host_that_is_not_known() -> None:
     with FoxgloveSource("ws://no-such-host.invalid:8765") as source:
         source.start(heard)
         heard.until(lambda h: h.said_of("is unknown"))
-
-
-# Stopping.
 
 
 @pytest.mark.parametrize("is_raw", [True, False])
@@ -855,8 +773,6 @@ def test_a_flood_does_not_hold_up_the_end() -> None:
         source.start(heard)
         heard.until(lambda h: h.taken)
         source.stop()
-        known = len(heard.taken)
-        assert known == len(heard.taken)
     assert heard.said == []
 
 
@@ -866,14 +782,9 @@ def test_a_sink_that_fails_is_told(monkeypatch: pytest.MonkeyPatch, calls: Calls
 
     heard = Heard()
     calls.fail(heard, "take", RuntimeError("no more"))
-    with Server(saying(b"1")) as server, FoxgloveSource(server.url) as source:
-        source.start(heard)
-        heard.until(lambda h: h.ends)
+    hear(lambda h: h.ends, saying(b"1"), heard=heard)
     assert "no more" in heard.ends[0]
     assert len(seen) == 1
-
-
-# TLS.
 
 
 @pytest.fixture(scope="module")
@@ -912,10 +823,8 @@ def test_tls_carries_messages_of_any_size(
         peer.send(*(message(number, 0, payload) for payload in payloads))
         peer.wait()
 
-    heard = Heard()
-    with tls_server(script, certificate) as server, FoxgloveSource(server.url) as source:
-        source.start(heard)
-        heard.until(lambda h: len(h.taken) == len(payloads))
+    server = tls_server(script, certificate)
+    heard = hear(lambda h: len(h.taken) == len(payloads), server=server)
     assert heard.payloads() == payloads
     assert heard.said == []
 
@@ -923,22 +832,15 @@ def test_tls_carries_messages_of_any_size(
 def test_a_certificate_that_nobody_vouches_for_is_refused(
     certificate: tuple[Path, Path],
 ) -> None:
-    heard = Heard()
-    with tls_server(Peer.wait, certificate) as server, FoxgloveSource(server.url) as source:
-        source.start(heard)
-        heard.until(lambda h: h.said_of("certificate is not trusted"))
+    server = tls_server(Peer.wait, certificate)
+    heard = hear(lambda h: h.said_of("certificate is not trusted"), server=server)
     assert heard.said_of("SSL_CERT_FILE")
 
 
 def test_a_server_without_tls_is_told() -> None:
-    heard = Heard()
-    with Server(answer(b"HTTP/1.1 400 Bad\r\n\r\n"), is_raw=True) as server:
-        with FoxgloveSource(server.url.replace("ws:", "wss:")) as source:
-            source.start(heard)
-            heard.until(lambda h: h.said_of("try ws://"))
-
-
-# The SDK's own server.
+    server = Server(answer(b"HTTP/1.1 400 Bad\r\n\r\n"), is_raw=True)
+    server.url = server.url.replace("ws:", "wss:")
+    hear(lambda h: h.said_of("try ws://"), server=server)
 
 
 @pytest.fixture
@@ -1015,56 +917,3 @@ def until_taken(heard: Heard, log: Callable[[], None], topic: str, payload: byte
         assert time.monotonic() < deadline, vars(heard)
         log()
         time.sleep(0.01)
-
-
-def start_again(sdk: Any, port: int, context: Any) -> Any:
-    """A server on a port that another one may not have left yet."""
-    deadline = time.monotonic() + DEADLINE_S
-    while True:
-        try:
-            return sdk.start_server(host="127.0.0.1", port=port, context=context)
-        except RuntimeError:
-            assert time.monotonic() < deadline
-            time.sleep(0.05)
-
-
-@pytest.mark.peer("Foxglove")
-def test_an_sdk_server_that_begins_anew(sdk: Any) -> None:
-    context = sdk.Context()
-    made = plain(sdk, "/a", context)
-    server = sdk.start_server(host="127.0.0.1", port=0, context=context)
-    port = server.port
-    heard = Heard()
-    try:
-        with FoxgloveSource(f"ws://127.0.0.1:{port}") as source:
-            source.start(heard)
-            until_taken(heard, lambda: made.log(b"1"), "/a", b"1")
-            server.stop()
-            heard.until(lambda h: h.said)
-            server = start_again(sdk, port, context)
-            until_taken(heard, lambda: made.log(b"2"), "/a", b"2")
-    finally:
-        server.stop()
-    lost = [(one.topic, one.cause, one.count) for one in heard.losses]
-    assert lost == [("/a", Cause.CONNECTION, None)]
-
-
-@pytest.mark.peer("Foxglove")
-def test_many_messages_of_the_sdk_come_in_order(sdk: Any) -> None:
-    context = sdk.Context()
-    made = plain(sdk, "/a", context)
-    count = 5000
-    server = sdk.start_server(
-        host="127.0.0.1", port=0, context=context, message_backlog_size=2 * count
-    )
-    heard = Heard()
-    try:
-        with FoxgloveSource(f"ws://127.0.0.1:{server.port}") as source:
-            source.start(heard)
-            subscribed(heard, {"/a": made})
-            for at in range(count):
-                made.log(b"%d" % at)
-            heard.until(lambda h: len(h.taken) == count)
-    finally:
-        server.stop()
-    assert heard.payloads() == [b"%d" % at for at in range(count)]

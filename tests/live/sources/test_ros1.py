@@ -18,7 +18,7 @@ from hybridlog.live.sources.base import Cause
 from hybridlog.live.sources.ros1.source import Ros1Source
 from hybridlog_storage.errors import UsageError
 from tests.limits import Limit
-from tests.live.sources.heard import must_return
+from tests.live.sources.heard import Listening, must_return
 from tests.live.sources.ros1_peers import (
     Collector,
     FakeMaster,
@@ -74,9 +74,6 @@ def _announce(master: FakeMaster, publisher: FakePublisher) -> None:
 def _free_port() -> int:
     with socket.create_server(("127.0.0.1", 0)) as server:
         return int(server.getsockname()[1])
-
-
-# What should happen
 
 
 def test_messages_come_as_they_were_sent() -> None:
@@ -241,9 +238,6 @@ def test_dropped_messages_are_counted(after: int) -> None:
     assert "/node" in loss.detail
 
 
-# Masters
-
-
 def test_a_master_that_is_not_there_yet() -> None:
     sink, port = Collector(), _free_port()
     with Ros1Source(f"http://127.0.0.1:{port}") as source:
@@ -322,9 +316,9 @@ def _xml(value: object) -> bytes:
     ],
 )
 def test_what_is_no_master(answer: bytes, words: str) -> None:
-    with _raw_server(_serve_raw(answer)) as port:
+    with Listening(_serve_raw(answer)) as server:
         sink = Collector()
-        with Ros1Source(f"http://127.0.0.1:{port}") as source:
+        with Ros1Source(f"http://127.0.0.1:{server.port}") as source:
             source.start(sink)
             sink.wait_said("no ROS master", words)
 
@@ -332,45 +326,16 @@ def test_what_is_no_master(answer: bytes, words: str) -> None:
 @pytest.mark.parametrize("answer", [b"x", b"HTTP/1.0 200 OK\r\n\r\n"], ids=["header", "body"])
 def test_an_answer_without_end(answer: bytes) -> None:
     before = psutil.Process().memory_info().rss
-    with _raw_server(_serve_raw(answer, endless=True)) as port:
+    with Listening(_serve_raw(answer, endless=True)) as server:
         sink = Collector()
-        with Ros1Source(f"http://127.0.0.1:{port}") as source:
+        with Ros1Source(f"http://127.0.0.1:{server.port}") as source:
             source.start(sink)
             sink.wait_said("no ROS master")
     assert psutil.Process().memory_info().rss - before < 150 << 20
 
 
-@contextmanager
-def _raw_server(script: Script) -> Iterator[int]:
-    """A server that does what it likes with each connection, one after the other."""
-    with socket.create_server(("127.0.0.1", 0)) as listening:
-
-        def work() -> None:
-            while True:
-                try:
-                    connection, _ = listening.accept()
-                except OSError:
-                    return
-                with connection:
-                    connection.settimeout(10)
-                    try:
-                        script(connection)
-                    except OSError:
-                        continue  # the other side has hung up
-
-        thread = threading.Thread(target=work)
-        thread.start()
-        yield listening.getsockname()[1]
-        listening.shutdown(socket.SHUT_RDWR)
-        thread.join()
-
-
-@pytest.mark.parametrize(
-    "uri",
-    ["robot", "localhost:11311", "https://robot:11311", "http://:1", "http://robot:0", "\x1b"],
-)
-def test_an_address_that_is_none(uri: str) -> None:
-    with Ros1Source(uri) as source:
+def test_an_address_that_is_none() -> None:
+    with Ros1Source("http://robot\x1b:0") as source:
         with pytest.raises(UsageError, match=r"not an address.*ROS_MASTER_URI") as caught:
             source.start(Collector())
     assert str(caught.value).isprintable()
@@ -390,9 +355,6 @@ def test_a_name_that_nobody_knows() -> None:
     with Ros1Source("http://no-such-host.invalid:11311") as source:
         source.start(sink)
         sink.wait_said("no ROS master", "no-such-host.invalid")
-
-
-# Publishers
 
 
 def test_a_publisher_that_dies_in_a_message_is_connected_again() -> None:
@@ -433,10 +395,8 @@ def test_memory_grows_with_what_comes_and_not_with_what_is_announced() -> None:
     ("greeting", "words"),
     [
         (b"\xff\xff\xff\xff", "connection header of 4294967295 bytes"),
-        (b"\x08\0\0\0\xff\xff\xff\x7fabcd", "exceeds it by"),
         (b"\x07\0\0\0\x03\0\0\0\xff\xfe\xfd", "no '='"),
         (b"\x20\0\0\0abc", "closed the connection within its header"),
-        (b"", "closed the connection within its header"),
         (framed(framed(b"error=you \x1b[31m may not")), "it refuses: you ?[31m may not"),
     ],
 )
@@ -539,9 +499,6 @@ def test_a_topic_nobody_speaks_on_delays_nothing() -> None:
         must_return(stack.close)
 
 
-# Our node
-
-
 def test_what_other_programs_may_ask() -> None:
     with _system(FakePublisher(sends(b"x"))) as (master, sink):
         sink.wait_for(b"x")
@@ -634,9 +591,6 @@ def test_ipv6(brackets: bool, monkeypatch: pytest.MonkeyPatch) -> None:
             assert next(iter(master.subscribers["/topic"].values())).startswith("http://[::1]:")
 
 
-# Stopping
-
-
 def test_what_has_come_is_handed_over_when_it_stops() -> None:
     """The source is held up with its socket full, and stopped."""
     payloads = [str(number).encode() * 100 for number in range(2000)]
@@ -684,17 +638,11 @@ def test_stopping_while_publishers_pour() -> None:
         _, sink = stack.enter_context(_system(FakePublisher(pour)))
         sink.wait(lambda: len(sink.taken) > 1000)
         must_return(stack.close)
-    count = len(sink.taken)
-    assert len(sink.taken) == count
 
 
 def test_a_master_that_never_answers_does_not_hold_up_the_end() -> None:
-    def silent(connection: socket.socket) -> None:
-        while connection.recv(4096):
-            pass
-
-    with _raw_server(silent) as port:
-        with Ros1Source(f"http://127.0.0.1:{port}") as source:
+    with Listening(until_closed) as server:
+        with Ros1Source(f"http://127.0.0.1:{server.port}") as source:
             source.start(Collector())
             time.sleep(0.1)  # so that it is in the middle of its call
             must_return(source.stop)

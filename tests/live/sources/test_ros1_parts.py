@@ -8,7 +8,6 @@ import random
 import select
 import socket
 import struct
-import time
 import warnings
 
 import pytest
@@ -120,11 +119,8 @@ def test_types_that_publishers_number(definition: str, numbered: bool) -> None:
 def test_what_peers_say_is_shown_harmlessly(text: str) -> None:
     line = one_line(text)
     assert line.isprintable()
-    assert len(line) < 1000
+    assert len(line) < 500
     assert one_line(text.encode(errors="replace")).isprintable()
-
-
-# Addresses
 
 
 @pytest.mark.parametrize(
@@ -165,9 +161,6 @@ def test_what_is_no_address(uri: str) -> None:
         endpoint_of(uri)
 
 
-# Being called
-
-
 @pytest.mark.parametrize("turns", range(6))
 def test_who_calls_while_the_server_is_stopped_is_hung_up_on(turns: int) -> None:
     async def stopped_after_turns() -> None:
@@ -193,15 +186,11 @@ def test_who_calls_while_the_server_is_stopped_is_hung_up_on(turns: int) -> None
     assert [str(warning.message) for warning in told] == []
 
 
-# Cutting
-
 _NUMBERED = Channel("/topic", "ros1", Schema("a/B", "ros1msg", b"Header header\n"))
 _PLAIN = Channel("/topic", "ros1", Schema("a/B", "ros1msg", b"string data\n"))
 
 
 class _Pipe:
-    """A stream, and the end that a publisher writes to."""
-
     def __init__(self, channel: Channel = _PLAIN, limit: int = 1 << 30) -> None:
         self.peer, ours = socket.socketpair()
         ours.setblocking(False)
@@ -212,7 +201,6 @@ class _Pipe:
         self.alive = True
 
     def send(self, data: bytes) -> None:
-        """Writes as much as fits, and reads, until all is through."""
         view = memoryview(data)
         while view:
             try:
@@ -222,7 +210,6 @@ class _Pipe:
             self.read()
 
     def read(self) -> None:
-        """Reads what is there."""
         while self.alive and select.select([self.stream.socket], [], [], 0)[0]:
             self.alive = self.stream.read()
 
@@ -268,33 +255,15 @@ def test_messages_come_out_as_they_went_in(seed: int, channel: Channel) -> None:
     assert pipe.ends == [""]
 
 
-def test_a_message_longer_than_a_piece() -> None:
-    payloads = [random.Random(1).randbytes(10_000_000), b"after", bytes(5_000_000), b""]
-    pipe = _Pipe()
-    pipe.send(framed(*payloads))
-    pipe.hang_up()
-    assert pipe.payloads() == payloads
-
-
-@pytest.mark.parametrize("size", [20, 200_000])
-def test_dropped_messages_are_counted(size: int) -> None:
+def test_a_gap_lies_between_the_message_before_it_and_the_one_after() -> None:
     pipe = _Pipe(_NUMBERED)
-    rest = bytes(size)
-    before = time.time_ns()
     for number in [*range(10), 12, 13, 20]:
-        pipe.send(framed(struct.pack("<I", number) + rest))
+        pipe.send(framed(struct.pack("<I", number)))
     pipe.hang_up()
-    assert len(pipe.payloads()) == 13
-    assert [(loss.cause, loss.count) for loss in pipe.sink.losses] == [
-        (Cause.TRANSPORT, 2),
-        (Cause.TRANSPORT, 6),
-    ]
-    assert all(before <= loss.first <= loss.last <= time.time_ns() for loss in pipe.sink.losses)
-    # Each lies between the message before it and the one after.
     times = [taken.received for taken in pipe.sink.taken]
-    assert [(loss.first, loss.last) for loss in pipe.sink.losses] == [
-        (times[9], times[10]),
-        (times[11], times[12]),
+    assert [(loss.count, loss.first, loss.last) for loss in pipe.sink.losses] == [
+        (2, times[9], times[10]),
+        (6, times[11], times[12]),
     ]
 
 

@@ -5,9 +5,7 @@ from __future__ import annotations
 import json
 import os
 import socket
-import struct
 import subprocess
-import threading
 import xmlrpc.client
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,7 +15,6 @@ from typing import Any
 
 import pytest
 
-from hybridlog.live.sources.base import Cause
 from hybridlog.live.sources.ros1.source import Ros1Source
 from tests.live.sources.ros1_debian import PACKAGES, Ros1, ros1
 from tests.live.sources.ros1_peers import Collector
@@ -35,9 +32,7 @@ if order["type"] == "image":
     kind, make = CompressedImage, lambda n, size: CompressedImage(data=bytes([n % 256]) * size)
 else:
     kind, make = String, lambda n, size: String(("%d " % n).ljust(size, "x"))
-publisher = rospy.Publisher(
-    order["topic"], kind, queue_size=order.get("queue", 0), latch=order.get("latch", False)
-)
+publisher = rospy.Publisher(order["topic"], kind, queue_size=0, latch=order["latch"])
 number = 0
 print(json.dumps({"definition": kind._full_text, "md5sum": kind._md5sum}), flush=True)
 for line in sys.stdin:
@@ -116,10 +111,10 @@ class _Master:
 
 
 class _Publisher:
-    """A node that publishes when it is told to."""
-
-    def __init__(self, master: _Master, topic: str, type_name: str = "text", **more: Any) -> None:
-        order = {"node": "talker", "topic": topic, "type": type_name, **more}
+    def __init__(
+        self, master: _Master, topic: str, type_name: str = "text", *, latch: bool = False
+    ) -> None:
+        order = {"node": "talker", "topic": topic, "type": type_name, "latch": latch}
         self._process = subprocess.Popen(
             [master.debian.python, "-c", PUBLISHER, json.dumps(order)],
             env=master.environment,
@@ -133,27 +128,19 @@ class _Publisher:
         assert self._process.stdout is not None
         return json.loads(self._process.stdout.readline())
 
-    def tell(self, count: int, size: int = 20, connections: int = 1) -> None:
+    def publish(self, count: int, size: int = 20, connections: int = 1) -> list[str]:
+        """Has messages sent; gives a hash of each payload."""
         assert self._process.stdin is not None
         command = {"count": count, "size": size, "connections": connections}
         self._process.stdin.write(json.dumps(command) + "\n")
         self._process.stdin.flush()
-
-    def publish(self, count: int, size: int = 20, connections: int = 1) -> list[str]:
-        """Has messages sent; gives a hash of each payload."""
-        self.tell(count, size, connections)
         return list(self._answer())
-
-    def kill(self) -> None:
-        self._process.kill()
-        self._process.communicate()
 
     def __enter__(self) -> _Publisher:
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._process.poll() is None:
-            self._process.communicate(timeout=20)
+        self._process.communicate(timeout=20)
 
 
 @pytest.fixture(scope="module")
@@ -210,78 +197,6 @@ def test_a_late_subscriber_gets_what_is_latched(master: _Master) -> None:
             sink.wait(lambda: len(sink.taken) == 1)
             assert _hashes(sink, "/latched") == [last]
     assert sink.taken[0].channel.metadata["latching"] == "1"
-
-
-def test_two_publishers_on_a_topic(master: _Master) -> None:
-    with (
-        _Publisher(master, "/pair", node="left") as left,
-        _Publisher(master, "/pair", node="right") as right,
-        _listening(master, _only("/pair")) as sink,
-    ):
-        hashes = left.publish(50) + right.publish(50)
-        sink.wait(lambda: len(sink.taken) == 100)
-        assert sorted(_hashes(sink, "/pair")) == sorted(hashes)
-        assert ("/pair", "std_msgs/String", 2) in sink.topics
-    assert {taken.channel.metadata["callerid"] for taken in sink.taken} == {"/left", "/right"}
-
-
-def test_a_publisher_that_is_killed_and_started_anew(master: _Master) -> None:
-    with _listening(master, _only("/mortal")) as sink:
-        with _Publisher(master, "/mortal") as first:
-            first.publish(10)
-            sink.wait(lambda: len(sink.taken) == 10)
-            first.kill()
-            sink.wait(lambda: ("/mortal",) in sink.topics)
-        with _Publisher(master, "/mortal") as second:
-            second.publish(10)
-            sink.wait(lambda: len(sink.taken) == 20)
-        sink.wait(lambda: sink.topics[-1] == ("/mortal",))
-
-
-def test_the_master_is_started_anew(debian: Ros1) -> None:
-    master, sink = _Master(debian), _only("/steady")
-    with master:
-        with _Publisher(master, "/steady") as publisher, Ros1Source(master.uri) as source:
-            source.start(sink)
-            publisher.publish(5)
-            master.__exit__()
-            publisher.publish(5)
-            sink.wait_said("no ROS master")
-            master.__enter__()
-            wait_for(lambda: bool(master.subscribers("/steady")))
-            publisher.publish(5)
-            sink.wait(lambda: len(sink.taken) == 15)
-            with _Publisher(master, "/steady", node="new") as other:
-                other.publish(5)
-                sink.wait(lambda: len(sink.taken) == 20)
-    assert sink.losses == []
-
-
-def test_what_a_publisher_drops_is_counted(master: _Master) -> None:
-    """Nothing is read while it sends far more than the sockets hold."""
-    reading = threading.Event()
-
-    class Slow(Collector):
-        def take(self, *arguments: Any, **more: Any) -> None:
-            super().take(*arguments, **more)
-            if len(self.taken) >= 20:
-                reading.wait(60)
-
-    sink = Slow(wanted=lambda name, type_name: name == "/flood")
-    with _Publisher(master, "/flood", "image", queue=2) as publisher:
-        with _listening(master, sink):
-            for number in range(20):
-                publisher.publish(1, 100)
-                sink.wait(lambda number=number: len(sink.taken) > number)  # type: ignore[misc]
-            publisher.publish(80, 2_000_000)
-            reading.set()
-            publisher.publish(1, 100)
-            sink.wait(lambda: sink.taken[-1].sequence == 101)
-    lost = sum(loss.count or 0 for loss in sink.losses)
-    assert {loss.cause for loss in sink.losses} == {Cause.TRANSPORT}
-    assert lost > 0
-    assert len(sink.taken) + lost == 101
-    assert all(t.sequence == struct.unpack("<I", t.payload[:4])[0] for t in sink.taken)
 
 
 BAG = """

@@ -7,11 +7,11 @@ import math
 import shutil
 import socket
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from tests import places
@@ -23,8 +23,9 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 import hybridlog as hl
-from hybridlog.view.playback.played import Covered, PlaybackClock, PlayedLog
+from hybridlog.view.playback.played import PlaybackClock, PlayedLog
 from hybridlog_storage.errors import TimeError, UsageError
+from hybridlog_storage.messages import Channel
 from tests.independent import Seen, read_mcap
 from tests.limits import Limit
 from tests.view.playback.viewer import SDK, WEBSOCKET, Data, State, Time, Viewer, served
@@ -97,6 +98,16 @@ def one(store: hl.Store) -> PlayedLog:
 @pytest.fixture(scope="module")
 def seen(logs: Path) -> list[Seen]:
     return read_mcap(logs / "one.mcap")
+
+
+@contextmanager
+def recorded(path: Path, messages: Iterable[tuple[str, int, bytes]]) -> Iterator[PlayedLog]:
+    """A log of topics, times and payloads."""
+    with hl.open(path / "store", create=True) as opened:
+        with opened.start("log") as recording:
+            for topic, log_time, payload in messages:
+                recording.write(Channel(topic, "json", None), payload, log_time=log_time)
+        yield PlayedLog(opened.all_topics())
 
 
 def data(found: list[Any]) -> list[Data]:
@@ -212,17 +223,8 @@ def test_subscriptions_may_change_while_it_plays(one: PlayedLog, seen: list[Seen
 def test_messages_of_the_same_time_stay_together(tmp_path: Path, limit: Limit) -> None:
     """A request that comes in the middle of them waits: behind it, all later ones are read."""
     limit(playback_sent=1)
-    with (tmp_path / "same.mcap").open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        topics = [writer.register_channel(topic, "json", 0) for topic in ("/same", "/other")]
-        for n in range(3000):
-            writer.add_message(topics[0], BEGIN, b"%d" % n, 0)
-        writer.add_message(topics[1], BEGIN + S, b"{}", 0)
-        writer.finish()
-    with hl.open(tmp_path / "store", create=True) as opened:
-        opened.record(tmp_path / "same.mcap")
-        log = PlayedLog(opened.all_topics())
+    same = [("/same", BEGIN, b"%d" % n) for n in range(3000)]
+    with recorded(tmp_path, [*same, ("/other", BEGIN + S, b"{}")]) as log:
         with served(log) as url, Viewer(url) as viewer, Viewer(url) as other:
             viewer.subscribe("/same")
             while not isinstance(first := viewer.read(), Data):
@@ -233,16 +235,8 @@ def test_messages_of_the_same_time_stay_together(tmp_path: Path, limit: Limit) -
 
 
 def test_time_may_begin_at_zero(tmp_path: Path) -> None:
-    with (tmp_path / "zero.mcap").open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        channel = writer.register_channel("/n", "json", 0)
-        for n in range(3):
-            writer.add_message(channel, n * S, b"%d" % n, 0)
-        writer.finish()
-    with hl.open(tmp_path / "store", create=True) as opened:
-        opened.record(tmp_path / "zero.mcap")
-        with served(PlayedLog(opened.all_topics())) as url, Viewer(url) as viewer:
+    with recorded(tmp_path, [("/n", n * S, b"%d" % n) for n in range(3)]) as log:
+        with served(log) as url, Viewer(url) as viewer:
             viewer.subscribe()
             assert [m.time for m in viewer.until_end()] == [0, S, 2 * S]
             viewer.control(plays=False, seek=0)
@@ -268,16 +262,8 @@ def test_a_late_subscriber_gets_what_is_current(one: PlayedLog) -> None:
 def test_a_slow_viewer_loses_nothing(tmp_path: Path) -> None:
     """The log time waits for it: with 64 MB in a third of a second, anything else would drop."""
     size, count = 1 << 20, 64
-    with (tmp_path / "big.mcap").open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        channel = writer.register_channel("/big", "json", 0)
-        for n in range(count):
-            writer.add_message(channel, BEGIN + n * S // 10, bytes([n]) * size, 0)
-        writer.finish()
-    with hl.open(tmp_path / "store", create=True) as opened:
-        opened.record(tmp_path / "big.mcap")
-        log = PlayedLog(opened.all_topics())
+    big = [("/big", BEGIN + n * S // 10, bytes([n]) * size) for n in range(count)]
+    with recorded(tmp_path, big) as log:
         with served(log, speed=20.0) as url, Viewer(url, small_buffers=True) as viewer:
             viewer.subscribe()
             viewer.until(State, status="playing")
@@ -318,13 +304,6 @@ def test_recordings_follow_one_another_at_once(store: hl.Store, logs: Path) -> N
             elif isinstance(each, Time):
                 assert not BEGIN + 600 * S < each.time < LATER
         assert [Seen(*m) for m in found] == [m for m in wanted if m.topic in {"/n", "/map"}]
-
-
-def test_covered_time() -> None:
-    # The second one lies within the first, the third one follows.
-    covered = Covered(np.array([20, 0, 5]), np.array([30, 10, 7]))
-    times = (-1, 0, 6, 8, 9, 10, 19, 20, 29, 30)
-    assert [covered.next(t) for t in times] == [-1, 0, 6, 8, 9, 20, 20, 20, 29, 30]
 
 
 def test_range_and_predicate(store: hl.Store, seen: list[Seen]) -> None:

@@ -47,15 +47,7 @@ class Time(NamedTuple):
 
 
 class Viewer:
-    """A connection to a server. A context manager.
-
-    Args:
-        url: The server's.
-        origin: As a browser says it.
-        protocols: Subprotocols that are offered.
-        host: The header; without, as the URL has it.
-        small_buffers: Take little off the network before it is asked for.
-    """
+    """A connection to a server. A context manager."""
 
     def __init__(
         self,

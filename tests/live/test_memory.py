@@ -1,17 +1,24 @@
-"""Memory is reserved ahead, and chunks follow the incoming rate."""
+"""Memory: reserved ahead, in chunks that follow the rate; its budget; what is not collected."""
 
 from __future__ import annotations
 
 import errno
-import threading
+import gc
+import os
 import time
+import weakref
+from collections.abc import Iterator
 from contextlib import closing
+from functools import partial
+from pathlib import Path
 
 import pytest
 
 import hybridlog as hl
 from hybridlog.live import memory as module
-from hybridlog.live.memory import MemoryReservation
+from hybridlog.live.memory import FrozenObjects, MemoryReservation
+from hybridlog.live.recorder import RecorderOptions
+from hybridlog.live.recording import LiveOptions
 from hybridlog_storage import buffers as pool_module
 from hybridlog_storage.buffers import SLAB, Buffers
 from hybridlog_storage.disk.copying import COPIED_AT_ONCE
@@ -20,7 +27,7 @@ from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.calls import Calls
 from tests.limits import Limit
 from tests.live.test_recording import channel, text
-from tests.waiting import wait_for
+from tests.waiting import at_once, wait_for
 
 SIZE = 1 << 18
 BUDGET = 128 * SIZE
@@ -49,16 +56,6 @@ def test_an_eighth_of_the_budget_is_there_before_the_first_message(pool: Buffers
         assert reservation._thread is None
 
 
-@pytest.mark.usefixtures("pool")
-def test_nothing_is_done_while_it_is_not_known_how_much_will_come() -> None:
-    with closing(MemoryReservation(SIZE, BUDGET)) as reservation:
-        for rate in [1e6, 1e8, 1e9, 2e9]:
-            reservation.observe(rate)
-        assert reservation._thread is None
-        comes(reservation, 2e9)
-        assert reservation.chunk_size == 4 * SIZE
-
-
 def test_as_much_as_comes_while_a_disk_stands_still_but_no_more_than_half_the_budget(
     pool: Buffers,
 ) -> None:
@@ -73,55 +70,39 @@ def test_as_much_as_comes_while_a_disk_stands_still_but_no_more_than_half_the_bu
     assert pool._whole_bytes <= pool_module._MAX_IDLE_BYTES
 
 
+FEW, LONG = MUCH / 2 - 1, module._RATES
+
+
 @pytest.mark.parametrize(
-    ("rate", "times"), [(MUCH / 2, 1), (MUCH / 2 + 1, 2), (MUCH, 2), (MUCH + 1, 4), (1e12, 4)]
+    ("came", "times"),
+    [
+        ([(MUCH / 2, 2)], 1),
+        ([(MUCH / 2 + 1, 2)], 2),
+        ([(MUCH, 2)], 2),
+        ([(MUCH + 1, 2)], 4),
+        ([(1e12, 2)], 4),
+        ([(1e6, 1), (1e8, 1), (1e9, 1), (2e9, 1)], 1),  # it is not known how much will come
+        ([(1e12, 1), (0, 1)], 4),  # by fits and starts
+        ([(2 * MUCH, 2), (FEW, LONG - 1)], 4),
+        ([(2 * MUCH, 2), (FEW, LONG + 1)], 1),  # little for long
+        ([(2 * MUCH, 2), (FEW, LONG + 1), (MUCH, 2)], 2),
+        ([(2 * MUCH, 2), (FEW, LONG + 1), (MUCH, 2), (MUCH / 4 + 1, 2 * LONG)], 2),
+    ],
 )
 @pytest.mark.usefixtures("pool")
-def test_chunks_are_larger_where_they_would_be_too_many(rate: float, times: int) -> None:
+def test_chunks_are_as_large_as_what_comes_asks_for(
+    came: list[tuple[float, int]], times: int
+) -> None:
     with closing(MemoryReservation(SIZE, BUDGET)) as reservation:
-        comes(reservation, rate)
+        for rate, looks in came:
+            comes(reservation, rate, looks)
         assert reservation.chunk_size == times * SIZE
 
 
+@pytest.mark.parametrize("budget", [2 * module._SHARE * SIZE - 1, SIZE])
 @pytest.mark.usefixtures("pool")
-def test_what_comes_by_fits_and_starts_is_provided_for() -> None:
-    with closing(MemoryReservation(SIZE, BUDGET)) as reservation:
-        for rate in [1e12, 0]:
-            comes(reservation, rate, looks=1)
-        assert reservation.chunk_size == 4 * SIZE
-
-
-def test_a_disk_that_stands_still_changes_nothing(pool: Buffers) -> None:
-    """Nothing comes then, for as long as the budget is spent."""
-    with closing(MemoryReservation(SIZE, BUDGET)) as reservation:
-        comes(reservation, 1e12, looks=3)
-        given, thread = dict(pool._given), reservation._thread
-        comes(reservation, 0, looks=10 * module._RATES)
-        comes(reservation, 1e12)
-        assert reservation._thread is thread
-        assert pool._given == given
-
-
-@pytest.mark.usefixtures("pool")
-def test_chunks_become_small_again_when_little_comes_for_long() -> None:
-    with closing(MemoryReservation(SIZE, BUDGET)) as reservation:
-        comes(reservation, 2 * MUCH)
-        comes(reservation, MUCH / 2 - 1, looks=module._RATES - 1)
-        assert reservation.chunk_size == 4 * SIZE
-        comes(reservation, MUCH / 2 - 1)
-        assert reservation.chunk_size == SIZE
-        comes(reservation, MUCH)
-        assert reservation.chunk_size == 2 * SIZE
-        comes(reservation, MUCH / 4 + 1, looks=2 * module._RATES)
-        assert reservation.chunk_size == 2 * SIZE
-
-
-@pytest.mark.usefixtures("pool")
-def test_no_chunk_takes_much_of_the_budget() -> None:
-    with closing(MemoryReservation(SIZE, 2 * module._SHARE * SIZE - 1)) as reservation:
-        comes(reservation, 1e12)
-        assert reservation.chunk_size == SIZE
-    with closing(MemoryReservation(SIZE, SIZE)) as reservation:
+def test_no_chunk_takes_much_of_the_budget(budget: int) -> None:
+    with closing(MemoryReservation(SIZE, budget)) as reservation:
         comes(reservation, 1e12)
         assert reservation.chunk_size == SIZE
 
@@ -149,18 +130,6 @@ def test_where_there_is_no_memory_it_is_asked_for_once(pool: Buffers, calls: Cal
         assert reservation.next_chunk_size() == 4 * SIZE
 
 
-def test_who_closes_does_not_wait_for_all_of_it(pool: Buffers, limit: Limit) -> None:
-    limit(buffer_pause_ratio=1e9)
-    with closing(MemoryReservation(SIZE, 16 * SLAB)) as reservation:
-        given = pool._given[SLAB]
-        reservation.observe(1e12)
-        reservation.observe(1e12)
-        wait_for(lambda: reservation._thread is not None)
-    assert reservation._thread is not None
-    assert not reservation._thread.is_alive()
-    assert given <= pool._given[SLAB] <= given + SLAB
-
-
 def test_large_chunks_leave_some_memory_to_messages(
     pool: Buffers,
 ) -> None:
@@ -176,24 +145,6 @@ def test_large_chunks_leave_some_memory_to_messages(
         assert reservation.next_chunk_size() == SIZE
         held.clear()
         assert reservation.next_chunk_size() == 4 * SIZE
-
-
-def test_no_large_chunk_asks_for_memory(pool: Buffers) -> None:
-    """Much may be spare, but nowhere enough at one place."""
-    with closing(MemoryReservation(SIZE, BUDGET)) as reservation:
-        comes(reservation, 1e12)
-        held = [pool.take(SIZE) for _ in range(pool._given[SLAB] // SIZE)]
-        del held[1::2]
-        assert reservation.next_chunk_size() == SIZE
-        del held[:]
-        assert reservation.next_chunk_size() == 4 * SIZE
-
-
-def test_usual_chunks_need_nothing(pool: Buffers) -> None:
-    with closing(MemoryReservation(SIZE, BUDGET)) as reservation:
-        held = [pool.take(SIZE) for _ in range(pool._given[SLAB] // SIZE)]
-        assert reservation.next_chunk_size() == SIZE
-        assert held
 
 
 def test_a_recording_of_much_has_larger_chunks(
@@ -217,12 +168,102 @@ def test_a_recording_of_much_has_larger_chunks(
                 n += 1
                 time.sleep(0.02)
 
-        threads = [threading.Thread(target=speak, args=(one,)) for one in own]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
+        at_once(*(partial(speak, one) for one in own))
         assert reservation.next_chunk_size() == 4 * SIZE
     for one in own:
         assert [m.raw for m in store.topic(one.topic)] == written[one]
     assert store.verify().findings == []
+
+
+MACHINE = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+
+
+def groups(root: Path, name: str, limits: dict[str, str]) -> tuple[Path, Path]:
+    """Control groups as Linux shows them, and what names one's own."""
+    for group, limit in limits.items():
+        (root / "groups" / group).mkdir(parents=True, exist_ok=True)
+        (root / "groups" / group / "memory.max").write_text(limit)
+    own = root / "own"
+    own.write_text(f"12:cpu:/elsewhere\n0::{name}\n")
+    return root / "groups", own
+
+
+def test_a_limit_counts_wherever_it_is_set(tmp_path: Path) -> None:
+    limits = {"a/b": "max\n", "a": f"{1 << 20}\n", "other": "7\n"}
+    assert module.memory_bytes(*groups(tmp_path, "/a/b", limits)) == 1 << 20
+
+
+def test_no_limit_is_the_machine(tmp_path: Path) -> None:
+    assert module.memory_bytes(*groups(tmp_path, "/a", {"a": "max\n"})) == MACHINE
+    assert module.memory_bytes(*groups(tmp_path, "/gone", {})) == MACHINE
+    assert module.memory_bytes(*groups(tmp_path, "/../..", {})) == MACHINE
+    assert module.memory_bytes(tmp_path / "none", tmp_path / "nowhere") == MACHINE
+
+
+@pytest.mark.parametrize(
+    ("memory", "want"),
+    [(512 << 20, 64 << 20), (8 << 30, 512 << 20), (24 << 30, 1536 << 20), (1 << 40, 2 << 30)],
+)
+def test_a_sixteenth(monkeypatch: pytest.MonkeyPatch, memory: int, want: int) -> None:
+    monkeypatch.setattr(module, "memory_bytes", lambda: memory)
+    module.default_budget.cache_clear()
+    try:
+        assert module.default_budget() == want
+        assert LiveOptions().budget_bytes == RecorderOptions().budget_bytes == want
+    finally:
+        monkeypatch.undo()
+        module.default_budget.cache_clear()
+
+
+@pytest.fixture
+def frozen(monkeypatch: pytest.MonkeyPatch) -> Iterator[FrozenObjects]:
+    """A context of this test alone, which other tests cannot hold open."""
+    own = FrozenObjects()
+    monkeypatch.setattr("hybridlog.live.recording.frozen_objects", own)
+    gc.unfreeze()
+    yield own
+    assert gc.get_freeze_count() == 0
+
+
+class Knot:
+    """Refers to itself: only the collector can take it away."""
+
+    def __init__(self) -> None:
+        self.itself = self
+
+
+def test_objects_are_frozen_until_the_last_has_left(frozen: FrozenObjects) -> None:
+    knot = weakref.ref(Knot())
+    with frozen:
+        with frozen:
+            assert gc.get_freeze_count() > 1000
+        gc.collect()
+        assert knot() is not None
+        later = weakref.ref(Knot())
+        gc.collect()
+        assert later() is None
+    gc.collect()
+    assert knot() is None
+
+
+def test_what_a_process_has_frozen_itself_stays_frozen(frozen: FrozenObjects) -> None:
+    gc.freeze()
+    try:
+        with frozen:
+            pass
+        assert gc.get_freeze_count() > 1000
+    finally:
+        gc.unfreeze()
+
+
+@pytest.mark.usefixtures("frozen")
+def test_they_are_frozen_as_long_as_something_is_recorded(tmp_path: Path) -> None:
+    with hl.open(tmp_path / "store", create=True) as store:
+        with store.start("first"):
+            with store.start("second"):
+                pass
+            assert gc.get_freeze_count() > 1000
+        assert gc.get_freeze_count() == 0
+        third = store.start("third")
+        assert gc.get_freeze_count() > 1000
+        third.abort()
