@@ -8,13 +8,17 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from mcap.writer import Writer
 
 import hybridlog as hl
+from hybridlog.across import topic_reader
 from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests.calls import Calls
+from tests.limits import Limit
 
 MS = 10**6
 BASE = 1_748_937_600 * 10**9
@@ -139,3 +143,20 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Logs]:
         for name in said:
             store.record(path / f"{name}.mcap", settings=SegmentSettings(chunk_size=4096))
         yield Logs(store, said)
+
+
+@pytest.fixture(params=[65_536, 3], ids=["whole", "in blocks"])
+def blocks(request: pytest.FixtureRequest, limit: Limit, calls: Calls) -> None:
+    """Topics are read in blocks of so many rows, also with messages of one time in two of them.
+
+    Rows that would be large are made a few at a time, too.
+    """
+    size = request.param
+    limit(align_piece_bytes=size * 400)
+
+    def tables(found: Iterator[Any], *_: Any) -> Iterator[Any]:
+        for times, table in found:
+            for begin in range(0, len(times), size):
+                yield times[begin : begin + size], table.slice(begin, size)
+
+    calls.change(topic_reader.TopicReader, "tables", tables)

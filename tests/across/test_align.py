@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -16,36 +15,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import hybridlog as hl
-from hybridlog.across import topic_reader
 from hybridlog.across.match import UNKNOWN, interpolated, match
 from hybridlog_storage.errors import TimeError, TopicError, UsageError
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import places
-from tests.calls import Calls
 from tests.cli.within import answer as run
 from tests.limits import Limit
 
 from .conftest import BASE, MS, Logs, Said
 
 TOLERANCE_MS = 7
-
-
-@pytest.fixture(params=[65_536, 3], ids=["whole", "in blocks"])
-def _blocks(request: pytest.FixtureRequest, limit: Limit, calls: Calls) -> None:
-    """Topics are read in blocks of so many rows, also with messages of one time in two of them.
-
-    Rows that would be large are made a few at a time, too.
-    """
-    size = request.param
-    limit(align_piece_bytes=size * 400)
-
-    def tables(found: Iterator[Any], *_: Any) -> Iterator[Any]:
-        for times, table in found:
-            for begin in range(0, len(times), size):
-                yield times[begin : begin + size], table.slice(begin, size)
-
-    calls.change(topic_reader.TopicReader, "tables", tables)
 
 
 def naive(
@@ -102,7 +82,7 @@ def frame_of(said: list[Said], clock: Callable[[Said], int], prefix: str) -> pd.
     return frame.sort_values("time", kind="stable")
 
 
-@pytest.mark.usefixtures("_blocks")
+@pytest.mark.usefixtures("blocks")
 @pytest.mark.parametrize("clock", ["log", "publish", "header"])
 @pytest.mark.parametrize(("how", "direction"), [("asof", "backward"), ("nearest", "nearest")])
 def test_joins_are_those_of_pandas(logs: Logs, how: str, direction: str, clock: str) -> None:
@@ -156,7 +136,7 @@ def on_the_sphere(low: np.ndarray, high: np.ndarray, part: float) -> np.ndarray:
     return product(low, share)
 
 
-@pytest.mark.usefixtures("_blocks")
+@pytest.mark.usefixtures("blocks")
 @pytest.mark.parametrize("tolerance", [None, 20])
 def test_interpolation_is_that_of_a_loop(logs: Logs, tolerance: int | None) -> None:
     found = logs.store.align(
@@ -214,7 +194,7 @@ def test_values_that_have_no_middle() -> None:
     assert found["n"].to_pylist() == [2.0**63, 2.0, 2.0, 3.0]
 
 
-@pytest.mark.usefixtures("_blocks")
+@pytest.mark.usefixtures("blocks")
 def test_regular_times(logs: Logs) -> None:
     poses = logs.store.topic("left/pose").fields("x")
     found = poses.resample("5ms", tolerance="4ms").to_pandas()
@@ -343,7 +323,6 @@ def test_what_is_refused(logs: Logs) -> None:
         store.topic("base").resample("1ns")
 
 
-@pytest.mark.usefixtures("_blocks")
 @pytest.mark.parametrize("how", ["asof", "nearest", "interpolate"])
 @pytest.mark.parametrize("tolerance", [None, 7 * MS])
 def test_empty_cells_are_explained(logs: Logs, how: str, tolerance: int | None) -> None:
@@ -392,7 +371,7 @@ def test_cells_without_a_value_are_counted_by_column(tmp_path: Path) -> None:
         ]
 
 
-@pytest.mark.usefixtures("_blocks")
+@pytest.mark.usefixtures("blocks")
 @pytest.mark.parametrize("clock", ["log", "header"])
 @pytest.mark.parametrize(("how", "direction"), [("asof", "backward"), ("nearest", "nearest")])
 @pytest.mark.parametrize("labels", [["c"], ["b", "c"]])

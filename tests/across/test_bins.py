@@ -12,29 +12,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from mcap.writer import Writer
 
 import hybridlog as hl
-from hybridlog.across import topic_reader
 from hybridlog.query.intervals import Intervals
 from hybridlog_storage.errors import UsageError
-from tests.calls import Calls
+from hybridlog_storage.messages import Channel, Schema
 from tests.cli.within import answer as run
 
 from .conftest import BASE, MS, Logs, Said
-
-
-@pytest.fixture(params=[65_536, 3], ids=["whole", "in blocks"])
-def _blocks(request: pytest.FixtureRequest, calls: Calls) -> None:
-    """Topics are read in blocks of so many rows, so that bins lie in several."""
-    size = request.param
-
-    def tables(found: Iterator[Any], *_: Any) -> Iterator[Any]:
-        for times, table in found:
-            for begin in range(0, len(times), size):
-                yield times[begin : begin + size], table.slice(begin, size)
-
-    calls.change(topic_reader.TopicReader, "tables", tables)
 
 
 def bins(begin: int, end: int, step: int, messages: list[Said]) -> Iterator[tuple[int, list[Said]]]:
@@ -53,7 +38,7 @@ def aggregate(how: str, values: list[Any]) -> Any:
     return min(finite) if how == "min" else max(finite)
 
 
-@pytest.mark.usefixtures("_blocks")
+@pytest.mark.usefixtures("blocks")
 @pytest.mark.parametrize("how", ["min", "max", "mean", "first", "last", "count"])
 def test_aggregates_of_a_topic(logs: Logs, how: str) -> None:
     query = logs.store.topic("left/pose")
@@ -83,7 +68,7 @@ def test_aggregates_of_a_topic(logs: Logs, how: str) -> None:
     assert any(row["count"] == 0 for row in found)
 
 
-@pytest.mark.usefixtures("_blocks")
+@pytest.mark.usefixtures("blocks")
 def test_bins_end_with_their_range(logs: Logs) -> None:
     """Also when the next range begins where the last bin would go on."""
     first = logs.said["b"][0].time
@@ -122,22 +107,15 @@ def test_fields_without_a_definition(logs: Logs) -> None:
 
 
 def test_integers_are_exact_and_types_stay(tmp_path: Path) -> None:
-    log = tmp_path / "log.mcap"
     rng = random.Random(5)
     values = [2**63 - 1 - rng.randrange(3) for _ in range(20)]
-    with log.open("wb") as file:
-        writer = Writer(file)
-        writer.start("ros1")
-        text = b"int64 big\nuint8 small\nfloat32 part\nduration wait\nint32[] list"
-        schema = writer.register_schema("demo/Numbers", "ros1msg", text)
-        channel = writer.register_channel("/n", "ros1", schema)
-        for n, value in enumerate(values):
-            data = value.to_bytes(8, "little") + bytes([n]) + b"\0\0\x80\x7f"  # infinite
-            data += n.to_bytes(4, "little") + bytes(4) + b"\1\0\0\0" + n.to_bytes(4, "little")
-            writer.add_message(channel, BASE + n * MS, data, BASE)
-        writer.finish()
+    text = b"int64 big\nuint8 small\nfloat32 part\nduration wait\nint32[] list"
+    channel = Channel("/n", "ros1", Schema("demo/Numbers", "ros1msg", text))
     with hl.open(tmp_path / "store", create=True) as store:
-        store.record(log)
+        with store.start("log") as recording:
+            for n, value in enumerate(values):
+                data = struct.pack("<qBfiiIi", value, n, math.inf, n, 0, 1, n)
+                recording.write(channel, data, log_time=BASE + n * MS)
         query = store.topic("/n")
         least, most = (query.resample("1s", how=how).to_arrow() for how in ("min", "max"))
         assert least["big"].to_pylist() == [min(values)]
@@ -179,19 +157,13 @@ def test_the_command(logs: Logs) -> None:
 
 
 def test_means_of_large_doubles(tmp_path: Path) -> None:
-    log = tmp_path / "log.mcap"
     values = [1.7e308, 1.7e308, 1.6e308, 1e308, -1e308, 3.0, 1.5, 2.5]
-    with log.open("wb") as file:
-        writer = Writer(file)
-        writer.start("ros1")
-        schema = writer.register_schema("demo/Large", "ros1msg", b"float64 v\nfloat64[] a")
-        channel = writer.register_channel("/n", "ros1", schema)
-        for n, value in enumerate(values):
-            data = struct.pack("<dIdd", value, 2, value, 1.75e308)
-            writer.add_message(channel, BASE + n * MS, data, BASE)
-        writer.finish()
+    channel = Channel("/n", "ros1", Schema("demo/Large", "ros1msg", b"float64 v\nfloat64[] a"))
     with hl.open(tmp_path / "store", create=True) as store:
-        store.record(log)
+        with store.start("log") as recording:
+            for n, value in enumerate(values):
+                data = struct.pack("<dIdd", value, 2, value, 1.75e308)
+                recording.write(channel, data, log_time=BASE + n * MS)
         query = store.topic("/n")
         found = query.resample("3ms", how="mean").to_arrow()["v"].to_pylist()
         assert found == pytest.approx([1.7e308 / 3 * 2 + 1.6e308 / 3, 1.0, 2.0])

@@ -6,12 +6,8 @@ from collections.abc import Callable
 from copy import copy
 from pathlib import Path
 
-import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from hybridlog.query.intervals import Intervals
 from hybridlog.query.predicate.across import (
     All,
     AnyOf,
@@ -105,27 +101,6 @@ def test_predicates_without_topics(text: str) -> None:
 def test_conditions_that_are_refused(logs: Logs, text: str, said: str) -> None:
     with pytest.raises(WhereError, match=said):
         logs.store.topic("base").where(text.replace("/odom", "/left/pose"), within="1ms")
-
-
-spans = st.lists(
-    st.tuples(st.sampled_from("ab"), st.integers(0, 20), st.integers(0, 6)), max_size=8
-)
-
-
-@given(spans, spans)
-def test_union_and_difference(
-    one: list[tuple[str, int, int]], other: list[tuple[str, int, int]]
-) -> None:
-    def made(rows: list[tuple[str, int, int]]) -> Intervals:
-        return Intervals.of((n, np.array([[b, b + d, 1]], np.int64)) for n, b, d in rows)
-
-    def covered(found: Intervals) -> set[tuple[str, int]]:
-        return {(i.recording, t) for i in found for t in range(i.begin_ns, i.end_ns)}
-
-    left, right = made(one), made(other)
-    assert covered(left.union(right)) == covered(left) | covered(right)
-    assert covered(left.without(right)) == covered(left) - covered(right)
-    assert all(i.begin_ns < i.end_ns for i in left.without(right))
 
 
 Holds = Callable[[Callable[[str, Callable[[Said], bool]], bool], Said], bool]

@@ -17,7 +17,6 @@ import pyarrow as pa
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mcap.writer import Writer
 
 import hybridlog as hl
 from hybridlog.drawing.density import gaps as silent
@@ -25,11 +24,7 @@ from hybridlog.drawing.density_cache import DensityCache
 from hybridlog.drawing.series import series
 from hybridlog.query import periods
 from hybridlog.query.answers.field_statistics import _Running
-from hybridlog.query.counters import Counters
-from hybridlog.query.engines import MatchColumns, Need
-from hybridlog.query.engines.chunk_index import ChunkIndex
-from hybridlog.query.engines.payload_scan import PayloadScan
-from hybridlog.query.engines.tables import TablesEngine
+from hybridlog.query.engines import MatchColumns
 from hybridlog.query.planner import Planner
 from hybridlog_storage.errors import TimeError, TopicError, UsageError
 from hybridlog_storage.messages import Channel
@@ -152,15 +147,6 @@ def test_times_of_a_rare_topic_cost_no_payloads(tmp_path: Path, calls: Calls, li
             for n in range(600):
                 topic = "/rare" if n % 20 == 0 else "/loud"
                 recording.write(Channel(topic, "json", None), b'"%0400d"' % n, log_time=BASE + n)
-        planner = Planner(store.session, store.topic("rare").question, Counters())
-        (part,) = planner.parts()
-        costs = [
-            engine(store.session, Counters()).cost(part, Need.OUTCOMES)
-            for engine in (TablesEngine, ChunkIndex, PayloadScan)
-        ]
-        assert None not in costs
-        assert costs == sorted(costs)  # type: ignore[type-var]
-        assert part.chunks == pytest.approx(30, rel=0.2)
         query = store.topic("rare")
         assert sum(row["messages"] for row in query.rate("10ns").to_pylist()) == 30
         assert query.counters.chunks_read == 0
@@ -200,19 +186,14 @@ def test_bursts_are_no_gaps(tmp_path: Path) -> None:
 
 def test_a_topic_that_fell_silent(tmp_path: Path) -> None:
     """A recording without any message of a topic is one gap, and so is its silent end."""
-    path = tmp_path / "a.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        schema = writer.register_schema("Any", "jsonschema", b"{}")
-        loud, shy = (writer.register_channel(n, "json", schema) for n in ("/loud", "/shy"))
-        for n in range(100):
-            writer.add_message(loud, BASE + n * 10 * MS, b'{"n": 1}', 0)
-            if n in {30, 32, 34, 36}:
-                writer.add_message(shy, BASE + n * 10 * MS, b'{"v": 1e300, "w": [1, 2]}', 0)
-        writer.finish()
+    loud, shy = (Channel(name, "json", None) for name in ("/loud", "/shy"))
     with hl.open(tmp_path / "store", create=True) as store:
-        store.record(path)
+        with store.start("a") as recording:
+            for n in range(100):
+                time = BASE + n * 10 * MS
+                recording.write(loud, b'{"n": 1}', log_time=time)
+                if n in {30, 32, 34, 36}:
+                    recording.write(shy, b'{"v": 1e300, "w": [1, 2]}', log_time=time)
         gaps = [
             ((g.begin_ns - BASE) // MS, (g.end_ns - BASE) // MS) for g in store.topic("shy").gaps()
         ]
@@ -256,32 +237,14 @@ def test_statistics_are_those_of_pandas(logs: Logs) -> None:
     )
 
 
-def test_blocks_of_different_means_are_joined() -> None:
-    values = np.concatenate([np.full(7, 1.0), np.arange(1000.0, 1013.0), np.full(400, -5.5)])
-    running = _Running()
-    for block in np.split(values, [7, 20, 21]):
-        running.add(pa.chunked_array([pa.array(block)]))
-    found = running.result("/n", "v")
-    assert (found.count, found.min, found.max) == (len(values), -5.5, 1012.0)
-    assert found.mean == pytest.approx(values.mean())
-    assert found.std == pytest.approx(values.std(ddof=1))
-
-
 def test_numbers_of_statistics_are_exact(tmp_path: Path) -> None:
     values = ["9007199254740993", "9007199254740995", "-9007199254740993"]
     floats = ["1e400", "2.5", "1e400"]
-    path = tmp_path / "a.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        schema = writer.register_schema("Any", "jsonschema", b"{}")
-        channel = writer.register_channel("/n", "json", schema)
-        for n, (value, other) in enumerate(zip(values, floats, strict=True)):
-            text = f'{{"v": {value}, "f": {other}}}'
-            writer.add_message(channel, BASE + n, text.encode(), 0)
-        writer.finish()
     with hl.open(tmp_path / "store", create=True) as store:
-        store.record(path)
+        with store.start("a") as recording:
+            for n, (value, other) in enumerate(zip(values, floats, strict=True)):
+                text = f'{{"v": {value}, "f": {other}}}'
+                recording.write(Channel("/n", "json", None), text.encode(), log_time=BASE + n)
         rows = {row.field: row for row in store.topic("n").stats()}
         assert (rows["v"].min, rows["v"].max) == (-9007199254740993, 9007199254740995)
         assert (rows["f"].count, rows["f"].infinite, rows["f"].nan) == (1, 2, 0)

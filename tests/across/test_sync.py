@@ -255,35 +255,6 @@ def numbers(synced: Synced, place: int) -> list[int]:
     return [int(message.decode().header.seq) for message in synced[place]]
 
 
-@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
-def test_workers_read_sets(logs: Logs) -> None:
-    synced = logs.store.sync(["base", "left/pose"], tolerance="30ms")
-    want = [numbers(synced, n) for n in range(16)]
-    with multiprocessing.get_context("fork").Pool(2) as pool:
-        found = pool.starmap(numbers, [(synced, n) for n in range(16)], chunksize=4)
-        assert found == want
-    assert numbers(synced, 3) == want[3]
-
-
-@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
-def test_a_set_is_read_after_a_fork_without_pickling(logs: Logs) -> None:
-    synced = logs.store.sync(["base", "left/pose"], tolerance="30ms")
-    want = numbers(synced, 5)
-    context = multiprocessing.get_context("fork")
-    answers = context.SimpleQueue()
-
-    def work() -> None:
-        answers.put(numbers(synced, 5))
-
-    workers = [context.Process(target=work) for _ in range(2)]
-    for worker in workers:
-        worker.start()
-    assert [answers.get() for _ in workers] == [want] * 2
-    for worker in workers:
-        worker.join()
-    assert numbers(synced, 5) == want
-
-
 def collated(sets: list[tuple[hl.Message, ...]]) -> np.ndarray:
     """What a `collate_fn` makes of the sets of a batch."""
     return np.array([[m.decode().header.seq for m in messages] for messages in sets])

@@ -19,7 +19,6 @@ import lz4.frame
 import pytest
 import zstandard
 
-from hybridlog.formats.detect import open_source
 from hybridlog.formats.yaml_values import YamlError, parse_yaml
 from hybridlog.live.sources.ros2.overrides import read_overrides
 from hybridlog_storage.errors import SegmentError, UsageError
@@ -397,19 +396,6 @@ def test_definitions_without_messages(tmp_path: Path) -> None:
     bag.write_bytes(bags.bag(*rows, bags.connection(0), bags.message(0, 1, b"")))
     reason = f"100 channels without messages are left out; a recording can have {FULL}"
     assert read(bag) == (1, FULL, [[reason, 0]])
-
-
-def test_definitions_between_messages(tmp_path: Path) -> None:
-    parts = [channel(1, f"/t{k % 3}") + message(1, bytes([k % 256])) for k in range(300)]
-    path = write(tmp_path / "a.mcap", *parts)
-    with open_source(path) as source:
-        found = [
-            (source.channels[number].topic, bytes(batch.payload(row))[0])
-            for batch in source.batches()
-            for row, number in enumerate(batch.channel.tolist())
-        ]
-        assert source.damage == []
-    assert found == [(f"/t{k % 3}", k % 256) for k in range(300)]
 
 
 def test_very_many_damaged_places_are_counted_together(tmp_path: Path) -> None:

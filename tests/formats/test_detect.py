@@ -11,7 +11,6 @@ import zstandard
 
 from hybridlog.formats.detect import UNKNOWN, open_source, sniff
 from hybridlog_storage.errors import SourceError
-from tests.calls import Calls
 from tests.data import DATA, needs_data
 from tests.other_user import User, needs_root, open_place
 
@@ -44,18 +43,6 @@ def test_by_content(
         assert source.bytes_read == source.size_bytes
     assert found == (source.message_count if messages is None else messages)
     assert source.message_count == found
-
-
-@needs_data
-def test_directory_with_one_log(tmp_path: Path) -> None:
-    shutil.copy(DATA / "odd/example.bag", tmp_path / "x.bin")
-    (tmp_path / "notes.txt").write_text("notes")
-    (tmp_path / "empty.bag").touch()
-    (tmp_path / "folder").mkdir()
-    with open_source(tmp_path) as source:
-        assert source.kind == "ROS 1 bag"
-        assert source.message_count == 8647
-        assert sum(map(len, source.batches())) == 8647
 
 
 @needs_data
@@ -99,7 +86,7 @@ def test_permission(tmp_path: Path) -> None:
     file = tmp_path / "a.bag"
     file.write_bytes(b"#ROSBAG V2.0\n")
     file.chmod(0)
-    with pytest.raises(SourceError, match="permission denied"):
+    with pytest.raises(SourceError, match=r"permission denied; .*chmod"):
         open_source(file)
 
 
@@ -114,17 +101,10 @@ def test_permission_of_another_user() -> None:
         file.chmod(0o600)
         done = User(place).python("-c", script, file)
         assert done.out.startswith("SourceError")
-        assert "permission denied" in done.out
+        assert "permission denied; " in done.out
+        assert "chmod" in done.out
         file.chmod(0o644)
         assert "permission denied" not in User(place).python("-c", script, file).out
-
-
-def test_permission_as_the_system_says_it(tmp_path: Path, calls: Calls) -> None:
-    file = tmp_path / "a.bag"
-    file.write_bytes(b"#ROSBAG V2.0\n")
-    calls.fail(Path, "open", PermissionError(13, "Permission denied"))
-    with pytest.raises(SourceError, match=r"permission denied; .*chmod"):
-        open_source(file)
 
 
 def test_special_files_and_empty_folders(tmp_path: Path) -> None:

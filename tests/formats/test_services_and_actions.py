@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sqlite3
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ from mcap.writer import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import hybridlog as hl
+from tests.formats.test_rosbag2 import MESSAGES, TOPICS, database
 from tests.schema.wire_oracle import DUMMY
 
 pytestmark = pytest.mark.mongo
@@ -183,36 +183,24 @@ def _mcap(path: Path) -> None:
 
 def _db3(path: Path) -> None:
     """The definition lies under the name of the service or action."""
-    database = sqlite3.connect(path)
-    database.executescript(
-        "CREATE TABLE schema(schema_version INTEGER PRIMARY KEY, ros_distro TEXT NOT NULL);"
-        "INSERT INTO schema VALUES(4, 'kilted');"
-        "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT NOT NULL, type TEXT NOT NULL, "
-        "serialization_format TEXT NOT NULL, offered_qos_profiles TEXT NOT NULL, "
-        "type_description_hash TEXT NOT NULL);"
-        "CREATE TABLE message_definitions(id INTEGER PRIMARY KEY, topic_type TEXT NOT NULL, "
-        "encoding TEXT NOT NULL, encoded_message_definition TEXT NOT NULL, "
-        "type_description_hash TEXT NOT NULL);"
-        "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER NOT NULL, "
-        "timestamp INTEGER NOT NULL, data BLOB NOT NULL);"
+    messages = [*_messages()]
+    kinds = {topic: kind for topic, kind, _ in messages}
+    topics = {topic: number for number, topic in enumerate(kinds, 1)}
+    database(
+        path,
+        "CREATE TABLE schema(schema_version INTEGER PRIMARY KEY, ros_distro TEXT NOT NULL)",
+        "INSERT INTO schema VALUES(4, 'kilted')",
+        TOPICS,
+        MESSAGES,
+        "CREATE TABLE message_definitions(id INTEGER PRIMARY KEY, topic_type TEXT, "
+        "encoding TEXT, encoded_message_definition TEXT, type_description_hash TEXT)",
+        *(f"INSERT INTO topics VALUES({topics[t]}, '{t}', '{kinds[t]}', 'cdr')" for t in topics),
+        *(
+            f"INSERT INTO message_definitions VALUES({n}, '{name}', 'ros2msg', '{text}', '')"
+            for n, (name, text) in enumerate(TEXTS.items())
+        ),
+        rows=[(n + 1, topics[t], BASE + n, data) for n, (t, _, data) in enumerate(messages)],
     )
-    for name, text in TEXTS.items():
-        row = (name, "ros2msg", text, "")
-        database.execute(
-            "INSERT INTO message_definitions(topic_type, encoding, encoded_message_definition, "
-            "type_description_hash) VALUES(?, ?, ?, ?)",
-            row,
-        )
-    topics: dict[str, int] = {}
-    for number, (topic, kind, data) in enumerate(_messages()):
-        if topic not in topics:
-            topics[topic] = len(topics) + 1
-            row = (topics[topic], topic, kind, "cdr", "", "")
-            database.execute("INSERT INTO topics VALUES(?, ?, ?, ?, ?, ?)", row)
-        row = (number + 1, topics[topic], BASE + number, data)
-        database.execute("INSERT INTO messages VALUES(?, ?, ?, ?)", row)
-    database.commit()
-    database.close()
 
 
 @pytest.mark.parametrize("name", ["events.mcap", "events.db3"])

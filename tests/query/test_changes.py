@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from mcap.writer import Writer
 
 import hybridlog as hl
 from hybridlog.query.rows_differ import objects_differ
+from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 
 CASES = Path(__file__).parents[1] / "cases"
@@ -29,20 +29,13 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Any:
         yield opened
 
 
-def _record(store: hl.Store, place: Path, messages: list[Any]) -> str:
+def _record(store: hl.Store, messages: list[Any]) -> str:
     name = f"log{next(NAMES)}"
-    with (place / "log.mcap").open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        schema = writer.register_schema("State", "jsonschema", b"{}")
-        channel = writer.register_channel("/state", "json", schema, {"name": name})
-        for number, message in enumerate(messages):
-            writer.add_message(
-                channel, BASE + number, json.dumps(message | {"pad": "x" * 400}).encode(), BASE
-            )
-        writer.finish()  # type: ignore[no-untyped-call]
     small = SegmentSettings(chunk_size=1024)  # two messages in a chunk
-    store.record(place / "log.mcap", name=name, settings=small)
+    with store.start(name, settings=small) as recording:
+        for number, message in enumerate(messages):
+            payload = json.dumps(message | {"pad": "x" * 400}).encode()
+            recording.write(Channel("/state", "json", None), payload, log_time=BASE + number)
     return name
 
 
@@ -55,17 +48,17 @@ def _steps(store: hl.Store, name: str, *fields: str, begin: int = 0) -> list[int
     return [change.begin_ns - BASE for change in found]
 
 
-def test_null_and_missing_are_different(store: hl.Store, tmp_path: Path) -> None:
+def test_null_and_missing_are_different(store: hl.Store) -> None:
     messages = [{"m": 1}, {"m": None}, {}, {"m": None}, {"m": 1}, {"m": 1}]
-    name = _record(store, tmp_path, messages)
+    name = _record(store, messages)
     assert _steps(store, name, "m") == [1, 2, 3, 4]
     assert _steps(store, name, "m", begin=2) == [2, 3, 4]
     below = [{"o": {"m": 1}}, {"o": {"m": None}}, {"o": {}}, {"o": None}, {}]
-    name = _record(store, tmp_path, below)
+    name = _record(store, below)
     assert _steps(store, name, "o.m") == [1, 2]
     assert _steps(store, name, "o") == [1, 2, 3, 4]
     in_list = [{"a": [{"m": None}, {}]}, {"a": [{"m": None}, {"m": None}]}, {"a": [{}, {}]}]
-    name = _record(store, tmp_path, in_list)
+    name = _record(store, in_list)
     assert _steps(store, name, "a[].m") == _steps(store, name, "a") == [1, 2]
 
 
@@ -87,21 +80,15 @@ def test_mixed_kinds_and_definitions(
     assert [(change.begin_ns - BASE) // 10**8 for change in found] == wanted
 
 
-def test_summaries_where_definitions_differ(store: hl.Store, tmp_path: Path) -> None:
-    with (tmp_path / "two.mcap").open("wb") as file:
-        writer = Writer(file)
-        writer.start("ros2")
+def test_summaries_where_definitions_differ(store: hl.Store) -> None:
+    with store.start("two") as recording:
         for number, (kind, width, values) in enumerate(
             [("float64", 8, [1, 4]), ("float32", 4, [4, 1]), ("float32", 4, [1, 4, 2])]
         ):
-            schema = writer.register_schema("my/msg/A", "ros2msg", f"{kind}[] a\n".encode())
-            channel = writer.register_channel("/two", "cdr", schema)
-
+            schema = Schema("my/msg/A", "ros2msg", f"{kind}[] a\n".encode())
             head = b"\x00\x01\x00\x00" + len(values).to_bytes(4, "little") + b"\0" * (width - 4)
             raw = head + np.array(values, f"<f{width}").tobytes()
-            writer.add_message(channel, BASE + number, raw, 0)
-        writer.finish()  # type: ignore[no-untyped-call]
-    store.record(tmp_path / "two.mcap")
+            recording.write(Channel("/two", "cdr", schema), raw, log_time=BASE + number)
     query = store.topic("/two")
     assert len(query.changes("a.min", "a.max", pause=0)) == 0
     assert [c.begin_ns - BASE for c in query.changes("a.n", pause=0)] == [2]
@@ -143,8 +130,8 @@ def _same(one: Any, other: Any) -> bool:
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )
 @given(messages=messages)
-def test_as_a_plain_comparison(store: hl.Store, tmp_path: Path, messages: list[Any]) -> None:
-    name = _record(store, tmp_path, messages)
+def test_as_a_plain_comparison(store: hl.Store, messages: list[Any]) -> None:
+    name = _record(store, messages)
     for field in ("a", "b"):
         wanted = [
             number

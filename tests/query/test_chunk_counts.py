@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -15,12 +14,11 @@ from hybridlog.query.intervals import Intervals
 from hybridlog_storage.errors import SegmentError
 from tests import places
 from tests.limits import Limit
+from tests.query.conftest import AWAY, PADDING
 from tests.query.test_intervals import BASE, SECOND, Model, intervals, recorded, several
 
 pytestmark = pytest.mark.mongo
 
-AWAY = "mongodb://127.0.0.1:9/?serverSelectionTimeoutMS=300&connectTimeoutMS=300"
-PADDING = "a" * 60  # about ten messages fill a chunk
 
 rows = st.lists(
     st.tuples(
@@ -32,13 +30,6 @@ rows = st.lists(
     max_size=80,
 )
 times = st.integers(-2, 63)
-
-
-@pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
-    place = tmp_path_factory.mktemp("chunk-counts") / "store"
-    with hl.open(place, create=True, require_database=True) as opened:
-        yield opened
 
 
 def looped(model: Model, topics: set[str], windows: Intervals) -> int:
@@ -86,13 +77,6 @@ def test_a_count_by_time_is_what_a_loop_counts(
                 assert between.during(windows).count() == looped(model, topics, common)
 
 
-@pytest.fixture
-def many(store: hl.Store) -> hl.Store:
-    """200 messages, a second apart, in about twenty chunks; counted by chunks."""
-    recorded(store, {"a": [(n, "/state", {"s": 0, "name": PADDING}) for n in range(200)]})
-    return store
-
-
 @pytest.fixture(autouse=True)
 def without_tables(limit: Limit) -> None:
     """Let the chunk index answer."""
@@ -108,29 +92,6 @@ def test_a_count_by_time_reads_indexes_at_its_ends_only(many: hl.Store) -> None:
     assert query.count() == 160
     assert query.counters.documents_read == query.counters.chunks_read == 0
     assert 0 < query.counters.bytes_read < 1000
-
-
-def test_a_count_by_time_where_a_segment_cannot_be_read(many: hl.Store) -> None:
-    path = segment_of(many)
-    whole = path.read_bytes()
-    chunk = many.session.chunks(
-        many.recordings()[0], [many.recordings()[0].channels[0].id], None, "log"
-    )[0]
-    length = chunk.place.length + chunk.place.trailer
-    with (
-        hl.open(many.directory.path, require_database=True) as opened,
-        hl.open(many.directory.path, mongo=AWAY) as alone,
-    ):
-        path.write_bytes(
-            whole[: chunk.place.offset] + bytes(length) + whole[chunk.place.offset + length :]
-        )
-        try:
-            for store in (opened, alone):
-                with pytest.raises(SegmentError, match=path.name):
-                    store.topic("/state").between("+5s", "+165s").count()
-        finally:
-            path.write_bytes(whole)
-        assert alone.topic("/state").between("+5s", "+165s").count() == 160
 
 
 @pytest.mark.parametrize("damage", ["time", "place", "length", "opcode", "arrivals"])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import pickle
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -87,37 +86,12 @@ def test_a_field_may_begin_as_ours_do(store: hl.Store) -> None:
     assert counts(store, "/j", "not (_metadata > 1)") == {2}
 
 
-@pytest.mark.parametrize(
-    "query", [{"x": {"$exists": 0}}, {"x": None}, {"x": {"$not": {"$mod": [2, 1]}}}]
-)
-def test_filters_of_mongodb_find_no_unreadable_message(
-    store: hl.Store, query: dict[str, Any]
-) -> None:
-    channel = Channel("/n", "ros1", NUMBER)
-    record(store, [(channel, number(0)), (channel, number(1)), (channel, b"short")])
-    asked = store.topic("/n").where(query)
-    want = 1 if query == {"x": {"$not": {"$mod": [2, 1]}}} else 0
-    assert asked.count() == len(list(asked)) == asked.to_arrow().num_rows == want
-
-
 def test_publish_times_of_two_channels(store: hl.Store) -> None:
     silent = Channel("/n", "ros1", NUMBER, {"of": "one"}, has_publish_time=False)
     telling = Channel("/n", "ros1", NUMBER, {"of": "other"})
     record(store, [*[(silent, number(1))] * 3, *[(telling, number(2))] * 4])
     assert counts(store, "/n", "_meta.pub exists") == {4}
     assert counts(store, "/n", "_meta.pub missing") == {3}
-
-
-def test_one_table_in_place_of_another_is_not_believed(store: hl.Store) -> None:
-    channel = Channel("/n", "ros1", NUMBER)
-    with store.start("log") as recording:
-        for index in range(4000):
-            recording.write(channel, number(index), log_time=index)
-    (path,) = (store.directory.path / "tables").rglob("*.parquet")
-    shutil.copy(path, path.with_name(path.name.replace("-000000", "-000001")))
-    path.unlink()
-    store.refresh()
-    assert store.topic("/n").where("x < 1000").count() == 1000
 
 
 def test_equal_questions_ask_the_same(store: hl.Store) -> None:
@@ -133,18 +107,6 @@ def test_equal_questions_ask_the_same(store: hl.Store) -> None:
     question = asked.where("n ~ 'x' and n > 1").during(windows).every(2).question
     assert pickle.loads(pickle.dumps(question)) == question
     assert hash(pickle.loads(pickle.dumps(question))) == hash(question)
-
-
-def test_every_counts_each_topic(store: hl.Store) -> None:
-    one, other = Channel("/one", "json", None), Channel("/other", "json", None)
-    rows = [(one if n % 2 else other, b'{"n": %d}' % n) for n in range(20)]
-    record(store, rows)
-    thinned = list(store.topic("/one", "/other").every(5))
-    assert [m.topic for m in thinned].count("/one") == 2
-    assert [m.topic for m in thinned].count("/other") == 2
-    assert store.topic("/one", "/other").every(5).count() == 4
-    first = store.topic("/one", "/other").every(10**30)
-    assert len(list(first)) == first.count() == len(first.to_pandas()) == 2
 
 
 @pytest.mark.parametrize("step", [1.5, "3", 0])
@@ -173,14 +135,6 @@ def test_a_recording_that_is_gone_is_not_left_out(store: hl.Store) -> None:
         with pytest.raises(TopicError, match="removed"):
             ask()
     assert everything.count() == 2  # of whatever there is now
-
-
-def test_only_mongodb_finds_and_the_messages_tell(store: hl.Store) -> None:
-    record(store, as_json(*[{"n": n, "v": n // 3} for n in range(9)]))
-    query = store.topic("/j").where({"$expr": {"$gt": ["$n", 4]}})
-    assert query.count() == len(list(query)) == query.to_arrow().num_rows == 4
-    assert sum(table.num_rows for table in query.to_tables()) == 4
-    assert len(query.changes("v", pause="0s")) == 1
 
 
 # Messages that a predicate cannot be asked of.
@@ -257,15 +211,3 @@ def test_what_a_predicate_cannot_be_asked_of_is_counted(
         assert (len(found), query.counters.unreadable) == (len(want), unasked)
         held = query.intervals(max_gap="1ns")
         assert (sum(i.messages for i in held), query.counters.unreadable) == (len(want), unasked)
-
-
-def test_a_filter_that_only_mongodb_understands_sees_documents_only(blind: hl.Store) -> None:
-    query = blind.topic("/r").where({"$expr": {"$gt": ["$n", 1]}})
-    assert (query.count(), query.counters.unreadable) == (1, 3)
-    assert [m.log_time_ns // SECOND for m in query] == [4]
-    assert query.counters.unreadable == 3
-    assert query.between(4 * SECOND, 6 * SECOND).count() == 1
-    mixed = query.where("n != 9")  # messages decide this
-    assert (mixed.count(), mixed.counters.unreadable) == (1, 3)
-    near = query.between(1 * SECOND, 3 * SECOND)
-    assert (near.count(), near.counters.unreadable) == (0, 0)

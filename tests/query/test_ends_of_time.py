@@ -7,67 +7,53 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
 from mcap.reader import make_reader
-from mcap.writer import Writer
 from rosbags.typesys import Stores, get_typestore
 
 import hybridlog as hl
-from hybridlog.cli.app import app
 from hybridlog.formats.slices import payload_bytes
 from hybridlog.query.query import Query
+from hybridlog_storage.messages import Channel
 from hybridlog_storage.times import END, span_of
+from tests.cli.within import answer
+from tests.odd_messages import ros_channel
 from tests.query.test_engines import WAYS, only
 
 SECOND = 10**9
 STAMPS = [-2_145_916_800 * SECOND, -SECOND - 1, -1, 0, SECOND, None]  # from 1902 on
+STATE = Channel("/state", "json", None)
+POINT = ros_channel("/point", "geometry_msgs/msg/PointStamped", 2)
 LATE = [END - 1000, END - 1000, END - 1, END, END]
 
 
-def _write(path: Path, times: list[int]) -> None:
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        schema = writer.register_schema("State", "jsonschema", b"{}")
-        channel = writer.register_channel("/state", "json", schema)
-        for number, time in enumerate(times):
-            writer.add_message(channel, time, json.dumps({"v": number}).encode(), time)
-        writer.finish()  # type: ignore[no-untyped-call]
-
-
-def _write_stamps(path: Path) -> None:
+def _stamped() -> Iterator[bytes]:
     types = get_typestore(Stores.ROS2_HUMBLE)
     header, time = types.types["std_msgs/msg/Header"], types.types["builtin_interfaces/msg/Time"]
     kind = types.types["geometry_msgs/msg/PointStamped"]
     point = types.types["geometry_msgs/msg/Point"](x=0.0, y=0.0, z=0.0)
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start("ros2")
-        definition, _ = types.generate_msgdef("geometry_msgs/msg/PointStamped", ros_version=2)
-        schema = writer.register_schema(
-            "geometry_msgs/msg/PointStamped", "ros2msg", definition.encode()
-        )
-        channel = writer.register_channel("/point", "cdr", schema)
-        for number, stamp in enumerate(STAMPS):
-            raw = b"\x00\x01\x00\x00"  # a message that is cut off has no stamp
-            if stamp is not None:
-                sec, nanosec = divmod(stamp, SECOND)
-                stamped = header(stamp=time(sec=sec, nanosec=nanosec), frame_id="")
-                message = kind(header=stamped, point=point)
-                raw = bytes(types.serialize_cdr(message, "geometry_msgs/msg/PointStamped"))
-            writer.add_message(channel, 1_700_000_000 * SECOND + number, raw, 0)
-        writer.finish()  # type: ignore[no-untyped-call]
+    for stamp in STAMPS:
+        if stamp is None:
+            yield b"\x00\x01\x00\x00"  # a message that is cut off has no stamp
+        else:
+            sec, nanosec = divmod(stamp, SECOND)
+            message = kind(
+                header=header(stamp=time(sec=sec, nanosec=nanosec), frame_id=""), point=point
+            )
+            yield bytes(types.serialize_cdr(message, "geometry_msgs/msg/PointStamped"))
 
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
-    place = tmp_path_factory.mktemp("ends")
-    with hl.open(place / "store", create=True) as opened:
+    with hl.open(tmp_path_factory.mktemp("ends") / "store", create=True) as opened:
         for name, times in (("late", LATE), ("last", [END])):
-            _write(place / f"{name}.mcap", times)
-            opened.record(place / f"{name}.mcap", name=name)
-        _write_stamps(place / "stamps.mcap")
-        opened.record(place / "stamps.mcap", name="stamps")
+            with opened.start(name) as recording:
+                for number, time in enumerate(times):
+                    said = json.dumps({"v": number}).encode()
+                    recording.write(STATE, said, log_time=time, publish_time=time)
+        with opened.start("stamps") as recording:
+            for number, raw in enumerate(_stamped()):
+                at = 1_700_000_000 * SECOND + number
+                recording.write(POINT, raw, log_time=at, publish_time=0)
         yield opened
 
 
@@ -153,23 +139,12 @@ def test_header_stamps_before_1970(store: hl.Store, way: str) -> None:
 
 
 def test_exports_by_stamps_before_1970(store: hl.Store, tmp_path: Path) -> None:
-    place = store.directory.path
     query = store.topic("/point").in_recording("stamps").clock("header")
     query = query.between("1969-12-31", "1970-01-02")
     assert payload_bytes(query) > 0
     assert query.to_arrow().column("header.stamp").cast("int64").to_pylist() == STAMPS[1:5]
-    words = [
-        "fetch",
-        "--store",
-        str(place),
-        "-t",
-        "/point",
-        "-r",
-        "stamps",
-        "--clock",
-        "header",
-    ]
-    words += ["--between", "1969-12-31", "1970-01-02", "-o", str(tmp_path / "some.mcap")]
-    assert CliRunner().invoke(app, words).exit_code == 0
+    asked = ("fetch", "-t", "/point", "-r", "stamps", "--clock", "header")
+    between = ("--between", "1969-12-31", "1970-01-02")
+    answer(*asked, *between, "-o", tmp_path / "some.mcap", store=store.directory.path)
     with (tmp_path / "some.mcap").open("rb") as file:
         assert len(list(make_reader(file).iter_messages())) == 4

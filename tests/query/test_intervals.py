@@ -45,16 +45,6 @@ def intervals(*rows: tuple[str, int, int]) -> Intervals:
 # --- the parts ------------------------------------------------------------------------
 
 
-def test_intervals_that_only_touch_have_nothing_in_common() -> None:
-    late, early = intervals(("r", 10, 20)), intervals(("r", 0, 10))
-    assert len(late.common(early)) == len(early.common(late)) == 0
-    both = intervals(("r", 0, 10), ("r", 20, 30))
-    assert [(i.begin_ns, i.end_ns) for i in intervals(("r", 9, 21)).common(both)] == [
-        (9, 10),
-        (20, 21),
-    ]
-
-
 @pytest.mark.parametrize("max_gap", [2**62, 2**63 - 2, 2**63 - 1])
 def test_a_state_may_be_believed_for_ever(max_gap: int) -> None:
     """No time that a recording can have is beyond what is believed."""
@@ -62,41 +52,6 @@ def test_a_state_may_be_believed_for_ever(max_gap: int) -> None:
     holding = Holding(max_gap)
     assert not len(holding.add(np.array([begin, begin + SECOND]), np.array([True, True])))
     assert listed(holding.finish(begin + 2 * SECOND)) == [(begin, begin + 2 * SECOND, 2)]
-
-
-def naive_holding(said: Sequence[tuple[int, bool]], end: int, max_gap: int | None) -> Rows:
-    """Looks at every nanosecond."""
-    holds = set()
-    for now in range(end):
-        past = [(time, holding) for time, holding in said if time <= now]
-        if past and past[-1][1] and (max_gap is None or now - past[-1][0] < max_gap):
-            holds.add(now)
-    found: Rows = []
-    for now in sorted(holds):
-        if now - 1 not in holds:
-            found.append((now, now + 1, 0))
-        found[-1] = (found[-1][0], now + 1, 0)
-    return [(b, e, sum(h and b <= t < e for t, h in said)) for b, e, _ in found]
-
-
-said = st.lists(st.tuples(st.integers(0, 20), st.booleans()), max_size=25).map(
-    lambda rows: sorted(rows, key=lambda row: row[0])
-)
-
-
-@given(said, st.none() | st.integers(1, 6), st.lists(st.integers(0, 25), max_size=4))
-def test_a_state_holds_until_the_next_message(
-    rows: list[tuple[int, bool]], max_gap: int | None, cuts: list[int]
-) -> None:
-    holding = Holding(max_gap)
-    found = []
-    places = [0, *sorted(min(cut, len(rows)) for cut in cuts), len(rows)]
-    for begin, end in pairwise(places):
-        part = rows[begin:end]
-        time = np.array([t for t, _ in part], np.int64)
-        found += listed(holding.add(time, np.array([h for _, h in part], np.bool_)))
-    found += listed(holding.finish(24))
-    assert found == naive_holding(rows, 24, max_gap)
 
 
 @given(st.lists(st.integers(0, 40), max_size=20), st.integers(0, 6), st.integers(1, 5))
@@ -137,6 +92,9 @@ def test_intervals_cover_what_sets_of_times_do(
     merged = left.merged()
     assert covered(merged) == covered(left)
     assert covered(left.common(right)) == covered(left) & covered(right)
+    assert covered(left.union(right)) == covered(left) | covered(right)
+    assert covered(left.without(right)) == covered(left) - covered(right)
+    assert all(i.begin_ns < i.end_ns for i in left.without(right))
     for name in "ab":
         rows = merged.of_recording(name).tolist()
         assert rows == left.of_recording(name).tolist()
@@ -330,13 +288,6 @@ def write_log(path: Path, said: list[tuple[int, str, dict[str, Any]]], mark: int
             found.append(Said(time, topic, value))
         writer.finish()  # type: ignore[no-untyped-call]
     return found
-
-
-@pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
-    place = tmp_path_factory.mktemp("intervals") / "store"
-    with hl.open(place, create=True, require_database=True) as opened:
-        yield opened
 
 
 _marks = iter(range(10**6))
@@ -534,6 +485,21 @@ def test_nothing_found_is_no_error(plain: hl.Store) -> None:
     assert len(query.during(none.intervals()).intervals()) == 0
 
 
+def test_containing_keeps_to_what_is_asked(plain: hl.Store) -> None:
+    state = plain.topic("/state")
+    windows = state.windows("100ms", "100ms")
+    assert len(windows.containing(state)) == 10
+    assert len(windows.containing(state.where("s == 1"))) == 5
+    assert len(windows.containing(state.between("+2s", "+4s"))) == 2
+    assert len(windows.containing(state.during(windows).reverse())) == 10
+    assert len(windows.containing(state.during(state.where("s == 1").windows("1s", "1ns")))) == 10
+    assert len(windows.containing(plain.topic("/other"))) == 0
+    assert len(state.windows("5s", "5s").containing(state.where("s == 1"))) == 10
+    for wrong in (state.limit(1), state.every(2)):
+        with pytest.raises(UsageError, match="cannot be combined"):
+            windows.containing(wrong)
+
+
 def test_times_within_windows_by_another_clock(plain: hl.Store) -> None:
     windows = plain.topic("/state").where("s == 1").windows(after="1s")
     query = plain.topic("/state").during(windows)
@@ -589,6 +555,3 @@ def test_wrong_questions_say_what_is_wrong(plain: hl.Store) -> None:
         plain.topic("/state").during(state.intervals()).at("+1s")
     with pytest.raises(WhereError):
         state.where("s <").intervals()
-
-
-# --- real logs ------------------------------------------------------------------------

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -18,12 +17,11 @@ from hybridlog_storage.segments.segment_reader import SegmentReader
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import places
 from tests.calls import Calls
+from tests.query.conftest import AWAY, PADDING
 from tests.query.test_intervals import BASE, SECOND, Model, recorded, several
 
 pytestmark = pytest.mark.mongo
 
-AWAY = "mongodb://127.0.0.1:9/?serverSelectionTimeoutMS=300&connectTimeoutMS=300"
-PADDING = "a" * 60  # about ten messages fill a chunk
 
 rows = st.lists(
     st.tuples(
@@ -32,13 +30,6 @@ rows = st.lists(
     min_size=1,
     max_size=60,
 )
-
-
-@pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
-    place = tmp_path_factory.mktemp("latest") / "store"
-    with hl.open(place, create=True, require_database=True) as opened:
-        yield opened
 
 
 def looked_for(
@@ -70,7 +61,7 @@ def test_the_message_at_a_time_is_what_a_loop_finds(
         store,
         {
             name: [
-                (t, topic, {"s": s, "n": n, "pad": PADDING}) for n, (t, topic, s) in enumerate(log)
+                (t, topic, {"s": s, "n": n, "name": PADDING}) for n, (t, topic, s) in enumerate(log)
             ]
             for name, log in logs.items()
         },
@@ -97,13 +88,6 @@ def test_the_message_at_a_time_is_what_a_loop_finds(
                     assert (same.recording, same.fields["n"]) == want
 
 
-@pytest.fixture
-def many(store: hl.Store) -> hl.Store:
-    """200 messages, a second apart, in about twenty chunks."""
-    recorded(store, {"a": [(n, "/state", {"n": n, "pad": PADDING}) for n in range(200)]})
-    return store
-
-
 def test_a_chunk_is_read_once_for_who_looks_around_in_it(many: hl.Store) -> None:
     query = many.topic("/state")
     read = []
@@ -128,7 +112,7 @@ def test_a_message_chosen_by_the_index_costs_something_too(many: hl.Store) -> No
 
 def test_what_was_read_is_forgotten_with_its_recording(many: hl.Store) -> None:
     assert many.topic("/state").at("end").fields["n"] == 199
-    recorded(many, {"a": [(n, "/state", {"n": -n, "pad": PADDING}) for n in range(200)]})
+    recorded(many, {"a": [(n, "/state", {"n": -n, "name": PADDING}) for n in range(200)]})
     assert many.topic("/state").at("end").fields["n"] == -199
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import pickle
 import re
 from collections.abc import Iterator
@@ -18,6 +19,7 @@ import hybridlog as hl
 from hybridlog.contract import Contract
 from hybridlog.live.snapshots import Trigger
 from hybridlog.query.choice import Choice
+from hybridlog.query.predicate.mongo_filter import MAX_DEPTH
 from hybridlog.query.query import Query
 from hybridlog_storage.errors import (
     DatabaseError,
@@ -109,9 +111,18 @@ def seqs(query: Query) -> list[tuple[str, int]]:
     return [(message.recording, message.seq) for message in query]
 
 
+def nested(operator: str) -> dict[str, object]:
+    """A filter that is nowhere deeper than it may be."""
+    found: dict[str, object] = {"x": 1}
+    for _ in range(MAX_DEPTH // 2):
+        found = {operator: [found, {"x": 2}]}
+    return found
+
+
 @pytest.mark.parametrize(
     "own",
     [
+        *map(nested, ("$and", "$or", "$nor")),
         {"x": 5},
         {"x": {"$gt": 4, "$lte": 9}},
         {"x": {"$in": [1, 4.0, 77]}, "s": "even"},
@@ -140,9 +151,14 @@ def seqs(query: Query) -> list[tuple[str, int]]:
         {"x": Decimal128("3")},
         {"_meta.seq": {"$lt": 9}},
         {"_meta.ref.len": {"$gt": 10}, "_meta.error": {"$exists": False}, "x": 3},
+        {"$expr": {"$eq": ["$s", {"$literal": "even"}]}},
+        {"$expr": {"$gt": [{"$size": {"$filter": {"input": ["$x", 2], "cond": True}}}, 1]}},
+        {"$expr": {"$gt": [{"$size": {"$ifNull": ["$two", []]}}, 1]}},
+        {"x": {"$nin": [1, math.inf]}, "s": {"$not": {"$regex": "a"}}},
+        {"_id": b"12345678901234567890"},
         {},
     ],
-    ids=str,
+    ids=lambda own: str(own)[:60],
 )
 def test_mongodb_answers_as_it_does_by_itself(store: hl.Store, own: dict[str, object]) -> None:
     if "nothing" in own:
@@ -150,6 +166,7 @@ def test_mongodb_answers_as_it_does_by_itself(store: hl.Store, own: dict[str, ob
             store.topic("/t").where(own)
         return
     query = store.topic("/t").where(own)
+    assert pickle.loads(pickle.dumps(query.question)) == query.question
     found = seqs(query)
     address = store.index.address()
     place = store.index.place("/t")
@@ -182,7 +199,7 @@ def test_it_is_joined_with_all_else(store: hl.Store) -> None:
     near = store.topic("/j").during(both.windows("1ns", "1ns"))
     assert [m.fields["n"] for m in near] == [6, 8, 10] * 2
     again = pickle.loads(pickle.dumps(both.question))
-    assert again == both.question
+    assert hash(again) == hash(both.question)
     assert Query(store.session, again).count() == 6
     assert store.all_topics().where({"_meta.seq": {"$lt": 4}}).count() == 8
     assert store.topic("/t").where({"x": -1}).count() == 0

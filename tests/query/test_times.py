@@ -3,7 +3,6 @@ from __future__ import annotations
 import contextlib
 import time
 from datetime import UTC, date, datetime, timedelta, timezone
-from fractions import Fraction
 
 import numpy as np
 import pandas as pd
@@ -171,13 +170,6 @@ def test_every_nanosecond_survives(ns: int) -> None:
     assert format_time(ns) == format_time(at(format_time(ns)))
     # An independent reader.
     assert pd.Timestamp(format_time(ns)).as_unit("ns").value == ns
-
-
-@given(st.datetimes(min_value=datetime(1700, 1, 1), max_value=datetime(2262, 1, 1)))
-def test_iso_like_datetime(moment: datetime) -> None:
-    expected = int(Fraction((moment - datetime(1970, 1, 1)) // timedelta(microseconds=1)) * 1000)
-    assert at(moment.isoformat()) == expected
-    assert at(moment) == expected
 
 
 @given(st.text(alphabet="0123456789.+-: TZmshdnu"))

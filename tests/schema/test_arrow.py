@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import struct
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,6 @@ import pyarrow as pa
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mcap.reader import make_reader
 
 from hybridlog.schema.codec import Codec, Decoded, OpaqueCodec
 from hybridlog.schema.codecs import codec_for
@@ -21,7 +19,6 @@ from hybridlog.schema.reduced_codec import reduce, reduced_channel
 from hybridlog_storage.errors import DefinitionError
 from hybridlog_storage.messages import Channel, Schema
 
-CASES = Path(__file__).parents[1] / "cases"
 JSON = codec_for(Channel("/t", "json", None))
 
 
@@ -34,17 +31,6 @@ def arrow_of(codec: Codec, payloads: list[bytes], fields: set[str] | None = None
     records = decoded_of(codec, payloads, fields).arrow()
     records.validate(full=True)
     return records
-
-
-def messages_of(name: str) -> dict[str, tuple[Channel, list[bytes]]]:
-    """Payloads by topic, as the mcap package reads them."""
-    found: dict[str, tuple[Channel, list[bytes]]] = {}
-    with (CASES / name).open("rb") as file:
-        for schema, channel, message in make_reader(file).iter_messages():
-            definition = Schema(schema.name, schema.encoding, schema.data) if schema else None
-            made = Channel(channel.topic, channel.message_encoding, definition)
-            found.setdefault(channel.topic, (made, []))[1].append(message.data)
-    return found
 
 
 def is_json(kind: pa.DataType) -> bool:
@@ -77,31 +63,6 @@ def same(one: Any, other: Any) -> bool:
     if isinstance(one, float) and isinstance(other, float) and math.isnan(other):
         return math.isnan(one)
     return bool(one == other)
-
-
-def test_json_integers_are_exact_whatever_is_missing() -> None:
-    for channel, payloads in messages_of("json_int64_missing.mcap").values():
-        records = arrow_of(codec_for(channel), payloads)
-        for found, payload in zip(records.to_pylist(), payloads, strict=True):
-            check(records.type, found, json.loads(payload))
-    records = arrow_of(JSON, messages_of("json_int64_missing.mcap")["/j"][1])
-    assert records.field("t_ns").type == pa.int64()
-    assert records.field("t_ns").to_pylist() == [1700000000123456789, None, 1700000000123456790]
-
-
-def test_json_missing_and_null_are_null_and_empty_is_empty() -> None:
-    seen = messages_of("json_optional_keys.mcap")
-    for channel, payloads in seen.values():
-        records = arrow_of(codec_for(channel), payloads)
-        for found, payload in zip(records.to_pylist(), payloads, strict=True):
-            check(records.type, found, json.loads(payload))
-    types = {name: arrow_of(JSON, payloads).type for name, (_, payloads) in seen.items()}
-    assert types["/opt"].field("ok").type == pa.bool_()
-    assert types["/opt"].field("n").type == pa.int64()
-    assert types["/opt"].field("list").type == pa.list_(pa.int64())
-    assert types["/ints2"].field("n").type == pa.int64()
-    assert is_json(types["/ints"].field("n").type)
-    assert is_json(types["/mix"].field("v").type)
 
 
 def test_json_numbers() -> None:
@@ -175,54 +136,6 @@ def test_chosen_fields() -> None:
     assert arrow_of(JSON, rows, {"a"}).field("a").to_pylist() == [{"x": 1, "y": 2}, None]
 
 
-def test_protobuf_is_whole() -> None:
-    from google.protobuf.json_format import MessageToDict
-    from mcap_protobuf.decoder import DecoderFactory
-
-    seen = 0
-    factory = DecoderFactory()
-    with (CASES / "foxglove_protobuf.mcap").open("rb") as file:
-        reader = make_reader(file, decoder_factories=[factory])
-        objects: dict[str, list[Any]] = {}
-        for _, channel, _, message in reader.iter_decoded_messages():
-            objects.setdefault(channel.topic, []).append(message)
-    for topic, (channel, payloads) in messages_of("foxglove_protobuf.mcap").items():
-        records = arrow_of(codec_for(channel), payloads)
-        for found, message in zip(records.to_pylist(), objects[topic], strict=True):
-            for name in ("data", "width", "height", "line", "point_stride", "message"):
-                if hasattr(message, name):
-                    assert found[name] == getattr(message, name)
-                    seen += 1
-            assert records.type.field("timestamp").type == pa.timestamp("ns", "UTC")
-            assert found["timestamp"].value == message.timestamp.ToNanoseconds()
-            if topic == "/pc":
-                plain = [MessageToDict(f, use_integers_for_enums=True) for f in message.fields]
-                for one, other in zip(found["fields"], plain, strict=True):
-                    assert one == {"offset": 0, **other}
-                pose = records.type.field("pose").type
-                assert found["pose"]["orientation"] == {
-                    n: getattr(message.pose.orientation, n)
-                    for n in [f.name for f in pose.field("orientation").type]
-                }
-    assert seen > 10
-    image = messages_of("foxglove_protobuf.mcap")["/raw"]
-    kinds = arrow_of(codec_for(image[0]), image[1]).type
-    assert kinds.field("width").type == pa.uint32()
-    assert kinds.field("data").type == pa.binary()
-
-
-def test_protobuf_types_that_writers_leave_out() -> None:
-    ((channel, payloads),) = messages_of("pb_std_imports_missing.mcap").values()
-    codec = codec_for(channel)
-    assert codec.reason is None
-    records = arrow_of(codec, payloads)
-    first = records[0].as_py()
-    assert first["speed"] == {"value": 2.5}
-    assert first["n"] == 7
-    assert first["info"]["fields"]["k"]["number_value"] == 3.0
-    assert first["e"] is None
-
-
 def test_protobuf_presence_maps_and_extremes() -> None:
     from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Field
     from google.protobuf.descriptor_pb2 import FileDescriptorProto, FileDescriptorSet
@@ -264,44 +177,6 @@ def test_protobuf_presence_maps_and_extremes() -> None:
     assert second["l"][1]["m"]["m"]["u"] == 2
     assert first["_id_"] == -1
     assert arrow_of(codec, [], {"u", "m.s"}).type.field("u").type == pa.uint64()
-
-
-def test_ros_is_what_rosbags_reads() -> None:
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    ((channel, payloads),) = messages_of("uint64_extremes.mcap").values()
-    assert channel.schema is not None
-    store.register(get_types_from_msg(channel.schema.data.decode(), channel.schema.name))
-    records = arrow_of(codec_for(channel), payloads)
-    kinds = records.type
-    assert kinds.field("big").type == pa.uint64()
-    assert kinds.field("stamp").type == pa.timestamp("ns", "UTC")
-    assert kinds.field("dur").type == pa.duration("ns")
-    assert kinds.field("four").type == pa.list_(pa.uint8(), 4)
-    assert pa.types.is_struct(kinds.field("points").type.value_type)
-    for row, payload in enumerate(payloads):
-        message: Any = store.deserialize_cdr(payload, channel.schema.name)
-        # rosbags reads a byte as signed; in ROS 2 it is an octet.
-        assert records.field("b")[row].as_py() == message.b % 256
-        for name in ("kind", "flag", "big", "neg", "c", "text", "f32", "f64"):
-            value = getattr(message, name)
-            assert same(records.field(name)[row].as_py(), value), name
-        for name in ("blob", "i8s", "arr", "bigs", "words", "flags"):
-            np.testing.assert_array_equal(
-                records.field(name)[row].as_py(), list(getattr(message, name))
-            )
-        stamp = message.stamp.sec * 10**9 + message.stamp.nanosec
-        assert records.field("stamp")[row].value == stamp
-        assert len(records.field("points")[row]) == len(message.points)
-
-
-def test_empty_clouds_are_empty_lists() -> None:
-    ((channel, payloads),) = messages_of("clouds_mixed_empty.mcap").values()
-    data = arrow_of(codec_for(channel), payloads).field("data")
-    assert data.null_count == 0
-    assert len(data[0]) == 0
-    assert max(len(row) for row in data) > 0
 
 
 def test_ros_numbers_are_not_copied_and_outlive_their_column() -> None:

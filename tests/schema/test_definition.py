@@ -1,18 +1,14 @@
-"""Definitions: real ones against rosbags, spellings, and hostile ones."""
+"""Definitions: standard ones against rosbags, spellings, and hostile ones."""
 
 from __future__ import annotations
 
 import contextlib
-import sqlite3
 import time
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mcap.records import Schema as McapSchema
-from mcap.stream_reader import StreamReader
 from rosbags.interfaces import Nodetype
-from rosbags.rosbag1 import Reader
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
 from hybridlog.schema.definition import (
@@ -28,7 +24,6 @@ from hybridlog.schema.definition import (
 )
 from hybridlog_storage.errors import DefinitionError
 from hybridlog_storage.messages import Schema
-from tests.data import DATA, needs_data
 
 RULE = "=" * 80
 DUMMY = "structure_needs_at_least_one_member"
@@ -68,41 +63,6 @@ def assert_same_type(found, desc, table) -> None:
             assert_same_type(inner, inner_desc, table)
 
 
-def full_name(name: str) -> str:
-    return name if name.count("/") == 2 else name.replace("/", "/msg/")
-
-
-def real_definitions() -> set[tuple[str, str, str]]:
-    found = set()
-    for folder in ("real", "odd"):
-        for path in (DATA / folder).rglob("*.bag"):
-            if path.name == "empty-file.bag":
-                continue
-            with Reader(path) as bag:
-                found |= {(c.msgtype, "ros1msg", c.msgdef.data) for c in bag.connections}
-        for path in (DATA / folder).rglob("*.mcap"):
-            with path.open("rb") as stream:
-                for record in StreamReader(stream).records:
-                    if isinstance(record, McapSchema) and record.encoding.startswith("ros"):
-                        found.add((record.name, record.encoding, record.data.decode()))
-    return found
-
-
-@needs_data
-def test_real_definitions_are_read_as_rosbags_reads_them():
-    seen = 0
-    for name, encoding, text in real_definitions():
-        found = parse(text, encoding, name)
-        assert found.name == name
-        if "---" in text.splitlines():
-            continue
-        table = get_types_from_msg(text, full_name(name))
-        store = get_typestore(Stores.ROS1_NOETIC if encoding == "ros1msg" else Stores.ROS2_KILTED)
-        assert_same_type(found, (Nodetype.NAME, full_name(name)), store.fielddefs | table)
-        seen += 1
-    assert seen > 60
-
-
 @pytest.mark.parametrize("ros", [1, 2])
 def test_every_standard_type_of_rosbags(ros):
     table = get_typestore(Stores.ROS1_NOETIC if ros == 1 else Stores.ROS2_KILTED).fielddefs
@@ -121,82 +81,6 @@ def test_every_standard_type_of_rosbags(ros):
     assert read > 100
     assert standard_type("nobody/Knows", ros) is None
     assert standard_type("sensor_msgs/Imu", ros) is not None
-
-
-@needs_data
-def test_definitions_of_service_events():
-    found = set()
-    path = DATA / "odd/rosbag2/topics_and_services.mcap"
-    with path.open("rb") as stream:
-        for record in StreamReader(stream).records:
-            if isinstance(record, McapSchema) and record.name.endswith("_Event"):
-                found.add((record.name, record.data))
-    assert found
-    for name, data in found:
-        message_type = parse_definition(Schema(name, "ros2msg", data))
-        assert listing(message_type) == {
-            "info": "service_msgs/ServiceEventInfo",
-            "info.event_type": "uint8",
-            "info.stamp": "time",
-            "info.client_gid": "char[16]",
-            "info.sequence_number": "int64",
-            "request": "example_interfaces/srv/AddTwoInts_Request[<=1]",
-            "request[].a": "int64",
-            "request[].b": "int64",
-            "response": "example_interfaces/srv/AddTwoInts_Response[<=1]",
-            "response[].sum": "int64",
-        }
-
-
-@needs_data
-def test_definitions_stored_in_sqlite_bags():
-    path = DATA / "odd/rosbag2/topics_and_services.db3"
-    connection = sqlite3.connect(f"file:{path}?mode=ro&immutable=1", uri=True)
-    rows = connection.execute(
-        "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
-    ).fetchall()
-    connection.close()
-    assert len(rows) > 3
-    for name, encoding, text in rows:
-        # They are kept under the name of the service, the topic has the event's type.
-        assert parse(text, encoding, name.replace("AddTwoInts", "AddTwoInts_Event")).fields
-
-
-ACTION = "int32 order\n---\nint32[] sequence\n---\nint32[] partial\n"
-
-
-@pytest.mark.parametrize(
-    ("suffix", "expected"),
-    [
-        ("_Goal", {"order": "int32"}),
-        ("_SendGoal_Response", {"accepted": "bool", "stamp": "time"}),
-        (
-            "_FeedbackMessage",
-            {
-                "goal_id": "unique_identifier_msgs/UUID",
-                "goal_id.uuid": "uint8[16]",
-                "feedback": "pkg/action/Fib_Feedback",
-                "feedback.partial": "int32[]",
-            },
-        ),
-        (
-            "_GetResult_Response",
-            {
-                "status": "int8",
-                "result": "pkg/action/Fib_Result",
-                "result.sequence": "int32[]",
-            },
-        ),
-    ],
-)
-def test_types_derived_from_an_action(suffix, expected):
-    assert listing(parse(ACTION, name=f"pkg/action/Fib{suffix}")) == expected
-
-
-def test_events_of_an_action():
-    found = listing(parse(ACTION, name="pkg/action/Fib_SendGoal_Event"))
-    assert found["request[].goal.order"] == "int32"
-    assert found["response[].accepted"] == "bool"
 
 
 # --- spelling

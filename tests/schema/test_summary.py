@@ -78,18 +78,6 @@ def test_a_row_does_not_depend_on_the_others(case: tuple[str, list[list[Any]]]) 
     assert bits(of(dtype, rows[::-1] + rows)) == alone[::-1] + alone
 
 
-@pytest.mark.parametrize("width", [33, 127, 128, 129, 720, 5000])
-def test_regular_rows_are_as_single_ones(width: int) -> None:
-    values = np.random.default_rng(1).normal(size=(50, width)) * 1e3
-    values[3, 5] = math.nan
-    for dtype in (np.float32, np.float64):
-        rows = values.astype(dtype)
-        together = summarise(Scalars(rows.ravel()), np.arange(51) * width)
-        for i, row in enumerate(rows):
-            alone = summarise(Scalars(row), np.array([0, width]))
-            assert bits(alone)[0] == bits(together)[i]
-
-
 @pytest.mark.parametrize("dtype", ["f4", "f8", "u1", "i1", "u2", "i2", "u4"])
 @pytest.mark.parametrize("width", [4095, 4096, 5001, 16_384, 16_385, 40_000])
 def test_rows_of_one_length_are_as_among_others(dtype: str, width: int) -> None:

@@ -290,10 +290,3 @@ def test_the_prompt(root: Path, tmp_path: Path) -> None:
     history = (tmp_path / "hybridlog" / "sql_history").read_text()
     assert "from few;" in history
     assert "base__scan" in history
-
-
-def test_errors_have_exit_codes(root: Path) -> None:
-    for query, expected in (("selec 1", 2), ("select * from nothing", 2)):
-        with pytest.raises(HybridlogError) as caught:
-            run(root, query)
-        assert caught.value.exit_code == expected

@@ -8,6 +8,7 @@ import shutil
 import signal
 import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,6 @@ import pyarrow as pa
 import pytest
 
 import hybridlog as hl
-from hybridlog.columns.parquet_file import ParquetFileReader
 from hybridlog.query.choice import Choice
 from hybridlog.sql import duck, engine
 from hybridlog.sql.engine import SqlConnection
@@ -29,10 +29,12 @@ from hybridlog_storage.errors import (
     TopicError,
     UsageError,
 )
+from hybridlog_storage.messages import Channel
 from tests import places
 from tests.limits import Limit
 from tests.sql.conftest import LARGE, SCANS, scan
 from tests.tables.logs import BASE, SECOND
+from tests.waiting import wait_for
 
 ENDLESS = "select sum(a.range * b.range) from range(10000000) a, range(1000000) b"
 
@@ -208,34 +210,6 @@ def test_without_duckdb(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
             opened.sql("select 1")
 
 
-def large_file(store: hl.Store) -> Path:
-    (path,) = (store.directory.path / "tables").glob(f"*/{store.entry('first').id}-*.parquet")
-    return path
-
-
-def test_missing_and_damaged_tables_are_made_again(own: hl.Store, limit: Limit) -> None:
-    limit(long_table_rows=1000)
-    query = "select count(*), sum(i8), sum(covariance_summary.n) from large"
-    wanted = own.sql(query).rows()
-    path = large_file(own)
-    data = bytearray(path.read_bytes())
-    data[3000] ^= 1
-    own.close()
-    path.write_bytes(data)
-    with hl.open(own.directory.path, mongo="mongodb://127.0.0.1:1/") as again:
-        assert again.sql("select * from large", between=("start", "end")).rows()
-        assert again.sql("select * from large").to_arrow().num_rows == wanted[0][0]
-        assert again.sql(query).rows() == wanted
-        again.mend()
-        assert [topic for _, topic in again.repairs.tables] == ["/large"]
-    ParquetFileReader(large_file(own)).check()
-    shutil.rmtree(own.directory.path / "tables")
-    with hl.open(own.directory.path, mongo="mongodb://127.0.0.1:1/") as again:
-        assert again.sql(query).rows() == wanted
-        again.mend()
-        assert again.repairs.tables
-
-
 def test_a_choice_of_recordings_and_a_time(store: hl.Store) -> None:
     """Views and tables show these alone, and only files of them are read."""
     count = "select count(*) from large"
@@ -354,18 +328,27 @@ def test_refreshing_sees_new_recordings(own: hl.Store) -> None:
         before.rows()
 
 
+def test_a_prompt_sees_what_a_running_recording_has_flushed(tmp_path: Path) -> None:
+    """In one connection, and from chunks alone; a topic that is new, too."""
+    with hl.open(tmp_path / "store", create=True) as opened:
+        with opened.start("live", flush_interval_s=0.05) as recording:
+            recording.write(Channel("/old", "json", None), b'{"a": 1}', log_time=BASE)
+            wait_for(lambda: opened.sql("select * from topics").rows())
+            prompt = opened.sql_engine.connect()
+            for n in range(2):
+                recording.write(Channel("/note", "json", None), b'{"n": 1}', log_time=BASE + n)
+                count = f"select 1 from topics where topic = '/note' and messages = {n + 1}"
+                wait_for(lambda count=count: prompt.query(count).rows())
+                opened.session.cache.drop("chunk")
+                answer = prompt.query("select sum(n) from note")
+                assert answer.rows() == [(n + 1,)]
+                assert (answer.counts.row_groups, answer.counts.chunks > 0) == (0, True)
+
+
 def test_threads_ask_at_once(store: hl.Store) -> None:
-    found: list[Any] = []
-
-    def ask() -> None:
-        query = "select count(*), max(ranges[1]) from scan"
-        found.extend(store.sql(query).rows() for _ in range(2))
-
-    threads = [threading.Thread(target=ask) for _ in range(3)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    query = "select count(*), max(ranges[1]) from scan"
+    with ThreadPoolExecutor(3) as pool:
+        found = list(pool.map(lambda _: store.sql(query).rows(), range(6)))
     assert found == [[(SCANS, SCANS - 1)]] * 6
 
 

@@ -42,19 +42,6 @@ def test_what_was_prepared_is_taken(made: list[int]) -> None:
     assert not any(start % mmap.PAGESIZE for start in starts)
 
 
-def test_no_more_is_prepared_than_was_said(made: list[int]) -> None:
-    pool = Buffers()
-    pool.prepare(SIZE, 3 * SIZE + 7)
-    assert (made, pool._given) == ([SLAB], {SLAB: 3 * SIZE})
-    pool.prepare(SIZE, 3 * SIZE)
-    pool.prepare(4 * SIZE, 4 * SIZE + 7)  # no buffer more than there is
-    assert (made, pool._given) == ([SLAB], {SLAB: 3 * SIZE})
-    held = [pool.take(SIZE) for _ in range(3)]
-    assert pool._given == {SLAB: 3 * SIZE}
-    held.append(pool.take(SIZE))
-    assert (made, pool._given) == ([SLAB], {SLAB: 4 * SIZE})
-
-
 def test_preparing_ends_when_somebody_settles_meanwhile(made: list[int]) -> None:
     class Enough(threading.Event):
         def wait(self, timeout: float | None = None) -> bool:
@@ -65,22 +52,6 @@ def test_preparing_ends_when_somebody_settles_meanwhile(made: list[int]) -> None
     pool.prepare(SIZE, 2 * module._MAX_IDLE_BYTES, enough=Enough())
     assert len(made) == 2 * module._MAX_IDLE_BYTES // SLAB
     assert pool._given == {SLAB: module._MAX_IDLE_BYTES}
-
-
-def test_what_is_begun_is_prepared_first_and_taken_last(made: list[int]) -> None:
-    pool = Buffers()
-    pool.prepare(SIZE, 3 * SIZE)
-    pool.prepare(SIZE, 5 * SIZE)
-    assert (made, pool._given) == ([SLAB], {SLAB: 5 * SIZE})
-    pool.prepare(SIZE, SLAB + 5 * SIZE)
-    assert (made, pool._given) == ([SLAB] * 2, {SLAB: SLAB + 5 * SIZE})
-    held = [pool.take(SIZE) for _ in range(13)]
-    assert pool._given == {SLAB: SLAB + 5 * SIZE}
-    del held[0]
-    held.append(pool.take(SIZE))
-    assert pool._given == {SLAB: SLAB + 5 * SIZE}
-    held.append(pool.take(SIZE))
-    assert (made, pool._given) == ([SLAB] * 2, {SLAB: SLAB + 6 * SIZE})
 
 
 def test_nothing_is_prepared_where_one_is_too_much(made: list[int]) -> None:
@@ -131,18 +102,6 @@ def test_buffers_beyond_a_slab_have_their_own(made: list[int]) -> None:
     del held
 
 
-def test_no_more_is_kept_than_the_bound(made: list[int]) -> None:
-    pool = Buffers()
-    most = module._MAX_IDLE_BYTES // SLAB
-    held = [pool.take(SIZE) for _ in range((most + 3) * SLAB // SIZE)]
-    del held
-    assert pool._given == {SLAB: most * SLAB}
-    del made[:]
-    held = [pool.take(SLAB) for _ in range(most + 3)]
-    assert len(made) == 3
-    del held
-
-
 def test_what_was_prepared_is_kept_until_things_settle(made: list[int]) -> None:
     pool = Buffers()
     usual = module._MAX_IDLE_BYTES // SLAB
@@ -161,17 +120,6 @@ def test_what_was_prepared_is_kept_until_things_settle(made: list[int]) -> None:
     assert len(made) == usual + 10
     pool.prepare(SIZE, (usual + 7) * SLAB)
     assert len(made) == usual + 12
-    del held
-
-
-def test_what_is_spare_of_another_kind_is_not_in_the_way(made: list[int]) -> None:
-    pool = Buffers()
-    held = [pool.take(SLAB) for _ in range(module._MAX_IDLE_BYTES // SLAB)]
-    del held
-    pool.prepare(2 * SLAB, 6 * SLAB)
-    assert made[-3:] == [2 * SLAB] * 3
-    held = [pool.take(2 * SLAB) for _ in range(3)]
-    assert made[-4:] == [SLAB] + [2 * SLAB] * 3
     del held
 
 
@@ -228,8 +176,9 @@ class Taking(RuleBasedStateMachine):
 
     @rule(size=st.sampled_from([1 << 18, 4 * SIZE]), total=st.integers(0, 4 * SLAB))
     def prepare(self, size: int, total: int) -> None:
+        before = self.pool._given[SLAB]
         self.pool.prepare(size, total)
-        assert self.pool._given[SLAB] > total - module._rounded(size)
+        assert total - module._rounded(size) < self.pool._given[SLAB] <= max(before, total)
 
     @rule()
     def settle(self) -> None:

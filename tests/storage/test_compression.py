@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import os
-import threading
-import tracemalloc
+from concurrent.futures import ThreadPoolExecutor
 
 import lz4.frame
 import numpy as np
@@ -108,28 +107,13 @@ def test_in_a_hurry_no_high_level_is_used() -> None:
         assert hurried[0] == "zstd"
 
 
-def test_none_stores_everything_as_it_is() -> None:
-    assert Compressor("none").compress(TEXT) == ("", TEXT)
-
-
 def test_a_compressor_may_be_used_by_many_threads() -> None:
     compressor = Compressor()
-    blocks = [TEXT[i * 1000 : i * 1000 + 200_000] for i in range(16)]
-    wrong: list[int] = []
-
-    def work(start: int) -> None:
-        for i in range(start, len(blocks), 4):
-            for _ in range(5):
-                name, out = compressor.compress(blocks[i])
-                if bytes(decompress(name, out, len(blocks[i]))) != blocks[i]:
-                    wrong.append(i)
-
-    threads = [threading.Thread(target=work, args=(i,)) for i in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert not wrong
+    blocks = [TEXT[i * 1000 : i * 1000 + 200_000] for i in range(16)] * 5
+    with ThreadPoolExecutor(4) as pool:
+        packed = list(pool.map(compressor.compress, blocks))
+    for block, (name, out) in zip(blocks, packed, strict=True):
+        assert bytes(decompress(name, out, len(block))) == block
 
 
 @pytest.mark.parametrize(("name", "level"), [("zstd", 23), ("lz4", 17), ("gzip", 1)])
@@ -179,33 +163,6 @@ def test_an_unknown_codec_is_an_error(name: str) -> None:
     with pytest.raises(SegmentError, match="not known") as caught:
         decompress(name, b"abc", 3)
     assert len(str(caught.value)) < 200
-
-
-def bomb(size: int) -> bytes:
-    """A few KiB of zstd that become `size` bytes, without a size in the frame."""
-    compressor = zstandard.ZstdCompressor(write_content_size=False).compressobj()
-    block = bytes(1 << 20)
-    out = b"".join(compressor.compress(block) for _ in range(size >> 20))
-    return out + compressor.flush()
-
-
-def test_bombs_are_refused_without_allocation() -> None:
-    data = bomb(64 << 20)
-    tracemalloc.start()
-    try:
-        with pytest.raises(SegmentError, match="limit"):
-            decompress("zstd", data, 2 << 30)
-        with pytest.raises(SegmentError, match="limit"):
-            decompress("zstd", data, 1 << 63, limit=1 << 62)
-        with pytest.raises(SegmentError, match="cannot hold"):
-            decompress("lz4", bytes(100), 1 << 29)
-        with pytest.raises(SegmentError, match="more bytes"):
-            decompress("zstd", data, 1 << 20)  # lies low
-        assert len(next(decompress_pieces("zstd", data))) <= 1 << 20
-        _, peak = tracemalloc.get_traced_memory()
-    finally:
-        tracemalloc.stop()
-    assert peak < 8 << 20
 
 
 @pytest.mark.parametrize("name", ["", "zstd", "lz4"])

@@ -1,11 +1,9 @@
 from __future__ import annotations
 
-import contextlib
 import json
 import logging
 import os
 import signal
-import socket
 import subprocess
 import tempfile
 import threading
@@ -34,6 +32,7 @@ from hybridlog_storage.mongo.database import (
     without_secrets,
 )
 from hybridlog_storage.mongo.mongod import EmbeddedMongod, find_mongod
+from tests.calls import Calls
 from tests.limits import Limit
 from tests.waiting import wait_for
 
@@ -148,10 +147,6 @@ def test_nothing_to_insert(database: Database, name: str) -> None:
     assert database.insert_raw(name, b"", 0) == 0
     assert database.insert_raw(name, b"", 0, lengths=np.zeros(0, np.int64)) == 0
     assert list(database.find_raw(name)) == []
-
-
-def test_with_the_journal(database: Database, name: str) -> None:
-    assert database.insert_raw(name, b"".join(encoded(3)), 3) == 3
 
 
 @pytest.mark.parametrize(
@@ -348,26 +343,16 @@ def nested(depth: int) -> dict[str, object]:
     "predicate",
     [
         {"x": {"$foo": 1}},
-        {"$where": "sleep(1000) || true"},
-        {"$expr": {"$function": {"body": "function(){}", "args": [], "lang": "js"}}},
-        {"s": {"$regex": "("}},
-        {"s": {"$regex": "a", "$options": "q"}},
         {"s": {"$regex": "a" * 40_000}},
-        {"x": {"$in": 3}},
         {"x": {"$type": "colour"}},
         {"x": {"$gt": 1 << 70}},
-        {"a\0b": 1},
-        {1: 2},
-        {"x": object()},
         {"$expr": {"$toInt": "$s"}},
         {"$expr": {"$divide": [1, 0]}},
         {"$expr": {"$substrBytes": ["$s", -1, 2]}},
-        {"$text": {"$search": "a"}},
-        {"x": "\ud800"},
         nested(300),
         nested(5000),
     ],
-    ids=range(19),
+    ids=range(9),
 )
 def test_a_wrong_predicate_is_the_users_error(
     database: Database, name: str, predicate: dict[str, object]
@@ -463,53 +448,11 @@ def test_a_database_in_the_uri_wins(mongod: EmbeddedMongod) -> None:
         assert connected.address.endswith("/mine")
 
 
-def test_an_old_server_is_refused(runtime: Path) -> None:
-    path = runtime / "old.sock"
-    with socket.socket(socket.AF_UNIX) as listener:
-        listener.bind(str(path))
-        listener.listen()
-        threading.Thread(target=old_server, args=(listener,), daemon=True).start()
-        uri = f"mongodb://{quote(str(path), safe='')}/?directConnection=true"
-        with pytest.raises(DatabaseError, match=r"version 5\.0\.9; hybridlog needs 5\.3"):
-            Database.connect(uri, timeout_s=5)
-        listener.shutdown(socket.SHUT_RDWR)
-
-
-def old_server(listener: socket.socket) -> None:
-    """As much of a MongoDB 5.0 as a driver wants to see."""
-    reply = {
-        "ok": 1,
-        "helloOk": True,
-        "isWritablePrimary": True,
-        "ismaster": True,
-        "minWireVersion": 0,
-        "maxWireVersion": 13,
-        "version": "5.0.9",
-        "versionArray": [5, 0, 9, 0],
-        "maxBsonObjectSize": 16 << 20,
-        "maxMessageSizeBytes": 48_000_000,
-        "maxWriteBatchSize": 100_000,
-    }
-
-    def serve(connection: socket.socket) -> None:
-        with connection, contextlib.suppress(OSError):
-            while header := connection.recv(16, socket.MSG_WAITALL):
-                length, request, _, opcode = np.frombuffer(header, "<i4").tolist()
-                connection.recv(length - 16, socket.MSG_WAITALL)
-                body = bson.encode(reply)
-                if opcode == 2013:
-                    body = b"\0\0\0\0\0" + body
-                    kind = 2013
-                else:
-                    body = np.array([8, 0, 0, 0, 1], "<i4").tobytes() + body
-                    kind = 1
-                head = np.array([16 + len(body), 1, request, kind], "<i4").tobytes()
-                connection.sendall(head + body)
-
-    with contextlib.suppress(OSError):
-        while True:
-            connection, _ = listener.accept()
-            threading.Thread(target=serve, args=(connection,), daemon=True).start()
+def test_an_old_server_is_refused(mongod: EmbeddedMongod, calls: Calls) -> None:
+    old = {"version": "5.0.9", "versionArray": [5, 0, 9, 0]}
+    calls.change(MongoClient, "server_info", lambda *_: old)
+    with pytest.raises(DatabaseError, match=r"version 5\.0\.9; hybridlog needs 5\.3"):
+        Database.connect(mongod.start(), timeout_s=5)
 
 
 def test_a_server_of_somebody_elses(runtime: Path) -> None:

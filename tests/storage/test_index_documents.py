@@ -70,6 +70,13 @@ def documents(data: NDArray[np.uint8]) -> list[dict[str, Any]]:
     return [bson.decode(row) for row in raw]
 
 
+def assembled(chunk: StoredChunk, error: str | None = None) -> NDArray[np.uint8]:
+    """Documents without fields, of all messages."""
+    rows = np.arange(len(chunk.batch))
+    nothing = np.empty((len(rows), 0), np.uint8)
+    return DocumentAssembler(ORIGIN).assemble(Placed.of([chunk]), rows, nothing, error)
+
+
 def body_of(values: list[dict[str, Any]]) -> NDArray[np.uint8]:
     """Elements of documents that are all of one size."""
     rows = [bson.encode(v)[4:-1] for v in values]
@@ -131,13 +138,7 @@ def test_documents_of_several_chunks_are_those_of_each(
     assembler = DocumentAssembler(ORIGIN)
     every = np.arange(len(placed.batch))
     made = assembler.assemble(placed, every, np.empty((len(every), 0), np.uint8))
-    alone = [
-        assembler.assemble(
-            Placed.of([chunk]), np.arange(len(rows)), np.empty((len(rows), 0), np.uint8)
-        )
-        for chunk, (_, rows) in zip(chunks, parts, strict=True)
-    ]
-    assert made.tobytes() == np.concatenate(alone).tobytes()
+    assert made.tobytes() == np.concatenate([assembled(chunk) for chunk in chunks]).tobytes()
     assert placed.number.tolist() == [n for n, (_, rows) in enumerate(parts) for _ in rows]
     payloads = [bytes(placed.batch.payload(row)) for row in every]
     assert payloads == [
@@ -148,11 +149,7 @@ def test_documents_of_several_chunks_are_those_of_each(
 @given(st.lists(st.tuples(TIMES, st.integers(0, 2**62)), min_size=2))
 def test_the_order_of_keys_is_the_order_of_messages(rows: list[tuple[int, int]]) -> None:
     chunk = chunk_of([r[0] for r in rows], [r[1] for r in rows])
-    empty = np.empty((len(rows), 0), np.uint8)
-    made = documents(
-        DocumentAssembler(ORIGIN).assemble(Placed.of([chunk]), np.arange(len(rows)), empty)
-    )
-    keys = [d["_id"] for d in made]
+    keys = [d["_id"] for d in documents(assembled(chunk))]
     assert sorted(range(len(rows)), key=lambda i: keys[i]) == sorted(
         range(len(rows)), key=lambda i: rows[i]
     )
@@ -160,23 +157,13 @@ def test_the_order_of_keys_is_the_order_of_messages(rows: list[tuple[int, int]])
 
 @given(TIMES, TIMES)
 def test_a_bound_parts_the_keys_at_its_time(time: int, bound: int) -> None:
-    chunk = chunk_of([time])
-    (made,) = documents(
-        DocumentAssembler(ORIGIN).assemble(
-            Placed.of([chunk]), np.arange(1), np.empty((1, 0), np.uint8)
-        )
-    )
+    (made,) = documents(assembled(chunk_of([time])))
     assert (made["_id"] >= key_bound(bound)) == (time >= bound)
 
 
 @pytest.mark.parametrize("time", [-1, -(2**70), 2**63, 2**80])
 def test_bounds_outside_of_all_times(time: int) -> None:
-    chunk = chunk_of([0, 2**63 - 1])
-    made = documents(
-        DocumentAssembler(ORIGIN).assemble(
-            Placed.of([chunk]), np.arange(2), np.empty((2, 0), np.uint8)
-        )
-    )
+    made = documents(assembled(chunk_of([0, 2**63 - 1])))
     assert all((d["_id"] >= key_bound(time)) == (time < 0) for d in made)
 
 
@@ -205,8 +192,5 @@ def test_errors_replace_the_fields() -> None:
 
 
 def test_the_recording_is_read_from_a_key() -> None:
-    chunk = chunk_of([5])
-    data = DocumentAssembler(ORIGIN).assemble(
-        Placed.of([chunk]), np.arange(1), np.empty((1, 0), np.uint8)
-    )
+    data = assembled(chunk_of([5]))
     assert recording_key(data[0].tobytes()) == ORIGIN.key

@@ -6,7 +6,6 @@ import contextlib
 import io
 import json
 import struct
-import time
 import zlib
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +17,6 @@ from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import (
     Channel,
-    Chunk,
     ChunkIndex,
     DataEnd,
     Footer,
@@ -45,6 +43,7 @@ from hybridlog_storage.mcap.mcap_scan import (
 )
 from hybridlog_storage.segments.attachments import Attachment
 from tests.data import DATA, needs_data
+from tests.work import calls_in
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -315,16 +314,8 @@ def test_an_attachment_that_claims_more_than_its_record_holds_is_damage(claim: i
 
 
 def test_messages_are_not_looked_at_one_by_one() -> None:
-    count, payload = 200_000, bytes(320)
-    one = content_of(Message(7, 123, payload, 456, 9))
-    data = one * count
-    best = 1.0
-    for _ in range(3):
-        start = time.process_time()
-        content = parse_content(data)
-        best = min(best, (time.process_time() - start) / count)
-    assert len(content.batch) == count
-    assert best < 2e-6  # about 0.3 µs on an idle machine; a call a message would be slower
+    data = content_of(Message(7, 123, bytes(320), 456, 9)) * 20_000
+    assert calls_in(lambda: parse_content(data)) < 3 * 20_000
 
 
 # Files
@@ -480,15 +471,6 @@ def test_a_chunk_above_the_limit_is_skipped() -> None:
     chunks = sum(isinstance(i, ScannedChunk) for _, i in items_of(data))
     assert len(damages(items)) == chunks
     assert items[-1][1] == End(len(data), clean=True)
-
-
-def test_a_chunk_that_claims_too_much_is_refused_when_opened() -> None:
-    builder = RecordBuilder()
-    Chunk("zstd", b"\0" * 50, 0, 0, 0, 1 << 40).write(builder)
-    data = MAGIC + content_of(Header("", "")) + builder.end()
-    (chunk,) = [i for _, i in items_of(data) if isinstance(i, ScannedChunk)]
-    with pytest.raises(SegmentError, match="limit"):
-        chunk.content_bytes()
 
 
 def test_checksums_of_chunks_are_checked_unless_told_otherwise() -> None:

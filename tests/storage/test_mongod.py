@@ -9,7 +9,6 @@ import socket
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -30,6 +29,7 @@ from hybridlog_storage.errors import (
 from hybridlog_storage.mongo.mongod import EmbeddedMongod, find_mongod
 from tests.limits import Limit
 from tests.some import in_turn
+from tests.waiting import wait_for
 
 pytestmark = pytest.mark.mongo("embedded")
 
@@ -46,13 +46,6 @@ user.stop()
 print("left", flush=True)
 sys.stdin.readline()
 """
-
-
-def wait_for(condition: Callable[[], bool], what: str, limit_s: float = 15.0) -> None:
-    deadline = time.monotonic() + limit_s
-    while not condition():
-        assert time.monotonic() < deadline, f"waited in vain for {what}"
-        time.sleep(0.02)
 
 
 def record(directory: Path) -> dict[str, object]:
@@ -73,7 +66,7 @@ def is_running(pid: int) -> bool:
 
 
 def gone(*numbers: int) -> None:
-    wait_for(lambda: not any(map(is_running, numbers)), f"the end of {numbers}")
+    wait_for(lambda: not any(map(is_running, numbers)))
 
 
 def processes_on(directory: Path) -> list[int]:
@@ -146,6 +139,39 @@ def fake_mongod(path: Path, script: str) -> Path:
     return path
 
 
+@pytest.fixture
+def fake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
+    """Puts a script in the place of mongod."""
+
+    def put(script: str) -> None:
+        path = fake_mongod(tmp_path / "fake", script)
+        monkeypatch.setenv("HYBRIDLOG_MONGOD", str(path))
+
+    return put
+
+
+def keep(uri: str) -> None:
+    """Put in what `kept` counts."""
+    with MongoClient(uri) as client:
+        client.test.kept.insert_one({"_id": 1})
+        client.admin.command("fsync")
+
+
+def kept(uri: str) -> int:
+    with MongoClient(uri) as client:
+        return client.test.kept.count_documents({})
+
+
+def used_once(directory: Path) -> EmbeddedMongod:
+    """One that has data files, and has ended."""
+    with EmbeddedMongod(directory, linger_s=LINGER_S) as user:
+        keep(user.start())
+        assert user.damage is None
+        processes = pids(directory)
+    gone(*processes)
+    return user
+
+
 # --- a life ---
 
 
@@ -215,7 +241,7 @@ def test_processes_share_one_and_the_last_ends_it(directory: Path) -> None:
 def test_users_that_come_all_at_once_start_one(directory: Path) -> None:
     users = [EmbeddedMongod(directory, linger_s=LINGER_S) for _ in range(6)]
     with ThreadPoolExecutor(6) as pool:
-        uris = set(pool.map(EmbeddedMongod.start, users))
+        uris = set(pool.map(EmbeddedMongod.start, users * 2))  # each from two threads
     assert len(uris) == 1
     mongods = [
         pid for pid in processes_on(directory) if "--dbpath" in psutil.Process(pid).cmdline()[1]
@@ -232,11 +258,9 @@ def test_users_that_come_while_it_is_ended_wait_and_start_it_anew(directory: Pat
     assert not (directory / "mongod.log.1").exists()
 
 
-@pytest.mark.parametrize(
-    "name", ["with space & 'quote'", "Größe-日本語", "long/" + "/".join(["d" * 60] * 5)]
-)
-def test_any_path_of_the_store_will_do(tmp_path: Path, directory: Path, name: str) -> None:
-    store = tmp_path / name
+@pytest.mark.usefixtures("directory")
+def test_any_path_of_the_store_will_do(tmp_path: Path) -> None:
+    store = tmp_path / "with space & 'quote'" / "Größe-日本語" / "/".join(["d" * 60] * 5)
     store.mkdir(parents=True)
     with EmbeddedMongod(store / "mongod", linger_s=LINGER_S) as user:
         assert ping(user.start())
@@ -277,8 +301,7 @@ def test_a_killed_keeper_takes_mongod_along_and_the_next_start_brings_another(
     directory: Path,
 ) -> None:
     with EmbeddedMongod(directory, linger_s=LINGER_S) as user:
-        with MongoClient(user.start()) as client:
-            client.test.kept.insert_one({"_id": 1})
+        keep(user.start())
         first = pids(directory)
         os.kill(first[1], signal.SIGKILL)
         gone(first[1])
@@ -286,23 +309,19 @@ def test_a_killed_keeper_takes_mongod_along_and_the_next_start_brings_another(
         second = pids(directory)
         assert not set(first) & set(second)
         gone(*first)
-        with MongoClient(uri) as client:
-            assert client.test.kept.count_documents({}) == 1
+        assert kept(uri) == 1
 
 
 def test_a_killed_mongod_comes_up_again_with_what_was_written(directory: Path) -> None:
     with EmbeddedMongod(directory, linger_s=LINGER_S) as user:
-        with MongoClient(user.start()) as client:
-            client.test.kept.insert_one({"_id": 1})
-            client.admin.command("fsync")
+        keep(user.start())
         first = pids(directory)
         os.kill(first[0], signal.SIGKILL)
         gone(first[0])
         uri = user.start()
         second = pids(directory)
         assert not set(first) & set(second)
-        with MongoClient(uri) as client:
-            assert client.test.kept.count_documents({}) == 1
+        assert kept(uri) == 1
     assert "killed by signal 9" in user.log.read_text()
 
 
@@ -326,19 +345,17 @@ def test_everything_killed_and_a_stale_socket_and_record(directory: Path) -> Non
 
 def test_a_store_removed_and_made_anew_under_a_running_mongod(directory: Path) -> None:
     user = EmbeddedMongod(directory, linger_s=0.5)
-    with MongoClient(user.start()) as client:
-        client.test.kept.insert_one({"_id": 1})
+    keep(user.start())
     first = pids(directory)
     while directory.exists():
         # Its keeper may take a file away before it is reached.
         shutil.rmtree(directory, ignore_errors=True)
-    with MongoClient(user.start()) as client:
-        assert client.test.kept.count_documents({}) == 0
-        second = pids(directory)
-        assert not set(first) & set(second)
-        gone(*first)
-        assert pids(directory) == second, "the first keeper leaves the second's record alone"
-        assert ping(user.start())
+    assert kept(user.start()) == 0
+    second = pids(directory)
+    assert not set(first) & set(second)
+    gone(*first)
+    assert pids(directory) == second, "the first keeper leaves the second's record alone"
+    assert ping(user.start())
     user.stop()
     gone(*second)
 
@@ -407,8 +424,11 @@ def test_no_store_at_all(tmp_path: Path) -> None:
 def test_a_program_that_fails_at_once(directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HYBRIDLOG_MONGOD", "/bin/false")
     user = EmbeddedMongod(directory, linger_s=LINGER_S)
-    with pytest.raises(DatabaseError, match=r"did not come up: .*with exit status 1"):
-        user.start()
+    before = psutil.Process().num_fds()
+    for _ in range(2):
+        with pytest.raises(DatabaseError, match=r"did not come up: .*with exit status 1"):
+            user.start()
+    assert psutil.Process().num_fds() == before
     monkeypatch.delenv("HYBRIDLOG_MONGOD")
     with user:
         assert ping(user.start()), "nothing stays behind"
@@ -419,27 +439,29 @@ def test_a_program_that_fails_at_once(directory: Path, monkeypatch: pytest.Monke
     in_turn(["kill -9 $$", "kill -15 $$", "exit 0", "kill -9 $PPID; sleep 9"], [1, 2, 9]),
 )
 def test_one_that_others_end_while_it_starts_is_started_again(
-    directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, end: str, times: int
+    directory: Path,
+    fake: Callable[[str], None],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    end: str,
+    times: int,
 ) -> None:
     """A signal to mongod or to its keeper, or an orderly end that a signal asked for."""
     ended = tmp_path / "ended"
-    with EmbeddedMongod(directory, linger_s=0) as user, MongoClient(user.start()) as client:
-        client.some.thing.insert_one({"kept": True})
-        started = pids(directory)
-    gone(*started)
+    used_once(directory)
     script = (
         f"echo >> {ended}; test $(wc -l < {ended}) -gt {times} || {{ {end}; }}; "
         f'exec {find_mongod()} "$@"'
     )
-    monkeypatch.setenv("HYBRIDLOG_MONGOD", str(fake_mongod(tmp_path / "fake", script)))
+    fake(script)
     user = EmbeddedMongod(directory, linger_s=LINGER_S)
     if times == 9:
         with pytest.raises(DatabaseError, match="did not come up"):
             user.start()
         assert len(ended.read_text().splitlines()) == 3
         monkeypatch.delenv("HYBRIDLOG_MONGOD")
-    with user, MongoClient(user.start()) as client:
-        assert client.some.thing.count_documents({"kept": True}) == 1
+    with user:
+        assert kept(user.start()) == 1
         assert user.damage is None
 
 
@@ -461,14 +483,9 @@ def test_one_that_others_end_while_it_starts_is_started_again(
     ],
 )
 def test_what_mongod_says_before_it_dies_is_told(
-    directory: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    script: str,
-    error: type[Exception],
-    words: str,
+    directory: Path, fake: Callable[[str], None], script: str, error: type[Exception], words: str
 ) -> None:
-    monkeypatch.setenv("HYBRIDLOG_MONGOD", str(fake_mongod(tmp_path / "fake", script)))
+    fake(script)
     with pytest.raises(error, match=words):
         EmbeddedMongod(directory, linger_s=LINGER_S).start()
 
@@ -485,14 +502,13 @@ def test_a_program_that_is_none(
 
 
 def test_a_mongod_that_never_answers(
-    directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: Limit
+    directory: Path, fake: Callable[[str], None], limit: Limit
 ) -> None:
-    fake = fake_mongod(tmp_path / "fake", "exec sleep 60")
-    monkeypatch.setenv("HYBRIDLOG_MONGOD", str(fake))
+    fake("exec sleep 60")
     limit(mongod_silence_s=1.0)
     with pytest.raises(DatabaseError, match="did not answer within 1 s"):
         EmbeddedMongod(directory, linger_s=LINGER_S).start()
-    wait_for(lambda: not (directory / "mongod.json").exists(), "the keeper's end")
+    wait_for(lambda: not (directory / "mongod.json").exists())
 
 
 def test_data_that_another_mongod_has_open(directory: Path, runtime: Path) -> None:
@@ -501,7 +517,7 @@ def test_data_that_another_mongod_has_open(directory: Path, runtime: Path) -> No
     command = [str(find_mongod()), "--dbpath", str(directory / "data"), "--bind_ip", str(path)]
     with subprocess.Popen([*command, "--nounixsocket"], stdout=subprocess.DEVNULL) as other:
         try:
-            wait_for(path.exists, "a plain mongod")
+            wait_for(path.exists)
             with pytest.raises(DatabaseError, match=r"Another mongod has .*data open"):
                 EmbeddedMongod(directory, linger_s=LINGER_S).start()
         finally:
@@ -523,29 +539,23 @@ def inside(directory: Path) -> list[str]:
 
 
 def test_damaged_data_files_are_replaced(directory: Path) -> None:
-    with EmbeddedMongod(directory, linger_s=LINGER_S) as user:
-        with MongoClient(user.start()) as client:
-            client.test.kept.insert_one({"_id": 1})
-        assert user.damage is None
-        processes = pids(directory)
-    gone(*processes)
+    used_once(directory)
     (directory / "data" / "WiredTiger.turtle").write_bytes(b"\0" * 100)
     with EmbeddedMongod(directory, linger_s=LINGER_S) as user:
         assert "Fatal assertion" in str(user.damage)
-        with MongoClient(user.start()) as client:
-            assert client.test.kept.count_documents({}) == 0
+        assert kept(user.start()) == 0
         assert user.damage is None, "told once"
         assert inside(directory) == ["data", "mongod.json", "mongod.log"], "nothing is left"
 
 
 def test_data_files_that_new_ones_cannot_replace_are_put_back(
-    directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    directory: Path, fake: Callable[[str], None], tmp_path: Path
 ) -> None:
     """If mongod cannot use new files either, it is not the fault of the old ones."""
     starts = tmp_path / "starts"
     script = f"""ls {directory}/data | tr '\\n' ' ' >> {starts}; echo >> {starts}
 echo '{{"s":"F","msg":"oh","attr":{{"error":"WT_PANIC"}}}}'; kill -6 $$"""
-    monkeypatch.setenv("HYBRIDLOG_MONGOD", str(fake_mongod(tmp_path / "fake", script)))
+    fake(script)
     data = marked(directory)
     user = EmbeddedMongod(directory, linger_s=LINGER_S)
     with pytest.raises(DatabaseError, match=r"oh .*WT_PANIC"):
@@ -557,31 +567,26 @@ echo '{{"s":"F","msg":"oh","attr":{{"error":"WT_PANIC"}}}}'; kill -6 $$"""
 
 
 def test_a_mongod_that_cannot_start_at_all_is_no_damage(
-    directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    directory: Path, fake: Callable[[str], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Later, when it can, what it said before is not held against the data files."""
-    with EmbeddedMongod(directory, linger_s=LINGER_S) as user:
-        with MongoClient(user.start()) as client:
-            client.test.kept.insert_one({"_id": 1})
-        processes = pids(directory)
-    gone(*processes)
+    used_once(directory)
     script = """echo '{"s":"F","msg":"oh","attr":{"error":"WT_PANIC"}}'; kill -6 $$"""
-    with monkeypatch.context() as patch:
-        patch.setenv("HYBRIDLOG_MONGOD", str(fake_mongod(tmp_path / "fake", script)))
-        with pytest.raises(DatabaseError, match="WT_PANIC"):
-            EmbeddedMongod(directory, linger_s=LINGER_S).start()
+    fake(script)
+    with pytest.raises(DatabaseError, match="WT_PANIC"):
+        EmbeddedMongod(directory, linger_s=LINGER_S).start()
+    monkeypatch.delenv("HYBRIDLOG_MONGOD")
     with EmbeddedMongod(directory, linger_s=LINGER_S) as user:
         assert user.damage is None
-        with MongoClient(user.start()) as client:
-            assert client.test.kept.count_documents({}) == 1
+        assert kept(user.start()) == 1
 
 
 def test_damaged_data_files_are_removed_at_once_if_room_is_short(
-    directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: Limit
+    directory: Path, fake: Callable[[str], None], tmp_path: Path, limit: Limit
 ) -> None:
     seen = tmp_path / "seen"
     script = f"""ls {directory} > {seen}; echo '{{"s":"F","msg":"oh"}}'; kill -6 $$"""
-    monkeypatch.setenv("HYBRIDLOG_MONGOD", str(fake_mongod(tmp_path / "fake", script)))
+    fake(script)
     limit(mongod_room_bytes=1 << 62)
     data = marked(directory)
     with pytest.raises(DatabaseError):
@@ -613,8 +618,8 @@ def test_what_an_interrupted_replacement_has_left_is_removed(directory: Path) ->
 )
 def test_other_causes_leave_the_data_files_alone(
     directory: Path,
+    fake: Callable[[str], None],
     tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
     words: str,
     end: str,
     error: type[Exception],
@@ -622,7 +627,7 @@ def test_other_causes_leave_the_data_files_alone(
 ) -> None:
     starts = tmp_path / "starts"
     script = f"""echo x >> {starts}; echo '{{"s":"F","msg":"wiredtiger: {words}"}}'; {end}"""
-    monkeypatch.setenv("HYBRIDLOG_MONGOD", str(fake_mongod(tmp_path / "fake", script)))
+    fake(script)
     data = marked(directory)
     with pytest.raises(error, match=told):
         EmbeddedMongod(directory, linger_s=LINGER_S).start()
@@ -630,63 +635,53 @@ def test_other_causes_leave_the_data_files_alone(
     assert (data / "WiredTiger.turtle").read_bytes() == b"old"
 
 
-@pytest.mark.parametrize(
-    ("said", "replaced"),
-    [
-        ('{"s":"F","msg":"Fatal assertion","attr":{"file":"wiredtiger_util.cpp"}}', True),
-        ('{"s":"I","msg":"Fatal assertion","attr":{"file":"wiredtiger_util.cpp"}}', False),
-        ('{"s":"F","msg":"Fatal assertion","attr":{"file":"query.cpp"}}', False),
-        ('{"s":"F","msg":"wiredtiger: Too many open files"}', False),
-    ],
-)
+FATAL = '{"s":"F","msg":"Fatal assertion","attr":{"file":"wiredtiger_util.cpp"}}'
+NO_DAMAGE = [
+    '{"s":"I","msg":"Fatal assertion","attr":{"file":"wiredtiger_util.cpp"}}',
+    '{"s":"F","msg":"Fatal assertion","attr":{"file":"query.cpp"}}',
+    '{"s":"F","msg":"wiredtiger: Too many open files"}',
+]
+
+
+@pytest.mark.parametrize(("said", "replaced"), [(FATAL, True), ("\n".join(NO_DAMAGE), False)])
 def test_damage_that_the_last_mongod_noticed_late(
     directory: Path, said: str, *, replaced: bool
 ) -> None:
     """A file that is opened only for a question: mongod has started well, and ends then."""
-    with EmbeddedMongod(directory, linger_s=LINGER_S) as user:
-        with MongoClient(user.start()) as client:
-            client.test.kept.insert_one({"_id": 1})
-        processes = pids(directory)
-    gone(*processes)
+    user = used_once(directory)
     with user.log.open("a") as log:
         log.write(f"{said}\nhybridlog: mongod ended by itself, killed by signal 6\n")
     with EmbeddedMongod(directory, linger_s=LINGER_S) as user:
         assert (user.damage is not None) == replaced
-        with MongoClient(user.start()) as client:
-            assert client.test.kept.count_documents({}) == (not replaced)
+        assert kept(user.start()) == (not replaced)
         processes = pids(directory)
     gone(*processes)
     with EmbeddedMongod(directory, linger_s=LINGER_S) as user:
         assert user.damage is None, "that run is over"
 
 
-@pytest.mark.parametrize("name", ["users.lock", "keeper.lock", "alive.lock", "mongod.json",
-                                  "mongod.json.new", "mongod.log", "data", ""])  # fmt: skip
-def test_a_file_for_a_folder_or_a_folder_for_a_file(directory: Path, name: str) -> None:
-    place = directory / name if name else directory
-    if name in {"data", ""}:
-        place.parent.mkdir(exist_ok=True)
-        place.write_text("x")
-    else:
-        place.mkdir(parents=True)
-        (place / "inner").write_text("x")
+@pytest.mark.parametrize("is_whole", [True, False])
+def test_a_file_for_a_folder_or_a_folder_for_a_file(directory: Path, *, is_whole: bool) -> None:
+    folders = ("users.lock", "keeper.lock", "alive.lock", "mongod.json")
+    for name in () if is_whole else (*folders, "mongod.json.new", "mongod.log"):
+        (directory / name).mkdir(parents=True)
+        (directory / name / "inner").write_text("x")
+    (directory if is_whole else directory / "data").write_text("x")
     with EmbeddedMongod(directory, linger_s=LINGER_S) as user:
         assert ping(user.start())
 
 
-def test_a_symlink_in_place_of_the_socket_directory(
+def test_a_socket_directory_that_is_a_symlink_or_open_to_others(
     directory: Path, runtime: Path, tmp_path: Path
 ) -> None:
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir(mode=0o700)
-    (runtime / f"hybridlog-{os.geteuid()}").symlink_to(elsewhere)
+    own = runtime / f"hybridlog-{os.geteuid()}"
+    own.symlink_to(elsewhere)
     with pytest.raises(DatabaseError, match="only this user can open"):
         EmbeddedMongod(directory).start()
     assert not list(elsewhere.iterdir())
-
-
-def test_a_socket_directory_that_others_can_open(directory: Path, runtime: Path) -> None:
-    own = runtime / f"hybridlog-{os.geteuid()}"
+    own.unlink()
     own.mkdir()
     own.chmod(0o755)
     with pytest.raises(DatabaseError, match="only this user can open"):
@@ -702,31 +697,6 @@ def test_a_runtime_directory_that_is_no_use(
     monkeypatch.setenv("HYBRIDLOG_RUNTIME_DIR", "/proc/nowhere")
     with pytest.raises(DatabaseError, match="cannot be made"):
         EmbeddedMongod(directory).start()
-
-
-def test_a_failed_start_leaves_no_user_behind(
-    directory: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("HYBRIDLOG_MONGOD", "/bin/false")
-    before = psutil.Process().num_fds()
-    user = EmbeddedMongod(directory, linger_s=LINGER_S)
-    for _ in range(2):
-        with pytest.raises(DatabaseError):
-            user.start()
-    assert psutil.Process().num_fds() == before
-
-
-def test_one_object_for_several_threads(directory: Path) -> None:
-    user = EmbeddedMongod(directory, linger_s=LINGER_S)
-    uris: list[str] = []
-    threads = [threading.Thread(target=lambda: uris.append(user.start())) for _ in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert len(uris) == 4
-    assert len(set(uris)) == 1
-    user.stop()
 
 
 # --- which mongod ---

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import asdict
 from io import BytesIO
 from pathlib import Path
@@ -13,19 +12,17 @@ import numpy as np
 import pytest
 from mcap.records import Metadata
 
-from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.segments import open_segment
 from hybridlog_storage.segments.attachments import Attachment
 from hybridlog_storage.segments.compression import FilePart
 from hybridlog_storage.segments.open_segment import OpenSegment
-from hybridlog_storage.segments.recovery import recover_segment
 from hybridlog_storage.segments.segment_format import (
     END_METADATA,
     LOSSES_METADATA,
     PROOF,
     json_metadata,
 )
-from hybridlog_storage.segments.segment_reader import SegmentReader, SegmentSummary, places_of
+from hybridlog_storage.segments.segment_reader import SegmentReader, SegmentSummary
 from hybridlog_storage.segments.segment_writer import RecordingWriter, SegmentSettings
 from tests.storage.test_segments import CHANNELS, LOSS, RECORDING, Row, batch_of, content_of
 
@@ -132,31 +129,6 @@ def test_it_is_followed_while_it_grows(written: Written, tmp_path: Path, step: i
     assert len(segment.losses) == 1
 
 
-def test_a_segment_that_was_taken_back_is_read_anew(written: Written, tmp_path: Path) -> None:
-    path = tmp_path / "000000.mcap.open"
-    path.write_bytes(written.data[: written.ends[4]])
-    segment = OpenSegment(tmp_path, 0)
-    segment.follow()
-    for size in (written.ends[2] + 5, written.ends[0], len(written.data)):
-        path.write_bytes(written.data[:size])
-        assert segment.follow()
-        check(segment, written, size)
-
-
-def test_another_chunk_in_the_place_of_the_last_is_read(written: Written, tmp_path: Path) -> None:
-    """The writer took the last one back, and went on."""
-    path = tmp_path / "000000.mcap.open"
-    last = written.summary.chunks[4]
-    other = bytearray(written.data[: written.ends[4]])
-    other[last.offset + 9] ^= 1  # its first time
-    path.write_bytes(other)
-    segment = OpenSegment(tmp_path, 0)
-    segment.follow()
-    path.write_bytes(written.data)
-    assert segment.follow()
-    check(segment, written, len(written.data))
-
-
 @pytest.mark.parametrize("step", [61, pytest.param(1, marks=pytest.mark.exhaustive)])
 def test_a_part_of_a_write_is_no_damage(
     written: Written, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: int
@@ -179,66 +151,6 @@ def test_a_part_of_a_write_is_no_damage(
         assert not segment.damaged, seen
         check(segment, written, len(written.data))
     assert waits
-
-
-def told_by(segment: OpenSegment) -> list[object]:
-    """All that is read of an open segment; what is damaged is left out."""
-    table = segment.flushed.table
-    found: list[object] = [{n: asdict(one) for n, one in segment.channels.items()}]
-    found += [*segment.losses, *segment.flushed.attachments, *segment.flushed.metadata]
-    for place in places_of(table):
-        with suppress(SegmentError):
-            if place.channels:
-                found.append(content_of(segment.reader.read_chunk(place))[3:5])
-                times = segment.reader.read_times(place)
-                found.append({c: t.tolist() for c, t in times.items()})
-    found += [row.tolist()[:5] for row in table.parts]  # publish times stand in messages only
-    return found
-
-
-@pytest.mark.parametrize(
-    "part", [0, *(pytest.param(n, marks=pytest.mark.exhaustive) for n in range(1, 32))]
-)
-def test_a_flipped_bit_anywhere_in_an_open_segment_is_seen(
-    written: Written, tmp_path: Path, part: int
-) -> None:
-    """What is told then is right, and not all of it is: by the walk, and after a recovery."""
-    path = tmp_path / "000000.mcap.open"
-    data = written.data[: written.ends[-1]]
-    path.write_bytes(data)
-    segment = OpenSegment(tmp_path, 0)
-    segment.follow()
-    right = told_by(segment)
-    assert not segment.damaged
-    channels = {n: asdict(one) for n, one in written.summary.channels.items()}
-    places = written.summary.chunks
-    indexes = {
-        at
-        for one in places
-        for at in range(one.offset + one.length, one.offset + one.length + one.trailer)
-    }
-    for at in range(part, len(data), 32):
-        changed = bytearray(data)
-        changed[at] ^= 1 << at // 32 % 8
-        path.write_bytes(changed)
-        segment = OpenSegment(tmp_path, 0, writing_s=0)
-        segment.follow()
-        found = told_by(segment)
-        is_reported = bool(segment.damaged) or segment.stopped is not None
-        # Where a message index is damaged, the messages of its chunk tell the same.
-        assert is_reported or len(found) < len(right) or (at in indexes and found == right), at
-        assert all(one in right for one in found[1:]), at
-        recovered = recover_segment(path, recording=RECORDING)
-        assert recovered.damage or recovered.cut_bytes, at
-        assert recovered.path is not None
-        with SegmentReader(recovered.path, 0) as reader:
-            summary = reader.summary()
-            for place in summary.chunks:
-                assert content_of(reader.read_chunk(place))[3:5] in written.contents, at
-            for number, channel in summary.channels.items():
-                assert asdict(channel) == channels[number], at
-            assert summary.losses in ([], written.summary.losses), at
-        recovered.path.unlink()
 
 
 def test_what_cannot_be_read_is_told_and_the_rest_is_there(

@@ -6,10 +6,10 @@ import json
 from collections.abc import Iterator
 
 import pytest
-from mcap.writer import Writer
 
 import hybridlog as hl
 from hybridlog.schema.text import MAX_DEPTH
+from hybridlog_storage.messages import Channel
 from tests.query.test_engines import WAYS, only
 
 KINDS = {"lists": ("[", "]"), "objects": ('{"a":', "}"), "both": ('[{"a":', "}]")}
@@ -23,19 +23,13 @@ def _text(kind: str, depth: int, value: int) -> str:
 
 @pytest.fixture(scope="module", params=KINDS)
 def store(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator:
-    place = tmp_path_factory.mktemp("deep")
-    with (place / "deep.mcap").open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        schema = writer.register_schema("Any", "jsonschema", b"{}")
-        for depth in DEPTHS:
-            channel = writer.register_channel(f"/t{depth}", "json", schema)
-            for value in range(3):
-                text = _text(request.param, depth, value)
-                writer.add_message(channel, 1000 + value, text.encode(), 0)
-        writer.finish()
-    with hl.open(place / "store", create=True) as opened:
-        opened.record(place / "deep.mcap", name="deep")
+    with hl.open(tmp_path_factory.mktemp("deep") / "store", create=True) as opened:
+        with opened.start("deep") as recording:
+            for depth in DEPTHS:
+                for value in range(3):
+                    text = _text(request.param, depth, value).encode()
+                    channel = Channel(f"/t{depth}", "json", None)
+                    recording.write(channel, text, log_time=1000 + value)
         yield opened, request.param
 
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,8 +15,6 @@ from hybridlog.columns.parquet_file import ParquetFileReader
 from hybridlog.columns.tables import Tables
 from hybridlog.maintenance import tables as making
 from hybridlog.record.marks import MARKS
-from hybridlog_storage.disk import files
-from hybridlog_storage.mongo.index_state import IndexState
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import places
 from tests.copies import bring
@@ -131,20 +127,6 @@ def test_what_is_left_of_recordings_that_are_gone(few: hl.Store, tmp_path: Path)
     assert compare(few) == 90
 
 
-def test_what_is_gone_has_no_tables_without_mongodb(few: hl.Store, tmp_path: Path) -> None:
-    root = few.directory.path
-    before = contents(few)
-    few.record(write_log(tmp_path / "more.mcap", FEW), name="more", again=True)
-    gone = few.entry("more").id
-    few.close()
-    shutil.rmtree(places.folder(root, "more"))
-    (root / PARTS / f"r{gone}").mkdir(parents=True)
-    (root / PARTS / ("r" + "b" * 32)).mkdir(parents=True)
-    with hl.open(root, mongo="none") as again:
-        assert contents(again) == before
-        assert not unfinished(again)
-
-
 def test_reindex_makes_what_is_missing_and_the_same(few: hl.Store) -> None:
     before = contents(few)
     few.index.rebuild()
@@ -152,25 +134,6 @@ def test_reindex_makes_what_is_missing_and_the_same(few: hl.Store) -> None:
     shutil.rmtree(few.directory.path / TABLES)
     few.index.rebuild()
     assert contents(few) == before
-
-
-def test_what_a_crash_has_left_gets_all_its_tables(
-    few: hl.Store, server: str, tmp_path: Path
-) -> None:
-    before = contents(few)
-    path, database = few.directory.path, few.shared.index.database_for("This")
-    # As if the recorder had been killed while it wrote.
-    (entry,) = few.recordings()
-    IndexState(database).put(entry, "open", turn=1)
-    few.catalog.put_indexed([entry.id], "")
-    shutil.rmtree(path / TABLES)
-    (path / PARTS / f"r{entry.id}").mkdir(parents=True)
-    (path / PARTS / f"r{entry.id}" / "1.parquet").write_bytes(b"PAR1 half")
-    few.shared.index.disconnect()
-    few.refresh()
-    few.connect()
-    assert contents(few) == before
-    assert not unfinished(few)
 
 
 def test_only_what_is_missing_is_made(few: hl.Store, tmp_path: Path, limit: Limit) -> None:
@@ -185,13 +148,6 @@ def test_only_what_is_missing_is_made(few: hl.Store, tmp_path: Path, limit: Limi
     assert making.make(few.directory, entry)
     assert other.stat().st_mtime_ns == kept
     assert compare(few) == 2490
-
-
-def test_topics_of_one_file_are_made_alone(few: hl.Store) -> None:
-    before = contents(few)
-    (entry,) = few.recordings()
-    assert making.make(few.directory, entry, ["/a"])
-    assert contents(few) == before
 
 
 def test_a_damaged_chunk_costs_no_table(few: hl.Store) -> None:
@@ -242,34 +198,6 @@ def test_rows_of_another_segment_are_not_kept(few: hl.Store) -> None:
     assert making.missing(few.directory, entry) == {"/b"}
 
 
-def test_rows_of_a_lost_segment_are_made_again_once(store: hl.Store, tmp_path: Path) -> None:
-    """The new ones are of the segments that are left."""
-    said = [(BASE + n, "/a" if n % 3 else "/b", varied(n)) for n in range(90)]
-    log = write_log(tmp_path / "long.mcap", said)
-    store.record(log, name="long", settings=logs.SETTINGS)
-    _, path = store.directory.segments(places.id_of(store.directory.path, "long"))[1]
-    before = contents(store)
-    content = path.read_bytes()
-    path.unlink()
-    store.refresh()
-    assert [f.place for f in store.verify().findings] == ["segment 1"]
-    entry = store.entry("long")
-    for topic in ("/a", "/b"):
-        assert store.topic(topic).where("i8 > -100").count()
-    tables = Tables(store.directory.path)
-    assert all(tables.of(entry, topic) is not None for topic in ("/a", "/b"))
-    after = contents(store)
-    assert after != before
-    store.refresh()
-    assert store.topic("/a").where("i8 > -100").count()
-    assert contents(store) == after
-    path.write_bytes(content)
-    store.refresh()
-    assert not store.verify().findings
-    assert making.make(store.directory, store.entry("long"))
-    assert contents(store) == before
-
-
 def test_a_store_that_cannot_be_written_makes_none(few: hl.Store, limit: Limit) -> None:
     (entry,) = few.recordings()
     limit(directory_is_writable=False)
@@ -284,97 +212,3 @@ def test_a_recording_that_is_held_is_left_alone(few: hl.Store) -> None:
     with few.directory.writing(few.entry("few").id):
         assert not making.make(few.directory, entry)
     assert not folders(few)
-
-
-class Killed(files.System):
-    """Ends the process at a step, as `kill -9` does."""
-
-    def __init__(self, step: int) -> None:
-        self.left = step
-
-    def _step(self, folder: int | None = None) -> None:
-        if self.left == 0:
-            os._exit(9)
-        self.left -= 1
-
-    def open(self, name: str, flags: int, mode: int = 0o666, *, folder: int | None = None) -> int:
-        if flags & os.O_CREAT:
-            self._step()
-        return super().open(name, flags, mode, folder=folder)
-
-    def writev(self, fd: int, parts: object) -> int:
-        self._step()
-        return super().writev(fd, parts)  # type: ignore[arg-type]
-
-    def rename(self, old: str, new: str, *, folder: int, new_folder: int) -> None:
-        self._step()
-        super().rename(old, new, folder=folder, new_folder=new_folder)
-
-    def unlink(self, name: str, *, folder: int) -> None:
-        self._step()
-        super().unlink(name, folder=folder)
-
-    def mkdir(self, name: str, mode: int, *, folder: int) -> None:
-        self._step()
-        super().mkdir(name, mode, folder=folder)
-
-    def rmdir(self, name: str, *, folder: int) -> None:
-        self._step()
-        super().rmdir(name, folder=folder)
-
-
-def killed_at(step: int, work: Callable[[], object]) -> bool:
-    """Do something in a process that is killed at a step; whether it came so far."""
-    child = os.fork()
-    if child == 0:
-        files.system = Killed(step)
-        try:
-            work()
-        finally:
-            os._exit(0)
-    _, status = os.waitpid(child, 0)
-    return os.waitstatus_to_exitcode(status) == 9
-
-
-@pytest.mark.parametrize("stride", [11, pytest.param(1, marks=pytest.mark.exhaustive)])
-@pytest.mark.parametrize("what", ["make", "make again", "remove"])
-def test_killed_at_each_step(
-    few: hl.Store, tmp_path: Path, limit: Limit, what: str, stride: int
-) -> None:
-    """At every step: what is there is whole, and what is missing is made by the next one."""
-    limit(long_table_rows=300)
-    said = [(BASE + n, "/large", varied(n)) for n in range(1100)]
-    settings = SegmentSettings(chunk_size=4096, segment_size=1 << 16)
-    entry = few.record(write_log(tmp_path / "l.mcap", said), name="l", settings=settings).entry
-    few.mark("l", BASE, "so that there are small ones, too")
-    few.connect()
-    (entry,) = few.select(["l"])
-    everything = topics_of(entry)
-    whole = contents(few)
-
-    def work() -> object:
-        if what == "remove":
-            return making.remove(few.directory, entry.id)
-        return making.make(few.directory, entry, everything)
-
-    step = 0
-    while True:
-        if what == "make":
-            making.remove(few.directory, entry.id)
-        was_killed = killed_at(step, work)
-        tables = Tables(few.directory.path)
-        for topic in everything:
-            table = tables.of(entry, topic)
-            assert table is None or table.rows == entry.messages_by_topic()[topic]
-        # Rows of the other recording are there at each moment.
-        assert not making.missing(few.directory, few.entry("few"))
-        assert making.make(few.directory, entry)
-        assert sorted(contents(few).values()) == sorted(whole.values())
-        if not was_killed:
-            break
-        step += stride
-    assert step > 5
-    few.refresh()
-    few.connect()
-    assert not unfinished(few)
-    assert few.verify().findings == []

@@ -102,14 +102,6 @@ def test_every_flipped_bit_is_found(path: Path, table: pa.Table) -> None:
             ParquetFileReader(path).check()
 
 
-@pytest.mark.parametrize("length", [0, 1, 8, 12, 100, 5000, -1, -8, -300])
-def test_a_file_that_was_cut(path: Path, table: pa.Table, length: int) -> None:
-    write(path, table)
-    path.write_bytes(path.read_bytes()[:length])
-    with pytest.raises(StoreError, match="damaged"):
-        ParquetFileReader(path).check()
-
-
 def test_a_file_that_is_cut_while_it_is_open(path: Path, table: pa.Table) -> None:
     write(path, table)
     reader = ParquetFileReader(path)
@@ -146,22 +138,6 @@ def test_text_that_looks_like_a_checksum_makes_no_file(path: Path, table: pa.Tab
     with pytest.raises(StoreError, match="looks like"):
         write(path, table, digest="hybridlog-footer:00000000")
     assert not path.exists()
-
-
-def test_no_float_has_statistics(path: Path, table: pa.Table) -> None:
-    """DuckDB answers wrongly from those of columns with NaN."""
-    write(path, table)
-    group = pq.read_metadata(path).row_group(0)
-    columns = [group.column(n) for n in range(group.num_columns)]
-    has = {column.path_in_schema: column.is_stats_set for column in columns}
-    assert has == {
-        "t": True,
-        "x": False,
-        "point.x": False,
-        "point.list.list.element": True,
-        "text": True,
-        "seq": True,
-    }
 
 
 def test_what_a_file_replaces_keeps_its_place(path: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -12,9 +11,8 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import hybridlog as hl
@@ -27,11 +25,9 @@ from hybridlog.maintenance import tables as making
 from hybridlog_storage.cache import Cache
 from hybridlog_storage.errors import StoreError
 from tests.calls import Calls
-from tests.limits import Limit
 from tests.some import in_turn
-from tests.tables import ask
 from tests.tables.conftest import SMALL_CHUNKS
-from tests.tables.logs import BASE, SECOND, decoded, varied, write_log
+from tests.tables.logs import decoded
 from tests.tables.test_writer import compare, topics_of
 
 
@@ -86,57 +82,6 @@ def test_only_what_is_wanted_is_read(recorded: hl.Store) -> None:
     assert table.has("points[].X")
     assert not table.has("seq")
     assert not table.has("header.stamp.sec")
-
-
-def test_all_below_a_field(recorded: hl.Store) -> None:
-    (block,) = table_of(recorded).scan(["header", "header.seq"])
-    kind = block.records.type.field("header").type
-    assert [kind.field(n).name for n in range(kind.num_fields)] == ["seq", "stamp", "frame_id"]
-
-
-def test_a_field_that_is_not_there(recorded: hl.Store) -> None:
-    (block,) = table_of(recorded).scan(["nowhere", "header.nowhere"])
-    assert block.records.type.num_fields == 0
-    assert len(block.records) == len(block) == 1200
-
-
-times = st.integers(-5, 6700).map(lambda n: BASE + n)
-
-
-@settings(
-    max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
-@given(bounds=st.lists(times, max_size=8, unique=True).map(sorted))
-@pytest.mark.parametrize("topic", ["/large", "/small/two"])
-def test_ranges_of_time(recorded: hl.Store, topic: str, bounds: list[int]) -> None:
-    spans = list(zip(bounds[::2], bounds[1::2], strict=False))
-    messages = [m for m in decoded(recorded, "log", topic) if any(a <= m.t < b for a, b in spans)]
-    found = list(table_of(recorded, topic).scan(["i8"], spans=spans))
-    assert [t for block in found for t in block.t.tolist()] == [m.t for m in messages]
-    assert all_of(iter(found), "i8") == [m.value.i8 for m in messages]
-
-
-def test_row_groups_out_of_range_are_not_read(
-    recorded: hl.Store, tmp_path: Path, calls: Calls, limit: Limit
-) -> None:
-
-    limit(table_group_rows=100, long_table_rows=1000)
-    (entry,) = recorded.recordings()
-    making.make(recorded.directory, entry, ["/large"])
-    table = table_of(recorded)
-    assert table.files[0].groups == 12
-    read = calls(ParquetFileReader, "read")
-    bounds = table.files[0].about.bounds
-    assert sum(map(len, table.scan(spans=[(bounds[5][1], bounds[5][1] + 1)]))) >= 1
-    assert {group for _, group, _ in read} <= {4, 5, None}
-    for rows, *_, last, _ in bounds:  # the last one of a row group begins the range
-        found = [block.t.tolist() for block in table.scan(spans=[(last, last + 10)])]
-        assert rows
-        assert last in found[0]
-    read.clear()
-    assert sum(map(len, table.scan(spans=[(0, 1)]))) == 0
-    assert {group for _, group, _ in read} <= {None}
-    assert sum(map(len, table.scan(spans=[]))) == 0
 
 
 def rows_of(t: list[int], seq: list[int]) -> reader.TableRows:
@@ -213,28 +158,17 @@ def lead_elsewhere(path: Path) -> None:
 DAMAGE = [garble, garble_footer, cut, empty, delete, be_a_folder, be_a_pipe, lead_elsewhere]
 
 
-def count(store: hl.Store, tables: Tables, topic: str) -> int | None:
-    (entry,) = store.recordings()
-    return ask.count(tables, entry, topic, mask=is_positive, fields=["i8"])
-
-
-def is_positive(records: Any) -> Any:
-    return pc.greater(records.field("i8"), 0).fill_null(False).to_numpy(zero_copy_only=False)
-
-
 @pytest.mark.parametrize(("harm", "topic"), in_turn(DAMAGE, ["/large", "/small/one"]))
 def test_damaged_tables_are_none_and_are_made_again(
     recorded: hl.Store, tables: Tables, harm: Callable[[Path], None], topic: str
 ) -> None:
     want = sum(m.value.i8 > 0 for m in decoded(recorded, "log", topic))
-    assert count(recorded, tables, topic) == want
     (entry,) = recorded.recordings()
     path = file_of(recorded, topic)
     whole = path.read_bytes()
     harm(path)
     tables.invalidate()
     if harm is not garble:  # of that, only who reads the part is told
-        assert count(recorded, tables, topic) is None
         assert tables.of(entry, topic) is None
     places = {f.place for f in recorded.verify().findings}
     if harm is not delete:
@@ -244,8 +178,6 @@ def test_damaged_tables_are_none_and_are_made_again(
     else:
         assert not places
         assert making.make(recorded.directory, entry)
-    tables.invalidate()
-    assert count(recorded, tables, topic) == want
     assert recorded.topic(topic).where("i8 > 0").count() == want
     assert recorded.verify().findings == []
     assert path.read_bytes() == whole
@@ -260,27 +192,10 @@ def test_damage_that_is_met_while_reading(recorded: hl.Store, tables: Tables) ->
     content = bytearray(path.read_bytes())
     content[: len(content) - 20_000] = bytes(len(content) - 20_000)
     path.write_bytes(content)
-    assert ask.count(tables, entry, "/large", mask=is_positive, fields=["i8"]) is None
-    assert tables.of(entry, "/large") is None  # from now on
-    tables.invalidate()
     with pytest.raises(StoreError, match="damaged"):
-        list(ask.rows(tables, entry, "/large", fields=None) or ())
+        list(table.scan(None))
     tables.reject(entry, "/large")
-    assert tables.of(entry, "/large") is None
-
-
-def test_all_tables_may_go_at_any_time(recorded: hl.Store, tables: Tables, mongo: str) -> None:
-    want = recorded.topic("/large").where("i8 > 0").count()
-    shutil.rmtree(recorded.directory.path / "tables")
-    assert recorded.topic("/large").where("i8 > 0").count() == want
-    recorded.refresh()
-    assert recorded.topic("/large").where("i8 > 0").count() == want
-    recorded.mend()
-    assert recorded.verify().findings == []
-    assert count(recorded, tables, "/large") == want
-    with hl.open(recorded.directory.path, mongo=mongo) as indexed:
-        indexed.index.rebuild()
-        assert compare(indexed) == 1800
+    assert tables.of(entry, "/large") is None  # from now on
 
 
 def test_tables_of_other_recordings_are_not_believed(
@@ -315,20 +230,6 @@ def test_a_segment_more_or_less_is_noticed(recorded: hl.Store, tables: Tables) -
     entry.channels[0].stats.messages += 1
     tables.invalidate()
     assert tables.of(entry, entry.channels[0].topic) is None
-
-
-def test_a_running_recording_has_no_answer_yet(store: hl.Store, tmp_path: Path) -> None:
-    from tests.tables.logs import channel
-
-    with store.start("live") as recording:
-        recording.write(channel("/a"), varied(1))
-        store.refresh()
-        (entry,) = store.recordings()
-        assert Tables(store.directory.path).of(entry, "/a") is None
-        assert not making.make(store.directory, entry)
-    store.refresh()
-    assert table_of(store, "/a").rows == 1
-    del recording
 
 
 def test_what_is_found_is_remembered(recorded: hl.Store, tables: Tables, calls: Calls) -> None:
@@ -384,96 +285,6 @@ def test_several_threads_may_ask_while_all_is_forgotten(recorded: hl.Store, tabl
             tables.invalidate()
         for one in asked:
             one.result()
-
-
-# --- answers --------------------------------------------------------------------------
-
-
-SPANS = [(BASE + 500, BASE + 900), (BASE + 3000, BASE + SECOND)]
-MASKS: list[tuple[str, list[str], Callable[[Any], Any], Callable[[Any], bool]]] = [
-    ("i8", ["i8"], lambda r: pc.greater(r.field("i8"), 0), lambda m: m.i8 > 0),
-    ("f64", ["f64"], lambda r: pc.less(r.field("f64"), 1.0), lambda m: m.f64 < 1.0),
-    ("name", ["name"], lambda r: pc.equal(r.field("name"), "ä"), lambda m: m.name == "ä"),
-    (
-        "u64",
-        ["u64"],
-        lambda r: pc.equal(r.field("u64"), pa.scalar(2**53 + 1, pa.uint64())),
-        lambda m: m.u64 == 2**53 + 1,
-    ),
-    (
-        "t",
-        ["t", "state"],
-        lambda r: pc.and_(pc.greater(r.field("t"), 90), pc.equal(r.field("state"), 1)),
-        lambda m: m.t > 90 and m.state == 1,
-    ),
-    (
-        "points",
-        ["points"],
-        lambda r: pc.equal(pc.list_value_length(r.field("points")), 2),
-        lambda m: len(m.points) == 2,
-    ),
-]
-
-
-@pytest.mark.parametrize("topic", ["/large", "/small/two"])
-@pytest.mark.parametrize("spans", [None, SPANS])
-@pytest.mark.parametrize(("_", "fields", "mask", "holds"), MASKS, ids=[m[0] for m in MASKS])
-def test_answers(
-    recorded: hl.Store,
-    tables: Tables,
-    topic: str,
-    spans: Any,
-    _: str,
-    fields: list[str],
-    mask: Callable[[Any], Any],
-    holds: Callable[[Any], bool],
-) -> None:
-    (entry,) = recorded.recordings()
-
-    def of(records: Any) -> Any:
-        return mask(records).fill_null(False).to_numpy(zero_copy_only=False)
-
-    want = [
-        m
-        for m in decoded(recorded, "log", topic)
-        if holds(m.value) and (spans is None or any(a <= m.t < b for a, b in spans))
-    ]
-    found = ask.count(tables, entry, topic, mask=of, fields=fields, spans=spans)
-    assert found == len(want)
-    assert want or topic != "/large"
-    rows = ask.rows(
-        tables, entry, topic, mask=of, fields=[*fields, "header.seq"], own=["ref"], spans=spans
-    )
-    assert rows is not None
-    blocks = list(rows)
-    assert [seq for block in blocks for seq in block.seq.tolist()] == [m.seq for m in want]
-    assert all_of(iter(blocks), "header.seq") == [m.value.header.seq for m in want]
-    assert ask.count(tables, entry, topic, spans=spans) == sum(
-        spans is None or any(a <= m.t < b for a, b in spans)
-        for m in decoded(recorded, "log", topic)
-    )
-
-
-def test_what_a_predicate_cannot_tell(recorded: hl.Store, tables: Tables) -> None:
-    (entry,) = recorded.recordings()
-    assert ask.count(tables, entry, "/large", mask=lambda _: None, fields=["i8"]) is None
-    assert ask.rows(tables, entry, "/large", mask=lambda _: None, fields=["i8"]) is None
-    assert ask.count(tables, entry, "/nowhere") is None
-    assert ask.rows(tables, entry, "/nowhere") is None
-
-
-def test_no_predicate_holds_of_an_unreadable_message(store: hl.Store, tmp_path: Path) -> None:
-    said = [(BASE + n, "/a", varied(n)[: len(varied(n)) - n % 2]) for n in range(50)]
-    write_log(tmp_path / "log.mcap", said)
-    store.record(tmp_path / "log.mcap", name="log")
-    (entry,) = store.recordings()
-    tables = Tables(store.directory.path)
-
-    def everything(records: Any) -> Any:
-        return np.ones(len(records), np.bool_)
-
-    assert ask.count(tables, entry, "/a", mask=everything, fields=["i8"]) == 25
-    assert ask.count(tables, entry, "/a") == 50
 
 
 # --- fields ---------------------------------------------------------------------------
@@ -562,31 +373,24 @@ def test_a_field_called_as_a_summary() -> None:
     assert records_of(columns).to_pylist() == array.to_pylist()
 
 
-def test_an_array_in_an_array_may_be_too_long() -> None:
-    kind = pa.list_(pa.list_(pa.int8()))
-    array = struct([{"a": [[1], [2] * 40]}, {"a": [[3], None]}, {"a": None}], a=kind)
-    columns = FieldShape().columns(array)
-    assert columns.field("a").to_pylist() == [None, [[3], None], None]
-    assert columns.field("a_summary").to_pylist() == [{"n": 2}, None, None]
+NESTED = pa.list_(pa.list_(pa.int8()))
+OTHERS = [pa.string(), pa.struct([("x", pa.int8())]), pa.list_(pa.int8()), pa.binary()]
 
 
 @pytest.mark.parametrize(
-    "kind", [pa.string(), pa.struct([("x", pa.int8())]), pa.list_(pa.int8()), pa.binary()]
+    ("kind", "values", "found"),
+    [
+        (NESTED, [[[1], [2] * 40], [[3]], None], [(None, 2), ([[3]], None), (None, None)]),
+        (pa.binary(), [b"x" * 33, None, b"x" * 32], [(None, 33), (None, None), (b"x" * 32, None)]),
+        *((pa.list_(kind), [[None] * 40], [(None, 40)]) for kind in OTHERS),
+    ],
 )
-def test_long_arrays_of_other_things_have_a_length(kind: Any) -> None:
-    values = pa.nulls(40, kind)
-    lists = pa.ListArray.from_arrays(pa.array([0, 40], pa.int32()), values)
-    array = pa.StructArray.from_arrays([lists], names=["a"])
-    assert FieldShape().columns(array).to_pylist() == [{"a": None, "a_summary": {"n": 40}}]
-
-
-def test_bytes() -> None:
-    array = struct([{"a": b"x" * 33}, {"a": None}, {"a": b""}, {"a": b"x" * 32}], a=pa.binary())
+def test_long_arrays_of_other_things_have_a_length(
+    kind: Any, values: list[Any], found: list[tuple[Any, int | None]]
+) -> None:
+    array = struct([{"a": value} for value in values], a=kind)
     assert FieldShape().columns(array).to_pylist() == [
-        {"a": None, "a_summary": {"n": 33}},
-        {"a": None, "a_summary": None},
-        {"a": b"", "a_summary": None},
-        {"a": b"x" * 32, "a_summary": None},
+        {"a": value, "a_summary": count and {"n": count}} for value, count in found
     ]
 
 

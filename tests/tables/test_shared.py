@@ -9,7 +9,6 @@ from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
-from mcap.writer import Writer
 
 import hybridlog as hl
 from hybridlog.columns import folders, parquet_file
@@ -22,7 +21,7 @@ from hybridlog_storage.errors import StoreError
 from hybridlog_storage.messages import Schema
 from tests.calls import Calls
 from tests.limits import Limit
-from tests.tables.logs import BASE, SECOND, STATE, varied, write_log
+from tests.tables.logs import BASE, SECOND, STATE, channel, varied, write_log
 from tests.tables.test_writer import compare, files_of
 
 COUNT = 8
@@ -248,17 +247,11 @@ def test_rows_of_a_topic_with_two_definitions_are_made_again(
     store: hl.Store, tmp_path: Path
 ) -> None:
     other = Schema("test/State", "ros1msg", b"int32 one\n")
-    with (tmp_path / "two.mcap").open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        for place, schema in enumerate((STATE, other)):
-            known = writer.register_schema(schema.name, schema.encoding, schema.data)
-            channel = writer.register_channel("/two", "ros1", known)
+    with store.start("two") as recording:
+        for schema in (STATE, other):
             for n in range(5):
-                data = bytes(4) if place else varied(n)
-                writer.add_message(channel, BASE + n, data, BASE + n)
-        writer.finish()  # type: ignore[no-untyped-call]
-    store.record(tmp_path / "two.mcap", name="two")
+                data = varied(n) if schema is STATE else bytes(4)
+                recording.write(channel("/two", schema), data, log_time=BASE + n)
     record(store, tmp_path, 0)
     paths = files_of(store)
     assert len(paths) == 2

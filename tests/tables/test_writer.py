@@ -22,15 +22,12 @@ from hybridlog.columns.tables import Tables
 from hybridlog.columns.topic_table import TableRows
 from hybridlog.maintenance import tables as making
 from hybridlog_storage.catalog import RecordingEntry
-from hybridlog_storage.disk import files
 from hybridlog_storage.messages import Schema
 from hybridlog_storage.segments.segment_reader import SegmentReader
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.calls import Calls
-from tests.data import DATA, needs_data
 from tests.indexed import documents_of
 from tests.limits import Limit
-from tests.some import each
 from tests.tables.conftest import SMALL_CHUNKS
 from tests.tables.logs import (
     BASE,
@@ -42,17 +39,6 @@ from tests.tables.logs import (
     varied,
     write_log,
 )
-
-REAL = [
-    "auv_ros2.mcap",
-    "compressed_image.bag",
-    "leg_tracker_stationary.bag",
-    "ouster.mcap",
-    "robot_localization_test1.bag",
-    "sick_laser_radar.bag",
-    "tilt_laser.bag",
-]
-INT32 = Schema("std_msgs/Int32", "ros1msg", b"int32 data")
 
 
 def tables_of(store: hl.Store) -> Path:
@@ -127,15 +113,6 @@ def references(block: TableRows) -> list[tuple[int, int, int, int]]:
     return [(r["seg"], r["chunk"], r["off"], r["len"]) for r in block.own["ref"].to_pylist()]
 
 
-@needs_data
-@pytest.mark.parametrize("name", REAL)
-def test_tables_of_real_logs_are_what_the_messages_say(store: hl.Store, name: str) -> None:
-    store.record(DATA / "real" / name, name="log")
-    (entry,) = store.recordings()
-    assert compare(store) == entry.messages
-    assert store.verify().findings == []
-
-
 @pytest.mark.parametrize(
     ("arena", "enough", "rows", "pending"),
     [
@@ -189,18 +166,6 @@ def test_topics_of_few_rows_share_a_file_a_type(recorded: hl.Store) -> None:
     topics = table.column("topic").to_pylist()
     assert topics == ["/large"] * 1200 + ["/small/one"] * 300 + ["/small/two"] * 300
     assert not (recorded.directory.path / PARTS / f"r{recorded.recordings()[0].id}").exists()
-
-
-def test_names_of_ours_and_twins_get_other_names(recorded: hl.Store) -> None:
-    (path,) = files_of(recorded)
-    schema = pq.read_schema(path)
-    assert {"t", "t_", "state", "state_", "name", "Name_2"} <= set(schema.names)
-    assert schema.field("t_").metadata[b"hybridlog.name"] == b"t"
-    assert schema.field("Name_2").metadata[b"hybridlog.name"] == b"Name"
-    inner = schema.field("points").type.value_type
-    assert [inner.field(n).name for n in range(4)] == ["x", "X_2", "data", "data_summary"]
-    assert schema.field("nothing").type == pa.bool_()
-    assert schema.field("u64").type == pa.uint64()
 
 
 def test_a_segment_has_its_tables_once_it_is_sealed(store: hl.Store, limit: Limit) -> None:
@@ -259,23 +224,6 @@ def test_a_topic_with_files_shares_one_for_its_last_rows(
     assert len(table.files) == 2
 
 
-def test_an_array_that_becomes_long(store: hl.Store, tmp_path: Path) -> None:
-    """Whole in the rows where it is short, a summary in the others."""
-    settings = SegmentSettings(chunk_size=4096, segment_size=1 << 17)
-    said = [
-        (BASE + n, "/a", payload(n, many=[1.0, float(n)] * (1 if n < 2500 else 20)))
-        for n in range(5000)
-    ]
-    write_log(tmp_path / "log.mcap", said)
-    store.record(tmp_path / "log.mcap", name="log", settings=settings)
-    assert compare(store) == 5000
-    found = pq.read_table(files_of(store), columns=["t", "many", "many_summary"]).sort_by("t")
-    assert found.column("many").to_pylist()[2499:2501] == [[1.0, 2499.0], None]
-    short, long = found.column("many_summary").to_pylist()[2499:2501]
-    assert short is None
-    assert long == {"n": 40, "min": 1.0, "max": 2500.0, "mean": 1250.5}
-
-
 @pytest.mark.parametrize("count", [40, 1200])
 def test_unreadable_messages_say_why(store: hl.Store, tmp_path: Path, count: int) -> None:
     said = [(BASE + n, "/a", varied(n)[:-1] if n % 3 == 1 else varied(n)) for n in range(count)]
@@ -303,20 +251,6 @@ def test_messages_that_nobody_can_read(store: hl.Store, tmp_path: Path) -> None:
     assert block.own["ref"].field("len").to_pylist() == list(range(20))
     assert set(block.own["state"].to_pylist()) == {"whole"}
     assert block.records.type.num_fields == 0
-
-
-def test_a_topic_of_two_types_has_two_files_and_no_answer(
-    store: hl.Store,
-) -> None:
-    with store.start("live") as recording:
-        recording.write(channel("/a"), varied(1), log_time=BASE)
-        recording.write(channel("/a", INT32), b"\1\0\0\0", log_time=BASE + 1)
-    assert {path.parent.name.split("~")[0] for path in files_of(store)} == {
-        "test_State",
-        "std_msgs_Int32",
-    }
-    (entry,) = store.recordings()
-    assert Tables(store.directory.path).of(entry, "/a") is None
 
 
 def chunks_of(store: hl.Store, entry: RecordingEntry) -> list[Any]:
@@ -421,45 +355,6 @@ def test_whatever_fails_the_recording_goes_on(
     assert store.verify().findings == []
 
 
-class FullDisk(files.System):
-    """Has room for so many bytes of tables."""
-
-    def __init__(self, room: int) -> None:
-        self.room = room
-
-    def writev(self, fd: int, parts: Any) -> int:
-        if Path(f"/proc/self/fd/{fd}").readlink().suffix == ".parquet":
-            self.room -= sum(map(len, parts))
-            if self.room < 0:
-                raise OSError(errno.ENOSPC, "No space left on device")
-        return super().writev(fd, parts)
-
-
-@pytest.mark.parametrize("room", [0, *each(4_000, 36_000), 24_000])
-def test_a_disk_that_fills_up(
-    store: hl.Store,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    calls: Calls,
-    limit: Limit,
-    room: int,
-) -> None:
-    calls.system(FullDisk(room))
-    limit(table_pending_bytes=80_000, table_left_bytes=20_000)
-    said = [(BASE + n, f"/{n % 4}", varied(n)) for n in range(2400)]
-    write_log(tmp_path / "log.mcap", said)
-    settings = SegmentSettings(chunk_size=4096, segment_size=1 << 17)
-    entry = store.record(tmp_path / "log.mcap", name="log", settings=settings).entry
-    assert entry.status == "complete"
-    assert entry.messages == 2400
-    assert not list((store.directory.path / PARTS).glob("*/*"))
-    tables = Tables(store.directory.path)
-    assert all(tables.of(entry, topic) is None for topic in topics_of(entry))
-    monkeypatch.undo()
-    store.index.rebuild()
-    assert compare(store) == 2400
-
-
 def test_too_many_topics_for_the_files_of_a_process(
     store: hl.Store, tmp_path: Path, limit: Limit
 ) -> None:
@@ -470,29 +365,3 @@ def test_too_many_topics_for_the_files_of_a_process(
     assert entry.status == "complete"
     tables = Tables(store.directory.path)
     assert 0 < sum(tables.of(entry, topic) is not None for topic in topics_of(entry)) < 10
-
-
-def test_what_is_written_goes_through_the_seam(store: hl.Store, tmp_path: Path) -> None:
-    """So that tests of faults see every step."""
-    seen = []
-    system = files.system
-
-    class Seen(files.System):
-        def rename(self, old: str, new: str, *, folder: int, new_folder: int) -> None:
-            seen.append(new)
-            super().rename(old, new, folder=folder, new_folder=new_folder)
-
-    files.system = Seen()
-    try:
-        write_log(tmp_path / "log.mcap", [(BASE, "/state", varied(1))])
-        store.record(tmp_path / "log.mcap", name="log")
-    finally:
-        files.system = system
-    assert sum(name.endswith(".parquet") for name in seen) == 1
-
-
-def test_messages_of_one_time_are_by_arrival(store: hl.Store, tmp_path: Path) -> None:
-    said = [(BASE + n % 2, "/a", payload(n)) for n in range(2400)]
-    write_log(tmp_path / "log.mcap", said)
-    store.record(tmp_path / "log.mcap", name="log", settings=SMALL_CHUNKS)
-    assert compare(store) == 2400

@@ -554,26 +554,6 @@ class SegmentReader:
         channels = distinct(batch.channel).tolist()
         return {c: np.sort(batch.log_time[batch.channel == c]) for c in channels}
 
-    def read_arrivals(self, place: ChunkPlace, count: int) -> NDArray[np.int64]:
-        """Arrival numbers of a chunk's messages, without reading the chunk.
-
-        Returns:
-                int64[count].
-
-        Raises:
-                SegmentError: They are missing or damaged; the message names file and offset.
-        """
-        return self._at_its_place(place, lambda at: self._read_arrivals(at, count))
-
-    def _read_arrivals(self, place: ChunkPlace, count: int) -> NDArray[np.int64]:
-        trailer = self.read(place.offset + place.length, place.trailer)
-        try:
-            if crc32(trailer) != place.trailer_crc:
-                raise SegmentError("its message indexes or arrival numbers changed")
-            return check_arrivals(trailer, place.offset, count)
-        except SegmentError as error:
-            raise self._damaged(place, error) from error
-
     def checksum(self, offset: int, length: int, digest: blake3 | None = None) -> int:
         """CRC-32 of a range of bytes of the file.
 

@@ -327,42 +327,8 @@ def test_of_even_json(ask: Ask, messages: list[Message], questions: list[str]) -
     ask(messages, documents, questions, None)
 
 
-@pytest.mark.parametrize(
-    ("where", "expected"),
-    [
-        ("a < 100", "short long far nested"),  # any element, also of the arrays in an array
-        ("a == 500", "far"),
-        ("a != 500", "short long none parts nested named"),
-        ("a[39] == 500", "far"),
-        ("a.n >= 3", "short long far parts named"),
-        ("a.n == 40", "long far"),
-        ("a.n < 3", "none nested"),
-        ("a.n != 40", "short none parts nested named"),
-        ("a.n == 9", "named"),  # a field of that name, no count
-        ("a.min < 100", "short long far"),
-        ("a.max > 100", "far"),
-        ("a.mean == 2", "short long"),
-        ("a.min == null", "none"),
-        ("a.min missing", "parts nested named"),
-        ("a[0] == 2", "short long nested"),
-        ("a[0].n == 2", "nested"),
-        ("a[1][0] == 5", "nested"),
-        ("a.v == 7", "parts"),
-        ("a[1:3] < 3", "short long"),  # the elements 1 and 2
-        ("a[:39] == 500", ""),
-        ("a[39:] == 500", "far"),
-        ("a[2:1000].n == 1", "short parts"),
-        ("a[5:].n == 0", "short none parts nested named"),
-        ("a[5:] != 500", "short long none parts nested named"),
-        ("a[1:].max > 100", "far"),
-        ("a[1:3].mean == 2", "short long"),
-        ("a[1:].min == null", "none"),
-        ("a[1:].v == 7", ""),
-        ("a[0][1:] == 2", "nested"),
-    ],
-)
-def test_what_json_arrays_answer(ask: Ask, where: str, expected: str) -> None:
-    messages: dict[str, Message] = {
+JSON_ARRAYS: dict[str, dict[str, Message]] = {
+    "flat": {
         "short": {"a": [2, 1, 3]},
         "long": {"a": [2] * 40},
         "far": {"a": [*[50] * 39, 500]},
@@ -370,46 +336,73 @@ def test_what_json_arrays_answer(ask: Ask, where: str, expected: str) -> None:
         "parts": {"a": [{"v": 7}, {"v": 8}, {"v": 9}]},
         "nested": {"a": [[1, 2], [5]]},
         "named": {"a": [{"n": 9}, {"n": 8}]},
-    }
-    codec = codec_for(Channel("/j", "json", None))
-    documents = [index_fields(codec, json.dumps(message).encode()) for message in messages.values()]
-    ask(list(messages.values()), documents, [where], None)
-    test = to_bool(parse(where))
-    assert [name for name, message in messages.items() if test(message)] == expected.split()
-
-
-@pytest.mark.parametrize(
-    ("where", "expected"),
-    [
-        ("a == 5", "flat two three mixed"),
-        ("a[:1] == 5", "flat two three"),
-        ("a[1:] == 5", "mixed"),
-        ("a[0] == 5", "flat two three"),
-        ("a[0][0] == 5", "two three"),
-        ("a[0][0][0] == 5", "three"),
-        ("not (a == 5)", "long empty"),
-        ("a != 5", "long empty"),
-        ("a in [4, 5]", "flat two three mixed"),
-        ("a < 7", "flat two three mixed long"),
-        ("a == 45", "long"),
-        ("a == 46", ""),
-        ("a ~ '^x$'", "mixed"),
-        ("a == null", "mixed"),
-        ("a.w == 3", "three mixed"),
-        ("a.w exists", "three mixed"),
-        ("a.w missing", "flat two long empty"),
-        ("a.n == 2", "three mixed empty"),
-    ],
-)
-def test_arrays_of_arrays_are_looked_into(ask: Ask, where: str, expected: str) -> None:
-    messages: dict[str, Message] = {
+    },
+    "nested": {
         "flat": {"a": [5]},
         "two": {"a": [[5, 6]]},
         "three": {"a": [[[5], [6]], [[{"w": 3}]]]},
         "mixed": {"a": [[8, "x", None], [[5, {"w": 3}], 9]]},
         "long": {"a": [list(range(6, 46))]},
         "empty": {"a": [[], [[]]]},
-    }
+    },
+}
+
+
+@pytest.mark.parametrize(
+    ("kind", "where", "expected"),
+    [
+        ("flat", "a < 100", "short long far nested"),  # any element, also of the arrays in an array
+        ("flat", "a == 500", "far"),
+        ("flat", "a != 500", "short long none parts nested named"),
+        ("flat", "a[39] == 500", "far"),
+        ("flat", "a.n >= 3", "short long far parts named"),
+        ("flat", "a.n == 40", "long far"),
+        ("flat", "a.n < 3", "none nested"),
+        ("flat", "a.n != 40", "short none parts nested named"),
+        ("flat", "a.n == 9", "named"),  # a field of that name, no count
+        ("flat", "a.min < 100", "short long far"),
+        ("flat", "a.max > 100", "far"),
+        ("flat", "a.mean == 2", "short long"),
+        ("flat", "a.min == null", "none"),
+        ("flat", "a.min missing", "parts nested named"),
+        ("flat", "a[0] == 2", "short long nested"),
+        ("flat", "a[0].n == 2", "nested"),
+        ("flat", "a[1][0] == 5", "nested"),
+        ("flat", "a.v == 7", "parts"),
+        ("flat", "a[1:3] < 3", "short long"),  # the elements 1 and 2
+        ("flat", "a[:39] == 500", ""),
+        ("flat", "a[39:] == 500", "far"),
+        ("flat", "a[2:1000].n == 1", "short parts"),
+        ("flat", "a[5:].n == 0", "short none parts nested named"),
+        ("flat", "a[5:] != 500", "short long none parts nested named"),
+        ("flat", "a[1:].max > 100", "far"),
+        ("flat", "a[1:3].mean == 2", "short long"),
+        ("flat", "a[1:].min == null", "none"),
+        ("flat", "a[1:].v == 7", ""),
+        ("flat", "a[0][1:] == 2", "nested"),
+        ("nested", "a == 5", "flat two three mixed"),
+        ("nested", "a[:1] == 5", "flat two three"),
+        ("nested", "a[1:] == 5", "mixed"),
+        ("nested", "a[0] == 5", "flat two three"),
+        ("nested", "a[0][0] == 5", "two three"),
+        ("nested", "a[0][0][0] == 5", "three"),
+        ("nested", "not (a == 5)", "long empty"),
+        ("nested", "a != 5", "long empty"),
+        ("nested", "a in [4, 5]", "flat two three mixed"),
+        ("nested", "a < 7", "flat two three mixed long"),
+        ("nested", "a == 45", "long"),
+        ("nested", "a == 46", ""),
+        ("nested", "a ~ '^x$'", "mixed"),
+        ("nested", "a == null", "mixed"),
+        ("nested", "a.w == 3", "three mixed"),
+        ("nested", "a.w exists", "three mixed"),
+        ("nested", "a.w missing", "flat two long empty"),
+        ("nested", "a.n == 2", "three mixed empty"),
+    ],
+)
+def test_what_json_arrays_answer(ask: Ask, kind: str, where: str, expected: str) -> None:
+    """Arrays in an array are looked into."""
+    messages = JSON_ARRAYS[kind]
     codec = codec_for(Channel("/j", "json", None))
     documents = [index_fields(codec, json.dumps(message).encode()) for message in messages.values()]
     ask(list(messages.values()), documents, [where], None)

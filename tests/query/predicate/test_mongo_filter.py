@@ -1,53 +1,15 @@
 from __future__ import annotations
 
-import math
-import pickle
 import re
 
 import numpy as np
 import pytest
-from bson import Code, Int64, ObjectId, Regex
-from pymongo.collection import Collection
+from bson import Code, Regex
 
 from hybridlog.query.predicate.mongo_filter import MAX_DEPTH, mongo_filter
 from hybridlog_storage.errors import WhereError
 
 Document = dict[str, object]
-
-
-@pytest.mark.parametrize(
-    "query",
-    [
-        {},
-        {"position": 0.0},
-        {"a.b": {"$gt": 1, "$lt": 2}, "c": None},
-        {"$and": [{"a": 1}, {"$or": [{"b": 2}, {"c": {"$exists": False}}]}]},
-        {"a": {"$in": [1, "x", None]}, "b": {"$nin": [1]}},
-        {"a": {"$not": {"$gt": 5}}},
-        {"a": {"$elemMatch": {"b": 1, "c": {"$gt": 2}}}},
-        {"a": {"$elemMatch": {"$gt": 1, "$lt": 2}}},
-        {"a": {"$all": [1, 2]}},
-        {"a": {"$all": [{"$elemMatch": {"b": 1}}]}},
-        {"a": {"$size": 3}, "b": {"$type": ["int", "double"]}, "c": {"$mod": [4, 0]}},
-        {"a": {"$regex": "^x", "$options": "i"}},
-        {"a": {"b": 1, "c": [1, {"d": 2}]}},
-        {"_id": b"12345678901234567890"},
-        {"_id": ObjectId("0123456789abcdef01234567"), "n": Int64(5)},
-        {"$expr": {"$gt": [{"$size": {"$ifNull": ["$a", []]}}, 3]}},
-        {"$expr": {"$eq": ["$a", {"$literal": "$b"}]}},
-        {"$expr": {"$gt": [{"$size": {"$filter": {"input": [1, 2], "cond": True}}}, 1]}},
-        {"a": math.inf},
-        {"a": {"$elemMatch": {"b": {"$not": {"$regex": "a"}}}}, "b": {"$lte": math.nan}},
-    ],
-)
-def test_allowed(query: Document, collection: Collection[Document]) -> None:
-    predicate = mongo_filter(query, None)
-    assert pickle.loads(pickle.dumps(predicate)) == predicate
-    assert hash(predicate) == hash(mongo_filter(query, None))
-    assert bool(predicate) == bool(query)
-    for node in predicate.filters:
-        assert node.to_filter() == query
-        list(collection.find(node.to_filter()))
 
 
 @pytest.mark.parametrize(
@@ -115,7 +77,7 @@ def test_refused(query: Document, place: str) -> None:
         mongo_filter(query, None)
 
 
-def test_deep_filters(collection: Collection[Document]) -> None:
+def test_deep_filters() -> None:
     deep: object = 1
     for _ in range(5_000):
         deep = {"a": deep}
@@ -125,8 +87,7 @@ def test_deep_filters(collection: Collection[Document]) -> None:
         deepest: Document = {"a": 1}
         for _ in range(MAX_DEPTH // 2):
             deepest = {operator: [deepest, {"b": 2}]}
-        (node,) = mongo_filter(deepest, None).filters
-        assert list(collection.find(node.to_filter())) == []
+        assert mongo_filter(deepest, None).filters  # MongoDB takes it: see `test_mongo_filters.py`
     clause: Document = {"a": 1}
     for _ in range(5_000):
         clause = {"$or": [clause]}

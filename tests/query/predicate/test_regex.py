@@ -6,7 +6,7 @@ import pyarrow as pa
 import pytest
 
 from hybridlog.query.predicate.parser import parse
-from hybridlog.query.predicate.regex import RegexError, compile_regex
+from hybridlog.query.predicate.regex import compile_regex
 from hybridlog.query.predicate.to_bool import to_bool
 from hybridlog.query.predicate.to_mask import to_mask
 
@@ -38,24 +38,6 @@ def test_long_lines_are_matched_to_their_end(pattern: str, found: list[bool]) ->
         mask = to_mask(predicate, None, pa.table({"s": lines}))
         assert mask is not None
         assert mask.tolist() == expected
-
-
-@pytest.mark.parametrize(
-    ("pattern", "place", "reason"),
-    [
-        ("ab(?=c)", 2, "looking around"),
-        (r"(a)\1", 3, "back references"),
-        (r"é\C", 1, "byte"),
-        ("é[b-a]", 2, "character class range"),
-        ("(", 0, "missing"),
-        ("a" * 1001, 1000, "longer than 1000"),
-        ("\ud800", 0, "Unicode"),
-    ],
-)
-def test_refused(pattern: str, place: int, reason: str) -> None:
-    with pytest.raises(RegexError, match=reason) as caught:
-        compile_regex(pattern)
-    assert caught.value.position == place
 
 
 def test_strings_that_are_no_unicode() -> None:
