@@ -657,7 +657,7 @@ def _problems(path: Path, report: RecordReport, *, quiet: bool) -> list[Hybridlo
             "the time range did not fit in memory."
         )
     if not quiet:
-        for line in output.surpluses(report.entry.channels):
+        for line in (*output.surpluses(report.entry.channels), *report.remarks):
             output.note(line)
     for damage in report.damage:
         place = "" if damage.offset is None else f" at byte {damage.offset}"

@@ -215,6 +215,7 @@ class JoinedSource(Source):
         for channel in inner.channels[len(numbers) :]:
             self._number(channel, alike)
         self.damage.extend(replace(damage, file=part.path) for damage in inner.damage)
+        self.remarks.extend(f"{part.path}: {remark}" for remark in inner.remarks)
         self._got += got
         if part.message_count is not None:
             self._check_count(Total(part.path, part.message_count), got, found_before)

@@ -89,6 +89,7 @@ class RecordReport:
         latched: Latched messages from before the time range.
         latched_left_out: Those that were in force and did not fit in memory.
         attachments_left_out: Attachments from behind the time range.
+        remarks: What is odd about the source, where nothing is damaged or lost.
     """
 
     entry: RecordingEntry
@@ -101,6 +102,7 @@ class RecordReport:
     latched: int = 0
     latched_left_out: int = 0
     attachments_left_out: int = 0
+    remarks: list[str] = field(default_factory=list)
 
 
 @at_safe_points()
@@ -173,6 +175,7 @@ def record(
         latched=copy.front.messages if copy.front is not None else 0,
         latched_left_out=copy.front.left_out if copy.front is not None else 0,
         attachments_left_out=copy.attachments_left_out,
+        remarks=list(source.remarks),
     )
 
 

@@ -12,7 +12,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import lz4.frame
-import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
@@ -20,9 +19,8 @@ from rosbags.rosbag1 import Writer
 
 from hybridlog.formats import reading
 from hybridlog.formats.reading import BATCH_MESSAGES, Damage, Source
-from hybridlog.formats.rosbag1 import records
 from hybridlog.formats.rosbag1.reader import Rosbag1Source
-from hybridlog.formats.rosbag1.records import RunReader, Stop
+from hybridlog.formats.rosbag1.records import read_run
 from hybridlog_storage.errors import SourceError
 from hybridlog_storage.messages import Channel, Schema
 from tests.data import DATA, needs_data
@@ -370,6 +368,58 @@ def test_a_gap_between_chunks_does_not_count_the_messages_behind_it(tmp_path: Pa
     assert [each.messages_lost for each in damage] == [0]
 
 
+def with_zeros(data: bytes) -> bytes:
+    """A bag with zeros behind each of its index records, which states them in its chunk list."""
+    parts, moved, at = [data[:13]], {}, 13
+    while at < len(data):
+        (size,) = struct.unpack_from("<I", data, at)
+        (length,) = struct.unpack_from("<I", data, at + 4 + size)
+        end = at + 8 + size + length
+        moved[at] = sum(map(len, parts))
+        record = bytearray(data[at:end])
+        if (place := record.find(b"chunk_pos=", 0, size)) > 0:
+            struct.pack_into(
+                "<Q", record, place + 10, moved[struct.unpack_from("<Q", record, place + 10)[0]]
+            )
+        parts.append(bytes(record))
+        if b"op=\x04" in record[: 4 + size] or b"op=\x06" in record[: 4 + size]:
+            parts.append(bytes(20))
+        at = end
+    whole = bytearray(b"".join(parts))
+    place = whole.index(b"index_pos=") + 10
+    struct.pack_into("<Q", whole, place, moved[struct.unpack_from("<Q", whole, place)[0]])
+    return bytes(whole)
+
+
+@pytest.mark.parametrize("compression", ["none", "lz4"])
+def test_zeros_behind_index_records_are_a_remark(tmp_path: Path, compression: str) -> None:
+    path = tmp_path / "a.bag"
+    expected = make(path, compression, chunk=2000, messages=400)
+    path.write_bytes(with_zeros(path.read_bytes()))
+    with Rosbag1Source(path) as source:
+        assert source.message_count == 400
+        assert contents(source) == expected
+        assert source.damage == []
+        (remark,) = source.remarks
+    assert "are zeros" in remark
+
+
+@pytest.mark.parametrize("size", [0, 12, 40])
+def test_zeros_in_place_of_a_chunk_are_damage(tmp_path: Path, size: int) -> None:
+    """From the head of the second chunk, or from somewhat before it, to its end."""
+    path = tmp_path / "a.bag"
+    expected = make(path, "lz4", chunk=2000, messages=400)
+    data = bytearray(path.read_bytes())
+    first = data.index(b"compression=lz4")
+    start = data.index(b"compression=lz4", first + 1) - 8
+    end = data.index(b"op=\x04", start) - 8
+    data[start - size : end] = bytes(end - start + size)
+    path.write_bytes(data)
+    found, damage = read(path)
+    lost = total(expected) - total(found)
+    assert sum(each.messages_lost or 0 for each in damage) == lost > 0
+
+
 def test_connections_without_messages_are_channels(tmp_path: Path) -> None:
     path = tmp_path / "a.bag"
     make(path, "none", chunk=2000, messages=2)  # of three topics
@@ -477,71 +527,14 @@ def test_zeros_are_no_records() -> None:
     data = sound + bytes(16 << 20)
     tracemalloc.start()
     try:
-        run = RunReader().read(data)
+        run = read_run(data)
         assert tracemalloc.get_traced_memory()[1] < 1 << 20
     finally:
         tracemalloc.stop()
-    assert (run.end, run.why) == (len(sound), Stop.BAD)
+    assert run.end == len(sound)
     messages, damage = read_bytes(bag(chunk(sound + bytes(1 << 20), "bz2")))
     assert values(messages) == [b"a"]
     assert damage
-
-
-@st.composite
-def runs(draw: st.DrawFn) -> bytes:
-    """Records of several writers in a row, with payloads that look like records, and damage."""
-    decoy = message(1, 7, b"inner")
-    payloads = st.sampled_from([b"", b"abc", decoy, decoy[:-1], decoy * 2, bytes(100)])
-    records = [
-        message(draw(st.integers(0, 3)), at, draw(payloads))
-        if draw(st.integers(0, 9))
-        else connection(draw(st.integers(0, 3)))
-        for at in range(draw(st.integers(1, 40)))
-    ]
-    data = bytearray(b"".join(records))
-    for _ in range(draw(st.integers(0, 2))):
-        data[draw(st.integers(0, len(data) - 1))] ^= 1 << draw(st.integers(0, 7))
-    return bytes(data[: draw(st.integers(len(data) * 2 // 3, len(data)))])
-
-
-@settings(max_examples=200, deadline=None)
-@given(data=runs(), more=st.sets(st.integers(0, 3000)), every=st.integers(1, 3))
-def test_places_where_records_may_start_change_nothing(
-    data: bytes, more: set[int], every: int
-) -> None:
-    head, body, end, need = records._walk(data)
-    u32 = struct.Struct("<I").unpack_from
-    places = [
-        place
-        for place in sorted({*head.tolist()[::every], *more})
-        if place + 8 <= len(data)
-        and records._LEAST_HEADER <= u32(data, place)[0] <= len(data) - place - 8
-    ]
-    found = records._follow(data, np.frombuffer(data, np.uint8), np.array(places, np.int64))
-    assert found[0].tolist() == head.tolist()
-    assert found[1].tolist() == body.tolist()
-    assert found[2:] == (end, need)
-
-
-@settings(max_examples=100, deadline=None)
-@given(data=runs())
-def test_a_reader_that_has_seen_many_messages_finds_what_a_new_one_finds(data: bytes) -> None:
-    many = connection(0) + b"".join(message(0, at, b"x" * (at % 7)) for at in range(300))
-    seasoned = RunReader()
-    seasoned.read(many)
-    again = seasoned.read(many)
-    assert again.log_time.tolist() == list(range(300))
-    assert again.length.tolist() == [at % 7 for at in range(300)]
-    fresh, found = RunReader().read(data), seasoned.read(data)
-    for name in ("offset", "length", "connection", "log_time"):
-        assert getattr(found, name).tolist() == getattr(fresh, name).tolist(), name
-    assert found.connections == fresh.connections
-    assert (found.why, found.end, found.need, found.last) == (
-        fresh.why,
-        fresh.end,
-        fresh.need,
-        fresh.last,
-    )
 
 
 def test_batches_are_bounded(tmp_path: Path) -> None:
