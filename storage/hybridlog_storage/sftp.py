@@ -47,7 +47,7 @@ from hybridlog_storage.errors import (
     UsageError,
 )
 from hybridlog_storage.manifest import MAX_BYTES, Manifest, encode, hasher, is_id
-from hybridlog_storage.manifests import WAIT_S, Manifests
+from hybridlog_storage.manifests import MANIFEST_LOCK, WAIT_S, Manifests
 from hybridlog_storage.settings import MAX_SETTINGS, StoreSettings, settings_of, settings_text
 from hybridlog_storage.settings import NAME as SETTINGS
 from hybridlog_storage.stopping import pause, safe_point
@@ -212,12 +212,16 @@ class Server(Place):
     def put_beside(self, content: bytes, folder: str) -> str:
         """Write a small file under a hidden name of its own."""
         name = f"{folder}/{MARK}{secrets.token_hex(8)}"
+        self.put(content, name)
+        return name
+
+    def put(self, content: bytes, name: str) -> None:
+        """Write a small file."""
         with tempfile.TemporaryFile() as file:
             os.fchmod(file.fileno(), 0o666)  # which it has there, less the umask
             file.write(content)
             file.flush()
             self.sftp(f"put -f {_handle(file.fileno())} {name}", passed=file.fileno())
-        return name
 
     def move(self, old: str, new: str) -> None:
         """Rename a file; it takes the place of another one."""
@@ -392,13 +396,16 @@ class _ServerManifests(Manifests):
                 folder = f"{RECORDINGS}/{manifest.id}"
                 self._replaced(
                     f"{MANIFESTS}/.lock",
-                    f"test -e {final} && exit {_CHANGED}; : >> {folder}/manifest.lock && "
-                    f"{{ sync {folder} {RECORDINGS} || sync; }} && mv {new} {final}",
+                    f"test -e {final} && exit {_CHANGED}; : >> {folder}/{MANIFEST_LOCK} && "
+                    f"{{ sync {folder} {RECORDINGS} || sync; }} && mv {new} {final} && "
+                    f"touch {RECORDINGS}",  # from which readers see that a recording has come
                     exists,
                 )
                 return
+            server.put(b"", f"{RECORDINGS}/{manifest.id}/{MANIFEST_LOCK}")
             try:
-                server.sftp(f"rename -l {new} {final}")  # not if there is one
+                mark = f"{RECORDINGS}/{MARK}{secrets.token_hex(8)}"  # as `touch` does
+                server.sftp(f"rename -l {new} {final}", f"-mkdir {mark}", f"-rmdir {mark}")
             except StoreError:
                 if not server.listed(final):
                     raise
@@ -480,6 +487,7 @@ class _ServerManifests(Manifests):
             server.sftp(f"-rmdir {lock}")
 
     def old(self, recording: str) -> Manifest | None:
+        """As of `Manifests`; nobody asks for it there."""
         return None
 
     def _drop(self, recording: str) -> None:
