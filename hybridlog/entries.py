@@ -420,7 +420,8 @@ def said_now(directory: StoreDirectory, entry: RecordingEntry, listing: Listing)
     """
     manifest = directory.manifests.read(entry.id)
     now = replace(entry, name=manifest.name, tags=dict(manifest.tags), **_said(manifest))
-    return Described(now, summary_of(now, listing.look), topic_types(now), listing.print, {})
+    shown = with_marks(now)
+    return Described(now, summary_of(shown, listing.look), topic_types(shown), listing.print, {})
 
 
 def read_again(directory: StoreDirectory, catalog: Catalog, entry: RecordingEntry) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import bisect
 import struct
+from contextlib import suppress
 from dataclasses import dataclass
 from io import BytesIO
 from typing import TYPE_CHECKING, BinaryIO, NamedTuple, TypeAlias
@@ -448,6 +449,11 @@ def _is_other_record(content: memoryview) -> bool:
     In files with chunks, messages outside of them are rare. But one wrong byte can turn
     any record between two chunks into a message, and no checksum covers those.
     """
+    with suppress(SegmentError):
+        if parse_attachment(content, FilePart(BytesIO(content), 0, len(content)))[1] == len(
+            content
+        ):
+            return True
     for opcode in (Opcode.MESSAGE_INDEX, Opcode.METADATA):
         try:
             record, used = read_record(opcode, content)

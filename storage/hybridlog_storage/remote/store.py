@@ -147,7 +147,7 @@ class SeenManifests(BucketManifests):
 
     Attributes:
         objects: Their objects by id.
-        number: Counts the looks that found something new.
+        number: Counts what others have changed at a look, and what came or went here.
     """
 
     def __init__(self, bucket: Bucket, cells: CatalogCells) -> None:
@@ -251,12 +251,16 @@ class SeenManifests(BucketManifests):
         self._doubt(recording)
         super()._forget(recording, is_said=is_said)
         with self._lock:
-            self.objects.pop(recording, None)
-            self._cells.write(lambda: [drop(_MANIFEST, recording)], 0)
             self._cells.has_changes = True
+            known = self._known.pop(recording, None)
+            if known is None or known[0].status == "removed":  # it was not created anew
+                self.objects.pop(recording, None)
+                self.number += 1
+                self._cells.write(lambda: [drop(_MANIFEST, recording)], 0)
 
     def _noted(self, recording: str, data: bytes, version: str) -> None:
         with self._lock:
+            self.number += recording not in self.objects
             self.objects[recording] = Object(self.name_of(recording), len(data), version)
             self._known.pop(recording, None)
             cell = put(_MANIFEST, recording, version.encode() + b"\n" + data)

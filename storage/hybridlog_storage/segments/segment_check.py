@@ -91,7 +91,7 @@ class SegmentCheck:
         elif not problems and self._digest:
             self._reader.checksum(table.end, self._reader.size - table.end, digest)
             if digest.hexdigest() != self._digest:
-                yield 0, "it is not the file that the manifest lists: their digests differ"
+                yield table.end, "it is not the file that the manifest lists: their digests differ"
 
     def _names(self) -> dict[int, str]:
         """Descriptions of the records of the source, by their offset."""
