@@ -180,28 +180,21 @@ class _Expiry:
             StoreError: A segment is not as it is listed, or has another digest.
         """
         logs = self._manifest.logs
-        for number in segments:
-            if (
-                number not in logs
-                or digests.get(number, logs[number].digest) != logs[number].digest
-            ):
-                raise StoreError(f"{self._manifest.name}: segment {number} was replaced meanwhile.")
+        if any(n not in logs or digests.get(n, logs[n].digest) != logs[n].digest for n in segments):
+            raise StoreError(f"{self._manifest.name}: a segment was replaced meanwhile.")
         for segment in walk(self._path, self._names(segments)):
-            if segment.summary.size != logs[segment.number].bytes:
+            number, summary = segment.number, segment.summary
+            if summary.size != logs[number].bytes:
                 raise StoreError(
                     f"{segment.reader.path} is not the segment that the manifest lists; nothing "
                     "was deleted. Run `hybridlog verify --repair` first."
                 )
-            self._choose(segment)
+            chosen = {place.number for place in summary.chunks if self._goes(place, summary)}
+            if chosen:
+                self._chosen[number], self._summaries[number] = chosen, summary
 
     def _names(self, segments: Iterable[int]) -> dict[int, str]:
         return {number: self._manifest.logs[number].name for number in segments}
-
-    def _choose(self, segment: WalkedSegment) -> None:
-        number, summary = segment.number, segment.summary
-        chosen = {place.number for place in summary.chunks if self._goes(place, summary)}
-        if chosen:
-            self._chosen[number], self._summaries[number] = chosen, summary
 
     def _goes(self, place: ChunkPlace, summary: SegmentSummary) -> bool:
         if place.is_expired:

@@ -113,8 +113,13 @@ def _damage(path: Path, inventory: Inventory) -> Iterator[Repaired]:
         yield Repaired(inventory.name, f"{PAYLOADS}/{file}", what, is_cured=False)
     for number in inventory.summaries:
         name = inventory.listing.sealed[number]
-        with SegmentCheck(path / name, inventory.digest(number)) as check:
-            for offset, problem in check.problems():
+        digest = inventory.digest(number)
+        with SegmentCheck(path / name, digest) as check:
+            problems = list(check.problems())
+        if problems and rebuild_summary(path / name, digest):
+            yield Repaired(inventory.name, name, "its summary was rebuilt")
+        else:
+            for offset, problem in problems:
                 what = f"{problem}; {RESTORE}"
                 yield Repaired(inventory.name, f"{name} byte {offset}", what, is_cured=False)
 

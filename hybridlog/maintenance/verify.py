@@ -303,7 +303,8 @@ class _Check:
             with SegmentCheck(self._path / name, "" if log is None else log.digest) as check:
                 for offset, problem in check.problems(tell):
                     self._is_damaged = True
-                    cure = RESTORE if check.summary is not None else _REPAIR
+                    is_data = check.summary is not None and offset < check.summary.table.end
+                    cure = RESTORE if is_data else _REPAIR
                     self.found(f"{name} byte {offset}", problem, cure)
             if summary is None:
                 return
