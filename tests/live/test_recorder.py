@@ -251,7 +251,7 @@ def test_a_disk_without_room_for_a_message_leaves_no_recording(
     assert robot.recorder.stopped_for_disk
     store.refresh()
     assert not store.recordings()
-    assert not store.directory.names()
+    assert not store.directory.ids()
 
 
 def test_a_recorder_that_is_refused_at_once_leaves_no_recording(store: hl.Store) -> None:
@@ -260,7 +260,7 @@ def test_a_recorder_that_is_refused_at_once_leaves_no_recording(store: hl.Store)
     robot.speaker.say(text_channel(), text("a"))
     assert robot.recorder.stop() == []
     assert robot.recorder.look().lost == {"disk": 1}
-    assert not store.directory.names()
+    assert not store.directory.ids()
 
 
 def test_as_many_messages_as_wanted_and_not_one_more(store: hl.Store) -> None:
