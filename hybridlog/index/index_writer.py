@@ -20,10 +20,11 @@ import numpy as np
 from hybridlog.index.indexing import ChunkIndexer
 from hybridlog_storage.catalog import decoded_rows
 from hybridlog_storage.errors import DatabaseError, HybridlogError, SegmentError
+from hybridlog_storage.manifests import manifests_at
 from hybridlog_storage.mongo.index_documents import with_prefix
 from hybridlog_storage.mongo.index_state import NOTHING, IndexState, Through
 from hybridlog_storage.mongo.topic_places import TopicPlaces
-from hybridlog_storage.segments.segment_file import OPEN_SUFFIX, SEALED_SUFFIX
+from hybridlog_storage.segments.segment_file import OPEN_SUFFIX, sealed_name
 from hybridlog_storage.segments.segment_reader import ChunkPlace, SegmentReader
 from hybridlog_storage.threads import Threads
 
@@ -421,8 +422,10 @@ class IndexWriter:
         path = self._recording / f"{segment:06d}{OPEN_SUFFIX}"
         try:
             self._reader = SegmentReader(path, segment, direct=True)
-        except SegmentError:  # it may be sealed and renamed at this moment
-            sealed = path.with_name(f"{segment:06d}{SEALED_SUFFIX}")
+        except SegmentError:  # it is sealed by now, and payloads of it may have expired
+            manifest = manifests_at(self._recording).read(self._recording.name)
+            log = manifest.logs.get(segment)
+            sealed = path.with_name(sealed_name(segment) if log is None else log.name)
             self._reader = SegmentReader(sealed, segment, direct=True)
         return self._reader
 
