@@ -21,7 +21,7 @@ from msgspec import ValidationError, convert, to_builtins
 
 from hybridlog.columns.layout import PAYLOAD_PARTS
 from hybridlog.record.losses import Cause, extent_of, joined, topics_of
-from hybridlog.record.marks_log import with_marks
+from hybridlog.record.marks import with_marks
 from hybridlog.schema.states import State, expired_messages
 from hybridlog_storage import manifest as truth
 from hybridlog_storage.catalog import (

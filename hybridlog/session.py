@@ -21,8 +21,7 @@ from hybridlog.query.chunk_columns import ChunkColumns
 from hybridlog.query.chunk_counts import Parts, part_rows
 from hybridlog.query.question import RecordedChannel, field_types
 from hybridlog.query.topics import resolve
-from hybridlog.record.marks import MARKS
-from hybridlog.record.marks_log import MARKS_SEGMENT
+from hybridlog.record.marks import MARKS, MARKS_SEGMENT
 from hybridlog.snapshot import UNFINISHED
 from hybridlog.wording import counted, listed
 from hybridlog_storage.catalog import ChannelStats, file_of, schema_hash

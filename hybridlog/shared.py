@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any
 from hybridlog.columns.payload_files import RecordingPayloads, open_segment
 from hybridlog.maintenance.opening import StoreFiles, open_catalog
 from hybridlog.maintenance.report import RepairReport
-from hybridlog.record.marks import MARK_SCHEMA
-from hybridlog.record.marks_log import with_marks
+from hybridlog.record.marks import MARK_SCHEMA, with_marks
 from hybridlog.snapshot import UNFINISHED
 from hybridlog_storage.cache import Cache
 from hybridlog_storage.catalog import file_of, schema_hash

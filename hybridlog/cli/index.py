@@ -143,7 +143,7 @@ def rebuild(given: _Rebuild) -> None:
                 "where."
             )
     messages = sum(r.documents for r in done)
-    without = sum(r.messages for r in done) - messages
+    without = sum(r.messages - len(r.marks) for r in done) - messages
     elapsed = time.monotonic() - started
     if given.as_json:
         output.print_json(

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from hybridlog_storage.messages import Channel, Schema
+
+if TYPE_CHECKING:
+    from hybridlog_storage.catalog import RecordingEntry
 
 MARKS: Final = "/hybridlog/marks"
 """Topic of marks."""
@@ -16,6 +19,8 @@ CONTRACT: Final = "contract"
 """Tag `cause` of marks that a recorder sets while a contract is broken."""
 MARK: Final = "hybridlog.Mark"
 """Type of marks."""
+MARKS_SEGMENT: Final = 10**9
+"""Number of the log in memory with the marks that somebody set, behind those of all files."""
 MARK_SCHEMA: Final = Schema(
     MARK,
     "jsonschema",
@@ -23,6 +28,15 @@ MARK_SCHEMA: Final = Schema(
     b'"tags":{"type":"object","additionalProperties":{"type":"string"}},'
     b'"end":{"type":"integer"}}}',
 )
+
+
+def with_marks(entry: RecordingEntry) -> RecordingEntry:
+    """The entry of a recording's files, and of the marks that somebody set."""
+    if not entry.marks:
+        return entry
+    from hybridlog.record.marks_log import beside  # loads numpy
+
+    return beside(entry)
 
 
 def mark_channel() -> Channel:

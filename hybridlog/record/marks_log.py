@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from hybridlog.record.marks import MARKS, mark_channel, mark_payload
+from hybridlog.record.marks import MARKS, MARKS_SEGMENT, mark_channel, mark_payload
 from hybridlog_storage.catalog import channel_entry, channel_totals
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.manifest import hasher
@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.segments.segment_reader import ChunkPlace
 
-MARKS_SEGMENT: Final = 10**9
-"""Its number, behind those of all files."""
 _ARRIVALS: Final = 1 << 52  # the first arrival number, behind those of all messages
 _CHUNK: Final = 1000  # marks
 
@@ -120,10 +118,8 @@ def _payloads(marks: Iterable[Mapping[str, Any]]) -> list[bytes]:
     return [mark_payload(one["text"], one["tags"], one.get("end")) for one in marks]
 
 
-def with_marks(entry: RecordingEntry) -> RecordingEntry:
-    """The entry of a recording's files, and of the marks that somebody set."""
-    if not entry.marks:
-        return entry
+def beside(entry: RecordingEntry) -> RecordingEntry:
+    """The entry of a recording's files, and of its marks."""
     flushed = _MarksLog(entry.marks).flushed
     channel = channel_entry(MARKS_CHANNEL, replace(mark_channel(), is_indexed=False), None)
     channel.stats = channel_totals(flushed.table, None)[MARKS_CHANNEL]
@@ -137,6 +133,6 @@ def with_marks(entry: RecordingEntry) -> RecordingEntry:
 
 
 def without(entry: RecordingEntry, known: Collection[str]) -> RecordingEntry:
-    """An entry `with_marks` whose log lacks those of some ids."""
+    """An entry `beside` its files whose log lacks those of some ids."""
     left = [one for one in entry.marks if one["id"] not in known]
     return replace(entry, flushed={**entry.flushed, MARKS_SEGMENT: _MarksLog(left).flushed})

@@ -20,7 +20,8 @@ from hybridlog.query.engines.payload_scan import PayloadScan
 from hybridlog.query.planner import Planner
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.topics import later
-from hybridlog.record.marks_log import MARKS_SEGMENT, without
+from hybridlog.record.marks import MARKS_SEGMENT
+from hybridlog.record.marks_log import without
 from hybridlog_storage.errors import UsageError
 from hybridlog_storage.stopping import pause, safe_point
 
