@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -37,6 +38,13 @@ def segment(store: Path, name: str, number: int = 0) -> Path:
 def manifest_of(folder: Path) -> Path:
     """The file of the manifest of the recording in a directory."""
     return folder.parent.parent / "manifests" / f"{folder.name}.json"
+
+
+def lose(store: Path, name: str) -> None:
+    """Take away the recording of a name, as somebody may do by hand."""
+    gone = folder(store, name)
+    manifest_of(gone).unlink()
+    shutil.rmtree(gone)
 
 
 def read_in(folder: Path) -> Manifest | None:

@@ -22,6 +22,7 @@ from hybridlog.columns.layout import PARTS
 from hybridlog.entries import describe_now, take_inventory
 from hybridlog.maintenance.lease import place_of
 from hybridlog.record.losses import losses_of
+from hybridlog.record.marks import MARKS
 from hybridlog_storage.catalog import CATALOG, RecordingEntry
 from hybridlog_storage.cells import put
 from hybridlog_storage.disk.directory import LOCK, StoreDirectory
@@ -258,8 +259,9 @@ def _look_at(store: hl.Store, entry: RecordingEntry) -> Seen:
         _check(asked.count() == len(wanted), f"count of {topic} where: {asked.count()}")
         given = [number_of(topic, bytes(m.raw)) for m in asked]
         _check(given == wanted, f"messages of {topic} where: {given} instead of {wanted}")
-        documents = query.where(EVERYTHING).count()
-        _check(documents == len(part), f"{documents} documents of {len(part)} {topic}")
+        if topic != MARKS:  # which MongoDB does not have
+            documents = query.where(EVERYTHING).count()
+            _check(documents == len(part), f"{documents} documents of {len(part)} {topic}")
         begin, end = part[0][0], part[-1][0] + 1
         middle = (begin + end + 1) // 2
         half = query.between(f"{begin}ns", f"{middle}ns")

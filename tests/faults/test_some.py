@@ -21,7 +21,7 @@ SOME: list[tuple[str, Fault, str, int, bool]] = [
     ("tag", "torn", "write .<id>.new", 0, False),
     ("mark", "die", "rename .<id>.new", 0, False),
     ("mark", "ENOSPC", "sync .<id>.new", 0, False),
-    ("import", "torn", "write 000000", 0, False),
+    ("import", "torn", "write .000000", 0, False),
     ("repair", "die", "rename 000000.mcap", 0, True),
     ("record", "die", "rename 000000.mcap.open", 0, True),
     ("open after a crash", "EIO", "sync .<id>.new", 0, True),

@@ -115,7 +115,7 @@ def test_what_is_left_of_recordings_that_are_gone(few: hl.Store, tmp_path: Path)
     few.record(write_log(tmp_path / "more.mcap", FEW), name="more", again=True)
     gone = few.entry("more").id
     assert contents(few) != before
-    shutil.rmtree(places.folder(root, "more"))
+    places.lose(root, "more")
     few.refresh()
     few.connect()
     assert contents(few) == before

@@ -27,7 +27,7 @@ from hybridlog.record.losses import CRASH, Cause, losses_of
 from hybridlog.schema.states import CAUSES, GONE, State
 from hybridlog.snapshot import UNFINISHED
 from hybridlog.wording import counted
-from hybridlog_storage.errors import HybridlogError, TimeError
+from hybridlog_storage.errors import HybridlogError, TimeError, TopicError
 from hybridlog_storage.times import BEGIN, END, span_of
 
 if TYPE_CHECKING:
@@ -130,7 +130,7 @@ def _expired(session: Session, question: Question) -> Counter[State]:
     summaries = session.snapshot().summaries
     if not any(one.expired or one.not_copied or one.status in UNFINISHED for one in summaries):
         return Counter()
-    with suppress(TimeError):  # nothing is in the range
+    with suppress(TimeError, TopicError):  # nothing is in the range, or has this clock
         return Planner(session, question, Counters()).count_expired()
     return Counter()
 
