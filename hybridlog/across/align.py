@@ -5,14 +5,22 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Protocol
+from itertools import chain, count
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
 
-from hybridlog.across.bins import AGGREGATES, Aggregate, Bins, RegularTimes
+from hybridlog.across.bins import AGGREGATES, Bins, RegularTimes
 from hybridlog.across.match import HOWS, UNKNOWN, How, interpolated, match
-from hybridlog.across.topic_reader import RECORDING, TIME, Stream, TopicReader, concatenated
+from hybridlog.across.topic_reader import (
+    RECORDING,
+    TIME,
+    Block,
+    Stream,
+    TopicReader,
+    concatenated,
+)
 from hybridlog.frames.names import free_name
 from hybridlog.query.answers.lost import completeness_of
 from hybridlog.query.answers.remarks import remarks
@@ -34,26 +42,21 @@ if TYPE_CHECKING:
     from hybridlog.query.ranges import Resolved
     from hybridlog.session import Session
 
-_DISTANCE = "distance"
 _MAX_NAMES = 20  # remarks about empty columns
+_DISTANCE = "distance"
 _LOST = "messages of that time are lost"
 _NO_TIME = "the row has no time on the clock"
-_NO_VALUE = "the message has no such value"
 _PIECE_BYTES = 32 << 20  # of the other topics, in rows that are made together
-
-
-class Base(Protocol):
-    """The rows: messages of a topic, or regular times."""
-
-    @property
-    def question(self) -> Question:
-        """The question; its recordings and times are those of the rows."""
-
-    def empty(self) -> pa.Table:
-        """No rows, with the columns of all of them."""
-
-    def tables(self, recording: str) -> Iterator[tuple[NDArray[np.int64], pa.Table]]:
-        """Times of the rows of a recording, ns, and their columns, in order."""
+_WHY = {
+    "asof": "no message came before",
+    "nearest": "no message",
+    "interpolate": "no message before, or none after",
+}
+_WHY_NEAR = {
+    "asof": "no message within {} before",
+    "nearest": "no message within {}",
+    "interpolate": "no message within {} before and after",
+}
 
 
 class Aligned:
@@ -82,7 +85,7 @@ class Aligned:
     def __init__(
         self,
         session: Session,
-        base: Base,
+        base: TopicReader | RegularTimes,
         others: Sequence[Stream],
         *,
         how: str,
@@ -104,24 +107,18 @@ class Aligned:
         self.rows = 0
         self._empty: Counter[tuple[str, str]] = Counter()
 
-    def _partner(self, stream: Stream) -> _Partner | Bins:
-        if isinstance(self._base, RegularTimes) and self._how in AGGREGATES:
-            how: Aggregate = self._how
-            return Bins(self._session, stream, self._base, how=how)
-        return _Partner(
-            self._session,
-            stream,
-            how=self._how,  # type: ignore[arg-type]
-            tolerance=self._tolerance,
-            clock=self._clock,
-            empty=self._empty,
-        )
-
     @property
     def _streams(self) -> list[Stream]:
         """The topics that are read."""
-        own = [self._base.stream] if isinstance(self._base, TopicBase) else []
+        own = [self._base.stream] if isinstance(self._base, TopicReader) else []
         return [*own, *self._others]
+
+    def _partner(self, stream: Stream) -> _Partner | Bins:
+        session, how = self._session, self._how
+        if isinstance(self._base, RegularTimes) and how in AGGREGATES:
+            return Bins(session, stream, self._base, how)
+        reader = TopicReader(session, stream, self._clock)
+        return _Partner(reader, how, self._tolerance)  # type: ignore[arg-type]
 
     @property
     def counters(self) -> Counters:
@@ -184,32 +181,49 @@ class Aligned:
             stream.counters.reset()
         self.rows = 0
         self._empty.clear()
-        partners = [self._partner(other) for other in self._others]
-        several = len(self._session.chosen(self._base.question)) > 1
+        base, partners = self._base, [self._partner(other) for other in self._others]
+        several = len(self._session.chosen(base.question)) > 1
         given = False
-        for resolved in RangeResolver(self._session, self._base.question).resolve():
-            recording = resolved.summary.id
+        for resolved in RangeResolver(self._session, base.question).resolve():
             for partner in partners:
-                partner.enter(recording, _end_of(resolved, self._clock))
-            for times, table in self._base.tables(recording):
-                name = resolved.summary.name if several else None
-                left = None if told is None else told - self.rows
-                for rows in _pieces(times, partners, left):
-                    own = table.slice(rows.start, rows.stop - rows.start)
-                    before = Counter(self._empty)
-                    _count_blanks(self._empty, own, 0)
-                    beside = [partner.rows(times[rows]) for partner in partners]
-                    if told is None or self.rows < told:
-                        self.rows += own.num_rows
-                    else:
-                        self._empty.clear()
-                        self._empty.update(before)
-                    yield _side_by_side(own, name, beside)
-                given = given or bool(table.num_rows)
+                partner.enter(resolved.summary.id, _end_of(resolved, self._clock))
+            name = resolved.summary.name if several else None
+            for times, table in base.tables(resolved.summary.id):
+                given, begin = True, 0
+                while begin < len(times):
+                    # Small pieces where many rows have the same large message.
+                    row = sum(partner.row_bytes(times[begin:]) for partner in partners)
+                    end = min(begin + max(_PIECE_BYTES // max(row, 1), 1), len(times))
+                    left = end if told is None else begin + told - self.rows
+                    end = left if begin < left < end else end
+                    piece = times[begin:end], table.slice(begin, end - begin)
+                    yield self._rows(piece, name, partners, is_told=left > begin)
+                    begin = end
         if not given:
-            empty = self._base.empty()
-            none = np.empty(0, np.int64)
-            yield _side_by_side(empty, "" if several else None, [p.rows(none) for p in partners])
+            none = np.empty(0, np.int64), base.empty()
+            yield self._rows(none, "" if several else None, partners, is_told=True)
+
+    def _rows(
+        self,
+        piece: Block,
+        recording: str | None,
+        partners: Sequence[_Partner | Bins],
+        *,
+        is_told: bool,
+    ) -> pa.Table:
+        """Some rows, which count if they are told about."""
+        times, own = piece
+        empty = self._empty if is_told else Counter[tuple[str, str]]()
+        self.rows += len(times) if is_told else 0
+        columns: dict[str, Any] = {TIME: own[TIME]}
+        if recording is not None:
+            text = recording.encode("utf-8", "replace").decode()
+            columns[RECORDING] = pa.repeat(pa.scalar(text, pa.string()), len(times))
+        if isinstance(self._base, TopicReader):
+            self._base.add(columns, own, empty, 0)
+        for partner in partners:
+            partner.add(columns, times, empty)
+        return pa.table(columns)
 
     def batches(self) -> Iterator[pa.RecordBatch]:
         """The rows in Arrow record batches of bounded size."""
@@ -247,29 +261,6 @@ class Aligned:
         return common_schema(self.to_tables())
 
 
-class TopicBase:
-    """The messages of a topic as rows."""
-
-    def __init__(self, session: Session, stream: Stream, clock: Clock) -> None:
-        self.stream = stream
-        self._reader = TopicReader(session, stream, clock)
-
-    @property
-    def question(self) -> Question:
-        """The question about the topic."""
-        return self._reader.question
-
-    def empty(self) -> pa.Table:
-        """No rows, with all columns."""
-        table = self._reader.empty()[1]
-        return self._reader.named(table, TIME, table[TIME])
-
-    def tables(self, recording: str) -> Iterator[tuple[NDArray[np.int64], pa.Table]]:
-        """Times and columns of the messages of a recording, in order."""
-        for times, table in self._reader.tables(recording):
-            yield times, self._reader.named(table, TIME, table[TIME])
-
-
 class _Partner:
     """A topic beside the rows: gives the messages that belong to times.
 
@@ -277,30 +268,15 @@ class _Partner:
     clocks the messages of a recording are sorted in memory.
     """
 
-    def __init__(
-        self,
-        session: Session,
-        stream: Stream,
-        *,
-        how: How,
-        tolerance: int | None,
-        clock: Clock,
-        empty: Counter[tuple[str, str]],
-    ) -> None:
-        self._reader = TopicReader(session, stream, clock)
-        (self._topic,) = stream.question.topics
-        self._empty = empty
-        self._reason = ""
-        self._lost = np.empty((0, 2), np.int64)
+    def __init__(self, reader: TopicReader, how: How, tolerance: int | None) -> None:
+        self._reader = reader
         self._how = how
         self._tolerance = tolerance
-        self._clock = clock
-        self._none = self._reader.empty()
-        self._recording = ""
-        self._end: int | None = None
-        self._blocks: Iterator[tuple[NDArray[np.int64], pa.Table]] | None = None
+        why = _WHY if tolerance is None else _WHY_NEAR
+        self._why = why[how].format(format_duration(tolerance or 0))
+        self._none: Block = np.empty(0, np.int64), reader.empty()
         self._times, self._table = self._none
-        self._last: tuple[int, pa.Table] | None = None  # the message before those of the table
+        self._blocks: Iterator[Block] | None = None
         self._is_last = True
 
     def enter(self, recording: str, end: int | None) -> None:
@@ -310,29 +286,12 @@ class _Partner:
             recording: Its id.
             end: Time that all rows are before, by the log clock, ns; None if unknown.
         """
-        self._recording = recording
-        elsewhere = self._reader.elsewhere(recording)
-        self._reason = self._why() if elsewhere is None else elsewhere
+        self._recording, self._end = recording, end
+        self._reason = self._reader.elsewhere(recording) or self._why
         self._lost = self._reader.lost(recording)
-        self._end = end
         self._blocks = None
         self._times, self._table = self._none
-        self._last = None
         self._is_last = False
-
-    def _why(self) -> str:
-        """The reason why no message belongs to a row."""
-        if self._tolerance is not None:
-            near = format_duration(self._tolerance)
-            if self._how == "interpolate":
-                return f"no message within {near} before and after"
-            return f"no message within {near}{' before' if self._how == 'asof' else ''}"
-        reasons = {
-            "asof": "no message came before",
-            "nearest": "no message",
-            "interpolate": "no message before, or none after",
-        }
-        return reasons[self._how]
 
     def _is_lost(self, times: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Rows whose message may have been lost."""
@@ -348,114 +307,94 @@ class _Partner:
         return found
 
     def row_bytes(self, times: NDArray[np.int64]) -> int:
-        """Mean bytes of the messages that are read next.
-
-        Args:
-            times: As for `rows`.
-        """
-        self._start(times)
-        size, rows = int(self._table.nbytes), int(self._table.num_rows)
-        return size // max(rows, 1)
-
-    def _start(self, times: NDArray[np.int64]) -> None:
-        """Read the first block."""
-        if self._blocks is None and not self._is_last and len(times):
-            self._open(times)
-            if not self._is_last:
+        """Mean bytes of the messages that are read next, for times as of `add`."""
+        if self._blocks is None:
+            if self._reader.is_by_log_time:
+                self._blocks = self._reader.tables(self._recording, self._span(int(times[0])))
                 self._advance()
-
-    def rows(self, times: NDArray[np.int64]) -> pa.Table:
-        """The columns of the messages that belong to some times, with their distance.
-
-        Args:
-            times: int64[n], ns; by the log clock ascending, not before those of the last call.
-        """
-        self._start(times)
-        parts = []
-        begin = 0
-        while True:
-            end = len(times)
-            if not self._is_last:
-                # What belongs to times before the last one of the block is known.
-                last = int(self._times[-1]) if len(self._times) else 0
-                end = int(np.searchsorted(times, last))
-            if end > begin or not len(times):
-                parts.append(self._matched(times[begin:end]))
-                begin = end
-            if begin == len(times):
-                return concatenated(parts)
-            self._advance()
-
-    def _open(self, times: NDArray[np.int64]) -> None:
-        if self._clock == "log":
-            self._blocks = self._reader.tables(self._recording, self._span(int(times[0])))
-            return
-        self._blocks = self._reader.tables(self._recording)
-        found = [self._none, *self._blocks]
-        all_times = np.concatenate([part for part, _ in found])
-        table = concatenated([part for _, part in found])
-        order = np.argsort(all_times, kind="stable")
-        order = order[all_times[order] != UNKNOWN]
-        self._times, self._table = all_times[order], table.take(pa.array(order))
-        self._is_last = True
+            else:
+                self._blocks, self._is_last = iter(()), True
+                self._times, self._table = self._reader.by_clock(self._recording)
+        size = int(self._table.nbytes)
+        return size // max(len(self._times), 1)
 
     def _span(self, first: int) -> tuple[int, int] | None:
         """Log time that can hold the messages of all rows; None for all of it."""
-        reader, recording, end = self._reader, self._recording, self._end
+        reader, end, near = self._reader, self._end, self._tolerance
         if reader.question.bounds is not None:
             return None
-        if self._tolerance is not None:
-            begin = max(first - self._tolerance, BEGIN)
+        if near is not None:
+            begin = max(first - near, BEGIN)
         else:
-            latest = reader.latest(recording, first)
-            begin = first if latest is None else latest
-        if end is not None and self._how != "asof":
-            if self._tolerance is not None:
-                end = min(end + self._tolerance, END)
-            else:
-                end = reader.following(recording, end)
-        return begin, END if end is None else end
+            begin = reader.latest(self._recording, first)
+        if end is None:
+            return begin, END
+        if self._how != "asof":
+            end = reader.following(self._recording, end) if near is None else min(end + near, END)
+        return begin, end
+
+    def add(
+        self, columns: dict[str, Any], times: NDArray[np.int64], empty: Counter[tuple[str, str]]
+    ) -> None:
+        """Add the columns of the messages that belong to some times, with their distance.
+
+        Args:
+            columns: Those of the rows, by name.
+            times: int64[n], ns; by the log clock ascending, not before those of the last call.
+            empty: Numbers of rows without a message or a value, by name and reason.
+        """
+        if len(times):
+            self.row_bytes(times)
+        parts, rest = [], times
+        while True:
+            end = len(rest)
+            if not self._is_last:
+                # What belongs to times before the last one of the block is known.
+                end = int(np.searchsorted(rest, self._times[-1])) if len(self._times) else 0
+            if end or not len(times):
+                parts.append(self._found(rest[:end]))
+                rest = rest[end:]
+            if not len(rest):
+                break
+            self._advance()
+        table = concatenated([one for one, _ in parts])
+        distance = pa.chunked_array([one for _, one in parts])
+        columns[free_name(self._reader.stream.prefix + _DISTANCE, columns)] = distance
+        none = distance.null_count
+        if none:
+            (topic,) = self._reader.question.topics
+            is_unknown = times == UNKNOWN
+            is_lost = distance.is_null().to_numpy() & ~is_unknown & self._is_lost(times)
+            lost, unknown = int(is_lost.sum()), int(is_unknown.sum())
+            empty[topic, _NO_TIME] += unknown
+            empty[topic, _LOST] += lost
+            empty[topic, self._reason] += none - lost - unknown
+        self._reader.add(columns, table, empty, none)
 
     def _advance(self) -> None:
-        """Read the next block; the last row before it may still be the latest one."""
-        assert self._blocks is not None
-        found = next(self._blocks, None)
+        """Read the next block, behind the last row before it, which may still be the latest."""
+        found = next(self._blocks or iter(()), None)
         if found is None:
             self._is_last = True
-            return
-        times, table = found
-        if len(self._times):
-            self._last = int(self._times[-1]), self._table.slice(self._table.num_rows - 1)
-        self._times, self._table = times, table
+        elif len(self._times):
+            last = self._table.slice(len(self._times) - 1)
+            self._times = np.concatenate([self._times[-1:], found[0]])
+            self._table = concatenated([last, found[1]])
+        else:
+            self._times, self._table = found
 
-    def _matched(self, times: NDArray[np.int64]) -> pa.Table:
-        """The columns of the messages that belong to times that the block decides."""
-        if self._last is None:
-            return self._found(times, self._times, self._table)
-        # Before the first message of the block, only that and the last one of the block before
-        # come into question.
-        begin = int(np.searchsorted(times, self._times[0]))
-        parts = []
-        if begin:
-            around = np.array([self._last[0], self._times[0]])
-            two = concatenated([self._last[1], self._table.slice(0, 1)])
-            parts.append(self._found(times[:begin], around, two))
-        if begin < len(times) or not parts:
-            parts.append(self._found(times[begin:], self._times, self._table))
-        return concatenated(parts)
-
-    def _found(
-        self, times: NDArray[np.int64], known: NDArray[np.int64], table: pa.Table
-    ) -> pa.Table:
+    def _found(self, times: NDArray[np.int64]) -> tuple[pa.Table, pa.Array[Any]]:
+        """The messages of times that the block decides, and their distance."""
+        known = self._times
         found = match(times, known, self._how, self._tolerance)
-        rows = _taken(table, found.before)
+        rows = _taken(self._table, found.before)
         if self._how == "interpolate":
             known = known if len(known) else times
             low, high = known[np.maximum(found.before, 0)], known[np.maximum(found.after, 0)]
             length = (high - low).astype(np.float64)
             weight = (times - low) / np.where(length > 0, length, 1)
             weight[length <= 0] = 0
-            after = _taken(table, found.after)
+            after = _taken(self._table, found.after)
             rows = interpolated(rows, after, weight, self._reader.quaternions)
         missing = found.before < 0
         distance = (
@@ -463,42 +402,7 @@ class _Partner:
             if missing.any()
             else numbers(found.distance, "duration")
         )
-        table = self._reader.named(rows, self._reader.prefix + _DISTANCE, distance)
-        empty = int(missing.sum())
-        if empty:
-            is_unknown = times == UNKNOWN
-            is_lost = missing & ~is_unknown & self._is_lost(times)
-            numbers_of = int(is_unknown.sum()), int(is_lost.sum())
-            for reason, number in zip((_NO_TIME, _LOST), numbers_of, strict=True):
-                self._empty[self._topic, reason] += number
-            self._empty[self._topic, self._reason] += empty - sum(numbers_of)
-        _count_blanks(self._empty, table, empty)
-        return table
-
-
-def _count_blanks(empty: Counter[tuple[str, str]], table: pa.Table, known: int) -> None:
-    """Count the rows that are empty in single columns, beside a number of rows without any."""
-    for name, column in zip(table.column_names, table.columns, strict=True):
-        if column.null_count > known:
-            empty[name, _NO_VALUE] += column.null_count - known
-
-
-def _pieces(
-    times: NDArray[np.int64], partners: Sequence[_Partner | Bins], left: int | None
-) -> Iterator[slice]:
-    """Rows in pieces that stay small where many rows have the same large message.
-
-    One ends behind `left` rows, if there are more.
-    """
-    begin = 0
-    while begin < len(times):
-        rest = times[begin:]
-        row = sum(one.row_bytes(rest) for one in partners if isinstance(one, _Partner))
-        end = min(begin + max(_PIECE_BYTES // max(row, 1), 1), len(times))
-        if left is not None and begin < left < end:
-            end = left
-        yield slice(begin, end)
-        begin = end
+        return rows, distance
 
 
 def _taken(table: pa.Table, rows: NDArray[np.int64]) -> pa.Table:
@@ -513,19 +417,6 @@ def _end_of(resolved: Resolved, clock: Clock) -> int | None:
     if resolved.windows is not None:
         return int(resolved.windows[-1, 1]) if len(resolved.windows) else 0
     return resolved.bounds[1] if resolved.bounds is not None and clock == "log" else None
-
-
-def _side_by_side(table: pa.Table, recording: str | None, parts: Sequence[pa.Table]) -> pa.Table:
-    columns = dict(zip(table.column_names, table.columns, strict=True))
-    found: dict[str, Any] = {TIME: columns.pop(TIME)}
-    if recording is not None:
-        text = recording.encode("utf-8", "replace").decode()
-        found[RECORDING] = pa.repeat(pa.scalar(text, pa.string()), table.num_rows)
-    found |= columns
-    for part in parts:
-        for name, column in zip(part.column_names, part.columns, strict=True):
-            found[free_name(name, found)] = column
-    return pa.table(found)
 
 
 def side_by_side(
@@ -547,25 +438,11 @@ def side_by_side(
             f"{listed(base.topics)}."
         )
     chosen: Clock = clock  # type: ignore[assignment]
-    taken: set[str] = set()
-    streams = [
-        Stream(
-            replace(question, topics=(topic,)),
-            _prefix(topic, taken),
-            is_apart=across_recordings and n > 0,
-        )
-        for n, question in enumerate((base, *others))
-        for topic in question.topics
-    ]
-    rows = TopicBase(session, streams[0], chosen)
-    return Aligned(
-        session,
-        rows,
-        streams[1:],
-        how=how,
-        tolerance=tolerance,
-        clock=chosen,
-    )
+    first, *beside = _streams([base, *others])
+    if across_recordings:
+        beside = [replace(stream, is_apart=True) for stream in beside]
+    rows = TopicReader(session, first, chosen)
+    return Aligned(session, rows, beside, how=how, tolerance=tolerance, clock=chosen)
 
 
 def resampled(
@@ -577,28 +454,19 @@ def resampled(
 ) -> Aligned:
     """An alignment of topics to regular times; see `Query.resample`."""
     times = RegularTimes(session, replace(question, predicate=None), parse_duration(step))
-    taken: set[str] = set()
-    several = len(question.topics) > 1
-    streams = [
-        Stream(replace(question, topics=(topic,)), _prefix(topic, taken) if several else "")
-        for topic in question.topics
-    ]
-    return Aligned(
-        session,
-        times,
-        streams,
-        how=how,
-        tolerance=tolerance,
-        clock="log",
-    )
+    streams = _streams([question])
+    if len(streams) == 1:
+        streams = [replace(streams[0], prefix="")]
+    return Aligned(session, times, streams, how=how, tolerance=tolerance, clock="log")
 
 
-def _prefix(topic: str, taken: set[str]) -> str:
-    """The beginning of the names of a topic's columns: `imu/data.`, `imu/data_2.`."""
-    name = short = topic.removeprefix("/")
-    number = 2
-    while name in taken:
-        name = f"{short}_{number}"
-        number += 1
-    taken.add(name)
-    return f"{name}."
+def _streams(questions: Sequence[Question]) -> list[Stream]:
+    """The topics of questions, with names for their columns: `imu/data.`, `imu/data_2.`."""
+    found: dict[str, Stream] = {}
+    for question in questions:
+        for topic in question.topics:
+            name = topic.removeprefix("/")
+            more = (f"{name}_{number}." for number in count(2))
+            prefix = next(one for one in chain([f"{name}."], more) if one not in found)
+            found[prefix] = Stream(replace(question, topics=(topic,)), prefix)
+    return list(found.values())

@@ -5,23 +5,23 @@ The bins begin at regular times, which are rows of an alignment too.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Final, Literal, get_args
+from itertools import chain
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import pyarrow as pa
 
-from hybridlog.across.topic_reader import TIME, Stream, TopicReader, concatenated
-from hybridlog.frames.names import is_summary
-from hybridlog.query.answers.match_times import match_times
-from hybridlog.query.counters import Counters
+from hybridlog.across.topic_reader import TIME, Block, Stream, TopicReader, concatenated
+from hybridlog.frames.names import free_name, is_summary
 from hybridlog.query.predicate.types import FieldTypes
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.schema.arrow_columns import numbers
 from hybridlog.schema.arrow_types import is_number, is_time
 from hybridlog.schema.summary import Totals
-from hybridlog_storage.errors import TimeError, UsageError
+from hybridlog_storage.errors import UsageError
 from hybridlog_storage.ordering import run_starts
 from hybridlog_storage.times import placed
 
@@ -32,11 +32,9 @@ if TYPE_CHECKING:
     from hybridlog.session import Session
 
 
-Aggregate = Literal["count", "first", "last", "min", "max", "mean"]
-AGGREGATES: Final[tuple[Aggregate, ...]] = get_args(Aggregate)
+AGGREGATES: Final = ("count", "first", "last", "min", "max", "mean")
 _OF_NUMBERS: Final = frozenset({"min", "max", "mean"})
 _COUNT = "count"
-_Block = tuple["NDArray[np.int64]", pa.Table]
 
 MAX_TIMES = 100_000_000
 """Maximum number of rows of `resample`."""
@@ -46,47 +44,37 @@ _GRID_ROWS = 65_536
 class Bins:
     """A topic beside regular times: gives what its messages say until the next time.
 
-    Args:
-        session: The open store.
-        stream: The topic.
-        grid: The times.
-        how: What is asked of the messages of a bin.
-
     Raises:
         UsageError: a field has no single number, or the question has limit, every or reverse.
     """
 
-    def __init__(
-        self,
-        session: Session,
-        stream: Stream,
-        grid: RegularTimes,
-        *,
-        how: Aggregate,
-    ) -> None:
+    def __init__(self, session: Session, stream: Stream, grid: RegularTimes, how: str) -> None:
         if how in _OF_NUMBERS:
-            fields = _numbers_of(session, stream, how)
+            fields = _numbers_of(session, stream.question, how)
             stream = replace(stream, question=replace(stream.question, fields=fields))
-        self._reader = TopicReader(session, stream, "log")
-        self._session = session
+        self._reader = TopicReader(session, stream)
         self._grid = grid
-        self._how: Aggregate = how
-        self._counters = stream.counters
-        self._none = self._reader.empty()[1] if how != _COUNT else pa.table({})
-        self._recording = ""
-        self._blocks: Iterator[_Block] = iter(())
-        self._rest: _Block | None = None
+        self._how = how
+        self._none = self._reader.empty() if how != _COUNT else pa.table({})
+        self._blocks: Iterator[Block] = iter(())
 
     def enter(self, recording: str, _end: int | None) -> None:
         """Go on with the messages of another recording."""
-        self._recording = recording
-        self._rest = None
-        self._blocks = self._times() if self._how == _COUNT else self._reader.tables(recording)
+        self._recording, self._blocks = recording, self._reader.tables(recording)
+        if self._how == _COUNT:
+            self._blocks = ((times, pa.table({})) for times, _ in self._reader.times(recording))
 
-    def rows(self, times: NDArray[np.int64]) -> pa.Table:
-        """The number of messages, and their fields, from each time to the next.
+    def row_bytes(self, _times: NDArray[np.int64]) -> int:
+        """Rows have a size of their own."""
+        return 0
+
+    def add(
+        self, columns: dict[str, Any], times: NDArray[np.int64], _empty: Counter[tuple[str, str]]
+    ) -> None:
+        """Add the number of messages, and their fields, from each time to the next.
 
         Args:
+            columns: Those of the rows, by name.
             times: int64[n], ns, of the grid; not before those of the last call.
         """
         made = _Rows(self._how, len(times))
@@ -100,40 +88,22 @@ class Bins:
         for field in self._reader.question.fields or ():
             if made.has_no_number(field):
                 raise _no_number(field, self._reader.question.topics[0])
-        return self._reader.named(
-            made.table(), self._reader.prefix + _COUNT, pa.array(made.messages)
-        )
+        name = free_name(self._reader.stream.prefix + _COUNT, columns)
+        columns[name] = pa.array(made.messages)
+        self._reader.add(columns, made.table(), Counter(), len(times))
 
-    def _until(self, end: int) -> Iterator[_Block]:
+    def _until(self, end: int) -> Iterator[Block]:
         """The messages before a time that were not given yet."""
-        while True:
-            block = self._rest or next(self._blocks, None)
-            self._rest = None
-            if block is None:
-                return
-            times, table = block
-            times = placed(times)
+        for whole, table in self._blocks:
+            times = placed(whole)
             cut = int(np.searchsorted(times, end))
             yield times[:cut], table.slice(0, cut)
             if cut < len(times):
-                self._rest = times[cut:], table.slice(cut)
+                self._blocks = chain([(times[cut:], table.slice(cut))], self._blocks)
                 return
 
-    def _times(self) -> Iterator[_Block]:
-        """Times of the messages, without their fields."""
-        question = replace(self._reader.question, recordings=(self._recording,), fields=None)
-        counters = Counters()
-        try:
-            for found in match_times(self._session, question, counters):
-                yield found.log_time, pa.table({})
-                counters.messages += len(found.log_time)
-        except TimeError:
-            return  # the range does not touch this recording
-        finally:
-            self._counters.add(counters)
 
-
-def _numbers_of(session: Session, stream: Stream, how: Aggregate) -> tuple[str, ...] | None:
+def _numbers_of(session: Session, question: Question, how: str) -> tuple[str, ...] | None:
     """The fields of a topic, or the requested ones, that are single numbers, also times.
 
     Times have no mean. None if no definition fixes the fields.
@@ -141,7 +111,6 @@ def _numbers_of(session: Session, stream: Stream, how: Aggregate) -> tuple[str, 
     Raises:
         UsageError: a requested field has none.
     """
-    question = stream.question
     known = session.field_types(question.topics, question.recordings)
     if known is None:
         return question.fields
@@ -177,14 +146,13 @@ class _Rows:
         messages: int64[size], messages in each bin.
     """
 
-    def __init__(self, how: Aggregate, size: int) -> None:
-        self._how: Aggregate = how
-        self._size = size
+    def __init__(self, how: str, size: int) -> None:
+        self._how = how
         self.messages = np.zeros(size, np.int64)
         self._others: set[str] = set()  # columns with values that are no numbers
         self._columns: dict[str, _Column] = {}
-        self._whole: list[pa.Table] = []
-        self._place = np.full(size, -1, np.int64)  # row of the first or last message of a bin
+        self._whole: list[pa.Table] = []  # the first or last messages of bins
+        self._place = np.full(size, -1, np.int64)  # row of that of each bin
         self._given = 0
 
     def add(self, table: pa.Table, row: NDArray[np.int64]) -> None:
@@ -198,78 +166,60 @@ class _Rows:
         bins, counts = row[begins], np.diff(np.append(begins, len(row)))
         if self._how in _OF_NUMBERS:
             for name, column in zip(table.column_names, table.columns, strict=True):
-                found = _values_of(column)
-                has_none = self._how == "mean" and pa.types.is_temporal(column.type)
-                if found is not None and not has_none:
-                    made = self._columns.setdefault(name, _Column(self._how, self._size))
-                    made.add(column.type, *found, row)
+                found = _values_of(column, self._how)
+                if found is not None:
+                    if name not in self._columns:
+                        self._columns[name] = _Column(self._how, len(self.messages))
+                    values, is_value = found
+                    self._columns[name].add(column.type, values, row[is_value])
                 elif not pa.types.is_null(column.type):
                     self._others.add(name)
         elif self._how != _COUNT:
-            is_new = self.messages[bins] == 0
-            chosen = begins[is_new] if self._how == "first" else begins + counts - 1
-            bins_of = bins[is_new] if self._how == "first" else bins
-            self._place[bins_of] = self._given + np.arange(len(chosen))
+            chosen = begins if self._how == "first" else begins + counts - 1
+            is_new = (self.messages[bins] == 0) | (self._how == "last")
+            chosen = chosen[is_new]
+            self._place[bins[is_new]] = self._given + np.arange(len(chosen))
             self._whole.append(table.take(pa.array(chosen)))
             self._given += len(chosen)
         self.messages[bins] += counts
 
     def has_no_number(self, field: str) -> bool:
         """True if a field has values, and none of them is a single number."""
-        mine = [
-            {name for name in names if name == field or name.startswith(f"{field}.")}
+        others, numeric = (
+            any(name == field or name.startswith(f"{field}.") for name in names)
             for names in (self._others, self._columns)
-        ]
-        return bool(mine[0]) and not mine[1]
+        )
+        return others and not numeric
 
     def table(self) -> pa.Table:
         """The columns."""
-        if self._how in _OF_NUMBERS:
-            return pa.table({name: column.array() for name, column in self._columns.items()})
-        if self._how == _COUNT:
-            return pa.table({})
-        missing = self._place < 0
-        return concatenated(self._whole).take(pa.array(self._place, mask=missing))
+        if self._whole:
+            missing = self._place < 0
+            return concatenated(self._whole).take(pa.array(self._place, mask=missing))
+        return pa.table({name: column.array() for name, column in self._columns.items()})
 
 
 class _Column:
     """The aggregate of one column by bin."""
 
-    def __init__(self, how: Aggregate, size: int) -> None:
+    def __init__(self, how: str, size: int) -> None:
         self._how = how
+        self._choose = np.minimum if how == "min" else np.maximum
         self._count = np.zeros(size, np.int64)
         self._totals = Totals(size if how == "mean" else 0)
-        self._value: NDArray[Any] = np.zeros(size, np.uint8)
-        self._kind: Any = None
+        self._parts: list[tuple[NDArray[np.int64], NDArray[Any]]] = []  # bins, their values
+        self._kinds: set[pa.DataType] = set()
 
-    def add(
-        self, kind: Any, values: NDArray[Any], is_value: NDArray[np.bool_], row: NDArray[np.int64]
-    ) -> None:
-        """Add values.
-
-        Args:
-            kind: Arrow type of the column.
-            values: (n,), numbers.
-            is_value: bool[n], False for those that do not count.
-            row: int64[n], ascending, the bin of each.
-        """
-        if self._kind is None and self._how != "mean":
-            self._value = self._value.astype(values.dtype)
-        elif self._how != "mean":
-            self._value = self._value.astype(np.result_type(self._value, values), copy=False)
-        self._kind = kind if self._kind in {None, kind} else pa.from_numpy_dtype(self._value.dtype)
-        chosen, row = values[is_value], row[is_value]
-        if not len(row):
-            return
+    def add(self, kind: pa.DataType, values: NDArray[Any], row: NDArray[np.int64]) -> None:
+        """Add values of an Arrow type in the bin of each."""
         begins = run_starts(row)
         bins = row[begins]
-        if self._how == "mean":
-            self._totals.add(chosen.astype(np.float64), begins, bins)
-        else:
-            choose = np.minimum if self._how == "min" else np.maximum
-            found = choose.reduceat(chosen, begins).astype(self._value.dtype)
-            is_first = self._count[bins] == 0
-            self._value[bins] = np.where(is_first, found, choose(self._value[bins], found))
+        if self._how != "mean":
+            # An empty part has the type, too.
+            self._parts.append((bins, self._choose.reduceat(values, begins)))
+            self._kinds.add(kind)
+        elif len(row):
+            self._totals.add(values.astype(np.float64), begins, bins)
         self._count[bins] += np.diff(np.append(begins, len(row)))
 
     def array(self) -> pa.Array[Any]:
@@ -277,24 +227,30 @@ class _Column:
         missing = self._count == 0
         if self._how == "mean":
             return pa.array(self._totals.means(self._count), mask=missing)
-        return pa.array(self._value, mask=missing).cast(self._kind)
+        row, values = (np.concatenate(parts) for parts in zip(*self._parts, strict=True))
+        begins = run_starts(row)
+        found = np.zeros(len(missing), values.dtype)
+        found[row[begins]] = self._choose.reduceat(values, begins)
+        made = pa.array(found, mask=missing)
+        return made.cast(*self._kinds) if len(self._kinds) == 1 else made
 
 
-def _values_of(column: Any) -> tuple[NDArray[Any], NDArray[np.bool_]] | None:
-    """The numbers of a column, and which of them count: finite ones. None for other types."""
+def _values_of(column: Any, how: str) -> tuple[NDArray[Any], NDArray[np.bool_]] | None:
+    """The numbers of a column that count, finite ones, and which these are; None of other types.
+
+    Times have no mean.
+    """
     kind = column.type
-    if is_time(kind):
+    if is_time(kind) and how != "mean":
         column = column.cast(pa.int64())
     elif pa.types.is_boolean(kind):
         column = column.cast(pa.uint8())
     elif not is_number(kind):
         return None
-    is_value = np.ones(len(column), np.bool_)
-    if column.null_count:
-        is_value = column.is_valid().to_numpy()
-        column = column.fill_null(0)
-    values = column.to_numpy()
-    return values, is_value & np.isfinite(values)
+    is_valid = column.is_valid().to_numpy() if column.null_count else True
+    values = (column.fill_null(0) if column.null_count else column).to_numpy()
+    is_value = np.isfinite(values) & is_valid
+    return values[is_value], is_value
 
 
 class RegularTimes:

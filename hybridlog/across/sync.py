@@ -8,12 +8,14 @@ from __future__ import annotations
 import os
 from array import array
 from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, overload
+from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias, overload
 
 import numpy as np
 
+from hybridlog.across.match import UNKNOWN
+from hybridlog.across.topic_reader import Stream, TopicReader
 from hybridlog.message import messages_in
 from hybridlog.query.answers.last_message import message_at
 from hybridlog.query.answers.lost import completeness_of
@@ -23,8 +25,6 @@ from hybridlog.query.intervals import Intervals
 from hybridlog.query.planner import Planner
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import DurationLike, parse_duration
-from hybridlog.schema.codec import stamp_array
-from hybridlog.schema.column import STAMP
 from hybridlog.wording import counted
 from hybridlog_storage.errors import StoreError, TimeError, UsageError
 from hybridlog_storage.times import span_of
@@ -39,21 +39,10 @@ if TYPE_CHECKING:
     from hybridlog.session import Session
 
 
-@dataclass(frozen=True, slots=True)
-class _Found:
-    """The messages of one topic that are in sets.
-
-    Attributes:
-        time: int64[n], ns on the clock.
-        log_time: int64[n], ns.
-        number: int64[n], its place among the messages of that log time that the question finds.
-        is_alone: bool[n], True if the topic has no other message of that log time.
-    """
-
-    time: NDArray[np.int64]
-    log_time: NDArray[np.int64]
-    number: NDArray[np.int64]
-    is_alone: NDArray[np.bool_]
+_SIDES: Final[tuple[Literal["left", "right"], ...]] = ("left", "right")
+_Times: TypeAlias = "NDArray[np.int64]"
+"""int64[4, n] of messages: time on the clock, ns; log time, ns; place among the messages of that
+log time that the question finds; 1 if the topic has no other message of that log time."""
 
 
 class Synced(Sequence[tuple["Message", ...]]):
@@ -93,29 +82,33 @@ class Synced(Sequence[tuple["Message", ...]]):
         snapshot = session.look()
         shared = [set(session.chosen(question).tolist()) for question in questions]
         ids: list[str] = []
-        found: list[list[_Found]] = []
+        # By topic int64[4, n] of each recording, as of `_Times`.
+        found = [[np.empty((4, 0), np.int64)] for _ in questions]
         known = np.zeros((2, len(questions)), np.int64)  # messages, those with a time
         places = sorted(set.intersection(*shared))
         in_range = set.union(*map(partial(_in_range, session), questions))
         for place in sorted(in_range.intersection(places)):
             recording = snapshot.summaries[place].id
-            columns = [
-                _times_of(session, replace(q, recordings=(recording,)), clock, self.counters)
-                for q in questions
-            ]
-            rows = approximate_sets([column.time for column in columns], limit)
+            read = [_times_of(session, q, recording, clock, self.counters) for q in questions]
+            rows = approximate_sets([time[order] for _, time, order in read], limit)
             ids += [recording] * len(rows)
-            found.append([column.take(rows[:, n]) for n, column in enumerate(columns)])
-            known += [[len(c.log_time) for c in columns], [len(c.time) for c in columns]]
+            for n, (log_time, time, order) in enumerate(read):
+                place_of = order[rows[:, n]]
+                log = log_time[place_of]
+                first, behind = (np.searchsorted(log_time, log, side) for side in _SIDES)
+                is_whole = questions[n].is_unbounded and questions[n].predicate is None
+                is_alone = (behind - first == 1) & is_whole
+                found[n].append(np.stack([time[place_of], log, place_of - first, is_alone]))
+            known += [[len(log) for log, _, _ in read], [len(order) for _, _, order in read]]
         self.recordings = tuple(ids)
         left_out = [
-            _left_out(session, question, read, places, len(ids))
-            for question, read in zip(questions, known.T.tolist(), strict=True)
+            _left_out(session, question, counts, places, len(ids))
+            for question, counts in zip(questions, known.T.tolist(), strict=True)
         ]
         self.left_out = tuple(messages for messages, _ in left_out)
         self._why_left_out = [why for _, why in left_out if why]
-        by_topic = [_joined([part[n] for part in found]) for n in range(len(questions))]
-        self.times: NDArray[np.int64] = np.stack([column.time for column in by_topic], axis=1)
+        by_topic = [np.concatenate(parts, axis=1) for parts in found]
+        self.times: NDArray[np.int64] = np.stack([times[0] for times in by_topic], axis=1)
         self._topics = list(zip(questions, by_topic, strict=True))
 
     def __repr__(self) -> str:
@@ -168,25 +161,18 @@ class Synced(Sequence[tuple["Message", ...]]):
         return (self[n] for n in range(len(self)))
 
     def _read(
-        self, session: Session, question: Question, topic: _Found, recording: str, row: int
+        self, session: Session, question: Question, times: _Times, recording: str, row: int
     ) -> Message:
-        time, number = int(topic.log_time[row]), int(topic.number[row])
-        plain = replace(
-            question,
-            recordings=(recording,),
-            bounds=None,
-            during=None,
-            predicate=None,
-            clock="log",
-        )
-        if topic.is_alone[row]:
+        _, time, number, is_alone = map(int, times[:, row])
+        question = replace(question, recordings=(recording,))
+        if is_alone:
+            plain = replace(question, bounds=None, during=None, predicate=None, clock="log")
             found = message_at(session, plain, self.counters, time)
             if found is not None and found.log_time_ns == time:
                 return found
         span = Intervals.of([(recording, np.array([[*span_of(time, time), 1]], np.int64))])
-        question = replace(question, recordings=(recording,), during=span)
         counters = Counters()
-        runs = Planner(session, question, counters).runs()
+        runs = Planner(session, replace(question, during=span), counters).runs()
         picture = picture_of(session)
         messages = [message for run in runs for message in messages_in(run, picture)]
         self.counters.add(counters)
@@ -198,44 +184,6 @@ class Synced(Sequence[tuple["Message", ...]]):
         return messages[number]
 
 
-@dataclass(frozen=True, slots=True)
-class _Times:
-    """Times of the messages of a topic of a recording.
-
-    Attributes:
-        time: int64[n], ns on the clock, ascending.
-        log_time: int64[m], ns, ascending; m > n if some have no time on the clock.
-        rows: int64[n], place of each time in `log_time`; None for the same place.
-        is_whole: True if these are all messages of the topic.
-    """
-
-    time: NDArray[np.int64]
-    log_time: NDArray[np.int64]
-    rows: NDArray[np.int64] | None
-    is_whole: bool
-
-    def take(self, chosen: NDArray[np.int64]) -> _Found:
-        """The messages of some times."""
-        rows = chosen if self.rows is None else self.rows[chosen]
-        log_time = self.log_time[rows]
-        begin = np.searchsorted(self.log_time, log_time, "left")
-        end = np.searchsorted(self.log_time, log_time, "right")
-        is_alone = (end - begin == 1) & self.is_whole
-        return _Found(self.time[chosen], log_time, rows - begin, is_alone)
-
-
-def _joined(parts: Sequence[_Found]) -> _Found:
-    none = np.empty(0, np.int64)
-    empty = _Found(none, none, none, np.empty(0, np.bool_))
-    whole = [empty, *parts]
-    return _Found(
-        np.concatenate([part.time for part in whole]),
-        np.concatenate([part.log_time for part in whole]),
-        np.concatenate([part.number for part in whole]),
-        np.concatenate([part.is_alone for part in whole]),
-    )
-
-
 def _in_range(session: Session, question: Question) -> set[int]:
     """Places of the recordings that a question's range touches."""
     try:
@@ -244,63 +192,20 @@ def _in_range(session: Session, question: Question) -> set[int]:
         return set()
 
 
-def _times_of(session: Session, question: Question, clock: Clock, counters: Counters) -> _Times:
-    """The messages of a question about one recording, ordered by their time on a clock.
+def _times_of(
+    session: Session, question: Question, recording: str, clock: Clock, counters: Counters
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Log times of a recording's messages, times on a clock, and the order by these.
 
     Raises:
         TopicError: the topic does not have the clock.
     """
-    if clock != "log":
-        # Refused where the topic does not have the clock.
-        on_clock = replace(question, clock=clock, bounds=(None, None), during=None)
-        Planner(session, on_clock, Counters()).parts()
-    planner = Planner(session, question, counters)
-    log_times, times, has = (
-        [np.empty(0, np.int64)],
-        [np.empty(0, np.int64)],
-        [np.empty(0, np.bool_)],
-    )
-    try:
-        for log_time, time, known in _read_times(planner, clock):
-            log_times.append(log_time)
-            times.append(time)
-            has.append(known)
-    except TimeError:
-        pass  # the range does not touch this recording
-    log_time, time, known = np.concatenate(log_times), np.concatenate(times), np.concatenate(has)
-    is_whole = question.is_unbounded and question.predicate is None
-    if known.all() and not np.any(time[1:] < time[:-1]):
-        return _Times(time, log_time, None, is_whole)
+    own = replace(question, recordings=(recording,), fields=())
+    reader = TopicReader(session, Stream(own, counters=counters), clock)
+    read = [(np.empty(0, np.int64), np.empty(0, np.int64)), *reader.times(recording)]
+    log_time, time = (np.concatenate(parts) for parts in zip(*read, strict=True))
     order = np.argsort(time, kind="stable")
-    order = order[known[order]]
-    return _Times(time[order], log_time, order, is_whole)
-
-
-_Block = tuple["NDArray[np.int64]", "NDArray[np.int64]", "NDArray[np.bool_]"]
-
-
-def _read_times(planner: Planner, clock: Clock) -> Iterator[_Block]:
-    """Log times, times on a clock, and whether these are known, in order."""
-    if clock == "publish":
-        for run in planner.runs():
-            batch = run.batch
-            yield batch.log_time, batch.publish_time, np.ones(len(batch), np.bool_)
-        return
-    for part in planner.parts():
-        if clock == "log":
-            for outcome in planner.outcomes(part):
-                chosen = outcome.log_time[outcome.holds]
-                yield chosen, chosen, np.ones(len(chosen), np.bool_)
-            continue
-        for values in planner.values(part, (STAMP,)):
-            stamps = stamp_array(values.records)
-            if stamps is None:
-                none = np.zeros(len(values.log_time), np.int64)
-                yield values.log_time, none, none.astype(np.bool_)
-                continue
-            known = stamps.is_valid().to_numpy(zero_copy_only=False)
-            filled = stamps.view("int64").fill_null(0).to_numpy()
-            yield values.log_time, filled, known
+    return log_time, time, order[time[order] != UNKNOWN]
 
 
 def _left_out(
@@ -312,12 +217,8 @@ def _left_out(
 ) -> tuple[int, str]:
     """The number of messages of a topic that are in no set, and a sentence about them.
 
-    Args:
-        session: The open store.
-        question: The question about the topic.
-        read: Messages in the recordings with all topics, and those with a time on the clock.
-        places: Places of these recordings.
-        sets: Number of sets.
+    `read` are the messages in the recordings with all topics, at `places`, and those of them
+    with a time on the clock.
     """
     summaries = session.snapshot().summaries
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from typing import TYPE_CHECKING, Any, Final
@@ -31,11 +32,13 @@ if TYPE_CHECKING:
     from hybridlog.query.question import Clock, Question
     from hybridlog.session import Session
 
-
+Block = tuple["NDArray[np.int64]", pa.Table]
+"""Times of some messages, ns, and their columns."""
 TIME: Final = "log_time"
 """Column of the time of a row."""
 RECORDING: Final = "recording"
 """Column of the recording of a row."""
+_NO_VALUE: Final = "the message has no such value"
 _MAX_NAMES: Final = 3  # recordings in a message
 
 
@@ -51,7 +54,7 @@ class Stream:
     """
 
     question: Question
-    prefix: str
+    prefix: str = ""
     is_apart: bool = False
     counters: Counters = field(default_factory=Counters, compare=False)
 
@@ -59,54 +62,62 @@ class Stream:
 class TopicReader:
     """Reads one topic with its times on a clock."""
 
-    def __init__(self, session: Session, stream: Stream, clock: Clock) -> None:
+    def __init__(self, session: Session, stream: Stream, clock: Clock = "log") -> None:
         question = stream.question
         if not question.returns_all or question.reverse:
             raise UsageError(
                 "An alignment uses all messages; it cannot be combined with limit, every or "
                 "reverse."
             )
-        self.prefix = stream.prefix
-        self._is_apart = stream.is_apart
-        if stream.is_apart:
-            question = replace(question, names_recording=True)
+        self.stream = stream
+        self.is_by_log_time = clock == "log"
         self._session = session
-        self._counters = stream.counters
         known = session.field_types(question.topics, question.recordings)
         self.quaternions = quaternion_paths(known)
-        self._own: str | None = None  # column that only tells the time
-        self._clock_column = TIME
+        self._time = {"log": TIME, "publish": "publish_time", "header": STAMP}[clock]
+        self._hidden = {TIME} if stream.is_apart else {TIME, RECORDING}
+        if stream.is_apart:
+            question = replace(question, names_recording=True)
         if clock != "log":
             # Refused where the topic does not have the clock.
-            on_clock = replace(question, clock=clock, bounds=question.bounds or (None, None))
+            on_clock = replace(question, clock=clock, bounds=(None, None), during=None)
             Planner(session, on_clock, Counters()).parts()
-            self._clock_column = STAMP if clock == "header" else "publish_time"
-            question = self._with_clock(question, known)
+            question = replace(question, fields=self._with_time(question.fields, known))
         self.question = question
 
-    def _with_clock(self, question: Question, known: dict[str, str] | None) -> Question:
-        name, fields = self._clock_column, question.fields
+    def _with_time(
+        self, fields: tuple[str, ...] | None, known: dict[str, str] | None
+    ) -> tuple[str, ...] | None:
+        """The requested fields and the time on the clock, which is hidden if only we ask."""
+        name = self._time
         if fields is None:
             if name == STAMP:
-                return question
+                return None
             if known is None:
                 raise UsageError("The fields of this topic are not fixed: name them.")
             fields = tuple(dict.fromkeys(path.split(".")[0].split("[")[0] for path in known))
-        if not any(path == name or name.startswith(f"{path}.") for path in fields):
-            self._own = name
-            fields = (*fields, name)
-        return replace(question, fields=fields)
+        if any(path == name or name.startswith(f"{path}.") for path in fields):
+            return fields
+        self._hidden.add(name)
+        return (*fields, name)
 
-    def empty(self) -> tuple[NDArray[np.int64], pa.Table]:
+    @contextmanager
+    def _planned(self, question: Question) -> Iterator[Planner]:
+        """A planner whose cost counts; a range that does not touch the recording is left."""
+        counters = Counters()
+        try:
+            with suppress(TimeError):
+                yield Planner(self._session, question, counters)
+        finally:
+            self.stream.counters.add(counters)
+
+    def empty(self) -> pa.Table:
         """No rows, with the columns of all recordings."""
         question = replace(self.question, limit=0, bounds=None, during=None, predicate=None)
-        table = next(stream(Planner(self._session, question, Counters())))
-        return self._times(table), table
+        return next(stream(Planner(self._session, question, Counters())))
 
-    def tables(
-        self, recording: str, span: tuple[int, int] | None = None
-    ) -> Iterator[tuple[NDArray[np.int64], pa.Table]]:
-        """Times, ns, and columns of the messages of a recording, by log time.
+    def tables(self, recording: str, span: tuple[int, int] | None = None) -> Iterator[Block]:
+        """The messages beside a recording, by log time.
 
         Args:
             recording: Id of the recording.
@@ -117,21 +128,41 @@ class TopicReader:
         question = self._beside(recording)
         if span is not None:
             question = replace(question, bounds=span)
-        counters = Counters()
-        try:
-            for table in stream(Planner(self._session, question, counters)):
+        with self._planned(question) as planner:
+            for table in stream(planner):
                 if table.num_rows:
-                    yield self._times(table), table
-        except TimeError:
-            return  # the range does not touch this recording
-        finally:
-            self._counters.add(counters)
+                    yield _ns(table[self._time]), table
+
+    def by_clock(self, recording: str) -> Block:
+        """The messages beside a recording that have a time, in memory, by their times."""
+        none = self.empty()
+        found = [(_ns(none[self._time]), none), *self.tables(recording)]
+        times = np.concatenate([part for part, _ in found])
+        order = np.argsort(times, kind="stable")
+        order = order[times[order] != UNKNOWN]
+        return times[order], concatenated([part for _, part in found]).take(pa.array(order))
+
+    def times(self, recording: str) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+        """Log times of the messages beside a recording, and their times, without their fields."""
+        if self._time == STAMP:
+            yield from ((_ns(table[TIME]), times) for times, table in self.tables(recording))
+            return
+        with self._planned(replace(self._beside(recording), fields=None)) as planner:
+            if not self.is_by_log_time:
+                for run in planner.runs():
+                    yield run.batch.log_time, run.batch.publish_time
+                return
+            for part in planner.parts():
+                for found in planner.outcomes(part):
+                    times = found.log_time[found.holds]
+                    planner.counters.messages += len(times)
+                    yield times, times
 
     def elsewhere(self, recording: str) -> str | None:
         """Why no message can be beside the rows of a recording; None if there may be some."""
         snapshot = self._session.snapshot()
         place, places = snapshot.by_id[recording], self._session.chosen(self.question)
-        if self._is_apart or place in places:
+        if self.stream.is_apart or place in places:
             return None
         is_near = (snapshot.begin[places] < snapshot.end[place]) & (
             snapshot.begin[place] < snapshot.end[places]
@@ -147,7 +178,7 @@ class TopicReader:
     def lost(self, recording: str) -> NDArray[np.int64]:
         """int64[n, 2], log time in which messages beside a recording are lost, ns, in order."""
         spans: list[tuple[int, int, int]] = []
-        if self._clock_column == TIME and self.elsewhere(recording) is None:
+        if self.is_by_log_time and self.elsewhere(recording) is None:
             with suppress(TimeError):  # the range does not touch this recording
                 lost = lost_times(self._session, self._beside(recording))
                 # Those that may be of any time explain no row.
@@ -157,51 +188,50 @@ class TopicReader:
 
     def _beside(self, recording: str) -> Question:
         """The question about the messages that may be beside the rows of a recording."""
-        return self.question if self._is_apart else replace(self.question, recordings=(recording,))
+        if self.stream.is_apart:
+            return self.question
+        return replace(self.question, recordings=(recording,))
 
-    def latest(self, recording: str, moment: int) -> int | None:
-        """Log time of the last message beside a recording by a time, ns."""
+    def latest(self, recording: str, moment: int) -> int:
+        """Log time of the last message beside a recording by a time, ns; that without any."""
         if moment >= END:
-            return None
-        question = self._beside(recording)
-        found = message_at(self._session, question, self._counters, moment)
-        return None if found is None else found.log_time_ns
+            return moment
+        found = message_at(self._session, self._beside(recording), self.stream.counters, moment)
+        return moment if found is None else found.log_time_ns
 
-    def following(self, recording: str, moment: int) -> int | None:
+    def following(self, recording: str, moment: int) -> int:
         """Log time just behind the first message beside a recording from a time on, ns."""
         later = replace(self._beside(recording), bounds=(moment, END), limit=1)
-        counters = Counters()
-        try:
-            for run in Planner(self._session, later, counters).runs():
+        with self._planned(later) as planner:
+            for run in planner.runs():
                 return min(int(run.batch.log_time[0]) + 1, END)
-        except TimeError:
-            return moment  # the recording ends before
-        finally:
-            self._counters.add(counters)
         return moment
 
-    def _times(self, table: pa.Table) -> NDArray[np.int64]:
-        column = table[self._clock_column]
-        if column.null_count:
-            column = column.cast(pa.int64()).fill_null(UNKNOWN)
-        whole = column.chunk(0) if column.num_chunks == 1 else column
-        times: NDArray[np.int64] = whole.to_numpy().view(np.int64)
-        return times
-
-    def named(self, table: pa.Table, first: str, column: Any) -> pa.Table:
-        """The columns of the answer, under their names in it.
+    def add(
+        self, columns: dict[str, Any], table: pa.Table, blank: Counter[tuple[str, str]], known: int
+    ) -> None:
+        """Add the columns of messages to those of the rows, under free names.
 
         Args:
+            columns: Those of the rows, by name.
             table: The messages.
-            first: Name of the first column, which no field takes.
-            column: That column.
+            blank: Numbers of rows that have no value, by column and reason.
+            known: Rows without a message, which do not count.
         """
-        found: dict[str, Any] = {first: column}
-        own = {TIME, self._own, *(() if self._is_apart else (RECORDING,))}
-        for name, values in zip(table.column_names, table.columns, strict=True):
-            if name not in own:
-                found[free_name(self.prefix + name, found)] = values
-        return pa.table(found)
+        for name, column in zip(table.column_names, table.columns, strict=True):
+            if name not in self._hidden:
+                free = free_name(self.stream.prefix + name, columns)
+                columns[free] = column
+                if column.null_count > known:
+                    blank[free, _NO_VALUE] += column.null_count - known
+
+
+def _ns(column: pa.ChunkedArray[Any]) -> NDArray[np.int64]:
+    if column.null_count:
+        column = column.cast(pa.int64()).fill_null(UNKNOWN)
+    whole = column.chunk(0) if column.num_chunks == 1 else column
+    times: NDArray[np.int64] = whole.to_numpy().view(np.int64)
+    return times
 
 
 def concatenated(tables: Sequence[pa.Table]) -> pa.Table:
@@ -212,13 +242,11 @@ def concatenated(tables: Sequence[pa.Table]) -> pa.Table:
         return pa.concat_tables(tables)
     columns: dict[str, Any] = {}
     for name in dict.fromkeys(chain.from_iterable(table.column_names for table in tables)):
-        chunks = [
-            table[name].combine_chunks() if name in table.column_names else table.num_rows
-            for table in tables
-        ]
         arrays = [
-            pa.concat_arrays(chunk.chunks) if isinstance(chunk, pa.ChunkedArray) else chunk
-            for chunk in chunks
+            pa.concat_arrays(table[name].chunks or [pa.nulls(0, table[name].type)])
+            if name in table.column_names
+            else table.num_rows
+            for table in tables
         ]
         kind = common_type([array for array in arrays if not isinstance(array, int)])
         parts = [
