@@ -846,7 +846,7 @@ class Store:
             SourceError: Nothing could be read.
             AlreadyRecordedError: Its content is in the store already.
         """
-        from hybridlog.formats.detect import open_source
+        from hybridlog.formats.log_set import open_source
         from hybridlog.formats.reading import fingerprint
         from hybridlog.record.recorder import RecordOptions, record
 

@@ -116,7 +116,7 @@ ALLOWED = {
     ),
     "yaml": ("hybridlog.formats.rosbag2.writer", "hybridlog.formats.yaml_values"),
     "zstandard": (
-        "hybridlog.formats.joined",
+        "hybridlog.formats.log_set",
         "hybridlog.formats.spool",
         "hybridlog_storage.segments.compression",
         "hybridlog_storage.segments.segment_format",
@@ -329,7 +329,7 @@ def test_starting_loads_nothing_heavy(start: str) -> None:
     ("modules", "heavy"),
     [
         ("hybridlog.demo.tour", "numpy rosbags pandas pyarrow"),
-        ("hybridlog.formats.detect", "rosbags yaml sqlite3 lz4 pandas pyarrow pymongo"),
+        ("hybridlog.formats.log_set", "rosbags yaml sqlite3 lz4 pandas pyarrow pymongo"),
         (
             "hybridlog.formats, hybridlog.query.times, hybridlog.query.topics, "
             "hybridlog.query.predicate.parser, hybridlog.query.predicate.mongo_filter",

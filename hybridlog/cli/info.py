@@ -554,7 +554,7 @@ def show_segment(path: Path, *, as_json: bool) -> None:
 
 def _refuse_log(path: Path) -> None:
     """Tell a log, and a file of another kind, from a segment."""
-    from hybridlog.formats.detect import open_source
+    from hybridlog.formats.log_set import open_source
     from hybridlog.record.recorder import name_of
 
     try:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -34,7 +34,8 @@ from hybridlog_storage.stopping import anywhere, at_safe_points, safe_point
 
 if TYPE_CHECKING:
     from hybridlog.cli.progress import Bar
-    from hybridlog.formats.find import Found, Log, Watch
+    from hybridlog.formats.find import Found, Watch
+    from hybridlog.formats.log_set import LogSet
     from hybridlog.formats.reading import Source
     from hybridlog.query.topics import TopicMatcher
     from hybridlog.record.recorder import RecordOptions, RecordReport
@@ -51,7 +52,7 @@ def record_logs(choices: RecordChoices) -> None:
         raise UsageError(f"--name names one recording; there are {len(logs)} logs.")
     # Wrong options are found before a store is made.
     recorder = LogRecorder(choices)
-    check_new_store(choices, [log.path for log in logs])
+    check_new_store(choices, logs)
     done = recorder.results
     done.expect(logs, is_search=walked is not None)
     if walked is not None:
@@ -93,7 +94,13 @@ def record_watched(choices: RecordChoices) -> None:
             look = partial(_look, recorder, store, watches, set[Path]())
             places = ", ".join(map(str, choices.paths))
             watch(places, look, quiet=choices.quiet, report=partial(done.fail, None))
-            _print_unfinished([path for one in watches for path in one.unfinished()])
+            left = [path for one in watches for path in one.unfinished()]
+            for path in left[:_MAX_UNFINISHED]:
+                output.note(
+                    f"{path} is not complete; `hybridlog record {path}` records what it has."
+                )
+            if more := left[_MAX_UNFINISHED:]:
+                output.note(f"and {len(more)} more that are not complete")
     finally:
         done.show()
     done.exit()
@@ -129,18 +136,12 @@ def _look(
                 raise
 
 
-def _print_unfinished(paths: Sequence[Path]) -> None:
-    for path in paths[:_MAX_UNFINISHED]:
-        output.note(f"{path} is not complete; `hybridlog record {path}` records what it has.")
-    if len(paths) > _MAX_UNFINISHED:
-        output.note(f"and {len(paths) - _MAX_UNFINISHED} more that are not complete")
-
-
-def _find(choices: RecordChoices) -> tuple[list[Log], Found | None]:
+def _find(choices: RecordChoices) -> tuple[list[LogSet], Found | None]:
     """The logs to record, and what was met in directories; None if each path is one log."""
-    from hybridlog.formats.find import Found, Log, find_logs
+    from hybridlog.formats.find import Found, find_logs
+    from hybridlog.formats.log_set import LogSet
 
-    logs: list[Log] = []
+    logs: list[LogSet] = []
     walked: Found | None = None
     if choices.paths and all(map(_is_topic, choices.paths)):
         topics = " ".join(f"-t {path}" for path in choices.paths)
@@ -152,8 +153,7 @@ def _find(choices: RecordChoices) -> tuple[list[Log], Found | None]:
         found = find_logs(path) if path.is_dir() else Found()
         is_one = len(found.logs) == 1 and path in {found.logs[0].path, found.logs[0].path.parent}
         if is_one or not found.logs:
-            size = path.stat().st_size if path.is_file() else sum(log.size for log in found.logs)
-            logs.append(Log(path, (path,), size))
+            logs.append(LogSet.at(path))
             print_stores(found.stores)
             continue
         walked = walked or Found()
@@ -178,7 +178,7 @@ def print_stores(stores: Iterable[Path]) -> None:
         )
 
 
-def _what(logs: Sequence[Log]) -> str:
+def _what(logs: Sequence[LogSet]) -> str:
     return logs[0].path.name if len(logs) == 1 else f"{len(logs)} logs"
 
 
@@ -202,10 +202,9 @@ class LogRecorder:
         self._choices = choices
         self._settings = segment_settings(choices)
         self._tags = parse_tags(choices.set_tag)
-        _matcher(choices)
-        _no_index(choices)
+        _matchers(choices)
 
-    def record(self, store: Store, log: Log, progress: Callable[[int, int], None]) -> None:
+    def record(self, store: Store, log: LogSet, progress: Callable[[int, int], None]) -> None:
         """Record a log, or those parts of it that are not in the store yet.
 
         Raises:
@@ -223,44 +222,39 @@ class LogRecorder:
                 self.results.fail(piece.path, error)
         self.results.finish(log)
 
-    def _pieces(self, store: Store, log: Log) -> Iterator[Log]:
-        """The log; the missing parts of it if others were recorded on their own."""
-        from hybridlog.formats.find import Log
+    def _pieces(self, store: Store, log: LogSet) -> Iterator[LogSet]:
+        """The log; in a search, the missing parts of it if others were recorded on their own."""
+        from hybridlog.formats.log_set import LogSet
         from hybridlog.formats.reading import fingerprint
 
-        if self._choices.again or len(log.files) == 1:
-            yield log
-            return
-        try:
-            with _opened(log) as source:
-                files = source.files
-            prints = fingerprint(files)
-        except SourceError:
-            yield log  # the error is told when it is recorded
-            return
-        find = store.catalog.with_fingerprint
-        missing = [f for f, p in zip(files, prints.parts, strict=True) if find(p) is None]
-        if not missing or len(missing) == len(files) or find(prints.whole) is not None:
-            yield log
-            return
-        for file in missing:
-            yield Log(file, (file,), file.stat().st_size)
+        missing: list[Path] = []
+        if self.results.is_search and not self._choices.again and len(log.files) > 1:
+            find = store.catalog.with_fingerprint
+            try:
+                prints = fingerprint(log.files)
+            except SourceError:
+                prints = None  # the error is told when it is recorded
+            if prints is not None and find(prints.whole) is None:
+                of_files = zip(log.files, prints.parts, strict=True)
+                missing = [file for file, part in of_files if find(part) is None]
+        is_whole = not missing or len(missing) == len(log.files)
+        yield from [log] if is_whole else map(LogSet.at, missing)
 
     def _record_one(
-        self, store: Store, log: Log, progress: Callable[[int, int], None]
+        self, store: Store, log: LogSet, progress: Callable[[int, int], None]
     ) -> RecordReport:
         from hybridlog.record.recorder import RecordOptions
 
         choices = self._choices
         with anywhere():
-            source = _opened(log)
+            source = log.open()
         with source:
-            matcher, no_index = _matcher(choices), _no_index(choices)
+            matcher, no_index = _matchers(choices)
             options = RecordOptions(
                 name=choices.name or log.name,
                 tags=self._tags,
                 matcher=matcher,
-                between=_between(source, choices),
+                between=_between(source, log, choices),
                 latched=not choices.no_latched,
                 original_times=choices.original_times,
                 again=choices.again,
@@ -274,36 +268,27 @@ class LogRecorder:
         return report
 
 
-def _opened(log: Log) -> Source:
-    from hybridlog.formats.detect import open_parts, open_source
-
-    is_split = len(log.files) > 1 and log.path == log.files[0]
-    return open_parts(log.files) if is_split else open_source(log.path)
-
-
-def check_new_store(choices: RecordChoices, paths: Sequence[Path]) -> None:
-    """Fail before a store is made, when no path can be read or the server does not answer."""
+def check_new_store(choices: RecordChoices, logs: Sequence[LogSet]) -> None:
+    """Fail before a store is made, when no log can be read or the server does not answer."""
     from hybridlog.maintenance.lease import check
     from hybridlog.store import store_path
     from hybridlog_storage.settings import NAME, is_uri, with_password
 
     if os.path.lexists(store_path(choices.store) / NAME):
         return
-    from hybridlog.formats.detect import open_source
-
     first: SourceError | None = None
-    for path in paths:
+    for log in logs:
         try:
-            open_source(path).close()
+            log.open().close()
         except SourceError as error:
             first = first or error
         else:
             break
     else:
-        if first is not None and len(paths) == 1:
+        if first is not None and len(logs) == 1:
             raise first
         if first is not None:
-            raise SourceError(f"None of the {len(paths)} paths can be read. {first}")
+            raise SourceError(f"None of the {len(logs)} paths can be read. {first}")
     if is_uri(choices.mongo):
         # The new store stores the URI, so it has to be right.
         from hybridlog_storage.mongo.database import Database
@@ -327,14 +312,13 @@ def _check_not_empty(
     raise _outside(source, options.between)
 
 
-def _between(source: Source, choices: RecordChoices) -> tuple[int, int] | None:
-    from hybridlog.formats.detect import read_time_range
+def _between(source: Source, log: LogSet, choices: RecordChoices) -> tuple[int, int] | None:
     from hybridlog.query.times import is_relative, parse_range
 
     if choices.between is None:
         return None
     if source.time_range is None and any(map(is_relative, choices.between)):
-        source.time_range = read_time_range(source.path)
+        source.time_range = log.read_time_range()
     start, end = source.time_range or (None, None)
     between = parse_range(*choices.between, start=start, end=end)
     if start is not None and end is not None and (between[1] <= start or between[0] >= end):
@@ -353,30 +337,26 @@ def _outside(source: Source, between: tuple[int, int]) -> TimeError:
     return TimeError(f"{source.path} has no message from {low} up to {high}{spans}.")
 
 
-def _matcher(choices: RecordChoices) -> TopicMatcher | None:
-    """A new matcher for each source, as it counts the uses of its patterns."""
+def _matchers(choices: RecordChoices) -> tuple[TopicMatcher | None, TopicMatcher | None]:
+    """The topics, and those without index documents; new ones, as each counts its uses."""
     from hybridlog.query.topics import matcher
 
-    if not choices.topics and not choices.exclude:
-        return None
-    return matcher(choices.topics, choices.exclude)
-
-
-def _no_index(choices: RecordChoices) -> TopicMatcher | None:
-    """The same for the topics without index documents."""
-    from hybridlog.query.topics import matcher
-
-    return matcher(choices.no_index) if choices.no_index else None
+    chosen = matcher(choices.topics, choices.exclude) if choices.topics or choices.exclude else None
+    return chosen, matcher(choices.no_index) if choices.no_index else None
 
 
 class Results:
-    """Results of logs, for the table at the end and the exit code."""
+    """Results of logs, for the table at the end and the exit code.
+
+    Attributes:
+        is_search: Whether logs are looked for in directories, so that known ones are no error.
+    """
 
     def __init__(self, choices: RecordChoices) -> None:
         self._choices = choices
-        self._logs: Sequence[Log] = ()
+        self._logs: Sequence[LogSet] = ()
         self._unfinished: list[Path] = []
-        self._is_search = False
+        self.is_search = False
         self._reports_each = False
         self._current: Path | None = None
         self._recorded = self._known = self._failed = 0
@@ -386,19 +366,19 @@ class Results:
         self._summaries: list[dict[str, Any]] = []
         self._messages: list[str] = []
 
-    def expect(self, logs: Sequence[Log], *, is_search: bool) -> None:
+    def expect(self, logs: Sequence[LogSet], *, is_search: bool) -> None:
         """Set the logs to record.
 
         Args:
             logs: The logs.
-            is_search: Whether they were found in directories, so that known ones are no error.
+            is_search: Whether they were found in directories.
         """
-        self._logs, self._is_search = logs, is_search
+        self._logs, self.is_search = logs, is_search
         self._unfinished = [log.path for log in logs]
 
     def report_each(self) -> None:
         """Print a line for each log when it is recorded; there is no end to the search."""
-        self._is_search = self._reports_each = True
+        self.is_search = self._reports_each = True
 
     def add_walk(self, found: Found) -> None:
         """Report what was met in directories besides logs."""
@@ -410,7 +390,7 @@ class Results:
         """The log at a path is recorded now."""
         self._current = path
 
-    def finish(self, log: Log) -> None:
+    def finish(self, log: LogSet) -> None:
         """Note that a log is done: all of it is stored, or reported as left out."""
         if log.path in self._unfinished:
             self._unfinished.remove(log.path)
@@ -437,7 +417,7 @@ class Results:
         Raises:
             AlreadyRecordedError: It is the only one.
         """
-        if not self._is_search:
+        if not self.is_search:
             self.fail(path, error)
             return
         self._current = None
@@ -451,7 +431,7 @@ class Results:
             HybridlogError: It is of the only log.
         """
         self._current = None
-        if len(self._logs) == 1 and not self._is_search:
+        if len(self._logs) == 1 and not self.is_search:
             self._unfinished.clear()
             raise error
         output.note(f"hybridlog: {error}")
@@ -484,14 +464,14 @@ class Results:
         """Print the table of the finished recordings, and what became of the others."""
         if self._choices.as_json:
             if self._summaries:
-                one = len(self._choices.paths) == 1 and not self._is_search
+                one = len(self._choices.paths) == 1 and not self.is_search
                 output.print_json(self._summaries[0] if one else self._summaries)
         elif not self._choices.quiet and self._reports:
             if len(self._reports) == 1:
                 _print_one(*self._reports[0])
             else:
                 _print_several([report for _, report in self._reports])
-        if self._is_search:
+        if self.is_search:
             self._sum_up()
 
     def _sum_up(self) -> None:
@@ -555,13 +535,16 @@ def _print_one(path: Path, report: RecordReport) -> None:
         videos = any(is_video_type(one.type) for one in entry.channels)
         what = "latched or frames of video" if videos else "latched"
         left_out += f"; {report.latched} of them {what}, from before the time range"
+    left_behind = report.attachments_left_out
+    attachments = f"{entry.attachments} ({left_behind} left out)" if left_behind else ""
+    attachments = attachments or str(entry.attachments or "")
     output.print_table(
         [("recording", "left"), (entry.name, "left")],
         [
             ("source", f"{path} ({entry.source['kind']})"),
             ("topics", str(_topics(report))),
             ("messages", f"{entry.messages}{left_out}"),
-            *_attachments(report),
+            *([("attachments", attachments)] if attachments else []),
             ("bytes in", output.size(taken)),
             ("bytes stored", output.size(entry.stored_bytes)),
             ("ratio", f"{_ratio(taken, entry.stored_bytes):.2f}"),
@@ -571,42 +554,9 @@ def _print_one(path: Path, report: RecordReport) -> None:
     )
 
 
-def _attachments(report: RecordReport) -> list[tuple[str, str]]:
-    """A row of the table, if the log has attachments."""
-    kept, left_out = report.entry.attachments, report.attachments_left_out
-    if not kept and not left_out:
-        return []
-    return [("attachments", f"{kept} ({left_out} left out)" if left_out else str(kept))]
-
-
-class _Figures(NamedTuple):
-    """A row of the table of several recordings."""
-
-    name: str
-    topics: int
-    messages: int
-    taken: int
-    stored: int
-    indexed: int
-    elapsed_s: float
-
-    def row(self) -> tuple[str, ...]:
-        return (
-            self.name,
-            str(self.topics),
-            str(self.messages),
-            output.size(self.taken),
-            output.size(self.stored),
-            f"{_ratio(self.taken, self.stored):.2f}",
-            str(self.indexed),
-            f"{self.elapsed_s:.2f} s",
-        )
-
-
 def _print_several(reports: Sequence[RecordReport]) -> None:
-    lines = [
-        _Figures(
-            report.entry.name,
+    figures = [
+        (
             _topics(report),
             report.entry.messages,
             int(report.entry.source["bytes"]),
@@ -616,28 +566,26 @@ def _print_several(reports: Sequence[RecordReport]) -> None:
         )
         for report in reports
     ]
-    total = _Figures(
-        "total",
-        len({c.topic for report in reports for c in report.entry.channels}),
-        sum(line.messages for line in lines),
-        sum(line.taken for line in lines),
-        sum(line.stored for line in lines),
-        sum(line.indexed for line in lines),
-        sum(line.elapsed_s for line in lines),
-    )
-    output.print_table(
-        [
-            ("recording", "left"),
-            ("topics", "right"),
-            ("messages", "right"),
-            ("bytes in", "right"),
-            ("stored", "right"),
-            ("ratio", "right"),
-            ("indexed", "right"),
-            ("time", "right"),
-        ],
-        [line.row() for line in (*lines, total)],
-    )
+    topics = len({c.topic for report in reports for c in report.entry.channels})
+    total = (topics, *(sum(column) for column in [*zip(*figures, strict=True)][1:]))
+    names = [*(report.entry.name for report in reports), "total"]
+    rows = [
+        (
+            name,
+            str(topics),
+            str(messages),
+            output.size(taken),
+            output.size(stored),
+            f"{_ratio(taken, stored):.2f}",
+            str(indexed),
+            f"{elapsed_s:.2f} s",
+        )
+        for name, (topics, messages, taken, stored, indexed, elapsed_s) in zip(
+            names, [*figures, total], strict=True
+        )
+    ]
+    heads = ("topics", "messages", "bytes in", "stored", "ratio", "indexed", "time")
+    output.print_table([("recording", "left"), *((head, "right") for head in heads)], rows)
 
 
 def _problems(path: Path, report: RecordReport, *, quiet: bool) -> list[HybridlogError]:

@@ -10,8 +10,9 @@ from pathlib import Path
 from stat import S_ISDIR, S_ISREG
 from typing import NamedTuple
 
-from hybridlog.formats import LOGS, LogFormat
-from hybridlog.formats.detect import UNKNOWN, grouped_parts, sniff
+from hybridlog.formats import LOGS
+from hybridlog.formats.detect import UNKNOWN, LogFile, grouped_parts, sniff
+from hybridlog.formats.log_set import LogSet
 from hybridlog.formats.reading import cannot_open
 from hybridlog.formats.rosbag2.directory import NAME, BagMetadata, read_metadata
 from hybridlog_storage.errors import SourceError
@@ -25,27 +26,6 @@ _BAG_INDEX = b"index_pos="
 _BAG_HEAD = 8192  # bytes; the header record of a bag has 4 KiB
 
 
-@dataclass(frozen=True, slots=True)
-class Log:
-    """A log that was found.
-
-    Attributes:
-        path: The file, the first of several, or the directory of a ROS 2 bag.
-        files: The file, the parts of a split log in order, or the logs in the directory.
-        size: Their bytes.
-    """
-
-    path: Path
-    files: tuple[Path, ...]
-    size: int
-
-    @property
-    def name(self) -> str | None:
-        """The name that the parts of a split log share; None for the name of `path`."""
-        is_split = len(self.files) > 1 and self.path == self.files[0]
-        return self.path.name.rpartition("_")[0] or None if is_split else None
-
-
 @dataclass(slots=True)
 class Found:
     """Logs and stores below a directory.
@@ -56,7 +36,7 @@ class Found:
         problems: Directories and files that cannot be read.
     """
 
-    logs: list[Log] = field(default_factory=list)
+    logs: list[LogSet] = field(default_factory=list)
     stores: list[Path] = field(default_factory=list)
     problems: list[SourceError] = field(default_factory=list)
 
@@ -82,13 +62,15 @@ def find_logs(top: Path) -> Found:
     """
     found = Found()
     for folder, files in _folders(top, found):
-        sizes = {file.path: file.size for file in files if _format(file, found.problems)}
-        metadata = _metadata(folder, files)
-        listed = set() if metadata is None else {Path(name).name for name in metadata.files}
-        for parts in grouped_parts([*sizes]):
-            size = sum(sizes[path] for path in parts)
-            is_bag = any(path.name in listed for path in parts)
-            found.logs.append(Log(folder if is_bag else parts[0], tuple(parts), size))
+        known = {file.path: log for file in files if (log := _log_file(file, found.problems))}
+        metadata, listed = _metadata(folder, files)
+        is_bag_found = False
+        for parts in grouped_parts(known):
+            if listed.isdisjoint(path.name for path in parts):
+                found.logs.append(LogSet.of([known[path] for path in parts], metadata))
+            elif not is_bag_found:
+                found.logs.append(LogSet.at(folder))
+                is_bag_found = True
     return found
 
 
@@ -111,7 +93,7 @@ class Watch:
         self._settle_ns = round(settle_s * 1e9)
         self._seen: set[_File] = set()  # at the last look
         self._done: set[_File] = set()  # taken, or no log
-        self._formats: dict[_File, LogFormat | None] = {}
+        self._logs: dict[_File, LogFile | None] = {}
 
     def check(self) -> None:
         """Check that the directory can be read.
@@ -138,52 +120,51 @@ class Watch:
                 found.logs += self._complete_in(folder, files, now, found.problems)
         self._seen = seen
         self._done &= seen
-        self._formats = {file: kind for file, kind in self._formats.items() if file in seen}
+        self._logs = {file: log for file, log in self._logs.items() if file in seen}
         return found
 
-    def put_back(self, log: Log) -> None:
+    def put_back(self, log: LogSet) -> None:
         """Find a log again at the next look."""
         self._done = {file for file in self._done if file.path not in log.files}
 
     def unfinished(self) -> list[Path]:
         """Logs that were not complete at the last look, by path."""
-        return sorted(file.path for file, kind in self._formats.items() if kind)
+        return sorted(file.path for file, log in self._logs.items() if log)
 
     def _complete_in(
         self, folder: Path, files: Sequence[_File], now: int, problems: list[SourceError]
-    ) -> Iterator[Log]:
+    ) -> Iterator[LogSet]:
         for file in files:
-            if file not in self._done and file not in self._formats and file.size:
-                self._formats[file] = _format(file, problems)
-        known = {file.path: file for file in files if self._formats.get(file)}
-        others = [file for file in files if file.size and not self._formats.get(file)]
-        self._done.update(others)
-        metadata = _metadata(folder, files)
-        listed = set() if metadata is None else {Path(name).name for name in metadata.files}
+            if file not in self._done and file not in self._logs and file.size:
+                self._logs[file] = _log_file(file, problems)
+        known = {file.path: file for file in files if self._logs.get(file)}
+        self._done.update(file for file in files if file.size and file.path not in known)
+        metadata, listed = _metadata(folder, files)
         names = {file.path.name for file in files}
         for parts in grouped_parts([*known, *(f.path for f in files if f in self._done)]):
-            ready = [
-                known[path]
-                for number, path in enumerate(parts)
-                if path in known
-                and self._is_complete(
-                    known[path], now, names, is_closed=path is not parts[-1] or path.name in listed
-                )
-            ]
+            ready: dict[_File, LogFile] = {}
+            for path in parts:
+                log = self._logs.get(known[path]) if path in known else None
+                is_closed = path is not parts[-1] or path.name in listed
+                if log and self._is_complete(known[path], log, now, names, is_closed=is_closed):
+                    ready[known[path]] = log
             self._done.update(ready)
             for file in ready:
-                del self._formats[file]
-            is_bag = listed.issubset(file.path.name for file in ready) and bool(listed)
+                del self._logs[file]
+            is_bag = bool(listed) and listed.issubset(file.path.name for file in ready)
             if is_bag and len(ready) == len(parts):
-                yield Log(folder, tuple(parts), sum(file.size for file in ready))
+                yield LogSet.at(folder)
             else:
-                yield from (Log(file.path, (file.path,), file.size) for file in ready)
+                yield from (LogSet.of([log], metadata) for log in ready.values())
 
-    def _is_complete(self, file: _File, now: int, names: set[str], *, is_closed: bool) -> bool:
+    def _is_complete(
+        self, file: _File, log: LogFile, now: int, names: set[str], *, is_closed: bool
+    ) -> bool:
         """True if nobody writes a file any more.
 
         Args:
             file: The file.
+            log: The same.
             now: The present time, ns.
             names: Names of the files beside it.
             is_closed: Whether a later part exists, or metadata lists it.
@@ -193,8 +174,7 @@ class Watch:
             return False
         if is_closed or _has_end(file):
             return True
-        kind = self._formats[file]
-        if (kind is None or kind.has_end) and not file.path.name.endswith(".zstd"):
+        if log.format.has_end and not file.path.name.endswith(".zstd"):
             return False
         beside = {f"{file.path.name}{suffix}" for suffix in ("-wal", "-journal")}
         return is_unchanged and not beside & names
@@ -237,26 +217,24 @@ def _folders(top: Path, found: Found) -> Iterator[tuple[Path, list[_File]]]:
         pending += reversed(below)
 
 
-def _format(file: _File, problems: list[SourceError]) -> LogFormat | None:
-    """The format of a log; None for other files. A wrong file with the name of a log is one."""
+def _log_file(file: _File, problems: list[SourceError]) -> LogFile | None:
+    """A log; None for other files. A wrong file with the name of a log is one."""
     is_called = file.path.name.removesuffix(".zstd").endswith(_SUFFIXES)
-    if not file.size:
-        return UNKNOWN if is_called else None
     try:
-        found, _ = sniff(file.path)
+        log = LogFile(file.path, *sniff(file.path)) if file.size else LogFile(file.path)
     except SourceError as error:
         if is_called:
             problems.append(error)
         return None
-    return found if is_called or not (found is UNKNOWN or found.needs_suffix) else None
+    return log if is_called or not (log.format is UNKNOWN or log.format.needs_suffix) else None
 
 
-def _metadata(folder: Path, files: Sequence[_File]) -> BagMetadata | None:
-    """The metadata of the ROS 2 bag in a directory; None without any that lists files."""
-    if not any(file.path.name == NAME for file in files):
-        return None
-    found = read_metadata(folder)
-    return found if isinstance(found, BagMetadata) and found.files else None
+def _metadata(folder: Path, files: Sequence[_File]) -> tuple[BagMetadata | None, set[str]]:
+    """The metadata of the ROS 2 bag in a directory, None without; and the names it lists."""
+    found = read_metadata(folder) if any(file.path.name == NAME for file in files) else None
+    if not isinstance(found, BagMetadata):
+        return None, set()
+    return found, {Path(name).name for name in found.files}
 
 
 def _has_end(file: _File) -> bool:

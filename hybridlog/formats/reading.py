@@ -99,7 +99,7 @@ class Source(ABC):
             or without messages.
         bytes_read: Bytes read of `size_bytes`, for progress.
         packed_messages: The log states that each payload is a zstd frame, and this reader
-            yields the frames (`JoinedSource` unpacks them).
+            yields the frames (`LogSet` unpacks them).
     """
 
     def __init__(self, path: Path, *, kind: str, profile: str, files: Sequence[Path]) -> None:
@@ -204,7 +204,7 @@ def regroup(batches: Iterator[Batch]) -> Iterator[Batch]:
             if held:
                 yield joined(held)
                 held, size, rows = [], 0, 0
-            yield from _split(batch)
+            yield from split(batch)
         else:
             held.append(batch)
             size += len(batch.buffer)
@@ -213,19 +213,15 @@ def regroup(batches: Iterator[Batch]) -> Iterator[Batch]:
         yield joined(held)
 
 
-def _split(batch: Batch) -> Iterator[Batch]:
-    """Split a batch into parts over the same buffer."""
-    if len(batch) <= BATCH_MESSAGES and batch.payload_bytes <= 2 * BATCH_BYTES:
-        yield batch
-        return
+def split(batch: Batch) -> Iterator[Batch]:
+    """Split a batch into parts over the same buffer, each closed once it has `BATCH_BYTES`."""
     ends = np.cumsum(batch.length)
-    row = 0
+    row = before = 0
     while row < len(batch):
-        before = int(ends[row - 1]) if row else 0
-        stop = int(np.searchsorted(ends, before + BATCH_BYTES, side="right"))
-        stop = min(max(stop, row + 1), row + BATCH_MESSAGES, len(batch))
+        full = int(np.searchsorted(ends, before + BATCH_BYTES)) + 1
+        stop = min(full, row + BATCH_MESSAGES, len(batch))
         yield batch.take(slice(row, stop))
-        row = stop
+        row, before = stop, int(ends[stop - 1])
 
 
 WHOLE = 4 << 20

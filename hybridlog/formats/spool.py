@@ -123,12 +123,8 @@ def _private(path: str, flags: int) -> int:
 
 
 def _copy(source: BinaryIO, count: int, target: IO[bytes], _: int) -> None:
-    while count > 0:
-        data = source.read(min(_PIECE, count))
-        if not data:
-            return
-        target.write(data)
-        count -= len(data)
+    shutil.copyfileobj(source, target)
+    target.truncate(count)
 
 
 def _unpack(source: BinaryIO, target: IO[bytes], room: int) -> str | None:

@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 import zstandard
 
-from hybridlog.formats.detect import UNKNOWN, open_source, sniff
+from hybridlog.formats.detect import UNKNOWN, sniff
+from hybridlog.formats.log_set import open_source
 from hybridlog_storage.errors import SourceError
 from tests.data import DATA, needs_data
 from tests.other_user import User, needs_root, open_place
@@ -92,7 +93,7 @@ def test_permission(tmp_path: Path) -> None:
 
 @needs_root
 def test_permission_of_another_user() -> None:
-    script = "import sys, pathlib; from hybridlog.formats.detect import open_source\n"
+    script = "import sys, pathlib; from hybridlog.formats.log_set import open_source\n"
     script += "try: open_source(pathlib.Path(sys.argv[1]))\n"
     script += "except Exception as error: print(type(error).__name__, error)"
     with open_place() as place:

@@ -9,7 +9,7 @@ import pytest
 from mcap.writer import Writer
 
 from hybridlog.formats import find
-from hybridlog.formats.detect import grouped_parts, open_parts
+from hybridlog.formats.detect import grouped_parts
 from hybridlog.formats.find import Found, Watch, find_logs
 from hybridlog_storage.errors import SourceError
 from tests import places
@@ -90,7 +90,7 @@ def test_all_logs_below_a_directory(tmp_path: Path) -> None:
     assert {log.name for log in found.logs if log is not drive} == {None}
     assert found.stores == [top / "inner"]
     assert found.problems == []
-    with open_parts(drive.files) as source:
+    with drive.open() as source:
         assert sum(len(batch) for batch in source.batches()) == 4
 
 

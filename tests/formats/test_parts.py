@@ -11,7 +11,7 @@ import pytest
 import zstandard
 from mcap.writer import Writer
 
-from hybridlog.formats.detect import open_source, read_time_range
+from hybridlog.formats.log_set import LogSet, open_source
 from hybridlog_storage.errors import SourceError
 
 BEGIN = 1_700_000_000_000_000_000
@@ -216,7 +216,7 @@ def test_last_part_that_was_not_compressed_any_more(bag: Path) -> None:
     put_metadata(bag, ["bag_0.db3.zstd", "bag_1.db3.zstd"], 10, "  compression_mode: FILE")
     found = Found(bag)
     assert (found.numbers, found.damage, found.time_range) == (FIFTEEN, [], None)
-    assert read_time_range(bag) == (BEGIN, BEGIN + 14 * SECOND + 1)
+    assert LogSet.at(bag).read_time_range() == (BEGIN, BEGIN + 14 * SECOND + 1)
 
 
 @pytest.mark.parametrize("kind", ["db3", "mcap"])
@@ -264,7 +264,7 @@ def test_mcap_files_one_after_the_other_in_one_file(tmp_path: Path) -> None:
     joined.write_bytes(b"".join(whole))
     found = Found(joined)
     assert (found.numbers, found.damage) == (FIFTEEN, [])
-    assert read_time_range(joined) == (BEGIN, BEGIN + 14 * SECOND + 1)
+    assert LogSet.at(joined).read_time_range() == (BEGIN, BEGIN + 14 * SECOND + 1)
     joined.write_bytes(whole[0] + whole[0])
     assert (Found(joined).numbers, Found(joined).damage) == ([*FIFTEEN[:5] * 2], [])
     # The first was not closed: it has no summary.

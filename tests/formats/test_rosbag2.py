@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from hybridlog.formats.detect import open_source
+from hybridlog.formats.log_set import open_source
 from hybridlog.formats.reading import BATCH_BYTES, BATCH_MESSAGES, Damage, Source
 from hybridlog.formats.rosbag2.directory import parse_metadata
 from hybridlog.formats.rosbag2.sqlite import SqliteSource
@@ -408,14 +408,18 @@ def damaged_database(path: Path, break_page: Callable[[int, int], bool]) -> tupl
         pytest.param(lambda n, _: n == 0, id="first"),
     ],
 )
-def test_goes_on_behind_damaged_pages(tmp_path: Path, which: Callable[[int, int], bool]) -> None:
+def test_everything_before_the_damage_is_read(
+    tmp_path: Path, which: Callable[[int, int], bool]
+) -> None:
     kept, broken = damaged_database(tmp_path / "a.db3", which)
     assert broken
     found, damage = read(tmp_path / "a.db3")
-    assert found.total() == kept
+    times = sorted(time - 1000 for _, _, time, _ in found)
+    assert times == [*range(1, len(times) + 1)]
+    assert len(times) <= kept
     assert all(data == bytes([(time - 1000) % 256]) * 100 for _, _, time, data in found)
-    assert sum(each.messages_lost or 0 for each in damage) == 2000 - kept
-    assert all("SQLite" in each.reason for each in damage)
+    assert [each.messages_lost for each in damage] == [2000 - len(times)]
+    assert f"rows from id {len(times) + 1} on cannot be read: SQLite says" in damage[0].reason
 
 
 @settings(max_examples=60, deadline=None)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,14 +10,13 @@ from mcap import records
 from mcap.opcode import Opcode
 
 from hybridlog.formats.reading import (
-    BATCH_BYTES,
-    BATCH_MESSAGES,
     MAX_CHUNK,
     TOO_MANY_CHANNELS,
     TOO_MANY_SILENT,
     Damage,
     Source,
     cannot_open,
+    split,
 )
 from hybridlog.wording import listed
 from hybridlog_storage.errors import SegmentError, SourceError
@@ -52,27 +51,6 @@ _TOO_MANY = -2  # one more than a recording can hold
 _IDS = 1 << 16
 
 
-@dataclass(slots=True)
-class _Open:
-    """Damage whose message count may still be found behind it.
-
-    Attributes:
-        offset: Byte where it starts.
-        length: Bytes of it, None if unknown.
-        reason: Description of the damage.
-        chunk: A whole chunk is lost, so the message indexes behind it list its messages.
-        counted: Messages listed by the message indexes behind it, None before the first.
-        got: Messages of the chunk that were read.
-    """
-
-    offset: int
-    length: int | None
-    reason: str
-    chunk: bool
-    counted: int | None = None
-    got: int = 0
-
-
 class McapSource(Source):
     """One MCAP file, read forward.
 
@@ -103,8 +81,7 @@ class McapSource(Source):
         self._definitions = _Definitions(self.channels, self._summary)
         self._given = 0
         self._lost = 0
-        self._pending: _Open | None = None
-        self._uncounted: list[_Open] = []
+        self._uncounted: list[Damage] = []  # what the totals at the end may count
         self._end_is_noted = False
         self._too_many = 0
         self._unpublished = 0
@@ -151,18 +128,15 @@ class McapSource(Source):
     def _take(self, offset: int, item: Item) -> Iterator[Batch]:
         if isinstance(item, records.MessageIndex):
             self._index(offset, item)
-            return
-        self._settle()
-        if isinstance(item, ScannedChunk):
+        elif isinstance(item, ScannedChunk):
             self._indexed = set()
-        if isinstance(item, ScannedChunk):
             yield from self._chunk(item)
         elif isinstance(item, Loose):
             yield from self._content(item.content, offset, relative=True)
         elif isinstance(item, ScanDamage):
             yield from self._damaged(item)
         elif isinstance(item, records.Schema | records.Channel):
-            self._define(offset, item)
+            self._definitions.add(item)
         elif isinstance(item, records.Metadata):
             self.extras.append(item)
         elif isinstance(item, Attachment):
@@ -172,18 +146,13 @@ class McapSource(Source):
             self._end(item)
 
     def _index(self, offset: int, item: records.MessageIndex) -> None:
-        """Process a message index: count messages of a lost chunk, or find a missed one."""
-        if self._pending is not None and self._pending.chunk:
-            self._pending.counted = (self._pending.counted or 0) + len(item.records)
-            return
-        # A chunk has one index for each channel. Totals, if they exist, count better.
-        foreign = self._indexed is None or item.channel_id in self._indexed
-        if foreign and item.records and self.message_count is None:
-            self._settle()
-            reason = "the chunk of these message indexes is missing"
-            self._pending = _Open(offset, 0, reason, chunk=True, counted=len(item.records))
-        elif self._indexed is not None:
-            self._indexed.add(item.channel_id)
+        """Tell that a chunk was missed: it has one index for each channel."""
+        if not item.records or self.message_count is not None:
+            return  # totals tell it, too
+        if self._indexed is None or item.channel_id in self._indexed:
+            self._note(offset, 0, "the chunk of these message indexes is missing", None)
+            self._indexed = set()
+        self._indexed.add(item.channel_id)
 
     def _chunk(self, chunk: ScannedChunk) -> Iterator[Batch]:
         before = self._given
@@ -195,7 +164,7 @@ class McapSource(Source):
             got = self._given - before
             if got:
                 reason += f"; {got} messages before that were read"
-            self._pending = _Open(chunk.offset, chunk.length, reason, chunk=True, got=got)
+            self._note_uncounted(chunk.offset, chunk.length, reason)
 
     def _damaged(self, item: ScanDamage) -> Iterator[Batch]:
         reason = item.reason
@@ -208,10 +177,10 @@ class McapSource(Source):
             reason += f"; {self._given - before} messages of its beginning were read"
         if item.length is not None and item.offset + item.length >= self.size_bytes:
             self._end_is_noted = True
+        if item.opcode == Opcode.CHUNK:
+            self._indexed = set()
         if item.messages is None:
-            self._pending = _Open(
-                item.offset, item.length, reason, chunk=item.opcode == Opcode.CHUNK
-            )
+            self._note_uncounted(item.offset, item.length, reason)
         else:
             self._note(item.offset, item.length, reason, item.messages)
 
@@ -271,32 +240,17 @@ class McapSource(Source):
         if not len(rows):
             return
         self._given += len(rows)
-        for part in _parts(rows.length):
-            piece = rows.take(part)
-            piece.channel = found[part]
-            yield piece
-
-    def _define(self, offset: int, record: records.Schema | records.Channel) -> None:
-        self._definitions.add(record)
-        self.bytes_read = max(self.bytes_read, offset)
+        yield from split(replace(rows, channel=found))
 
     def _note(self, offset: int | None, length: int | None, reason: str, lost: int | None) -> None:
         self.note(Damage(self.path, offset, length, reason, lost))
         self._lost += lost or 0
 
-    def _settle(self) -> None:
-        """Note pending damage, or defer it, since no message index follows."""
-        pending, self._pending = self._pending, None
-        if pending is None:
-            return
-        if pending.counted is None and self.message_count is not None:
-            self._uncounted.append(pending)  # the totals at the end may show it
+    def _note_uncounted(self, offset: int, length: int | None, reason: str) -> None:
+        if self.message_count is None:
+            self._note(offset, length, reason, None)
         else:
-            counted = pending.counted
-            self._note_open(pending, None if counted is None else max(counted - pending.got, 0))
-
-    def _note_open(self, pending: _Open, lost: int | None) -> None:
-        self._note(pending.offset, pending.length, pending.reason, lost)
+            self._uncounted.append(Damage(self.path, offset, length, reason, None))
 
     def _end(self, end: End) -> None:
         self.bytes_read = self.size_bytes
@@ -314,11 +268,10 @@ class McapSource(Source):
         if self.message_count is not None:
             missing = max(self.message_count - self._given - self._lost, 0)
         if len(self._uncounted) == 1:
-            self._note_open(self._uncounted[0], missing)
+            self._uncounted = [replace(self._uncounted[0], messages_lost=missing)]
             missing = 0
-        else:
-            for pending in self._uncounted:
-                self._note_open(pending, None)
+        for damage in self._uncounted:
+            self.note(damage)
         self._uncounted.clear()
         if missing:
             self._note(
@@ -347,18 +300,6 @@ def _time_range(summary: Summary) -> tuple[int, int] | None:
         if by_chunks != (start, last):
             return None
     return span_of(start, last) if start <= last <= END else None
-
-
-def _parts(length: NDArray[np.int64]) -> Iterator[slice]:
-    """Runs of at most `BATCH_MESSAGES` rows, closed once they hold `BATCH_BYTES`."""
-    count = len(length)
-    total = np.cumsum(length)
-    start, before = 0, 0
-    while start < count:
-        full = int(np.searchsorted(total, before + BATCH_BYTES)) + 1
-        end = min(full, start + BATCH_MESSAGES, count)
-        yield slice(start, end)
-        start, before = end, int(total[end - 1])
 
 
 class _Definitions:

@@ -1,7 +1,6 @@
 """Reads a `.db3` file of a ROS 2 bag.
 
-Rows are queried in the order of row ids. In a damaged database, reading continues behind
-the damage.
+Rows are read in the order of row ids, in a damaged database up to the damage.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ from hybridlog_storage.messages import MAX_PAYLOAD, Batch, Channel, Schema
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
-    from typing import Any, Literal
+    from typing import Any
 
 MAGIC = b"SQLite format 3\x00"
 
@@ -40,7 +39,6 @@ MAGIC = b"SQLite format 3\x00"
 _COUNT_BYTES = 64 << 20
 
 _MIN_ROWID = -(2**63)
-_MAX_ROWID = 2**63 - 1
 
 
 class _Row(NamedTuple):
@@ -67,6 +65,7 @@ class SqliteSource(Source):
         self._early = 0
         self._select = ""
         self._got = 0
+        self._problem: tuple[int, str] | None = None
         header = _read_header(path)
         self._missing = header.pages * header.page - self.size_bytes
         try:
@@ -208,7 +207,7 @@ class SqliteSource(Source):
     def _indexes(self) -> list[str]:
         return [row[1] for row in self._optional("PRAGMA index_list(messages)")]
 
-    def _optional(self, query: str, *values: str) -> list[tuple[Any, ...]]:
+    def _optional(self, query: str, *values: str | int) -> list[tuple[Any, ...]]:
         """Rows of an optional query; empty if it fails."""
         try:
             return self._db.execute(query, values).fetchall()
@@ -218,49 +217,46 @@ class SqliteSource(Source):
     # Reading.
 
     def batches(self) -> Iterator[Batch]:
-        """Yield all messages that SQLite returns, in the order of row ids."""
-        start = _MIN_ROWID
-        regions = 0
-        while start <= _MAX_ROWID:
-            rows: list[_Row] = []
-            size = 0
-            problem = ""
-            try:
-                for row in self._db.execute(self._select, (start,)):
-                    if row[0] < start:
-                        problem = "rows out of order"
-                        break
-                    rows.append(row)
-                    start = row[0] + 1
-                    size += len(row[4])
-                    if size >= BATCH_BYTES or len(rows) >= BATCH_MESSAGES:
-                        yield from self._batch(rows, size)
-                        rows, size = [], 0
-            except (sqlite3.Error, OverflowError) as error:
-                problem = str(error)
-            yield from self._batch(rows, size)
-            if not problem:
-                break
-            # The driver reads one row ahead, so the last valid row was lost with the error.
-            row = self._one(start)
-            if row:
-                yield from self._batch([row], len(row[4]))
-                start = row[0] + 1
-                continue
-            regions += 1
-            found = self._next_sound(start) if regions <= _MAX_REGIONS else None
-            self._report_gap(start, found, problem)
-            if found is None:
-                break
-            start = found
+        """Yield the messages before the first damage, in the order of row ids."""
+        rows: list[_Row] = []
+        size = 0
+        for row in self._rows():
+            rows.append(row)
+            size += len(row[4])
+            if size >= BATCH_BYTES or len(rows) >= BATCH_MESSAGES:
+                yield from self._batch(rows, size)
+                rows, size = [], 0
+        yield from self._batch(rows, size)
         self.bytes_read = self.size_bytes
-        if self._missing > 0 and not regions:
+        if self._problem is not None:
+            self._report_unread(*self._problem)
+        elif self._missing > 0:
             reason = "the file is cut short, but only behind its messages"
             self.damage.append(Damage(self.path, self.size_bytes, self._missing, reason, 0))
         self._report_undefined()
         if self._early:
             reason = "messages with a time before 1970, which no log can keep"
             self.damage.append(Damage(self.path, None, None, reason, self._early))
+
+    def _rows(self) -> Iterator[_Row]:
+        """The rows before the first damage; keeps its place and what SQLite says of it."""
+        start, problem = _MIN_ROWID, "rows out of order"
+        try:
+            for row in self._db.execute(self._select, (start,)):
+                if row[0] < start:
+                    break
+                start = row[0] + 1
+                yield row
+            else:
+                return
+        except (sqlite3.Error, OverflowError) as error:
+            problem = str(error)
+        # The driver reads one row ahead, so the last valid row was lost with the error.
+        for row in self._optional(f"{self._select} LIMIT 1", start):
+            if row[0] >= start:
+                start = row[0] + 1
+                yield _Row(*row)
+        self._problem = max(start, 1), problem
 
     def _batch(self, rows: list[_Row], size: int) -> Iterator[Batch]:
         if not rows:
@@ -290,52 +286,18 @@ class SqliteSource(Source):
         if len(batch):
             yield batch
 
-    def _one(self, start: int) -> _Row | Literal[False] | None:
-        """The first row at or behind an id; None without one, False if it is damaged."""
-        try:
-            row: _Row | None = self._db.execute(f"{self._select} LIMIT 1", (start,)).fetchone()
-        except (sqlite3.Error, OverflowError):
-            return False
-        return row if row is None or row[0] >= start else False
-
-    def _next_sound(self, bad: int) -> int | None:
-        """Smallest known id from which rows can be read again, None without one.
-
-        Args:
-            bad: Id of a damaged row.
-        """
-        bad, step = max(bad, 0), 1
-        while self._one(bad + step) is False:
-            step *= 2
-            if bad + step > _MAX_ROWID:
-                return None
-        good = bad + step
-        bad += step // 2
-        while good - bad > 1:
-            middle = (good + bad) // 2
-            if self._one(middle) is False:
-                bad = middle
-            else:
-                good = middle
-        return good
-
-    def _report_gap(self, start: int, found: int | None, problem: str) -> None:
-        """Report rows that SQLite does not return; row ids of rosbag2 have no gaps."""
-        first = max(start, 1)
-        # Losses behind the last row cannot be counted by ids.
-        is_last = found is None or self._one(found) is None
-        lost: int | None = None
-        if not is_last and found is not None:
-            lost = found - first
-            where = f"row {first}" if lost == 1 else f"rows {first} to {found - 1}"
+    def _report_unread(self, first: int, problem: str) -> None:
+        """Report the rows from an id on, counted by an index, or by ids: these have no gaps."""
+        lost = None
+        if self.message_count is not None:
+            lost = max(0, self.message_count - self._got)
         else:
-            where = f"rows from id {first} on"
-            if self.message_count is not None:
-                known = sum(damage.messages_lost or 0 for damage in self.damage)
-                lost = max(0, self.message_count - self._got - known)
-        self.damage.append(
-            Damage(self.path, None, None, f"{where} cannot be read: SQLite says {problem}", lost)
-        )
+            for (last,) in self._optional("SELECT max(rowid) FROM messages"):
+                # The id may be damaged, too; no row takes less than a byte.
+                if last is not None and first <= last < first + self.size_bytes:
+                    lost = last - first + 1
+        reason = f"rows from id {first} on cannot be read: SQLite says {problem}"
+        self.damage.append(Damage(self.path, None, None, reason, lost))
 
     def _report_undefined(self) -> None:
         if self._undefined:
@@ -348,7 +310,6 @@ class SqliteSource(Source):
 
 
 _LOG_TIMES = ("timestamp", "recv_timestamp")
-_MAX_REGIONS = 4096
 
 
 class _Header(NamedTuple):

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Final, cast
 
 import numpy as np
 
-from hybridlog.formats.detect import open_source
+from hybridlog.formats.log_set import open_source
 from hybridlog.live.sources.base import Cause, LiveSource, Loss, Sink
 from hybridlog.live.sources.replay_order import Lookahead, Rows
 from hybridlog_storage.errors import SourceError, UsageError

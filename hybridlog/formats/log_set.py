@@ -1,0 +1,485 @@
+"""One log: its files, in their order, opened and read as one source."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, replace
+from stat import S_ISDIR, S_ISREG
+from typing import TYPE_CHECKING
+
+import numpy as np
+import zstandard
+
+from hybridlog.formats.detect import (
+    UNKNOWN,
+    LogFile,
+    files_in,
+    is_split,
+    kinds,
+    missing_parts,
+    natural,
+)
+from hybridlog.formats.reading import BATCH_BYTES, Damage, Source, cannot_open, regroup
+from hybridlog.formats.rosbag2.directory import NAME, BagMetadata, locate, plain, read_metadata
+from hybridlog.formats.spool import ZSTD_MAGIC, spool
+from hybridlog.wording import listed
+from hybridlog_storage.errors import SourceError
+from hybridlog_storage.messages import MAX_PAYLOAD, Batch
+from hybridlog_storage.times import span_of
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+_CDR = frozenset({"cdr", ""})  # encodings of ROS 2 messages
+
+
+def open_source(path: Path) -> Source:
+    """Open a log: a file, or the directory of a ROS 2 bag or of a split log.
+
+    Raises:
+        SourceError: As `LogSet.open`.
+    """
+    return LogSet.at(path).open()
+
+
+@dataclass(frozen=True, slots=True)
+class LogSet:
+    """The files of one log.
+
+    Attributes:
+        path: The file, the first of several, or the directory of a ROS 2 bag or a split log.
+        parts: The files in reading order.
+        metadata: Metadata of the log.
+        damage: Files that are missing, and metadata that cannot be read.
+        gaps: Files that seem to be missing; damage unless all messages of the metadata are there.
+        unread: Files that are left out.
+        problem: Why there is no log.
+    """
+
+    path: Path
+    parts: tuple[LogFile, ...] = ()
+    metadata: BagMetadata | None = None
+    damage: tuple[Damage, ...] = ()
+    gaps: tuple[Damage, ...] = ()
+    unread: tuple[Damage, ...] = ()
+    problem: SourceError | None = None
+
+    @classmethod
+    def at(cls, path: Path) -> LogSet:
+        """The log at a path: a file, or the directory of a ROS 2 bag or of a split log.
+
+        A directory without `metadata.yaml` is a log when it holds exactly one, or the parts of
+        one log that was split. What is wrong is told when the log is opened.
+        """
+        try:
+            mode = path.stat().st_mode
+            if S_ISDIR(mode) or path.name == NAME:
+                return _in_folder(path if S_ISDIR(mode) else path.parent)
+            if S_ISREG(mode):
+                return cls.of([LogFile.at(path)], read_metadata(path.parent))
+            reason = "neither a file nor a directory; give the path of a log"
+            return cls(path, problem=SourceError(f"{path}: {reason}"))
+        except OSError as error:
+            return cls(path, problem=cannot_open(path, error))
+        except SourceError as error:
+            return cls(path, problem=error)
+
+    @classmethod
+    def of(cls, parts: Sequence[LogFile], metadata: BagMetadata | Damage | None) -> LogSet:
+        """A file, or the parts of a split log in their order.
+
+        Args:
+            parts: The files.
+            metadata: The metadata beside them.
+        """
+        first = parts[0]
+        if len(parts) == 1 and isinstance(metadata, BagMetadata) and first.format.rosbag2:
+            files, _ = locate(first.path.parent, metadata)
+            if first.path in files:
+                return cls(first.path, (replace(first, messages=files[first.path]),), metadata)
+        return cls(first.path, tuple(parts), gaps=tuple(missing_parts(parts)))
+
+    @property
+    def files(self) -> list[Path]:
+        """Paths of its files in reading order."""
+        return [part.path for part in self.parts]
+
+    @property
+    def size(self) -> int:
+        """Bytes of its files that are there."""
+        return sum(path.stat().st_size for path in self.files if path.exists())
+
+    @property
+    def name(self) -> str | None:
+        """The name that the parts of a split log share; None for the name of `path`."""
+        is_split = len(self.parts) > 1 and self.path == self.parts[0].path
+        return self.path.name.rpartition("_")[0] or None if is_split else None
+
+    def open(self) -> Source:
+        """Open its files as one source.
+
+        Raises:
+            SourceError: Nothing can be read: the path is missing, not readable, empty, of an
+                unknown kind, encrypted or of an old version, or a directory without a log. The
+                message names the cause and the cure.
+        """
+        if self.problem is not None:
+            raise self.problem
+        if all(part.format is UNKNOWN for part in self.parts):
+            self.parts[0].open()
+        return _JoinedSource(self)
+
+    def read_time_range(self) -> tuple[int, int] | None:
+        """Read the log to find its log time `[start, end)`, ns; None without messages.
+
+        Raises:
+            SourceError: As `open`.
+        """
+        first, last = 1 << 63, -1
+        with self.open() as source:
+            for batch in source.batches():
+                if len(batch):
+                    first = min(first, int(batch.log_time.min()))
+                    last = max(last, int(batch.log_time.max()))
+                source.extras.clear()
+        return span_of(first, last) if first <= last else None
+
+
+def _in_folder(folder: Path) -> LogSet:
+    """The log in a directory; its metadata need not list all parts, nor right names.
+
+    Raises:
+        SourceError: There is none, or more than one.
+    """
+    metadata = read_metadata(folder)
+    bag = metadata if isinstance(metadata, BagMetadata) else None
+    damage = [metadata] if isinstance(metadata, Damage) else []
+    found, missing = ({}, []) if bag is None else locate(folder, bag)
+    there = files_in(folder)
+    files = [LogFile.at(path, count) for path, count in found.items()]
+    if not found:
+        files = [file for file in there if file.format is not UNKNOWN]
+        _check_one(folder, files, bag)
+    first = next((file for file in files if file.format is not UNKNOWN), None)
+    paths, names = {file.path for file in files}, {plain(file.path) for file in files}
+    more, unread = [], []
+    for file in there:
+        reason, lost = "", None
+        if file.path in paths:
+            continue
+        if file.format is not UNKNOWN and plain(file.path) in names:
+            reason, lost = f"it is another form of {plain(file.path)}", 0
+        elif first is not None and is_split([first, file]):
+            more.append(file)
+        elif file.format is not UNKNOWN:
+            reason = (
+                f"{NAME} does not list it, and its name is not that of a part of the bag; record "
+                "it by its own path"
+            )
+            lost = file.stated()
+        if reason:
+            unread.append(Damage(file.path, None, None, f"the file is not read: {reason}", lost))
+    if more:
+        files = sorted([*files, *more], key=lambda file: natural(file.path))
+    lacking = {damaged.file for damaged in missing}
+    gaps = [gap for gap in missing_parts(files) if gap.file not in lacking]
+    if found:
+        damage += missing
+    else:  # with as many messages as listed, they are the listed files under other names
+        gaps = [*missing, *gaps]
+    return LogSet(folder, tuple(files), bag, tuple(damage), tuple(gaps), tuple(unread))
+
+
+def _check_one(folder: Path, logs: Sequence[LogFile], bag: BagMetadata | None) -> None:
+    """Refuse a directory whose files are not one log."""
+    if len(logs) == 1 or (logs and is_split(logs)):
+        return
+    if bag is not None:
+        reason = (
+            f"none of the files that its {NAME} lists is there "
+            f"({', '.join(bag.files[:5]) or 'no file'}); put them beside it, or give the path of "
+            "the file itself"
+        )
+    elif logs:
+        names = listed((log.path.name for log in logs), 5)
+        reason = (
+            f"{len(logs)} logs that are not parts of one ({names}); give the path of one of them"
+        )
+    else:
+        reason = (
+            f"a directory without a log; give one that holds {kinds()}, or the path of a log itself"
+        )
+    raise SourceError(f"{folder}: {reason}")
+
+
+# Reading.
+
+
+class _JoinedSource(Source):
+    """Files of one log, read one after the other; only one is open at a time.
+
+    Equal channels of all files become one channel. An unreadable file counts as damage,
+    unless all are unreadable.
+
+    Args:
+        log: The files, one of which at least has a known format.
+    """
+
+    def __init__(self, log: LogSet) -> None:
+        form = next(part.format for part in log.parts if part.format is not UNKNOWN)
+        is_bag = log.metadata is not None and bool(form.rosbag2)
+        super().__init__(
+            log.path,
+            kind=form.rosbag2 if is_bag else "",
+            profile="ros2" if is_bag else form.profile,
+            files=log.files,
+        )
+        self._log = log
+        self._states_frames = log.metadata is not None and log.metadata.packed_messages
+        self._got = 0
+        self.damage.extend(log.damage)
+        self._numbers: dict[tuple[object, ...], int] = {}
+        self._inner: Source | None = None
+        if len(log.parts) == 1:
+            # With one file, its error is raised at once.
+            self._inner = self._open(log.parts[0])
+            self._say(self._inner)
+            self.message_count = self._inner.message_count
+            self.time_range = self._inner.time_range
+        elif not any(part.is_packed for part in log.parts):
+            self._look()
+        self.kind = self.kind or form.name
+
+    def _say(self, inner: Source) -> None:
+        self.profile = self.profile or inner.profile
+        self.kind = self.kind or inner.kind
+
+    def _look(self) -> None:
+        """Add up the statements of each file about itself."""
+        counts: list[int | None] = []
+        ranges: list[tuple[int, int]] = []
+        for part in self._log.parts:
+            try:
+                with part.open() as inner:
+                    self._say(inner)
+                    counts.append(inner.message_count)
+                    if inner.time_range is not None:
+                        ranges.append(inner.time_range)
+                    elif inner.message_count != 0:
+                        return
+            except SourceError:
+                return
+        known = [count for count in counts if count is not None]
+        if len(known) == len(counts):
+            self.message_count = sum(known)
+        if ranges:
+            self.time_range = (min(low for low, _ in ranges), max(high for _, high in ranges))
+
+    def close(self) -> None:
+        """Close the open file."""
+        if self._inner is not None:
+            self._inner.close()
+        self._inner = None
+
+    def batches(self) -> Iterator[Batch]:
+        """Yield the messages of each file in turn."""
+        done = failed = 0
+        first: SourceError | None = None
+        for part in self._log.parts:
+            size = part.path.stat().st_size if part.path.exists() else 0
+            try:
+                inner = self._inner = self._inner or self._open(part)
+            except SourceError as error:
+                failed += 1
+                first = first or error
+                reason = _without_path(error, part.path)
+                self.damage.append(Damage(part.path, 0, size, reason, part.messages))
+            else:
+                self._say(inner)
+                with inner:
+                    yield from self._read(part, inner, done, size)
+                self._inner = None
+            done += size
+            self.bytes_read = done
+        if first is not None and failed == len(self._log.parts):
+            raise first
+        self._check_total()
+        self.damage.extend(self._log.unread)
+
+    def _open(self, part: LogFile) -> Source:
+        if not part.is_packed:
+            return part.open()
+        spooled = spool(part.path)
+        try:
+            inner = part.open(spooled.path)
+        except SourceError as error:
+            reason = spooled.problem or _without_path(error, spooled.path)
+            raise SourceError(
+                f"{part.path}: {reason}; try to unpack it with `zstd -d` and use what comes out"
+            ) from error
+        finally:
+            spooled.remove()
+        if spooled.problem is not None:
+            self.damage.append(Damage(part.path, None, None, spooled.problem, None))
+        return inner
+
+    def _read(self, part: LogFile, inner: Source, done: int, size: int) -> Iterator[Batch]:
+        """Yield the messages of one open file, over the channels of this source."""
+        numbers = np.empty(0, np.int32)
+        alike: Counter[tuple[object, ...]] = Counter()
+        got = 0
+        found_before = len(self.damage)
+        is_stated = self._states_frames or inner.packed_messages
+        batches = self._unpacked(part.path, inner, is_stated=is_stated)
+        for batch in regroup(batches) if is_stated else batches:
+            got += len(batch)
+            numbers = self._numbered(inner, numbers, alike)
+            share = inner.bytes_read / inner.size_bytes if inner.size_bytes else 1.0
+            self.bytes_read = done + int(size * min(share, 1.0))
+            self._take_extras(inner)
+            yield replace(batch, channel=numbers[batch.channel])
+        self._take_extras(inner)
+        self._numbered(inner, numbers, alike)
+        self.damage.extend(replace(damage, file=part.path) for damage in inner.damage)
+        self.remarks.extend(f"{part.path}: {remark}" for remark in inner.remarks)
+        self._got += got
+        self._check_count(part.path, part.messages, got, found_before)
+
+    def _check_total(self) -> None:
+        """Compare with the number of all messages in the metadata of a directory."""
+        path, metadata = self._log.path, self._log.metadata
+        total = metadata.message_count if metadata is not None and path.is_dir() else None
+        lost = sum(damage.messages_lost or 0 for damage in self.damage)
+        if total is None or self._got + lost < total:
+            self.damage.extend(self._log.gaps)
+        self._check_count(path / NAME, total, self._got, 0)
+
+    def _check_count(self, path: Path, total: int | None, got: int, found_before: int) -> None:
+        """Compare with a number of messages in the metadata.
+
+        Args:
+            path: The file that they are missing from.
+            total: The number, None if unknown.
+            got: Messages that were read.
+            found_before: Damage found before them.
+        """
+        if total is None or got >= total:
+            return
+        found = self.damage[found_before:]
+        missing = total - got - sum(damage.messages_lost or 0 for damage in found)
+        unknown = [row for row, damage in enumerate(found) if damage.messages_lost is None]
+        if len(unknown) == 1:
+            row = found_before + unknown[0]
+            self.damage[row] = replace(self.damage[row], messages_lost=max(0, missing))
+        elif not unknown and missing > 0:
+            reason = f"the log's metadata lists {total} messages, {got} are there"
+            self.damage.append(Damage(path, None, None, reason, missing))
+
+    def _take_extras(self, inner: Source) -> None:
+        self.extras.extend(inner.extras)
+        inner.extras.clear()
+
+    def _numbered(
+        self, inner: Source, numbers: NDArray[np.int32], alike: Counter[tuple[object, ...]]
+    ) -> NDArray[np.int32]:
+        """Numbers of the channels of a file in this source.
+
+        Equal channels of one file are publishers of their own, of two files the same ones.
+
+        Args:
+            inner: The file.
+            numbers: Numbers of its channels so far.
+            alike: How many of these are alike, by what they have in common; changed.
+        """
+        more = []
+        for channel in inner.channels[len(numbers) :]:
+            schema = channel.schema
+            key = (
+                channel.topic,
+                channel.message_encoding,
+                None if schema is None else (schema.name, schema.encoding, schema.data),
+                tuple(sorted(channel.metadata.items())),
+                channel.has_publish_time,
+            )
+            alike[key] += 1
+            number = self._numbers.setdefault((alike[key], *key), len(self.channels))
+            if number == len(self.channels):
+                self.channels.append(channel)
+            more.append(number)
+        return np.append(numbers, np.array(more, np.int32)) if more else numbers
+
+    def _unpacked(self, path: Path, inner: Source, *, is_stated: bool) -> Iterator[Batch]:
+        """Unpack payloads that are zstd frames; the others stay as they are.
+
+        In a log that does not say so only CDR is unpacked, which never begins like a frame.
+        """
+        may_be = np.empty(0, np.bool_)
+        unpacker = zstandard.ZstdDecompressor()
+        broken = plain = 0
+        for batch in inner.batches():
+            if len(may_be) < len(inner.channels):
+                may_be = np.array(
+                    [is_stated or c.message_encoding in _CDR for c in inner.channels], np.bool_
+                )
+            packed = may_be[batch.channel] & _is_frame(batch)
+            plain += len(batch) - int(packed.sum())
+            if not packed.any():
+                yield batch
+                continue
+            row = 0
+            while row < len(batch):
+                start, size = row, 0
+                payloads: list[bytes] = []
+                while row < len(batch) and size < BATCH_BYTES:
+                    payload = bytes(batch.payload(row))
+                    data = _unpack_payload(unpacker, payload) if packed[row] else payload
+                    broken += data is None
+                    payloads.append(payload if data is None else data)
+                    size += len(payloads[-1])
+                    row += 1
+                length = np.fromiter(map(len, payloads), np.int64, len(payloads))
+                rows = batch.take(slice(start, row))
+                yield replace(
+                    rows, buffer=b"".join(payloads), length=length, offset=length.cumsum() - length
+                )
+        for count, problem in ((broken, "do not unpack"), (plain, "are not compressed")):
+            if count and is_stated:
+                reason = (
+                    f"{count} payloads {problem}, although the bag says they are compressed; they "
+                    "are taken as they are"
+                )
+                self.damage.append(Damage(path, None, None, reason, 0))
+
+
+def _is_frame(batch: Batch) -> NDArray[np.bool_]:
+    """Test which payloads begin like a zstd frame; return bool[n]."""
+    found = batch.length >= len(ZSTD_MAGIC)
+    if found.any():
+        size = len(batch.buffer) - len(ZSTD_MAGIC) + 1
+        # A view of four bytes at every byte of the buffer; only the needed ones are read.
+        starts = np.ndarray((size,), "<u4", batch.buffer, strides=(1,))
+        magic = int.from_bytes(ZSTD_MAGIC, "little")
+        found[found] = starts[batch.offset[found]] == magic
+    return found
+
+
+def _unpack_payload(unpacker: zstandard.ZstdDecompressor, payload: bytes) -> bytes | None:
+    """The content of a zstd frame, None if it is damaged or too large."""
+    try:
+        size = zstandard.frame_content_size(payload)
+        if size > MAX_PAYLOAD:
+            return None
+        if size >= 0:
+            return unpacker.decompress(payload)
+        with unpacker.stream_reader(payload) as reader:
+            data = reader.read(MAX_PAYLOAD + 1)
+    except zstandard.ZstdError:
+        return None
+    return data if len(data) <= MAX_PAYLOAD else None
+
+
+def _without_path(error: SourceError, path: Path) -> str:
+    return str(error).removeprefix(f"{path}: ")
