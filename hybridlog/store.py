@@ -192,7 +192,7 @@ def _target(to: str | Path, options: CopyOptions, store: Store) -> Iterator[Targ
 
         with Server(str(to), options.ssh) as server:
             server.begin()
-            yield Target(server, lambda name: free_name(name, server.names()))
+            yield Target(server, lambda name, _: free_name(name, server.names()))
         return
     if address is not None:
         from hybridlog.maintenance.bucket_derived import bring_derived, free_name_there

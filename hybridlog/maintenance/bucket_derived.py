@@ -61,10 +61,10 @@ def bring_derived(source: Shared, target: RemoteDirectory, recordings: Collectio
     cells.close(0)  # a manifest may have been made again
 
 
-def free_name_there(directory: StoreDirectory, name: str) -> str:
-    """A name that no recording of a store has, by their manifests."""
+def free_name_there(directory: StoreDirectory, name: str, but: str) -> str:
+    """A name that no recording of a store has, by their manifests, but for one, by its id."""
     names = set()
-    for one in directory.ids():
+    for one in set(directory.ids()) - {but}:
         with suppress(StoreError):
             names.add(directory.manifests.read(one).name)
     return free_name(text(name), names)

@@ -87,13 +87,13 @@ class Target:
 
     Attributes:
         place: The store.
-        named: Makes a name that no recording there has.
+        named: Makes a name that no recording there has, but for the one of an id.
         made: Called with the id of each new one.
         arrived: Ids of the recordings of which something was copied.
     """
 
     place: Place
-    named: Callable[[str], str]
+    named: Callable[[str, str], str]
     made: Callable[[str], object] = lambda _: None
     arrived: list[str] = field(default_factory=list)
 

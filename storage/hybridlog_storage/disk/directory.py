@@ -184,8 +184,10 @@ class StoreDirectory:
         """True if this user may change the store."""
         if self.read_only:
             return False
-        folders = self.path, self.path / MANIFESTS, self.path / _RECORDINGS
-        return all(os.access(folder, os.W_OK | os.X_OK) for folder in folders)
+        if not os.access(self.path, os.W_OK | os.X_OK):
+            return False
+        folders = self.path / MANIFESTS, self.path / _RECORDINGS  # a copy by hand may lack one
+        return all(os.access(one, os.W_OK | os.X_OK) or not one.exists() for one in folders)
 
     def check_writable(self) -> None:
         """Raise if the store cannot be written.
@@ -254,7 +256,7 @@ class StoreDirectory:
             StoreError: They cannot be read.
         """
         found: dict[str, str] = {}
-        if not ids:
+        if not ids or not (self.path / MANIFESTS).exists():  # a copy by hand may lack it
             return found
         try:
             with (
