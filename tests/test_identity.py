@@ -183,18 +183,19 @@ def test_an_import_goes_on_where_it_was_stopped(place: Path, uri: str, tmp_path:
     with hl.open(place, mongo=uri) as store:
         (entry,) = store.recordings()
     with hl.open(tmp_path / "mine", create=True) as mine:
-        begun = places.root(tmp_path / "mine") / f".importing-{entry.id}"
+        begun = places.root(tmp_path / "mine") / entry.id
         begun.mkdir()
         source = places.folder(place, "one")
         shutil.copy(source / "000000.mcap", begun)
         half = (source / "000001.mcap").read_bytes()
-        (begun / "000001.mcap").write_bytes(half[: len(half) // 2])
+        listed = places.manifest(place, "one").logs[1]
+        (begun / f".{listed.digest[:32]}.part").write_bytes(half[: len(half) // 2])
         assert not mine.recordings()
         report = bring(mine, place)
         left = entry.stored_bytes - (source / "000000.mcap").stat().st_size - len(half) // 2
         assert (report.copied, report.bytes_copied) == (["one"], left)
         assert answers(mine) == right()
-        assert not begun.exists()
+        assert not [path for path in begun.iterdir() if path.name.endswith(".part")]
 
 
 def test_what_is_damaged_is_not_imported(place: Path, tmp_path: Path) -> None:
@@ -203,10 +204,10 @@ def test_what_is_damaged_is_not_imported(place: Path, tmp_path: Path) -> None:
     data[data.index(b"xxxx")] ^= 1  # in a payload: nothing but the copy is checked for that
     path.write_bytes(data)
     with hl.open(tmp_path / "mine", create=True) as mine:
-        assert "does not match its checksums" in bring(mine, place).refused["one"]
+        assert "do not have the digest" in bring(mine, place).refused["one"]
         assert not mine.recordings()
         path.unlink()
-        assert "is incomplete" in bring(mine, place).refused["one"]
+        assert "000001.mcap" in bring(mine, place).refused["one"]
         assert not mine.recordings()
 
 

@@ -74,7 +74,7 @@ def _import(bench: Bench) -> Scenario:
             state.recordings == before.recordings
             and not state.findings
             and before.files < state.files
-            and all(name.startswith(".importing-") for name in extra)
+            and all(name.partition("/")[0] == "c" for name in extra)
         )
 
     return bench.scenario(

@@ -51,8 +51,6 @@ LOCK_WAIT_S: Final = 10.0
 """Seconds that a command waits for another one that holds its recording."""
 PAYLOADS: Final = "payloads"
 """Folder of a recording that holds the fields of its expired messages."""
-REMOVED: Final = ".removed-"
-"""Prefix of the directory of a recording that is being deleted."""
 _RECORDINGS: Final = "recordings"
 _OF_MANIFEST: Final = frozenset({MANIFEST_LOCK, MANIFEST_OLD, f".{MANIFEST_OLD}"})
 _TICK_NS: Final = 50_000_000

@@ -154,7 +154,8 @@ def open_file(path: Path, flags: int, mode: int = 0o666) -> int:
     if not flags & _WRITES and (found := _mounted(path)) is not None:
         return found[0].open(found[1])
     with folder(path.parent) as fd:
-        return system.open(path.name, flags | os.O_NOFOLLOW, mode, folder=fd)
+        # A pipe in the place of a file would be waited for.
+        return system.open(path.name, flags | os.O_NOFOLLOW | os.O_NONBLOCK, mode, folder=fd)
 
 
 def read_file(path: Path, most: int) -> bytes:
