@@ -21,7 +21,6 @@ from msgspec import ValidationError, convert, to_builtins
 
 from hybridlog.columns.layout import PAYLOAD_PARTS
 from hybridlog.record.losses import Cause, extent_of, joined, topics_of
-from hybridlog.record.marks import with_marks
 from hybridlog.schema.states import State, expired_messages
 from hybridlog_storage import manifest as truth
 from hybridlog_storage.catalog import (
@@ -304,6 +303,15 @@ def read_summary(path: Path, number: int) -> SegmentSummary:
     """
     with SegmentReader(path, number) as reader:
         return reader.summary()
+
+
+def with_marks(entry: RecordingEntry) -> RecordingEntry:
+    """The entry of a recording's files, and of the marks that somebody set."""
+    if not entry.marks:
+        return entry
+    from hybridlog.record.marks_log import beside  # loads numpy
+
+    return beside(entry)
 
 
 def describe(catalog: Catalog, inventory: Inventory, *, is_open: bool = False) -> Described:

@@ -10,9 +10,10 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from hybridlog.columns.payload_files import RecordingPayloads, open_segment
+from hybridlog.entries import with_marks
 from hybridlog.maintenance.opening import StoreFiles, open_catalog
 from hybridlog.maintenance.report import RepairReport
-from hybridlog.record.marks import MARK_SCHEMA, with_marks
+from hybridlog.record.marks import MARK_SCHEMA
 from hybridlog.snapshot import UNFINISHED
 from hybridlog_storage.cache import Cache
 from hybridlog_storage.catalog import file_of, schema_hash

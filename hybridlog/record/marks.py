@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from hybridlog_storage.messages import Channel, Schema
-
-if TYPE_CHECKING:
-    from hybridlog_storage.catalog import RecordingEntry
 
 MARKS: Final = "/hybridlog/marks"
 """Topic of marks."""
@@ -28,15 +25,6 @@ MARK_SCHEMA: Final = Schema(
     b'"tags":{"type":"object","additionalProperties":{"type":"string"}},'
     b'"end":{"type":"integer"}}}',
 )
-
-
-def with_marks(entry: RecordingEntry) -> RecordingEntry:
-    """The entry of a recording's files, and of the marks that somebody set."""
-    if not entry.marks:
-        return entry
-    from hybridlog.record.marks_log import beside  # loads numpy
-
-    return beside(entry)
 
 
 def mark_channel() -> Channel:
