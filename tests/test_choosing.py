@@ -188,7 +188,7 @@ def test_a_choice_without_a_meaning_is_refused(
         (("-r", "mon*", "--tag", "robot="), "named 'mon*', with the tag robot=. The tags"),
         (("--has", "imy"), "did you mean /imu?"),
         (("--type", "sensor_msgs/LaserScam"), "Did you mean sensor_msgs/LaserScan, "),
-        (("--type", "x"), f"The store has: {ODD}, {SCAN}, {IMU}"),
+        (("--type", "x"), f"The store has: {ODD}, hybridlog.Mark, {SCAN}, {IMU}"),
         (("--during", "2030-01-01", "end"), "lie between 2025-06-03T00:00:00Z and 2025-06-07"),
         (("--with", "/scan: n > 99"), "3 with /scan were asked."),
         (("-r", "x*"), "named 'x*'. There are: monday 1, monday 2, tuesday, run[1], run1."),

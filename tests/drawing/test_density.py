@@ -313,12 +313,13 @@ def test_parts_of_chunks_are_known_as_they_come(store: hl.Store) -> None:
     span = BASE - MS, BASE + 2 * LENGTH
     (segment, first, last) = entry.spans[0]
     whole = store.session.chunk_table(entry, segment)
+    reader = store.session.segment(entry.id, segment)
     assert (whole.chunks["parts"] > 1).any()
 
     def flushed(count: int) -> RecordingEntry:
         parts = whole.parts[: int(whole.chunks["parts"][:count].sum())]
         now = replace(whole, chunks=whole.chunks[:count], parts=parts, is_flushed=True)
-        content = {segment: Flushed(now, (), ())}
+        content = {segment: Flushed(now, (), (), reader)}
         spans = [(segment, first, last)]
         return replace(entry, status="open", digests={}, flushed=content, spans=spans)
 
@@ -337,7 +338,7 @@ def test_parts_of_chunks_are_known_as_they_come(store: hl.Store) -> None:
     chunks = whole.chunks.copy()
     chunks["trailer_crc"][-1] ^= 1
     other = flushed(len(chunks))
-    other.flushed[segment] = Flushed(replace(whole, chunks=chunks, is_flushed=True), (), ())
+    other.flushed[segment] = Flushed(replace(whole, chunks=chunks, is_flushed=True), (), (), reader)
     assert not RecordedChunks(store.session, other).parts(span, []).segment.size
     assert not step.follow(other)
     assert not step.follow(flushed(len(chunks)))

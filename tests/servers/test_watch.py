@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import signal
 import subprocess
@@ -29,8 +30,12 @@ WATCH = ("index", "watch", "--every", "100ms")
 def arrive(robot: Path, lab: Path, label: str) -> None:
     """A recording comes whole into the lab's store, as a copy lets it."""
     folder = places.folder(robot, label)
-    shutil.copytree(folder, places.root(lab) / ".coming")
-    (places.root(lab) / ".coming").rename(places.new_folder(lab, folder.name))
+    there = places.new_folder(lab, folder.name)
+    shutil.copytree(folder, there)
+    coming = places.manifest_of(there).with_name(".coming")
+    shutil.copy(places.manifest_of(folder), coming)
+    coming.rename(places.manifest_of(there))
+    os.utime(places.root(lab))
 
 
 def test_what_comes_into_a_store_is_indexed_once_by_several_that_watch(

@@ -83,7 +83,7 @@ def written(
 def check(segment: OpenSegment, written: Written, size: int) -> None:
     """Compare what was read of the first bytes with what the summary says of them."""
     summary = written.summary
-    table, attachments, metadata = segment.flushed
+    table, attachments, metadata, _ = segment.flushed
     count = sum(end <= size for end in written.ends)
     assert len(table.chunks) == count
     assert table.is_flushed
