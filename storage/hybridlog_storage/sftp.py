@@ -201,7 +201,8 @@ class Server(Place):
         """
         if self.has_shell:
             pattern = r'^{"id":"[^"]*","name":"\([^"\]\|\\.\)*"'
-            _, said = self.shell(f"grep -rhao '{pattern}' {MANIFESTS}")
+            whole = f"find {MANIFESTS} -name '[!.]*.json'"  # others were left by a cut
+            _, said = self.shell(f"{whole} -exec grep -hao '{pattern}' {{}} + || true")
             return {json.loads(f"{row}}}")["name"] for row in said.splitlines()}
         found = set()
         for recording in self.manifests.ids():
