@@ -499,7 +499,7 @@ class _Source:
             self._fd = -1
 
     def _open(self) -> None:
-        self._fd = files.open_file(self._path, os.O_RDONLY | os.O_NONBLOCK)
+        self._fd = files.open_file(self._path, os.O_RDONLY)
         same = files.identity(self._fd)
         if self._same is not None and same != self._same:
             os.close(self._fd)

@@ -273,7 +273,7 @@ class Directory(Source):
         final, part = self._path / sent.name, self._path / sent.part
         self._make_folders(final)
         try:
-            fd = files.open_file(part, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK)
+            fd = files.open_file(part, os.O_RDWR | os.O_CREAT)
             try:
                 if not _fill(fd, sent):
                     files.system.truncate(fd, 0)
@@ -452,7 +452,7 @@ def _written(fd: int, sent: Sending, at: int) -> Iterator[bytes]:
 @contextmanager
 def _file(path: Path) -> Iterator[int]:
     """A handle of an ordinary file."""
-    fd = files.open_file(path, os.O_RDONLY | os.O_NONBLOCK)
+    fd = files.open_file(path, os.O_RDONLY)
     try:
         if not stat.S_ISREG(os.fstat(fd).st_mode):
             raise OSError(0, "it is not an ordinary file")

@@ -626,7 +626,7 @@ def _locked(path: Path, wait_s: float | None = None) -> Iterator[None]:
         fd = _opened(path, os.O_RDWR)
         try:
             _lock(fd, path, end)
-            if _is_at(path, fd):
+            if files.is_at(fd, path):
                 locked = time.monotonic()
                 try:
                     yield
@@ -645,7 +645,7 @@ def _make_file(path: Path) -> None:
 
 def _opened(path: Path, flags: int) -> int:
     try:
-        return files.open_file(path, flags | os.O_NONBLOCK)
+        return files.open_file(path, flags)
     except FileNotFoundError:
         raise
     except OSError as error:
@@ -684,12 +684,6 @@ def _lock(fd: int, path: Path, end: float) -> None:
             ) from error
         else:
             return
-
-
-def _is_at(path: Path, fd: int) -> bool:
-    with suppress(FileNotFoundError):
-        return os.path.samestat(files.status(path), os.fstat(fd))
-    return False
 
 
 def _exists(path: Path) -> bool:

@@ -84,7 +84,7 @@ class AppendFile:
         Raises:
             OSError: It cannot be opened for writing, or is not an ordinary file.
         """
-        fd = files.open_file(path, os.O_RDWR | os.O_NONBLOCK)
+        fd = files.open_file(path, os.O_RDWR)
         if not stat.S_ISREG(os.fstat(fd).st_mode):
             os.close(fd)
             raise OSError(errno.EINVAL, "it is not an ordinary file", str(path))

@@ -475,7 +475,7 @@ class StoreDirectory:
     def holder(self, recording: str) -> Holder | None:
         """The process that holds a recording's lock at this moment."""
         try:
-            fd = files.open_file(self.recording(recording) / LOCK, os.O_RDONLY | os.O_NONBLOCK)
+            fd = files.open_file(self.recording(recording) / LOCK, os.O_RDONLY)
         except OSError:
             return None
         try:
@@ -519,11 +519,8 @@ def gone(name: str) -> TopicError:
 
 
 def _is_at(fd: int, path: Path) -> bool:
-    """True if an open file has a path."""
     try:
-        return os.path.samestat(os.fstat(fd), files.status(path))
-    except FileNotFoundError:
-        return False
+        return files.is_at(fd, path)
     except OSError as error:
         raise durability.explain(error, path, "locking") from error
 

@@ -141,7 +141,7 @@ def _is_in_store(path: Path) -> bool:
 
 
 def open_file(path: Path, flags: int, mode: int = 0o666) -> int:
-    """Open a file of a store without following symlinks.
+    """Open a file of a store; no symlink is followed, and no pipe is waited for.
 
     Args:
         path: The file.
@@ -154,7 +154,6 @@ def open_file(path: Path, flags: int, mode: int = 0o666) -> int:
     if not flags & _WRITES and (found := _mounted(path)) is not None:
         return found[0].open(found[1])
     with folder(path.parent) as fd:
-        # A pipe in the place of a file would be waited for.
         return system.open(path.name, flags | os.O_NOFOLLOW | os.O_NONBLOCK, mode, folder=fd)
 
 
@@ -168,7 +167,7 @@ def read_file(path: Path, most: int) -> bytes:
     Raises:
         OSError: It cannot be read, or is not an ordinary file.
     """
-    fd = open_file(path, os.O_RDONLY | os.O_NONBLOCK)
+    fd = open_file(path, os.O_RDONLY)
     try:
         if not stat.S_ISREG(os.fstat(fd).st_mode):
             raise OSError(0, "it is not an ordinary file", str(path))
@@ -319,6 +318,13 @@ def preadv(fd: int, buffers: Sequence[memoryview], offset: int) -> int:
     if is_fetched(fd):
         cast("Fetched", fd).fetch([(offset, offset + sum(map(len, buffers)))])
     return os.preadv(fd, buffers, offset)
+
+
+def is_at(fd: int, path: Path) -> bool:
+    """True if an open file is the one that has a path now."""
+    with suppress(FileNotFoundError):
+        return os.path.samestat(os.fstat(fd), status(path))
+    return False
 
 
 def identity(fd: int) -> tuple[int, ...]:

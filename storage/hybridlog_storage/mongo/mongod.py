@@ -254,7 +254,7 @@ class EmbeddedMongod:
         return descriptor
 
     def _open(self, name: str) -> int:
-        flags = os.O_RDWR | os.O_CREAT | os.O_NONBLOCK
+        flags = os.O_RDWR | os.O_CREAT
         path = self._directory / name
         try:
             try:
@@ -416,7 +416,7 @@ class EmbeddedMongod:
             )
         script = Path(__file__).with_name("mongod_keeper.py")
         with files.folder(self._directory) as folder:
-            flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_NONBLOCK
+            flags = os.O_RDWR | os.O_CREAT | os.O_APPEND
             log = files.open_file(self.log, flags, 0o600)
             job = {
                 "command": self._command(program, path),
@@ -812,8 +812,7 @@ def _answers(path: str) -> bool:
 def _read_from(path: Path, start: int) -> str:
     """The end of a file: at most `_LOG_TAIL` bytes, not before `start`."""
     try:
-        flags = os.O_RDONLY | os.O_NONBLOCK
-        with os.fdopen(files.open_file(path, flags), "rb") as file:
+        with os.fdopen(files.open_file(path, os.O_RDONLY), "rb") as file:
             size = file.seek(0, os.SEEK_END)
             file.seek(max(start, size - _LOG_TAIL))
             return file.read(_LOG_TAIL).decode(errors="replace")

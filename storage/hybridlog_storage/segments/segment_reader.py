@@ -230,12 +230,11 @@ class SegmentReader:
         self.bytes_read = 0
 
     def _open(self, path: Path) -> int:
-        flags = os.O_RDONLY | os.O_NONBLOCK
         if self._direct:
             with suppress(OSError):
-                return files.open_file(path, flags | DIRECT)
+                return files.open_file(path, os.O_RDONLY | DIRECT)
             self._direct = False
-        return files.open_file(path, flags)
+        return files.open_file(path, os.O_RDONLY)
 
     def close(self) -> None:
         """Close the file."""
