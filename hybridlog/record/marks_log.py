@@ -88,18 +88,8 @@ class _MarksLog(SegmentReader):
             times,
             np.zeros(len(own), np.uint32),
         )
-        return StoredChunk(
-            segment=MARKS_SEGMENT,
-            number=place.number,
-            offset=place.offset,
-            length=place.length,
-            trailer=place.trailer,
-            crc=place.crc,
-            trailer_crc=place.trailer_crc,
-            batch=batch,
-            seq=_ARRIVALS + place.number * _CHUNK + np.arange(len(own)),
-            compressed_size=0,
-        )
+        seq = _ARRIVALS + place.number * _CHUNK + np.arange(len(own))
+        return place.stored(MARKS_SEGMENT, batch, seq)
 
     def read_times(self, place: ChunkPlace) -> dict[int, NDArray[np.int64]]:
         """Their log times, as of a segment."""
@@ -133,6 +123,6 @@ def beside(entry: RecordingEntry) -> RecordingEntry:
 
 
 def without(entry: RecordingEntry, known: Collection[str]) -> RecordingEntry:
-    """An entry `beside` its files whose log lacks those of some ids."""
+    """The entry without the marks of some ids, which have been told before."""
     left = [one for one in entry.marks if one["id"] not in known]
     return replace(entry, flushed={**entry.flushed, MARKS_SEGMENT: _MarksLog(left).flushed})

@@ -254,12 +254,13 @@ class StoreDirectory:
             StoreError: They cannot be read.
         """
         found: dict[str, str] = {}
-        if not ids or not (self.path / MANIFESTS).exists():  # a copy by hand may lack it
+        if not ids:
             return found
         try:
             with (
-                files.folder(self.path / MANIFESTS) as fd,
                 files.folder(self.recordings) as inside,
+                suppress(FileNotFoundError),  # a copy by hand may lack the next one
+                files.folder(self.path / MANIFESTS) as fd,
             ):
                 for one in ids:
                     with suppress(FileNotFoundError):

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import stat
 import struct
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -113,6 +113,29 @@ class ChunkPlace:
     def is_expired(self) -> bool:
         """True if its payloads were deleted, or are to be copied later."""
         return self.length in ADDED_IDS
+
+    def stored(
+        self,
+        segment: int,
+        batch: Batch,
+        seq: NDArray[np.int64],
+        compressed_size: int = 0,
+        fields: Sequence[tuple[NDArray[np.intp], Any]] | None = None,
+    ) -> StoredChunk:
+        """The chunk of a segment with its content; see `StoredChunk`."""
+        return StoredChunk(
+            segment=segment,
+            number=self.number,
+            offset=self.offset,
+            length=self.length,
+            trailer=self.trailer,
+            crc=self.crc,
+            trailer_crc=self.trailer_crc,
+            batch=batch,
+            seq=seq,
+            compressed_size=compressed_size,
+            fields=fields,
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -464,19 +487,7 @@ class SegmentReader:
             seq = check_arrivals(trailer, place.offset, len(batch))
         except SegmentError as error:
             raise self._damaged(place, error) from error
-        return StoredChunk(
-            segment=self.number,
-            number=place.number,
-            offset=place.offset,
-            length=place.length,
-            trailer=place.trailer,
-            crc=place.crc,
-            trailer_crc=place.trailer_crc,
-            batch=batch,
-            seq=seq,
-            compressed_size=compressed,
-            fields=fields,
-        )
+        return place.stored(self.number, batch, seq, compressed, fields)
 
     def _messages(self, place: ChunkPlace, content: Buffer, trailer: memoryview) -> Batch:
         """The messages of a chunk; damaged message indexes are ignored."""
