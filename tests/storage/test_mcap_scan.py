@@ -436,6 +436,27 @@ def test_junk_between_records_is_stepped_over() -> None:
         assert [(d.offset, d.length) for d in damages(items)] == [(place, len(junk))]
 
 
+def test_one_record_amid_junk_is_no_place_to_go_on() -> None:
+    data = written()
+    end = next(o for o, i in items_of(data) if isinstance(i, DataEnd))
+    place = [o for o, i in items_of(data) if isinstance(i, ScannedChunk)][1]
+    junk = bytes(20) + struct.pack("<BQ", Opcode.METADATA, 8) + bytes(58)
+    items = items_of(data[:place] + junk + data[place:end])
+    assert payloads(items) == ALL
+    assert [(d.offset, d.length) for d in damages(items)] == [(place, len(junk))]
+
+
+def test_a_record_that_claims_too_much_costs_no_chunk_behind_it() -> None:
+    data = bytearray(written())
+    end = next(o for o, i in items_of(bytes(data)) if isinstance(i, DataEnd))
+    place = next(o for o, i in items_of(bytes(data)) if isinstance(i, Attachment))
+    (length,) = struct.unpack_from("<Q", data, place + 1)
+    struct.pack_into("<Q", data, place + 1, length + 7)
+    items = items_of(bytes(data[:end]))
+    assert payloads(items) == ALL
+    assert [d.offset for d in damages(items)] == [place + 9 + length]
+
+
 def test_a_message_index_that_starts_at_the_very_end_is_damage() -> None:
     data = written()
     end = next(o for o, i in items_of(data) if isinstance(i, DataEnd))

@@ -654,7 +654,7 @@ class _Scanner:
 
     def _plain(self, at: int, opcode: int, end: int) -> Iterator[tuple[int, Item]]:
         start = at + _HEAD
-        self._at = end
+        self._at, self._behind = end, start
         if opcode == Opcode.DATA_END:
             if self._stop is None and self._ends_data(end):
                 yield from self._finish(at, _DATA_END)
@@ -727,7 +727,8 @@ class _Scanner:
     def _lost(self, at: int, reason: str, opcode: int | None = None) -> tuple[int, Item]:
         """Skip to the next chunk of the summary, or to the next records that are whole."""
         found = self._places.next(at) if self._places.count() else None
-        found = found or self._search(min(self._behind, at) + 1) or self._stop
+        start = self._behind if self._behind < at else at + 1
+        found = found or self._search(start) or self._stop
         if found is None:
             return self._torn(at, f"the file ends in the middle of a record: {reason}")
         where = min(at, self._behind, found)
