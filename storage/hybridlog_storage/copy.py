@@ -9,10 +9,10 @@ from __future__ import annotations
 import time
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 from hybridlog_storage.copy_places import RECORDINGS, RefusedError, Sending
-from hybridlog_storage.disk.directory import PAYLOADS
+from hybridlog_storage.disk.directory import PAYLOADS, ListedFile, listed_files
 from hybridlog_storage.errors import ManifestError, RecordingExistsError, StoreError
 from hybridlog_storage.manifest import Manifest, replace
 from hybridlog_storage.manifests import MANIFEST_LOCK, WRITER_LOCK
@@ -80,14 +80,6 @@ class Copied:
     lost: list[str] = field(default_factory=list)
 
 
-class _File(NamedTuple):
-    """A file of a recording: its path below it, its size and its digest."""
-
-    path: str
-    bytes: int
-    digest: str
-
-
 def copy(source: Source, target: Place, recording: str, how: How | None = None) -> Copied:
     """Copy a recording. What an interrupted copy has left is used by the next one.
 
@@ -131,7 +123,7 @@ class _Copy:
 
     def __init__(self, source: Source, target: Place, here: Manifest, how: How) -> None:
         self._source, self._target, self._here, self._how = source, target, here, how
-        self._own = {one.path for one in files_of(here)}
+        self._own = {one.path for one in listed_files(here)}
         self._others = source  # has the files that are not in `_own`
         self._must_prove = how.check or how.proved is not None
         self._done = self._total = 0
@@ -148,7 +140,7 @@ class _Copy:
             return None
         if self._target.mends:
             sizes = self._target.sizes(here.id)
-            if any(sizes.get(one.path) != one.bytes for one in files_of(there)):
+            if any(sizes.get(one.path) != one.bytes for one in listed_files(there)):
                 return None
         return Copied(there, lacking=_lacking(here, there))
 
@@ -229,14 +221,14 @@ class _Copy:
     ) -> None:
         """Send what is lacking, or lost, and prove what has to be."""
         target = self._target
-        ours = {one.path: one for one in files_of(here)}
-        listed = {one.path: one for one in ([] if there is None else files_of(there))}
+        ours = {one.path: one for one in listed_files(here)}
+        listed = {one.path: one for one in ([] if there is None else listed_files(there))}
         new = [ours[log.name] for log in logs]
         if needs_fields(logs):
             fields = (one for path, one in ours.items() if path.startswith(f"{PAYLOADS}/"))
             new += [one for one in fields if one.path not in listed]
         kept = merged(here, there, {log.name for log in logs})
-        old = [listed[one.path] for one in files_of(kept) if one.path in listed]
+        old = [listed[one.path] for one in listed_files(kept) if one.path in listed]
         self._new = {one.path for one in new}
         doubtful = [one for one in old if self._must_prove or sizes.get(one.path) != one.bytes]
         self._total = sum(one.bytes for one in (*new, *doubtful))
@@ -254,7 +246,7 @@ class _Copy:
             self._proved[one.path] = one.digest
         copied.bytes, copied.sent_bytes = self._total, self._sent_bytes
 
-    def _sending(self, file: _File) -> Sending:
+    def _sending(self, file: ListedFile) -> Sending:
         source = self._source if file.path in self._own else self._others
         rate = self._how.limit_rate
         return Sending(source, self._here.id, *file, self._count, rate)
@@ -295,8 +287,8 @@ class _Copy:
 
     def _clear(self, there: Manifest | None, now: Manifest, sizes: Mapping[str, int]) -> None:
         """Delete files that others have replaced, and what has arrived of those not to come."""
-        before = [] if there is None else files_of(there)
-        listed = {one.path for one in files_of(now)}
+        before = [] if there is None else listed_files(there)
+        listed = {one.path for one in listed_files(now)}
         left = {one.path for one in before} - listed
         if self._how.prepare is None:  # or else the next copy goes on with them
             arrived = {path for path in sizes if path.endswith(".part")}
@@ -318,12 +310,6 @@ class _Copy:
             and self._proved.get(there[number].name) == there[number].digest
             and (there[number].digest == log.digest or not there[number].expired)
         }
-
-
-def files_of(manifest: Manifest) -> list[_File]:
-    """All files that a manifest lists."""
-    logs = [_File(one.name, one.bytes, one.digest) for one in manifest.files]
-    return logs + [_File(f"{PAYLOADS}/{o.file}", o.bytes, o.digest) for o in manifest.fields]
 
 
 def _lacking(here: Manifest, there: Manifest | None) -> list[int]:

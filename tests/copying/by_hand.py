@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 from blake3 import blake3
 
-from hybridlog_storage.copy import files_of
 from hybridlog_storage.copy_places import BucketStore, Directory, Place, Source
+from hybridlog_storage.disk.directory import listed_files
 from hybridlog_storage.manifest import (
     Channel,
     Fields,
@@ -142,7 +142,7 @@ class Store:
 
     def begin(self, manifest: Manifest) -> None:
         """Make a recording with all its files."""
-        for file in files_of(manifest):
+        for file in listed_files(manifest):
             self.write(f"recordings/{manifest.id}/{file.path}", bytes_of(file.path))
         self.place.manifests.create(manifest)
 
@@ -179,7 +179,7 @@ class Store:
         """The recording, whose files are there whole, and nothing else if it is as wanted."""
         found = self.manifests().read(RECORDING)
         paths = set()
-        for file in files_of(found):
+        for file in listed_files(found):
             path = f"recordings/{RECORDING}/{file.path}"
             assert blake3(self.read(path)).hexdigest() == file.digest, path
             paths.add(path)

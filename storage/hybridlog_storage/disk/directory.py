@@ -27,7 +27,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from itertools import takewhile
 from pathlib import Path
-from typing import Any, ClassVar, Final
+from typing import Any, ClassVar, Final, NamedTuple
 
 from hybridlog_storage.cells import Cells
 from hybridlog_storage.disk import durability, files
@@ -57,6 +57,21 @@ _TICK_NS: Final = 50_000_000
 _POLL_S = 0.02
 _RECORDER_WAIT_S = 0.5  # a reader's look at a lock must not pass for a recorder
 _MAX_HOLDER = 256  # bytes of the line in a lock
+
+
+class ListedFile(NamedTuple):
+    """A file of a recording: its path below the recording, its size and its digest."""
+
+    path: str
+    bytes: int
+    digest: str
+
+
+def listed_files(manifest: Manifest) -> list[ListedFile]:
+    """All files that a manifest lists, without those that are gone."""
+    here = (one for one in manifest.files if one.is_here)
+    found = [ListedFile(one.name, one.bytes, one.digest) for one in here]
+    return found + [ListedFile(f"{PAYLOADS}/{o.file}", o.bytes, o.digest) for o in manifest.fields]
 
 
 @dataclass(frozen=True, slots=True)

@@ -32,7 +32,13 @@ from hybridlog_storage import manifest as truth
 from hybridlog_storage.cells import Cells, drop, put
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk import files
-from hybridlog_storage.disk.directory import PAYLOADS, Listing, StoreDirectory, gone
+from hybridlog_storage.disk.directory import (
+    PAYLOADS,
+    Listing,
+    StoreDirectory,
+    gone,
+    listed_files,
+)
 from hybridlog_storage.errors import (
     BucketError,
     ManifestError,
@@ -330,17 +336,11 @@ class BucketFiles:
         known = self._files.get(manifest.id)
         if known is None or known[0] is not manifest:
             place = f"{RECORDINGS}/{manifest.id}"
-            here = {
-                one.name: Object(f"{place}/{one.name}", one.bytes, one.digest)
-                for one in manifest.files
-                if one.is_here
+            found = {
+                one.path: Object(f"{place}/{one.path}", one.bytes, one.digest)
+                for one in listed_files(manifest)
             }
-            fields = {
-                path: Object(f"{place}/{path}", one.bytes, one.digest)
-                for one in manifest.fields
-                for path in [f"{PAYLOADS}/{one.file}"]
-            }
-            known = self._files[manifest.id] = manifest, here | fields
+            known = self._files[manifest.id] = manifest, found
         return known[1]
 
     def settings(self) -> bytes:
