@@ -47,6 +47,17 @@ def lose(store: Path, name: str) -> None:
     shutil.rmtree(gone)
 
 
+def spoil_manifest(folder: Path, harm: str) -> None:
+    """Harm the manifest of the recording in a directory: `gone`, `cut`, `flipped` or `empty`."""
+    path = manifest_of(folder)
+    data = path.read_bytes()
+    if harm == "gone":
+        path.unlink()
+    else:
+        flipped = data[:20] + bytes([data[20] ^ 1]) + data[21:]
+        path.write_bytes({"cut": data[:-2], "flipped": flipped, "empty": b""}[harm])
+
+
 def read_in(folder: Path) -> Manifest | None:
     """The manifest of the recording in a directory; None without one."""
     return manifests_at(folder).find(folder.name)

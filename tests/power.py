@@ -15,12 +15,17 @@ from __future__ import annotations
 import errno
 import os
 import random
+import shutil
 import stat
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import pytest
+
+from hybridlog_storage.disk import files
 from hybridlog_storage.disk.files import System
+from hybridlog_storage.errors import HybridlogError
 
 SECTOR = 512
 
@@ -244,6 +249,37 @@ class PowerCut(System):
             number += 1 << 64
         self._numbers[about.st_ino] = number
         return number
+
+
+def each_cut(
+    store: Path,
+    tmp_path: Path,
+    rng: random.Random,
+    monkeypatch: pytest.MonkeyPatch,
+    work: Callable[[Path], object],
+) -> Iterator[tuple[Path, bool]]:
+    """Cut the power at each call of some work, and after the last one.
+
+    Yields:
+        The store as it is on the disk then, and whether the work came to its end.
+    """
+    at, is_done = 0, False
+    while not is_done:
+        place, found = tmp_path / f"{at}", tmp_path / f"{at} after"
+        shutil.copytree(store, place)
+        power = PowerCut(place, at)
+        with monkeypatch.context() as patch:
+            patch.setattr(files, "system", power)
+            try:
+                work(place)
+                is_done = True
+            except HybridlogError:
+                pass
+            except OSError:
+                assert power.is_off
+        power.after_cut(found, rng)
+        yield found, is_done
+        at += 1
 
 
 def _exists(name: str, folder: int | None) -> bool:

@@ -396,13 +396,7 @@ def test_any_flipped_bit_of_a_summary_costs_that_segment(made: Made) -> None:
 
 @pytest.mark.parametrize("harm", ["gone", "cut", "flipped", "empty"])
 def test_without_its_manifest_a_recording_answers_nothing(made: Made, harm: str) -> None:
-    path = places.manifest_of(made.path)
-    data = path.read_bytes()
-    if harm == "gone":
-        path.unlink()
-    else:
-        flipped = data[:20] + bytes([data[20] ^ 1]) + data[21:]
-        path.write_bytes({"cut": data[:-2], "flipped": flipped, "empty": b""}[harm])
+    places.spoil_manifest(made.path, harm)
     with pytest.raises(ManifestError, match="`hybridlog verify --repair` makes it again"):
         made.entry()
     assert all(segment.exists() for segment in made.segments)

@@ -189,13 +189,7 @@ def test_a_manifest_is_made_again_when_it_is_asked_for(
     with closing(hl.open(store, mongo=NOWHERE)) as opened:
         opened.edit("one", tag={"place": "lab"})
         opened.edit("one", note="wind")
-    path = places.manifest_of(folder)
-    data = path.read_bytes()
-    if harm == "gone":
-        path.unlink()
-    else:
-        flipped = data[:20] + bytes([data[20] ^ 1]) + data[21:]
-        path.write_bytes({"cut": data[:-2], "flipped": flipped, "empty": b""}[harm])
+    places.spoil_manifest(folder, harm)
     if not has_old:
         (folder / MANIFEST_OLD).unlink()
     before = sorted(p.name for p in folder.iterdir())

@@ -201,13 +201,13 @@ class Manifests(ABC):
                 check(now)
             return replace(now, status="removed")
 
-        is_said = True
+        says_so = True
         try:
             found = self._change(recording, removed)
         except DiskFullError:  # and who wants to free some space comes here
-            is_said, found = False, self._read(recording)[0]
+            says_so, found = False, self._read(recording)[0]
         self._delete_files(recording)
-        self._forget(recording, is_said=is_said)
+        self._forget(recording, says_so=says_so)
         return found
 
     def _change(self, recording: str, how: Callable[[Manifest], Manifest]) -> Manifest:
@@ -271,7 +271,7 @@ class Manifests(ABC):
         """Delete the files of a removed recording, but not its lock."""
 
     @abstractmethod
-    def _forget(self, recording: str, *, is_said: bool) -> None:
+    def _forget(self, recording: str, *, says_so: bool) -> None:
         """Delete the manifest of a removed recording, which says so unless the disk was full."""
 
 
@@ -495,13 +495,13 @@ class DiskManifests(Manifests):
         except OSError as error:
             raise durability.explain(error, folder, "deleting") from error
 
-    def _forget(self, recording: str, *, is_said: bool) -> None:
+    def _forget(self, recording: str, *, says_so: bool) -> None:
         # A copy may have created it anew meanwhile, if somebody else has finished the removal.
         # A change makes no lock where there is no manifest, so the folder is empty in the end.
         _make_file(self._folder / _ALL)  # copies of a store may leave out what is empty
         with _locked(self._folder / _ALL):
             with suppress(RecordingGoneError):
-                if is_said and self._read(recording)[0].status != "removed":
+                if says_so and self._read(recording)[0].status != "removed":
                     return
             try:
                 self._drop(recording)
@@ -576,7 +576,7 @@ class BucketManifests(Manifests):
         names = [one.name for one in self._bucket.objects(f"{_RECORDINGS}/{recording}/")]
         self._bucket.delete(names)
 
-    def _forget(self, recording: str, *, is_said: bool) -> None:
+    def _forget(self, recording: str, *, says_so: bool) -> None:
         # Servers have no condition for deletions: between these two it could be created anew.
         with suppress(RecordingGoneError):
             if self._read(recording)[0].status == "removed":

@@ -497,7 +497,7 @@ class _ServerManifests(Manifests):
     def _delete_files(self, recording: str) -> None:
         raise _only_there(self._server)
 
-    def _forget(self, recording: str, *, is_said: bool) -> None:
+    def _forget(self, recording: str, *, says_so: bool) -> None:
         raise _only_there(self._server)
 
 

@@ -28,7 +28,7 @@ from tests.calls import Calls
 from tests.copying.by_hand import RECORDING, Makes, Store, recording, without_payloads
 from tests.copying.test_any_place import as_of, edited
 from tests.manifests.test_disk import Dying
-from tests.power import PowerCut
+from tests.power import each_cut
 
 SMALL = recording(3)
 PART = f".{SMALL.files[0].digest[:32]}.part"
@@ -96,21 +96,12 @@ def test_power_cut_at_each_system_call(
     source, target = stores
     assert target.folder is not None
     rng = random.Random(seed)
-    at, is_done = 0, False
-    while not is_done:
-        place, found = tmp_path / f"{at}", tmp_path / f"{at} after"
-        shutil.copytree(target.folder, place)
-        power = PowerCut(place, at)
-        with monkeypatch.context() as patch:
-            patch.setattr(files, "system", power)
-            try:
-                copies(source, place)
-                is_done = True
-            except HybridlogError:
-                pass
-            except OSError:
-                assert power.is_off
-        power.after_cut(found, rng)
+    at = 0
+
+    def work(place: Path) -> None:
+        copies(source, place)
+
+    for found, is_done in each_cut(target.folder, tmp_path, rng, monkeypatch, work):
         if is_done:
             Store(Directory(found), found, None).check(SMALL)
         check(source, found)

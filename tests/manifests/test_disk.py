@@ -29,7 +29,7 @@ from hybridlog_storage.manifest import Manifest, Note, encode, new_id, replace
 from hybridlog_storage.manifests import DiskManifests
 from tests.calls import Calls
 from tests.limits import Limit
-from tests.power import PowerCut
+from tests.power import each_cut
 
 ONE = Manifest(new_id("run"), "run", 1)
 
@@ -196,21 +196,12 @@ def test_power_cut_at_each_system_call(
     store: Path, tmp_path: Path, what: str, seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rng = random.Random(f"{what} {seed}")
-    at, is_done = 0, False
-    while not is_done:
-        place, found = tmp_path / f"{at}", tmp_path / f"{at} after"
-        shutil.copytree(store, place)
-        power = PowerCut(place, at)
-        with monkeypatch.context() as patch:
-            patch.setattr(files, "system", power)
-            try:
-                WORKS[what](DiskManifests(place))
-                is_done = True
-            except HybridlogError:
-                pass
-            except OSError:
-                assert power.is_off
-        power.after_cut(found, rng)
+    at = 0
+
+    def work(place: Path) -> None:
+        WORKS[what](DiskManifests(place))
+
+    for found, is_done in each_cut(store, tmp_path, rng, monkeypatch, work):
         if is_done:
             ids = DiskManifests(found).ids()
             assert (ONE.id in ids, OTHER.id in ids) == (what != "remove", what == "create")

@@ -278,6 +278,7 @@ def test_the_prompt(root: Path, tmp_path: Path) -> None:
     person.reads("998")
     person.reads("sql> ")
     person.types(f"{ENDLESS};\r")
+    person.reads(" b;")
     person.reads("\n")
     while b"stopped" not in person.shown:  # it may not have begun yet
         os.kill(person.process.pid, signal.SIGINT)

@@ -253,9 +253,9 @@ class SeenManifests(BucketManifests):
         super()._delete_files(recording)
         self._cells.put_tables(recording)
 
-    def _forget(self, recording: str, *, is_said: bool) -> None:
+    def _forget(self, recording: str, *, says_so: bool) -> None:
         self._doubt(recording)
-        super()._forget(recording, is_said=is_said)
+        super()._forget(recording, says_so=says_so)
         with self._lock:
             self._cells.has_changes = True
             known = self._known.pop(recording, None)
