@@ -112,7 +112,7 @@ def _statement(completer: Completer, keys: _Keys) -> str | None:
         try:
             with keys.heard():
                 line = input(_MORE if lines else _PROMPT)
-        except KeyboardInterrupt:
+        except (KeyboardInterrupt, SystemError):  # CPython's, for one that follows at once
             say()
             lines.clear()
             continue
