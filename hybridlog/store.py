@@ -921,10 +921,7 @@ class Store:
         """
         from hybridlog.maintenance.sizes import sizes_of
 
-        entries = self.select(recordings)
-        database = self.database
-        places = None if database is None else self.shared.index.places("Sizes")
-        return sizes_of(self.directory, self.catalog, entries, database, places)
+        return sizes_of(self.directory, self.catalog, self.select(recordings), self.database)
 
     @overload
     def verify(

@@ -82,7 +82,6 @@ PLACES = {
     "inserted_bytes_together": "hybridlog_storage.mongo.database._MAX_COMMAND_BYTES",
     "mongod_silence_s": "hybridlog_storage.mongo.mongod.SILENCE_LIMIT_S",
     "mongod_room_bytes": "hybridlog_storage.mongo.mongod._ROOM",
-    "own_collections": "hybridlog_storage.mongo.topic_places.OWN_COLLECTIONS",
     "segment_chunks": "hybridlog_storage.segments.segment_writer._MAX_CHUNKS",
     "segment_parts": "hybridlog_storage.segments.segment_writer._MAX_PARTS",
     "sync_stride_bytes": "hybridlog_storage.segments.segment_writer._SYNC_STRIDE",

@@ -17,10 +17,8 @@ from hybridlog_storage.errors import TopicError
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.mongo.collection_names import collection_of
 from tests import places
-from tests.calls import Calls
 from tests.cli.running import run
 from tests.copies import bring
-from tests.limits import Limit
 from tests.many_topics import topic, write_log
 
 pytestmark = pytest.mark.mongo
@@ -88,19 +86,6 @@ def test_every_rebuild_keeps_it(store: hl.Store) -> None:
         assert [c.topic for c in entry.channels if not c.is_indexed] == LEFT_OUT
         index = StoreIndex(again.directory, again.catalog, again.connect())
         assert index.catch_up(entry.id) == 0
-
-
-def test_what_has_no_documents_is_not_missing_among_those_of_others(
-    tmp_path: Path, log: Path, calls: Calls, limit: Limit
-) -> None:
-    limit(own_collections=1)
-    with hl.open(tmp_path / "shared", create=True, require_database=True) as store:
-        store.record(log, name="whole")
-        store.record(log, name="part", again=True, no_index=matcher(["re:.*signal[23]"]))
-        indexed = calls(StoreIndex, "catch_up")
-        store.index.rebuild()
-        assert sorted(one for _, one in indexed) == sorted(one.id for one in store.recordings())
-        assert store.verify().findings == []
 
 
 def test_documents_that_should_not_be_there_are_found(store: hl.Store) -> None:

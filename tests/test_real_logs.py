@@ -166,7 +166,6 @@ def dump(store: hl.Store) -> dict[str, list[bytes]]:
         found[name] = [
             bson.encode({**d, "index": {**d["index"], "turn": 0}} if d["_id"] != "store" else d)
             for d in documents
-            if d["_id"] != "turn"
         ]
     return found
 

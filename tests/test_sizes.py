@@ -14,9 +14,7 @@ from mcap.writer import Writer
 import hybridlog as hl
 from hybridlog.query.topics import matcher
 from hybridlog_storage.catalog import Catalog
-from hybridlog_storage.mongo import topic_places
 from hybridlog_storage.mongo.database import CollectionStats, Database
-from hybridlog_storage.mongo.topic_places import SHARED
 from tests import places
 from tests.calls import Calls
 from tests.cli.running import run
@@ -53,11 +51,7 @@ def write(path: Path, small: int, large: int) -> Path:
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("sizes")
-    with (
-        pytest.MonkeyPatch.context() as patch,
-        hl.open(folder / "store", create=True, require_database=True) as store,
-    ):
-        patch.setattr(topic_places, "OWN_COLLECTIONS", 1)
+    with hl.open(folder / "store", create=True, require_database=True) as store:
         store.record(write(folder / "one.mcap", 400, 30))
         store.record(write(folder / "two.mcap", 1200, 0))
         store.record(write(folder / "mute.mcap", 10, 0), no_index=matcher(["/a", "/b"]))
@@ -135,7 +129,11 @@ def stats_of(documents: int, storage: int, index: int = 0) -> CollectionStats:
 
 def test_shares_of_mongodb(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: Counter[str] = Counter()
-    answers = {"a": stats_of(1600, 16_000, 1600), SHARED: stats_of(2000, 4000)}
+    answers = {
+        "a": stats_of(1600, 16_000, 1600),
+        "b": stats_of(2000, 4000),
+        "large": stats_of(30, 60),
+    }
 
     def stats(_: Database, collection: str) -> CollectionStats:
         asked[collection] += 1
@@ -144,9 +142,9 @@ def test_shares_of_mongodb(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> 
     store.connect()
     monkeypatch.setattr(Database, "stats", stats)
     rows = by_name(store.sizes().rows)
-    assert asked == {"a": 1, SHARED: 1}
+    assert asked == {"a": 1, "b": 1, "large": 1}
     assert (rows["one", "/a"].index_bytes, rows["two", "/a"].index_bytes) == (4400, 13_200)
-    # Of 2000 documents, the store knows 1630; the others belong to nobody.
+    # Of 2000 documents of /b, the store knows 1600; the others belong to nobody.
     shares = [rows["one", "/b"], rows["two", "/b"], rows["one", "/large"]]
     assert [row.index_bytes for row in shares] == pytest.approx([800, 2400, 60], abs=1)
     assert rows["mute", "/a"].index_bytes == rows["one", ""].index_bytes == 0
@@ -163,13 +161,12 @@ def test_the_cost_does_not_depend_on_the_number_of_messages(store: hl.Store, cal
             calls(thing, method, lambda *_, name=method, **__: made.update([name]))
     calls.fail(hl.Query, "__iter__", AssertionError)
     store.connect()
-    store.sizes(["mute"])  # knows the places of the topics
     found = []
     for recording in ("one", "two"):
         made.clear()
         store.sizes([recording])
         found.append(dict(made))
-    assert found == [{"table": 1, "stats": 2}] * 2
+    assert found == [{"table": 1, "stats": 3}, {"table": 1, "stats": 2}]
 
 
 def test_without_mongodb(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -193,7 +190,8 @@ def test_as_commands(place: Path) -> None:
     assert {line.split()[0] for line in lines[1:-1]} == {"/large", "/a", "/b", "(no"}
     assert lines[-1].startswith("total")
     assert any(line.startswith("(no topic)") for line in lines)
-    assert run("info", "--sizes", "both", store=place).lines[1].startswith(rows[0]["recording"])
+    largest = max(both["rows"], key=lambda row: row["total_bytes"])
+    assert run("info", "--sizes", "both", store=place).lines[1].startswith(largest["recording"])
     shown = run("info", "one", "--sizes", "both", store=place).lines
     assert "total" in shown[-1]
     assert len(shown) == 6

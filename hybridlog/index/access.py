@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from hybridlog.maintenance.report import Progress
     from hybridlog.shared import Shared
     from hybridlog_storage.mongo.database import Database
-    from hybridlog_storage.mongo.topic_places import TopicPlaces
 
 _TRIES = 5  # to connect, while the connection breaks
 _PAUSE_S = 0.1  # before the second try; doubles each time
@@ -63,13 +62,11 @@ class IndexAccess:
         self._connecting = threading.RLock()
         self._is_complete = False  # the index has all recordings
         self._stale: set[str] = set()  # recordings that the index may lack
-        self._places: TopicPlaces | None = None
 
     def note_changes(self, *recordings: str) -> None:
         """Note that the index may lack something, of some recordings for certain."""
         self._stale.update(recordings)
         self._is_complete = False
-        self._places = None
 
     @property
     def connected(self) -> Database | None:
@@ -137,7 +134,6 @@ class IndexAccess:
 
         shared = self._shared
         if self.connected is None:
-            self._places = None
             self._is_complete = False
         repairs = RepairReport()
         changed: set[str] = set()
@@ -171,7 +167,6 @@ class IndexAccess:
     def disconnect(self) -> None:
         """Disconnect from MongoDB; questions are then answered from the files."""
         self.connection.close()
-        self._places = None
 
     def take_over(self) -> None:
         """Record in the index that the store is at this location."""
@@ -250,16 +245,3 @@ class IndexAccess:
             return self.connection.another()
         except (StoreError, ResourceError, MissingDependencyError) as error:
             raise DatabaseError(str(error)) from error
-
-    def places(self, purpose: str) -> TopicPlaces:
-        """The places of topics in the index.
-
-        Raises:
-            DatabaseError: it is unavailable; has the purpose and the reason.
-        """
-        from hybridlog_storage.mongo.topic_places import TopicPlaces
-
-        database = self.connected or self.database_for(purpose)
-        if self._places is None:
-            self._places = TopicPlaces(database)
-        return self._places

@@ -1,8 +1,7 @@
 """Indexes on fields, with which MongoDB finds documents without a scan.
 
 They change the duration of a query and never its answer, so the segments do not have
-them: MongoDB stores them, and `index rebuild` leaves them in place. In a collection that topics
-share, an index holds the documents of one topic (a partial index).
+them: MongoDB stores them, and `index rebuild` leaves them in place.
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 from hybridlog_storage.errors import UsageError
-from hybridlog_storage.mongo.topic_places import TopicPlaces
+from hybridlog_storage.mongo.collection_names import collection_of
 
 if TYPE_CHECKING:
     from hybridlog_storage.mongo.database import Database
@@ -42,28 +41,23 @@ def add(database: Database, topics: Iterable[str], fields: Sequence[str]) -> Non
         DatabaseError: MongoDB cannot create it: two of the fields are arrays.
     """
     _check(fields)
-    for place in TopicPlaces(database).assigned(list(topics)).values():
-        database.create_index(place.collection, _keys(fields), only=place.of_topic)
+    for topic in topics:
+        database.ensure_collection(collection_of(topic))
+        database.create_index(collection_of(topic), _keys(fields))
 
 
 def remove(database: Database, topics: Iterable[str], fields: Sequence[str]) -> int:
     """Drop the index on these fields from each topic; returns the number of indexes dropped."""
     _check(fields)
-    return sum(
-        database.drop_index(place.collection, _keys(fields), only=place.of_topic)
-        for place in TopicPlaces(database).of(list(topics)).values()
-    )
+    return sum(database.drop_index(collection_of(topic), _keys(fields)) for topic in topics)
 
 
 def of_topics(database: Database, topics: Iterable[str]) -> list[FieldIndex]:
     """The indexes of some topics, in the order of the topics, by fields."""
-    places = TopicPlaces(database).of(list(topics)).values()
-    indexes = {name: database.indexes(name) for name in {place.collection for place in places}}
     return [
-        FieldIndex(place.topic, tuple(field for field, _ in index.keys))
-        for place in places
-        for index in indexes[place.collection]
-        if index.only == place.of_topic
+        FieldIndex(topic, tuple(field for field, _ in keys))
+        for topic in topics
+        for keys in database.indexes(collection_of(topic))
     ]
 
 

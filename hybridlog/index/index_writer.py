@@ -21,9 +21,8 @@ from hybridlog.index.indexing import ChunkIndexer
 from hybridlog_storage.catalog import decoded_rows
 from hybridlog_storage.errors import DatabaseError, HybridlogError, SegmentError
 from hybridlog_storage.manifests import manifests_at
-from hybridlog_storage.mongo.index_documents import with_prefix
+from hybridlog_storage.mongo.collection_names import collection_of
 from hybridlog_storage.mongo.index_state import NOTHING, IndexState, Through
-from hybridlog_storage.mongo.topic_places import TopicPlaces
 from hybridlog_storage.segments.segment_file import OPEN_SUFFIX, sealed_name
 from hybridlog_storage.segments.segment_reader import ChunkPlace, SegmentReader
 from hybridlog_storage.threads import Threads
@@ -85,15 +84,20 @@ class DocumentSender:
         self.through = self.added = through
         self._key = entry.key
         self._database = database
-        self._places = TopicPlaces(database)
+        self._collections: set[str] = set()  # that exist
         self._documents: dict[str, list[NDArray[np.uint8]]] = {}
         self._size = self._sent = 0
         self._thread = Threads(1, "hybridlog-send")
         self._sending: Future[None] | None = None
 
     def prepare(self, topics: Collection[str]) -> None:
-        """Assign places to topics before their first documents."""
-        self._places.assigned(topics)
+        """Create the collections of topics before their first documents."""
+        if not self._collections:
+            # One command, where creating each would be one for each topic.
+            self._collections.update(self._database.list_collections())
+        for name in {*map(collection_of, topics)} - self._collections:
+            self._database.ensure_collection(name)
+            self._collections.add(name)
 
     def add(self, documents: Sequence[Documents], entries: Sequence[ChunkEntry]) -> None:
         """Add the documents of chunks that follow those added before.
@@ -142,24 +146,17 @@ class DocumentSender:
         self._thread.shutdown(wait=True, cancel_futures=True)
 
     def _send(self, documents: Mapping[str, list[NDArray[np.uint8]]], through: Through) -> None:
-        for collection, tables in self._by_collection(documents).items():
+        self.prepare(documents.keys())
+        for topic, tables in documents.items():
+            if not tables:
+                continue
             counts, widths = zip(*(table.shape for table in tables), strict=True)
             data = b"".join(table.data for table in tables)
             lengths = np.repeat(widths, counts).astype(np.int64)
-            self._database.insert_raw(collection, data, len(lengths), lengths=lengths)
+            self._database.insert_raw(collection_of(topic), data, len(lengths), lengths=lengths)
             self._sent += len(data)
         IndexState(self._database).put_through(self._key, through)
         self.through = through
-
-    def _by_collection(
-        self, documents: Mapping[str, list[NDArray[np.uint8]]]
-    ) -> dict[str, list[NDArray[np.uint8]]]:
-        """The documents of topics by collection, with their keys there."""
-        found: dict[str, list[NDArray[np.uint8]]] = {}
-        for topic, place in self._places.assigned(documents.keys()).items():
-            own = [with_prefix(table, place.prefix) for table in documents[topic]]
-            found.setdefault(place.collection, []).extend(own)
-        return {collection: tables for collection, tables in found.items() if tables}
 
 
 class IndexWriter:
@@ -265,15 +262,15 @@ class IndexWriter:
         self._sealed[sealed.segment] = sealed.digest
         self._calls.put("")
 
-    def prepare(self, channel: Channel, *, with_place: bool) -> None:
+    def prepare(self, channel: Channel, *, has_documents: bool) -> None:
         """Prepare a channel before its first message.
 
         Args:
             channel: The channel.
-            with_place: Whether to assign a place in MongoDB to its topic.
+            has_documents: Whether its messages get documents in MongoDB.
         """
         self._indexer.prepare(channel)
-        if with_place:
+        if has_documents:
             self._calls.put(channel.topic)
 
     def close(self) -> None:

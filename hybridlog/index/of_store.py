@@ -10,13 +10,13 @@ from hybridlog.index.connection import IndexAddress, again_if_lost
 from hybridlog.query.query import Query
 from hybridlog.query.question import Question
 from hybridlog_storage.errors import TopicError, UsageError
+from hybridlog_storage.mongo.collection_names import collection_of
 
 if TYPE_CHECKING:
     from hybridlog.index.field_indexes import FieldIndex
     from hybridlog.maintenance.report import ArraysOfTopic, Progress
     from hybridlog.opened import OpenStore
     from hybridlog_storage.catalog import RecordingEntry
-    from hybridlog_storage.mongo.topic_places import TopicPlace
 
 # `list` is a method below.
 _Entries: TypeAlias = "list[RecordingEntry]"
@@ -166,23 +166,6 @@ class Index:
         database = self._shared.index.connect()
         return IndexAddress(self._shared.index.connection.address(_CLIENTS_WAIT_S), database.name)
 
-    @again_if_lost
-    def place(self, topic: str) -> TopicPlace:
-        """The place of a topic's index documents in MongoDB.
-
-        Args:
-            topic: Full name, or an unambiguous short one.
-
-        Returns:
-            Has `collection`, its name, and `documents(begin, end)`, a filter for the
-            documents of the topic with log times in `[begin, end)`, ns.
-
-        Raises:
-            TopicError: The topic does not exist.
-        """
-        (name, *_) = self._about(topic).topics
-        return self._shared.index.places("The place of a topic").of([name])[name]
-
     def _about(self, *topics: str) -> Query:
         return Query(self._shared, Question(*self._shared.now().resolve(topics)))
 
@@ -191,11 +174,6 @@ class Index:
 def contents(shared: OpenStore) -> list[tuple[str, str, int]]:
     """Each topic with the MongoDB collection of its documents, and their number there."""
     database = shared.index.database_for("The contents of the index")
-    places = shared.index.places("The contents of the index").of(shared.now().topics())
-    known = [place for place in places.values() if place.is_listed]
-    filters = [(place.collection, place.documents()) for place in known]
-    counts = iter(database.count_each([one for one in filters if one[1]]))
-    return [
-        (place.topic, collection, next(counts) if own else database.count(collection))
-        for place, (collection, own) in zip(known, filters, strict=True)
-    ]
+    there = {*database.list_collections()}
+    topics = ((topic, collection_of(topic)) for topic in shared.now().topics())
+    return [(topic, name, database.count(name)) for topic, name in topics if name in there]

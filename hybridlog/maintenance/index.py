@@ -23,8 +23,8 @@ from hybridlog_storage.errors import (
     SegmentError,
     TopicError,
 )
+from hybridlog_storage.mongo.collection_names import collection_of
 from hybridlog_storage.mongo.index_state import NOTHING, Indexed, IndexState, Through
-from hybridlog_storage.mongo.topic_places import TopicPlaces
 
 if TYPE_CHECKING:
     from typing import Any
@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from hybridlog_storage.catalog import Catalog, ChannelStats, RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.mongo.database import Database
-    from hybridlog_storage.mongo.topic_places import TopicPlace
     from hybridlog_storage.summary import RecordingSummary
 
 
@@ -225,7 +224,7 @@ class StoreIndex:
         state.put(entry, "clearing", turn=turn, segments=left)
         if indexed is None:
             # No documents are known. Unknown ones are within the same times.
-            state.clear(entry.key, _places(self.database, [entry]).values(), entry.span)
+            state.clear(entry.key, {c.topic for c in entry.channels}, entry.span)
         else:
             _clear_documents(self.database, entry.key, indexed, entry, but=[int(n) for n in left])
         state.put(entry, "indexing", turn=turn, segments=left)
@@ -330,8 +329,7 @@ class StoreIndex:
         """
         state = self._state
         known = {entry.key: entry for entry in entries}
-        places = _places(self.database, known.values())
-        expected = {entry.key: documents_in(entry, places) for entry in known.values()}
+        expected = {key: documents_in(entry) for key, entry in known.items()}
         again: set[str] = set()
         orphans: list[object] = []
         collections = state.document_collections()
@@ -409,7 +407,7 @@ def _clear_documents(
         topics |= {channel.topic for channel in entry.channels}
         if span is not None and entry.span is not None:
             span = min(span[0], entry.span[0]), max(span[1], entry.span[1])
-    IndexState(database).clear(key, TopicPlaces(database).of(topics).values(), span, but)
+    IndexState(database).clear(key, topics, span, but)
 
 
 def finish(
@@ -437,17 +435,12 @@ def finish(
     return entry
 
 
-def _places(database: Database, entries: Iterable[RecordingEntry]) -> dict[str, TopicPlace]:
-    """The places of the topics of some recordings."""
-    return TopicPlaces(database).of({c.topic for entry in entries for c in entry.channels})
-
-
-def documents_in(entry: RecordingEntry, places: Mapping[str, TopicPlace]) -> Counter[str]:
+def documents_in(entry: RecordingEntry) -> Counter[str]:
     """Number of documents of a recording in each collection."""
     found: Counter[str] = Counter()
     for channel in entry.channels:
         if channel.is_indexed:
-            found[places[channel.topic].collection] += channel.stats.messages
+            found[collection_of(channel.topic)] += channel.stats.messages
     return found
 
 

@@ -20,6 +20,7 @@ from hybridlog.columns.layout import type_prefix
 from hybridlog.entries import read_again
 from hybridlog_storage.errors import CatalogError
 from hybridlog_storage.mcap.mcap_content import MESSAGE_HEAD
+from hybridlog_storage.mongo.collection_names import collection_of
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -29,7 +30,6 @@ if TYPE_CHECKING:
     from hybridlog_storage.catalog import Catalog, RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.mongo.database import Database
-    from hybridlog_storage.mongo.topic_places import TopicPlaces
     from hybridlog_storage.segments.chunk_table import ChunkTable
 
 
@@ -102,12 +102,11 @@ def sizes_of(
     catalog: Catalog,
     entries: Sequence[RecordingEntry],
     database: Database | None,
-    places: TopicPlaces | None,
 ) -> Sizes:
     """Sizes of some recordings."""
     index: dict[tuple[str, str], int] = {}
-    if database is not None and places is not None:
-        index = _index_bytes(entries, database, places)
+    if database is not None:
+        index = _index_bytes(entries, database)
     rows: list[Size] = []
     tables = table_bytes(directory.path, entries)
     for entry in entries:
@@ -232,16 +231,15 @@ def _divided(size: int, weights: Mapping[_Key, int]) -> Counter[_Key]:
 
 
 def _index_bytes(
-    entries: Sequence[RecordingEntry], database: Database, places: TopicPlaces
+    entries: Sequence[RecordingEntry], database: Database
 ) -> dict[tuple[str, str], int]:
     """Bytes in MongoDB by recording and topic: the documents' share of their collection."""
     documents: dict[str, Counter[tuple[str, str]]] = defaultdict(Counter)
-    placed = places.of({c.topic for entry in entries for c in entry.channels})
     for entry in entries:
         for channel in entry.channels:
             if channel.is_indexed and channel.stats.messages:
-                collection = placed[channel.topic].collection
-                documents[collection][entry.id, channel.topic] += channel.stats.messages
+                count = documents[collection_of(channel.topic)]
+                count[entry.id, channel.topic] += channel.stats.messages
     found: dict[tuple[str, str], int] = {}
     for collection, counts in documents.items():
         stats = database.stats(collection)

@@ -19,9 +19,10 @@ from hybridlog_storage.errors import (
     TopicError,
     WhereError,
 )
+from hybridlog_storage.mongo.collection_names import collection_of
 from hybridlog_storage.mongo.index_columns import KEY, key_columns
+from hybridlog_storage.mongo.index_documents import between
 from hybridlog_storage.mongo.index_state import IndexState
-from hybridlog_storage.mongo.topic_places import TopicPlaces
 from hybridlog_storage.stopping import check_wanted
 from hybridlog_storage.times import END
 
@@ -32,7 +33,6 @@ if TYPE_CHECKING:
     from hybridlog.query.question import Part, Span
     from hybridlog.session import Session
     from hybridlog_storage.mongo.database import Database
-    from hybridlog_storage.mongo.topic_places import TopicPlace
 
 _MAX_RANGES = 100
 """Recordings whose log time is asked for apart: as many as one command takes."""
@@ -83,8 +83,7 @@ class IndexReader:
         own: list[Filter] = [node.to_filter() for node in predicate.filters]
         everything: Filter = {"$and": [*own, _READABLE] if asks_fields else own}
 
-        def ask(database: Database) -> Found:
-            asked = _Asked(self._session, database, parts)
+        def ask(asked: _Asked) -> Found:
             documents = asked.documents()
             asked.check_arrays(predicate.filters)
             numbers = self._numbers(asked, parts, everything)
@@ -104,7 +103,7 @@ class IndexReader:
 
     def documents(self, parts: Sequence[Part]) -> dict[Part, int]:
         """Number of documents of those parts of which the index may lack some."""
-        return self._ask(parts, lambda database: _Asked(self._session, database, parts).documents())
+        return self._ask(parts, _Asked.documents)
 
     def _numbers(
         self, asked: _Asked, parts: Sequence[Part], own: Filter
@@ -113,24 +112,20 @@ class IndexReader:
 
         A recording has each number once, whatever the topic.
         """
-        kinds: dict[bool, list[Part]] = defaultdict(list)  # keys differ in their length
-        for part in parts:
-            kinds[asked.places[part.topic].is_shared].append(part)
         found: dict[str, list[NDArray[np.int64]]] = defaultdict(list)
-        for group in kinds.values():
-            for raw in asked.database.find_each(asked.queries(group, own), KEY):
-                check_wanted()
-                keys = key_columns(raw)
-                self._counters.documents_read += len(keys)
-                for recording in np.unique(keys.recording).tolist():
-                    found[f"{recording:016x}"].append(keys.seq[keys.recording == recording])
+        for raw in asked.database.find_each(asked.queries(parts, own), KEY):
+            check_wanted()
+            keys = key_columns(raw)
+            self._counters.documents_read += len(keys)
+            for recording in np.unique(keys.recording).tolist():
+                found[f"{recording:016x}"].append(keys.seq[keys.recording == recording])
         none = np.empty(0, np.int64)
         return {
             part.recording.key: np.unique(np.concatenate([none, *found[part.recording.key]]))
             for part in parts
         }
 
-    def _ask(self, parts: Sequence[Part], ask: Callable[[Database], _T]) -> _T:
+    def _ask(self, parts: Sequence[Part], ask: Callable[[_Asked], _T]) -> _T:
         """An answer during which no other process has removed documents."""
         for part in parts:
             if not part.is_indexed:
@@ -144,12 +139,11 @@ class IndexReader:
         failure: Exception | None = None
         for _ in range(_TRIES):
             database = self._session.shared.index.index_as_it_is()
-            state = IndexState(database)
+            keys = {part.recording.key for part in parts}
             try:
-                # What is read after this is as new as this, whichever member is the primary.
-                turn = state.turn(read="linearizable")
-                found = ask(database)
-                if state.turn() == turn:
+                indexed = IndexState(database).segments(keys)
+                found = ask(_Asked(database, parts, indexed))
+                if IndexState(database).segments(keys) == indexed:
                     return found
             except ConnectionLostError as error:
                 failure = error
@@ -159,24 +153,26 @@ class IndexReader:
 
 
 class _Asked:
-    """Parts of a question, and where their documents are."""
+    """Parts of a question, and what the index has of their recordings."""
 
-    def __init__(self, session: Session, database: Database, parts: Sequence[Part]) -> None:
+    def __init__(
+        self,
+        database: Database,
+        parts: Sequence[Part],
+        indexed: Mapping[str, tuple[int, Mapping[str, str]]],
+    ) -> None:
         self.database = database
-        self.places = TopicPlaces(database).of({part.topic for part in parts})
-        self._session = session
         self._parts = parts
+        self._indexed = indexed
 
     def documents(self) -> dict[Part, int]:
         """Number of documents of the parts whose recordings are not in the index as a whole."""
-        indexed = IndexState(self.database).segments({part.recording.key for part in self._parts})
-        doubtful = [
-            part
-            for part in self._parts
-            if part.recording.status == "open"
-            or not self.places[part.topic].is_listed
-            or not part.recording.digests.items() <= indexed.get(part.recording.key, {}).items()
-        ]
+        doubtful = []
+        for part in self._parts:
+            _, segments = self._indexed.get(part.recording.key, (0, {}))
+            is_there = part.recording.digests.items() <= segments.items()
+            if part.recording.status == "open" or not is_there:
+                doubtful.append(part)
         return dict(zip(doubtful, self.counts(doubtful, {}), strict=True))
 
     def counts(self, parts: Sequence[Part], own: Filter) -> list[int]:
@@ -216,24 +212,23 @@ class _Asked:
         alike: dict[tuple[str, str, Span | None], list[tuple[Part, Span]]] = defaultdict(list)
         found: list[Query] = []
         for part in parts:
-            place = self.places[part.topic]
             if part.windows is not None:
-                found += [(place.collection, _joined(each, own)) for each in _windows(part, place)]
+                windows = _windows(part)
+                found += [(collection_of(part.topic), _joined(each, own)) for each in windows]
                 continue
             span, bounds = _time_of(part)
             if span[0] < span[1]:
                 alike[part.topic, part.clock, bounds].append((part, span))
         for (topic, clock, bounds), group in alike.items():
-            place = self.places[topic]
             # Finding many documents in one range costs less than asking for many ranges.
             together = [group] if len(group) > _MAX_RANGES else [[one] for one in group]
             for some in together:
                 keys = sorted(part.recording.key for part, _ in some)
                 span = min(low for _, (low, _) in some), max(high for _, (_, high) in some)
-                condition: Filter = {"_meta.rec": {"$in": keys}, **_between(place, span)}
+                condition: Filter = {"_meta.rec": {"$in": keys}, **_between(span)}
                 if clock != "log" and bounds is not None:
                     condition.update(_on_clock(clock, bounds))
-                found.append((place.collection, _joined(condition, own)))
+                found.append((collection_of(topic), _joined(condition, own)))
         return found
 
 
@@ -266,13 +261,13 @@ def _joined(condition: Filter, other: Filter) -> Filter:
     return {"$and": [condition, other]} if other else condition
 
 
-def _windows(part: Part, place: TopicPlace) -> Iterator[Filter]:
+def _windows(part: Part) -> Iterator[Filter]:
     """The recording, topic and time of a part as filters, one for each window, in order."""
     recording: Filter = {"_meta.rec": part.recording.key}
     if part.bounds is not None and part.clock != "log":
         recording.update(_on_clock(part.clock, part.bounds))
     for begin, end in part.log_windows.tolist():
-        yield {**recording, **_between(place, (begin, end))}
+        yield {**recording, **_between((begin, end))}
 
 
 def _on_clock(clock: str, bounds: Span) -> Filter:
@@ -298,8 +293,8 @@ def _time_of(part: Part) -> tuple[Span, Span | None]:
     return (max(first, low), min(end, high)), None if is_whole else part.bounds
 
 
-def _between(place: TopicPlace, span: Span) -> Filter:
+def _between(span: Span) -> Filter:
     begin, end = span
     if begin <= 0 and end >= END:
-        return place.documents()
-    return place.documents(begin, end if end < END else None)
+        return {}
+    return between(begin, end if end < END else None)

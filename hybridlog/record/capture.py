@@ -35,7 +35,6 @@ from hybridlog_storage.errors import DatabaseError, DiskFullError, HybridlogErro
 from hybridlog_storage.manifest import Manifest, Source, new_id
 from hybridlog_storage.manifest import replace as replaced
 from hybridlog_storage.mongo.index_state import IndexState
-from hybridlog_storage.mongo.topic_places import TopicPlaces
 from hybridlog_storage.segments.segment_format import END_METADATA, LOSSES_METADATA, json_metadata
 from hybridlog_storage.segments.segment_writer import RecordingWriter, SegmentSettings
 
@@ -184,7 +183,7 @@ class Capture:
 
     def expect(self, channel: Channel) -> None:
         """Prepare a channel before its first message."""
-        self.index.prepare(channel, with_place=not self._no_index(channel.topic))
+        self.index.prepare(channel, has_documents=not self._no_index(channel.topic))
 
     def close(self, end: Mapping[str, Any]) -> DatabaseError | None:
         """Complete the recording; `entry` is then complete, too.
@@ -283,7 +282,7 @@ class Capture:
             if database is not None:
                 state = IndexState(database)
                 topics = {channel.topic for channel in self.writer.channels.values()}
-                state.clear(entry.key, TopicPlaces(database).of(topics).values())
+                state.clear(entry.key, topics)
                 state.remove(entry.key)
         self._held.close()
 

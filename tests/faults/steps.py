@@ -325,7 +325,6 @@ def step_database(seam: Seam) -> None:
         setattr(Database, method, call)
 
     insert, delete = Database.insert_raw, Database.delete
-    delete_each = Database.delete_each
 
     def half_of_insert(
         self: Database, collection: str, documents: Any, count: int, **_: Any
@@ -339,12 +338,8 @@ def step_database(seam: Seam) -> None:
         ids = [found["_id"] for found in self.find(collection, query, {"_id": 1})]
         delete(self, collection, {"_id": {"$in": ids[: len(ids) // 2]}})
 
-    def half_of_delete_each(self: Database, collection: str, filters: Sequence[Any]) -> None:
-        delete_each(self, collection, filters[: len(filters) // 2])
-
     stepped("insert_raw", "insert", half_of_insert)
     stepped("delete", "delete", half_of_delete)
-    stepped("delete_each", "delete", half_of_delete_each)
     for method in ("replace", "update"):
         stepped(method, method)
     for method in ("ensure_collection", "drop", "create_index", "drop_index"):

@@ -28,11 +28,10 @@ from hybridlog_storage.cells import put
 from hybridlog_storage.disk.directory import LOCK, StoreDirectory
 from hybridlog_storage.manifests import MANIFEST_LOCK, MANIFEST_OLD
 from hybridlog_storage.messages import MARKS_CHANNEL
-from hybridlog_storage.mongo.collection_names import CATALOG_PREFIX
+from hybridlog_storage.mongo.collection_names import CATALOG_PREFIX, collection_of
 from hybridlog_storage.mongo.database import Database
 from hybridlog_storage.mongo.index_state import RECORDINGS, STORE, IndexState
 from hybridlog_storage.mongo.mongod import EmbeddedMongod
-from hybridlog_storage.mongo.topic_places import SHARED, TOPICS, TopicPlaces
 from tests import places
 from tests.faults.logs import Content
 from tests.indexed import EVERYTHING
@@ -121,7 +120,7 @@ class Prepared:
         try:
             with Database.connect(uri) as database:
                 for collection, data in self.documents.items():
-                    if collection in {SHARED, TOPICS} or not collection.startswith(CATALOG_PREFIX):
+                    if not collection.startswith(CATALOG_PREFIX):
                         database.ensure_collection(collection)
                     count = len(bson.decode_all(data))
                     if count and collection != STORE:
@@ -361,9 +360,9 @@ def _check_database(store: hl.Store, database: Database) -> None:
         _check(document == wanted, f"the mirror of {entry.name}: {document} not {wanted}")
     expected: dict[str, Counter[str]] = defaultdict(Counter)
     for key, entry in entries.items():
-        for place in TopicPlaces(database).of({c.topic for c in entry.channels}).values():
-            if messages := entry.messages_by_topic()[place.topic]:
-                expected[place.collection][key] += messages
+        for topic in {c.topic for c in entry.channels}:
+            if messages := entry.messages_by_topic()[topic]:
+                expected[collection_of(topic)][key] += messages
     for collection in IndexState(database).document_collections():
         pipeline = [{"$group": {"_id": "$_meta.rec", "n": {"$sum": 1}}}]
         documents = {d["_id"]: d["n"] for d in database.aggregate(collection, pipeline)}

@@ -13,7 +13,7 @@ from tests.faults.steps import Fault, Point
 SOME: list[tuple[str, Fault, str, int, bool]] = [
     ("rm", "die", "rename", 0, True),
     ("rm", "torn", "delete number", 0, False),
-    ("rm", "TERM", "update hybridlog.store", 0, True),
+    ("rm", "TERM", "replace hybridlog.recordings", 0, True),
     ("reindex", "die", "delete stamped", 0, True),
     ("reindex", "INT", "insert number", 0, True),
     ("reindex one", "database", "replace hybridlog.recordings", 1, False),

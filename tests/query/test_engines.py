@@ -33,7 +33,6 @@ from hybridlog.query.predicate.parser import parse
 from hybridlog.query.predicate.to_bool import to_bool
 from hybridlog.query.query import Query
 from hybridlog_storage.errors import DatabaseError, TimeError
-from hybridlog_storage.mongo import topic_places
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from hybridlog_storage.settings import EMBEDDED, NONE
 
@@ -192,10 +191,7 @@ def world(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[World]:
     place = tmp_path_factory.mktemp("engines")
-    with pytest.MonkeyPatch.context() as patch:
-        # One topic has a collection of its own, the others share one.
-        patch.setattr(topic_places, "OWN_COLLECTIONS", 1)
-        yield from _world(place, request.param)
+    yield from _world(place, request.param)
 
 
 def _world(place: Path, mongo: str) -> Iterator[World]:
@@ -219,8 +215,6 @@ def _world(place: Path, mongo: str) -> Iterator[World]:
             assert len(everything) == 400 * (seed + 1)
         everything.sort(key=lambda m: (m.log_time, m.recording[-16:], m.seq))
         assert (store.database is None) == (mongo == NONE)
-        if store.database is not None:
-            assert store.database.count(topic_places.SHARED, {"_meta.seq": {"$gte": 0}}) > 400
         yield World(store, everything, ids)
 
 

@@ -169,10 +169,9 @@ def test_mongodb_answers_as_it_does_by_itself(store: hl.Store, own: dict[str, ob
     assert pickle.loads(pickle.dumps(query.question)) == query.question
     found = seqs(query)
     address = store.index.address()
-    place = store.index.place("/t")
     labels = {one.key: one.id for one in store.recordings()}
     with MongoClient(address.uri) as client:
-        collection = client[address.database][place.collection]
+        collection = client[address.database]["t"]
         want = [
             (labels[one["_meta"]["rec"]], one["_meta"]["seq"])
             for one in collection.find(own).sort("_id")
@@ -390,6 +389,11 @@ def test_messages_without_fields_are_told(tmp_path: Path) -> None:
 
 def test_an_index_that_others_change_is_asked_again(store: hl.Store, calls: Calls) -> None:
     turns = iter([0, 1, 1, 1])
-    calls.change(IndexState, "turn", lambda *_, **__: next(turns))
+
+    def told(found: dict[str, tuple[int, dict[str, str]]], *_: object) -> object:
+        turn = next(turns)
+        return {key: (turn, segments) for key, (_, segments) in found.items()}
+
+    calls.change(IndexState, "segments", told)
     assert store.topic("/t").where({"x": 3}).count() == 2
     assert next(turns, None) is None

@@ -19,7 +19,6 @@ from hybridlog_storage.mongo.index_documents import (
     Origin,
     Placed,
     key_bound,
-    recording_key,
 )
 from hybridlog_storage.segments.chunk import StoredChunk
 
@@ -189,8 +188,3 @@ def test_errors_replace_the_fields() -> None:
         "error"
         not in documents(assembler.assemble(Placed.of([chunk]), np.arange(3), none))[0]["_meta"]
     )
-
-
-def test_the_recording_is_read_from_a_key() -> None:
-    data = assembled(chunk_of([5]))
-    assert recording_key(data[0].tobytes()) == ORIGIN.key

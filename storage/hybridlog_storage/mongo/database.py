@@ -15,8 +15,6 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import hashlib
-import json
 import operator
 import re
 import struct
@@ -49,9 +47,9 @@ Document = dict[str, Any]
 """A decoded document with values of the `bson` package."""
 Sort = Sequence[tuple[str, int]]
 """Field paths with 1 (ascending) or -1 (descending)."""
-ReadConcern = Literal["local", "majority", "linearizable"]
-"""What a read of a replica set may see: everything that the primary has; only what cannot be
-rolled back; that, and certainly all of it. A single server knows no difference."""
+ReadConcern = Literal["local", "majority"]
+"""What a read of a replica set may see: everything that the primary has, or only what cannot be
+rolled back. A single server knows no difference."""
 _T = TypeVar("_T")
 
 BATCH_BYTES = 16 << 20
@@ -116,27 +114,11 @@ class CollectionStats:
     index_bytes: int
 
 
-@dataclass(frozen=True, slots=True)
-class Index:
-    """An index of a collection.
-
-    Attributes:
-        name: Its name.
-        keys: Field paths with 1 (ascending) or -1 (descending).
-        only: Values of fields; documents with other values are not in the index.
-    """
-
-    name: str
-    keys: tuple[tuple[str, int], ...]
-    only: Mapping[str, object]
-
-
 class Database:
     """One MongoDB database, opened by `connect`. A context manager; thread safe.
 
     Every method raises `DatabaseError` if the server does not answer or refuses. Methods
-    with a `filter` or a pipeline raise `WhereError` if that is invalid. `max_time_ms`
-    limits the time of a read on the server.
+    with a `filter` or a pipeline raise `WhereError` if that is invalid.
 
     Attributes:
         is_lost: True after a method found no connection; make a new `Database` then.
@@ -346,14 +328,6 @@ class Database:
             inserted += self._insert_batch(collection, bytes(part))
         return inserted
 
-    def insert_missing(self, collection: str, documents: Sequence[Mapping[str, object]]) -> int:
-        """Insert the documents whose `_id` does not exist; return their number."""
-        from bson import encode
-
-        with _mapped(self._address):
-            encoded = [encode(document) for document in documents]
-        return self.insert_raw(collection, b"".join(encoded), len(encoded))
-
     def _insert_batch(self, collection: str, documents: bytes) -> int:
         if not collection or "$" in collection or "\0" in collection:
             raise DatabaseError(f"{collection!r} cannot be the name of a collection.")
@@ -423,13 +397,12 @@ class Database:
         sort: Sort | None = None,
         limit: int = 0,
         batch_size: int = 0,
-        max_time_ms: int | None = None,
         read: ReadConcern = "local",
     ) -> Iterator[Document]:
         """Find documents one by one; for small answers.
 
         The arguments are those of `find_raw`, and `read` for what the answer may hold; `limit`
-        0 is for all documents, and `max_time_ms` the most milliseconds on the server.
+        0 is for all documents.
         """
         of = self._collection(collection, read)
 
@@ -440,7 +413,6 @@ class Database:
                 sort=sort or None,
                 limit=limit,
                 batch_size=batch_size,
-                max_time_ms=max_time_ms,
             )
 
         is_keyed = not limit and (projection is None or projection.get("_id", 1))
@@ -500,13 +472,10 @@ class Database:
         projection: Mapping[str, object] | None = None,
         *,
         sort: Sort | None = None,
-        max_time_ms: int | None = None,
         read: ReadConcern = "local",
     ) -> Document | None:
         """Find the first document, None if no document matches. Arguments as in `find`."""
-        found = self.find(
-            collection, filter, projection, sort=sort, limit=1, max_time_ms=max_time_ms, read=read
-        )
+        found = self.find(collection, filter, projection, sort=sort, limit=1, read=read)
         return next(found, None)
 
     def count(
@@ -654,16 +623,6 @@ class Database:
         of = self._collection(collection)
         return self._again(lambda: of.delete_many(dict(filter))).deleted_count
 
-    def delete_each(self, collection: str, filters: Sequence[Mapping[str, object]]) -> int:
-        """Delete every document that matches one of many filters; return their number."""
-        from pymongo import DeleteMany
-
-        if not filters:
-            return 0
-        of = self._collection(collection)
-        each = [DeleteMany(dict(query)) for query in filters]
-        return self._again(lambda: of.bulk_write(each, ordered=False)).deleted_count
-
     def checkpoint(self) -> None:
         """Have the server write what is only in its journal, which it then shortens.
 
@@ -690,58 +649,27 @@ class Database:
         names = self._again(self._database.list_collection_names)
         return sorted(name for name in names if not name.startswith("system."))
 
-    def create_index(
-        self,
-        collection: str,
-        keys: Sort,
-        *,
-        unique: bool = False,
-        sparse: bool = False,
-        only: Mapping[str, str] | None = None,
-    ) -> str:
-        """Create an index unless it exists; return its name.
-
-        Args:
-            collection: The collection.
-            keys: The indexed fields.
-            unique: Whether to refuse equal values.
-            sparse: Whether to leave out documents without the fields.
-            only: Values of fields; documents with other values are not in the index.
-        """
+    def create_index(self, collection: str, keys: Sort) -> None:
+        """Create an index on fields unless it exists."""
         of = self._collection(collection)
-        options: dict[str, Any] = {"sparse": True} if sparse else {}
-        if only:
-            options["partialFilterExpression"] = dict(only)
-        options["name"] = index_name(keys, only)
-        return self._again(lambda: of.create_index(list(keys), unique=unique, **options))
+        self._again(lambda: of.create_index(list(keys)))
 
-    def indexes(self, collection: str) -> list[Index]:
-        """All indexes but the one on `_id`, sorted by their keys."""
+    def indexes(self, collection: str) -> list[tuple[tuple[str, int], ...]]:
+        """Fields of all indexes but the one on `_id`, each with 1 or -1, sorted."""
         of = self._collection(collection)
         found = [
-            Index(
-                str(about["name"]),
-                tuple((str(field), int(order)) for field, order in about["key"].items()),
-                dict(about.get("partialFilterExpression") or {}),
-            )
+            tuple((str(field), int(order)) for field, order in about["key"].items())
             for about in self._again(lambda: list(of.list_indexes()))
         ]
-        return sorted(
-            (index for index in found if [field for field, _ in index.keys] != ["_id"]),
-            key=operator.attrgetter("keys"),
-        )
+        return sorted(keys for keys in found if [field for field, _ in keys] != ["_id"])
 
-    def drop_index(
-        self, collection: str, keys: Sort, *, only: Mapping[str, str] | None = None
-    ) -> bool:
-        """Drop the index with these keys and documents; return whether it existed."""
-        wanted = tuple(keys), dict(only or {})
+    def drop_index(self, collection: str, keys: Sort) -> bool:
+        """Drop the index with these keys; return whether it existed."""
+        if tuple(keys) not in self.indexes(collection):
+            return False
         of = self._collection(collection)
-        for index in self.indexes(collection):
-            if (index.keys, index.only) == wanted:
-                self._again(functools.partial(of.drop_index, index.name))
-                return True
-        return False
+        self._again(lambda: of.drop_index(list(keys)))
+        return True
 
     def stats(self, collection: str) -> CollectionStats:
         """Size of a collection."""
@@ -777,14 +705,6 @@ class Database:
 _IN_ORDER: Document = {"$sort": {"_id": 1}}
 """Lets MongoDB consider a range of `_id` for a pipeline: with another matching index, it does
 so only if that saves sorting."""
-
-
-def index_name(keys: Sort, only: Mapping[str, str] | None = None) -> str:
-    """The name that `create_index` gives: MongoDB's own, but one for each `only`."""
-    if only:
-        text = json.dumps([keys, sorted(only.items())])
-        return hashlib.sha256(text.encode()).hexdigest()
-    return "_".join(f"{field}_{order}" for field, order in keys)
 
 
 def _batched(

@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import struct
 from dataclasses import dataclass
-from functools import cache
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from hybridlog_storage.errors import StoreError
-from hybridlog_storage.mongo.index_documents import KEY_BYTES, PREFIX_BYTES
+from hybridlog_storage.mongo.index_documents import KEY_BYTES
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -22,8 +21,17 @@ if TYPE_CHECKING:
 KEY: Final = {"_id": 1}
 """The projection that `key_columns` reads."""
 
-_LONG_KEY = bytes([KEY_BYTES + PREFIX_BYTES])
-_KEY_VALUE = np.dtype([("time", ">u8"), ("recording", ">u8"), ("seq", ">u8")])
+_HEAD = struct.pack("<i", KEY_BYTES + 15) + b"\x05_id\0" + struct.pack("<iB", KEY_BYTES, 0)
+_LAYOUT = np.dtype(
+    [
+        ("head", f"V{len(_HEAD)}"),
+        ("time", ">u8"),
+        ("recording", ">u8"),
+        ("seq", ">u8"),
+        ("end", "u1"),
+    ]
+)
+"""A projected document."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,11 +62,11 @@ def key_columns(batch: bytes) -> KeyColumns:
     Raises:
         StoreError: a document is not one of hybridlog's.
     """
-    layout, head = _key_layout(_prefix_bytes(batch))
-    documents = _documents(batch, layout)
-    if len(documents) and (documents["head"] != head).any():
+    if len(batch) % _LAYOUT.itemsize:
+        raise _strange("layout")
+    keys = np.frombuffer(batch, _LAYOUT)
+    if (keys["head"] != np.void(_HEAD)).any():
         raise _strange("_id")
-    keys = documents["key"]
     return KeyColumns(
         keys["time"].astype(np.int64),
         keys["recording"].astype(np.uint64),
@@ -66,25 +74,5 @@ def key_columns(batch: bytes) -> KeyColumns:
     )
 
 
-def _documents(batch: bytes, layout: np.dtype[np.void]) -> NDArray[np.void]:
-    if len(batch) % layout.itemsize:
-        raise _strange("layout")
-    return np.frombuffer(batch, layout)
-
-
 def _strange(what: str) -> StoreError:
     return StoreError(f"An index document has an unexpected {what}: run `hybridlog index rebuild`.")
-
-
-def _prefix_bytes(batch: bytes) -> int:
-    """Bytes before the keys of documents, which come from one collection."""
-    return PREFIX_BYTES if batch[9:10] == _LONG_KEY else 0
-
-
-@cache
-def _key_layout(prefix: int) -> tuple[np.dtype[np.void], np.void]:
-    """The layout of a projected document, and the bytes before its key."""
-    size = KEY_BYTES + prefix
-    head = struct.pack("<i", size + 15) + b"\x05_id\0" + struct.pack("<iB", size, 0)
-    fields = [("head", f"V{len(head)}"), ("prefix", f"V{prefix}"), ("key", _KEY_VALUE)]
-    return np.dtype([*fields, ("end", "u1")]), np.void(head)

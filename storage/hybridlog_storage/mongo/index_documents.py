@@ -24,10 +24,9 @@ if TYPE_CHECKING:
     from hybridlog_storage.segments.chunk import StoredChunk
 
 KEY_BYTES: Final = 24
-PREFIX_BYTES: Final = 8
-"""Bytes before the key of a document in a collection that topics share."""
 _HEAD_WIDTH: Final = 4 + 1 + 4 + 4 + 1 + KEY_BYTES
 _KEY_AT: Final = _HEAD_WIDTH - KEY_BYTES
+_HEAD: Final = b"\x05_id\x00" + struct.pack("<iB", KEY_BYTES, 0)  # behind the length
 _MAX_TIME: Final = (1 << 63) - 1
 
 
@@ -36,41 +35,12 @@ def key_bound(log_time: int) -> bytes:
     return struct.pack(">QQQ", min(max(log_time, 0), _MAX_TIME + 1), 0, 0)
 
 
-def last_key(prefix: bytes) -> bytes:
-    """A key after all of those with a prefix."""
-    return prefix + b"\xff" * KEY_BYTES
-
-
-def recording_key(document: bytes) -> str:
-    """Key of the recording of an index document, 16 hexadecimal digits."""
-    at = _KEY_AT + document[_KEY_AT - 5] - KEY_BYTES
-    return document[at + 8 : at + 16].hex()
-
-
-def with_prefix(documents: NDArray[np.uint8], prefix: bytes) -> NDArray[np.uint8]:
-    """Documents with a prefix before their keys.
-
-    Args:
-        documents: uint8[k, width]: a whole document a row, its key without a prefix.
-        prefix: The prefix; nothing changes without one.
-
-    Returns:
-        uint8[k, width + len(prefix)].
-    """
-    if not prefix:
-        return documents
-    count, width = documents.shape
-    out = np.empty((count, width + len(prefix)), np.uint8)
-    at = _KEY_AT + len(prefix)
-    out[:, :at] = np.frombuffer(_head(width, prefix), np.uint8)
-    out[:, at:] = documents[:, _KEY_AT:]
-    return out
-
-
-def _head(width: int, prefix: bytes = b"") -> bytes:
-    """The beginning of a document with a key, up to the key, and its prefix."""
-    key = struct.pack("<iB", KEY_BYTES + len(prefix), 0)
-    return struct.pack("<i", width + len(prefix)) + b"\x05_id\x00" + key + prefix
+def between(begin: int | None = None, end: int | None = None) -> dict[str, object]:
+    """A filter for documents with log times in `[begin, end)`, ns; None for no bound."""
+    if begin is None and end is None:
+        return {}
+    until = {} if end is None else {"$lt": key_bound(end)}
+    return {"_id": {"$gte": key_bound(begin or 0), **until}}
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,7 +127,7 @@ class DocumentAssembler:
         count, fields = body.shape
         width = _HEAD_WIDTH + fields + len(tail.template)
         out = np.empty((count, width), np.uint8)
-        out[:, :_KEY_AT] = np.frombuffer(_head(width), np.uint8)
+        out[:, :_KEY_AT] = np.frombuffer(struct.pack("<i", width) + _HEAD, np.uint8)
         batch = placed.batch
         log_time = batch.log_time[rows]
         seq = placed.seq[rows]

@@ -17,9 +17,9 @@ from itertools import chain
 from typing import Any, Final, Literal, NamedTuple
 
 from hybridlog_storage.catalog import RecordingEntry
-from hybridlog_storage.mongo.collection_names import CATALOG_PREFIX
-from hybridlog_storage.mongo.database import Database, ReadConcern
-from hybridlog_storage.mongo.topic_places import SHARED, TopicPlace
+from hybridlog_storage.mongo.collection_names import CATALOG_PREFIX, collection_of
+from hybridlog_storage.mongo.database import Database
+from hybridlog_storage.mongo.index_documents import between
 
 RECORDINGS: Final = f"{CATALOG_PREFIX}recordings"
 STORE: Final = f"{CATALOG_PREFIX}store"
@@ -31,9 +31,6 @@ _ENTRIES_PER_BATCH: Final = (
 State = Literal["open", "clearing", "indexing", "complete", "removing"]
 """State of a recording's index: being recorded, documents being removed for a rebuild, being
 indexed, complete, being removed for good."""
-_DESTROYS: Final = frozenset({"clearing", "removing"})
-_TURN: Final = {"_id": "turn"}
-_TURN_MS: Final = 20_000  # a linearizable read waits for members that may be away
 _CHANNEL_BYTES: Final = 600  # of a channel in the mirror, without its texts
 _MAX_CHANNEL_BYTES: Final = 8 << 20  # of all: a document of MongoDB has at most 16 MiB
 _OF_CHANNELS: Final = ("channels.topic", "channels.stats.first", "channels.stats.last")
@@ -147,17 +144,17 @@ class IndexState:
         """Number of recordings in the mirror; may be wrong after the server was killed."""
         return self._db.stats(RECORDINGS).documents
 
-    def turn(self, read: ReadConcern = "local") -> int:
-        """The number of removals of documents of any recording so far."""
-        found = self._db.find_one(STORE, _TURN, read=read, max_time_ms=_TURN_MS)
-        return int(found["turn"]) if found is not None else 0
+    def segments(self, keys: Collection[str]) -> dict[str, tuple[int, dict[str, str]]]:
+        """Turn, and digests of the indexed segments, of recordings by key, without unknown ones.
 
-    def segments(self, keys: Collection[str]) -> dict[str, Mapping[str, str]]:
-        """Digests of the indexed segments of recordings by key, without unknown ones."""
-        chosen = {"_id": {"$in": sorted(keys)}}
+        Who reads the same before and after a question has been told of all removals meanwhile.
+        """
+        chosen, wanted = {"_id": {"$in": sorted(keys)}}, {"index.turn": 1, "index.segments": 1}
+        found = self._db.find(RECORDINGS, chosen, wanted, read="majority")
+        indexed = ((one["_id"], one.get("index") or {}) for one in found)
         return {
-            found["_id"]: dict((found.get("index") or {}).get("segments") or {})
-            for found in self._db.find(RECORDINGS, chosen, {"index.segments": 1}, read="majority")
+            key: (int(index.get("turn", 0)), dict(index.get("segments") or {}))
+            for key, index in indexed
         }
 
     def put(
@@ -193,9 +190,6 @@ class IndexState:
             },
         }
         self._db.replace(RECORDINGS, {"_id": entry.key}, document)
-        if state in _DESTROYS:
-            # Concurrent questions compare this number before and after.
-            self._db.update(STORE, _TURN, {"$inc": {"turn": 1}}, upsert=True)
 
     def show(self, entry: RecordingEntry) -> None:
         """Mirror a recording; leave the state of its index unchanged."""
@@ -216,7 +210,7 @@ class IndexState:
     def clear(
         self,
         key: object,
-        places: Iterable[TopicPlace] | None = None,
+        topics: Iterable[str] | None = None,
         span: tuple[int, int] | None = None,
         but: Collection[int] = (),
     ) -> None:
@@ -224,27 +218,20 @@ class IndexState:
 
         Args:
             key: Key of the recording, or another value of `_meta.rec` in foreign documents.
-            places: Places of topics that may have documents; None for all documents, which
-                takes a scan.
-            span: First and last log time of its documents at these places, ns; None for any.
+            topics: Those that may have documents; None for all documents, which takes a scan.
+            span: First and last log time of its documents of these topics, ns; None for any.
             but: Segments whose documents stay.
         """
         chosen: dict[str, object] = {"_meta.rec": key}
         if but:
             chosen["_meta.ref.seg"] = {"$nin": sorted(but)}
-        if places is None:
+        if topics is None:
             for collection in self.document_collections():
                 self._db.delete(collection, chosen)
             return
         bounds = (None, None) if span is None else (span[0], span[1] + 1)
-        shared: list[dict[str, object]] = []
-        for place in places:
-            within = {**chosen, **place.documents(*bounds)}
-            if place.is_shared:
-                shared.append(within)
-            else:
-                self._db.delete(place.collection, within)
-        self._db.delete_each(SHARED, shared)
+        for topic in topics:
+            self._db.delete(collection_of(topic), {**chosen, **between(*bounds)})
 
     def remove(self, key: str) -> None:
         """Remove a recording from the mirror, as the last step of its removal."""
@@ -252,8 +239,7 @@ class IndexState:
 
     def document_collections(self) -> list[str]:
         """Names of the collections that hold index documents."""
-        names = self._db.list_collections()
-        return [c for c in names if c == SHARED or not c.startswith(CATALOG_PREFIX)]
+        return [c for c in self._db.list_collections() if not c.startswith(CATALOG_PREFIX)]
 
     def mark(self) -> Mapping[str, Any] | None:
         """The store that owns the database, and its place; None without an owner."""
