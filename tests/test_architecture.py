@@ -71,6 +71,10 @@ ALLOWED = {
     ),
     "obstore": ("hybridlog_storage.remote.bucket",),
     "pandas": ("hybridlog.frames",),
+    "picows": (
+        "hybridlog.live.sources.foxglove.connection",
+        "hybridlog.live.sources.foxglove.session",
+    ),
     "polars": ("hybridlog.frames.frame",),
     "pyarrow": (
         "hybridlog.across",
@@ -109,11 +113,7 @@ ALLOWED = {
     "pydantic": ("hybridlog.view.tool_server",),
     "starlette": ("hybridlog.view",),
     "uvicorn": ("hybridlog.view.server",),
-    "websockets": (
-        "hybridlog.view.playback.server",
-        "hybridlog.live.sources.foxglove.connection",
-        "hybridlog.live.sources.foxglove.handshake",
-    ),
+    "websockets": ("hybridlog.view.playback.server",),
     "yaml": ("hybridlog.formats.rosbag2.writer", "hybridlog.formats.yaml_values"),
     "zstandard": (
         "hybridlog.formats.log_set",

@@ -360,7 +360,7 @@ def test_the_only_store_below_the_folder(words: str, code: int, said: str, tmp_p
 
 UNNEEDED = {
     *("PIL", "asyncio", "bson", "pandas", "pyarrow", "pydantic", "pymongo", "rich", "rosbags"),
-    *("subprocess", "typer", "websockets"),
+    *("picows", "subprocess", "typer", "websockets"),
 }
 
 

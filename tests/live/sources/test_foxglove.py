@@ -14,15 +14,12 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from hybridlog.live.sources.base import Cause
-from hybridlog.live.sources.foxglove import protocol as foxglove_protocol
-from hybridlog.live.sources.foxglove import session as foxglove_session
 from hybridlog.live.sources.foxglove.protocol import PeerError, parse_channel
 from hybridlog.live.sources.foxglove.source import FoxgloveSource
 from hybridlog_storage.errors import MissingDependencyError, UsageError
@@ -33,19 +30,16 @@ from tests.live.sources.heard import DEADLINE_S, Heard, Listening, must_return
 from tests.waiting import wait_for
 
 pytest.importorskip(
+    "picows", reason="picows is not installed: nothing of the Foxglove source is tested"
+)
+pytest.importorskip(
     "websockets", reason="websockets is not installed: nothing of the Foxglove source is tested"
 )
 
-from websockets.client import ClientProtocol
 from websockets.frames import Frame, Opcode
 from websockets.protocol import State
 from websockets.server import ServerProtocol
 from websockets.typing import Subprotocol
-from websockets.uri import parse_uri
-
-from hybridlog.live.sources.foxglove import connection as foxglove_connection
-from hybridlog.live.sources.foxglove import handshake as foxglove_handshake
-from hybridlog.live.sources.foxglove import session as foxglove_client
 
 # A server that sends whatever bytes a test wants.
 
@@ -171,11 +165,10 @@ def hear(
     *scripts: Script,
     heard: Heard | None = None,
     server: Server | None = None,
-    **options: int,
 ) -> Heard:
     """What a source hears of a server, until something has come."""
     heard = heard or Heard()
-    with server or Server(*scripts) as server, FoxgloveSource(server.url, **options) as source:
+    with server or Server(*scripts) as server, FoxgloveSource(server.url) as source:
         source.start(heard)
         heard.until(until)
     return heard
@@ -193,8 +186,7 @@ def saying(payload: bytes, time: int = 0, number: int = 1) -> Script:
 @pytest.fixture(autouse=True)
 def _quick(limit: Limit) -> Iterator[None]:
     """Look more often and try again sooner; and nothing is left behind."""
-    limit(foxglove_handshake_tick_s=0.02, foxglove_tick_s=0.02)
-    limit(foxglove_pauses_s=(0.02, 0.05))
+    limit(foxglove_tick_s=0.02, foxglove_pauses_s=(0.02, 0.05))
     yield
     assert [t.name for t in threading.enumerate() if t.name == "hybridlog-foxglove"] == []
 
@@ -229,17 +221,12 @@ def test_no_password_is_shown() -> None:
     assert FoxgloveSource("wss://me:secret@robot:8765/x").address == "wss://robot:8765/x"
 
 
-def test_a_limit_that_is_too_small_is_refused() -> None:
-    with pytest.raises(UsageError, match="1 MiB"):
-        FoxgloveSource("ws://robot:8765", max_message_bytes=1000)
-
-
-def test_without_websockets_the_message_says_how_to_install_it(
+def test_without_picows_the_message_says_how_to_install_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    for module in (foxglove_client, foxglove_connection, foxglove_handshake):
-        monkeypatch.delitem(sys.modules, module.__name__)
-    monkeypatch.setitem(sys.modules, "websockets.client", None)
+    for module in ("connection", "session"):
+        monkeypatch.delitem(sys.modules, f"hybridlog.live.sources.foxglove.{module}", False)
+    monkeypatch.setitem(sys.modules, "picows", None)
     with pytest.raises(MissingDependencyError, match=r"pip install 'hybridlog\[foxglove\]'"):
         FoxgloveSource("ws://127.0.0.1:1").start(Heard())
 
@@ -531,26 +518,28 @@ def test_a_time_that_no_log_can_hold_is_replaced() -> None:
     assert heard.said_of("2262")
 
 
-def test_a_message_over_the_limit_is_passed_over_and_counted() -> None:
-    def script(peer: Peer) -> None:
+def test_a_message_over_the_limit_ends_the_connection_and_is_counted(limit: Limit) -> None:
+    limit(foxglove_message_bytes=1 << 20)
+
+    def first(peer: Peer) -> None:
         number = peer.offer(channel())[1]
-        peer.send(message(number, 0, bytes((1 << 20) + 1)), message(number, 0, b"small"))
-        peer.send(message(number, 0, bytes(1 << 20)))
+        peer.send(message(number, 0, bytes((1 << 20) - 13)), message(number, 0, bytes(1 << 20)))
         peer.wait()
 
-    heard = hear(lambda h: len(h.taken) == 2, script, max_message_bytes=1 << 20)
-    assert heard.payloads() == [b"small", bytes(1 << 20)]
-    (lost,) = heard.losses
-    assert (lost.topic, lost.cause, lost.count) == ("/a", Cause.UNREADABLE, 1)
-    assert str((1 << 20) + 1) in lost.detail
-    assert heard.said_of("exceed the limit")
+    heard = hear(lambda h: len(h.taken) == 2, first, saying(b"2"))
+    assert heard.payloads() == [bytes((1 << 20) - 13), b"2"]
+    lost, outage = heard.losses
+    assert (lost.topic, lost.cause, lost.count) == ("", Cause.UNREADABLE, 1)
+    assert "exceeds the limit" in lost.detail
+    assert (outage.topic, outage.count) == ("/a", None)
+    assert heard.said_of(f"announces a message of more than {1 << 20} bytes")
 
 
 BREAKS = [
     (frame(2, body(0, 0, b"x"), length=1 << 62), "announces a message"),
-    (frame(1, b"{", length=1 << 40), "sends a JSON message of more than"),
-    (frame(2, b"\x01", is_last=False, length=1 << 40), "sends a message in pieces of more than"),
-    (frame(9, b"x", length=1 << 40), "control frame is too long"),
+    (frame(1, b"{", length=1 << 40), "announces a message of more than"),
+    (frame(2, b"\x01", is_last=False, length=1 << 40), "announces a message of more than"),
+    (frame(9, b"x", length=1 << 40), "violates the websocket protocol"),
     (b"\x82\x85abcd12345", "violates the websocket protocol"),
     (b"\x83\x01x", "violates the websocket protocol"),
     (b"\xc2\x01x", "violates the websocket protocol"),
@@ -582,23 +571,16 @@ def test_a_connection_that_ends_is_made_anew(sent: bytes, words: str) -> None:
     assert heard.topics == [("/a", "T", 1), ("/a",)] * 2
 
 
-@pytest.mark.parametrize(
-    ("size", "is_in_pieces"),
-    [(100, False), (60_000, False), (200_000, False), (5_000_000, False), (100, True)],
-)
-def test_a_connection_that_breaks_in_a_message_is_a_row(*, size: int, is_in_pieces: bool) -> None:
+@pytest.mark.parametrize("size", [100, 60_000, 200_000, 5_000_000])
+def test_a_message_in_which_the_connection_breaks_belongs_to_the_outage(size: int) -> None:
     def first(peer: Peer) -> None:
-        number = peer.offer(channel(1))[1]
-        whole = message(number, 0, bytes(size))
-        if is_in_pieces:
-            whole = frame(Opcode.BINARY, body(number, 0, bytes(size)), is_last=False) + b"."
-        peer.send(whole[: len(whole) - 1])
+        peer.send(message(peer.offer(channel(1))[1], 0, bytes(size))[:-1])
 
-    heard = hear(lambda h: h.losses, first, Peer.wait)
-    assert heard.taken == []
-    (lost,) = heard.losses
-    assert (lost.topic, lost.cause, lost.count) == ("/a", Cause.CONNECTION, 1)
-    assert "in the middle" in lost.detail
+    heard = hear(lambda h: h.taken, first, saying(b"2"))
+    assert heard.payloads() == [b"2"]
+    (outage,) = heard.losses
+    assert (outage.topic, outage.cause, outage.count) == ("/a", Cause.CONNECTION, None)
+    assert heard.said_of("the connection broke")
 
 
 def test_the_first_address_of_a_host_that_answers_is_taken() -> None:
@@ -610,7 +592,7 @@ def test_the_first_address_of_a_host_that_answers_is_taken() -> None:
 def test_a_server_that_falls_silent_is_asked_and_then_left(
     limit: Limit,
 ) -> None:
-    limit(foxglove_ping_s=0.1, foxglove_silent_s=0.3)
+    limit(foxglove_ping_s=0.15)
     asked: list[Opcode] = []
 
     def first(peer: Peer) -> None:
@@ -631,9 +613,9 @@ def test_a_server_that_falls_silent_is_asked_and_then_left(
     assert "has been silent for" in line
 
 
-def test_whatever_bytes_come_the_reader_ends_in_order() -> None:
+def test_whatever_bytes_come_the_reader_ends_in_order(limit: Limit) -> None:
+    limit(foxglove_pauses_s=(0.0,))
     dice = random.Random(5)
-    address = foxglove_protocol.parse_address("ws://localhost:1")
     whole = [
         advertise(channel(), channel(2, "/b")),
         message(0, 1, bytes(100)),
@@ -644,28 +626,24 @@ def test_whatever_bytes_come_the_reader_ends_in_order() -> None:
         message(0, 3, b"y"),
         frame(Opcode.CLOSE, b""),
     ]
-    for _ in range(300):
+
+    def broken(peer: Peer) -> None:
         stream = bytearray(b"".join(whole))
         for _ in range(dice.randrange(4)):
             # Most of what can go wrong lies in the heads of frames.
             starts = [sum(map(len, whole[:at])) for at in range(len(whole))]
             place = (dice.choice(starts) + dice.randrange(12)) % len(stream)
             stream[place] = dice.randrange(256)
-        data = bytes(stream[: dice.choice([len(stream), dice.randrange(len(stream))])])
-        ours, theirs = socket.socketpair()
-        with ours, theirs:
-            theirs.sendall(data[200:])
-            theirs.shutdown(socket.SHUT_WR)
-            protocol = ClientProtocol(parse_uri(address.url), state=State.OPEN, max_size=None)
-            opened = foxglove_handshake.Opened(ours, protocol, data[:200])
-            connection = foxglove_connection.Connection(opened, 1 << 20, lambda: False)
-            heard = Heard()
-            session = foxglove_session.Session(
-                heard, foxglove_session.Notifier(heard, "x"), connection.send, {}
-            )
-            with suppress(PeerError):
-                assert "closed" in connection.read(session)
-            session.end(is_stopped=True)
+        peer.send(bytes(stream[: dice.choice([len(stream), dice.randrange(len(stream))])]))
+        peer.socket.shutdown(socket.SHUT_WR)
+
+    heard = hear(lambda h: b"end" in h.payloads("/end"), *[broken] * 300, end)
+    assert heard.ends == []
+
+
+def end(peer: Peer) -> None:
+    peer.send(message(peer.offer(channel(1, "/end"))[1], 0, b"end"))
+    peer.wait()
 
 
 def answer(data: bytes) -> Script:
@@ -702,6 +680,36 @@ def test_somebody_elses_server_is_told_and_tried_again(script: Script, words: st
     heard = hear(lambda h: any(h.said_of(word) for word in words.split("|")), server=server)
     assert all(line.isprintable() and line.endswith("; trying again") for line in heard.said)
     assert heard.taken == []
+
+
+def test_user_and_password_are_in_one_header_only() -> None:
+    asked: list[bytes] = []
+
+    def script(peer: Peer) -> None:
+        asked.append(peer.socket.recv(1 << 16))
+
+    server = Server(script, is_raw=True)
+    server.url = f"ws://me:pa%C3%9F%40@127.0.0.1:{server.port}/x?y"
+    heard = hear(lambda h: h.said, server=server)
+    assert heard.said_of(f"ws://127.0.0.1:{server.port}/x?y")
+    lines = asked[0].split(b"\r\n")
+    assert lines[0] == b"GET /x?y HTTP/1.1"
+    assert f"Host: 127.0.0.1:{server.port}".encode() in lines
+    expected = base64.b64encode("me:pa\u00df@".encode())
+    assert b"Authorization: Basic " + expected in lines
+
+
+def test_a_server_that_does_not_read_is_left(limit: Limit) -> None:
+    limit(foxglove_send_s=0.2)
+
+    def script(peer: Peer) -> None:
+        peer.offer(channel())
+        flood = frame(Opcode.PING, bytes(125)) * 1000
+        while True:
+            peer.send(flood)
+
+    heard = hear(lambda h: h.said, script, Peer.wait)
+    assert "has not read for 0.2 s" in heard.said[0]
 
 
 def test_a_server_that_comes_late_is_waited_for() -> None:

@@ -7,9 +7,8 @@ import binascii
 import json
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Final, Protocol, TypeGuard
-from urllib.parse import urlsplit
+from typing import Final, NamedTuple, TypeGuard
+from urllib.parse import unquote, urlsplit
 
 from hybridlog.live.sources.base import one_line
 from hybridlog_storage.errors import UsageError
@@ -37,79 +36,35 @@ _SCHEMA_ENCODINGS = {
 _BASE64 = frozenset({"protobuf", "flatbuffer"})
 _MAX_ID = 1 << 64
 _MAX_SHOWN = 200  # characters of an address that are shown
+_REMEDY = "give an address like ws://robot:8765"
 _PORTS = {"ws": 80, "wss": 443}
-
-
-class Receiver(Protocol):
-    """Receiver of a connection's messages, called by the thread that reads it."""
-
-    def data(self, subscription: int, log_time: int, payload: bytes) -> None:
-        """Take a message, with the server's log time in ns since the epoch."""
-        ...
-
-    def time(self, now: int) -> None:
-        """Take the time of the server, ns."""
-        ...
-
-    def text(self, data: bytes) -> None:
-        """Take a JSON message."""
-        ...
-
-    def broken(self, reason: str) -> None:
-        """Note a malformed binary message."""
-        ...
-
-    def too_large(self, subscription: int, size: int) -> None:
-        """Note a skipped message that is larger than the limit, bytes."""
-        ...
-
-    def cut(self, subscription: int) -> None:
-        """Note that the connection broke in the middle of a message."""
-        ...
-
-    def look(self) -> None:
-        """Do postponed work; called after reads and in pauses."""
-        ...
 
 
 class PeerError(Exception):
     """The server is unreachable or violates the protocol; the message is for the user."""
 
 
-@dataclass(frozen=True, slots=True)
-class Address:
-    """Address of a server.
-
-    Attributes:
-        url: As the user gave it, with a password: not to be shown.
-        shown: The URL without user and password.
-        host: Host name or IP address.
-        port: TCP port.
-        is_secure: Use TLS.
-    """
+class Address(NamedTuple):
+    """Address of a server; only `headers`, those of the handshake, hold the password."""
 
     url: str
     shown: str
     host: str
     port: int
-    is_secure: bool
+    headers: dict[str, str]
 
 
-@dataclass(frozen=True, slots=True)
-class Advertised:
-    """A channel that a server offers.
-
-    Attributes:
-        id: The server's number of the channel.
-        channel: The channel, as in a log.
-        type_name: Name of its type, empty if unknown.
-        problem: Problem with its definition, or an empty string.
-    """
+class Offer(NamedTuple):
+    """A channel that a server offers, and the problem with its definition, if any."""
 
     id: int
     channel: Channel
-    type_name: str
     problem: str = ""
+
+    @property
+    def type_name(self) -> str:
+        """Name of its type, empty if unknown."""
+        return self.channel.schema.name if self.channel.schema is not None else ""
 
 
 def parse_address(url: str) -> Address:
@@ -118,37 +73,36 @@ def parse_address(url: str) -> Address:
     Raises:
         UsageError: The address is invalid.
     """
-    remedy = "give an address like ws://robot:8765"
     shown = without_user(url)
-    if not url.isprintable() or " " in url:
-        raise UsageError(f"{shown}: not the address of a Foxglove server; {remedy}")
     try:
         parts = urlsplit(url)
-        host, port = parts.hostname, parts.port
+        host, port = parts.hostname or "", parts.port
+        host = host if host.isascii() else host.encode("idna").decode()
+        user = unquote(f"{parts.username}:{parts.password}", errors="strict").encode()
+        if not url.isprintable() or " " in url:
+            raise ValueError("it has spaces or control characters")
     except ValueError as error:
-        raise UsageError(
-            f"{shown}: not the address of a Foxglove server ({error}); {remedy}"
-        ) from error
-    if parts.scheme not in _PORTS:
-        raise UsageError(f"{shown}: does not begin with ws:// or wss://; {remedy}")
-    if not host:
-        raise UsageError(f"{shown}: names no host; {remedy}")
-    if parts.fragment:
-        raise UsageError(f"{shown}: an address has no part after '#'; {remedy}")
-    if port == 0:
-        raise UsageError(f"{shown}: port 0 is invalid; {remedy}")
+        reason = f"not the address of a Foxglove server ({one_line(str(error))})"
+        raise UsageError(f"{shown}: {reason}; {_REMEDY}") from error
+    for is_wrong, reason in (
+        (parts.scheme not in _PORTS, "does not begin with ws:// or wss://"),
+        (not host, "names no host"),
+        (parts.fragment, "an address has no part after '#'"),
+        (port == 0, "port 0 is invalid"),
+    ):
+        if is_wrong:
+            raise UsageError(f"{shown}: {reason}; {_REMEDY}")
     if parts.username is not None and parts.password is None:
         raise UsageError(
             f"{shown}: a user without a password; give both "
             "(wss://user:password@robot:8765) or none"
         )
-    return Address(
-        url=url,
-        shown=shown,
-        host=host,
-        port=port or _PORTS[parts.scheme],
-        is_secure=parts.scheme == "wss",
-    )
+    headers = {"Sec-WebSocket-Protocol": ", ".join(SUBPROTOCOLS)}
+    if parts.username is not None:
+        headers["Authorization"] = f"Basic {base64.b64encode(user).decode()}"
+    place = (f"[{host}]" if ":" in host else host) + (f":{port}" if port else "")
+    url = parts._replace(netloc=place).geturl()
+    return Address(url, shown, host, port or _PORTS[parts.scheme], headers)
 
 
 def without_user(url: str) -> str:
@@ -171,22 +125,7 @@ def parse_text(data: bytes) -> Mapping[str, object]:
     return message
 
 
-def subscribe(wanted: Mapping[int, int]) -> str:
-    """The request to subscribe to channels.
-
-    Args:
-        wanted: Number of each new subscription, and the server's number of its channel.
-    """
-    subscriptions = [{"id": number, "channelId": channel} for number, channel in wanted.items()]
-    return json.dumps({"op": "subscribe", "subscriptions": subscriptions})
-
-
-def unsubscribe(number: int) -> str:
-    """The request to end a subscription."""
-    return json.dumps({"op": "unsubscribe", "subscriptionIds": [number]})
-
-
-def parse_channel(entry: object) -> Advertised:
+def parse_channel(entry: object) -> Offer:
     """Parse an advertised channel.
 
     A channel with an unreadable definition has none: its messages are recorded, but their
@@ -218,7 +157,7 @@ def parse_channel(entry: object) -> Advertised:
             if _is_text(key) and _is_text(value)
         },
     )
-    return Advertised(number, channel, schema.name if schema is not None else "", problem)
+    return Offer(number, channel, problem)
 
 
 def _parse_schema(

@@ -1,27 +1,30 @@
-"""Connects to a Foxglove server; channels and subscriptions of one connection."""
+"""Channels, subscriptions and messages of one connection to a Foxglove server."""
 
 from __future__ import annotations
 
+import asyncio
+import json
 import re
-import threading
 import time
-from collections import deque
-from collections.abc import Callable
+from collections import Counter, deque
+from collections.abc import Iterable
 from dataclasses import dataclass
+from operator import attrgetter
 from struct import Struct
 from typing import Final
 
+from picows import WSCloseCode, WSFrame, WSListener, WSMsgType, WSTransport
+
 from hybridlog.live.sources.base import Cause, Loss, Sink, one_line
-from hybridlog.live.sources.foxglove.connection import Connection
-from hybridlog.live.sources.foxglove.handshake import StoppedError, open_websocket, websocket_uri
 from hybridlog.live.sources.foxglove.protocol import (
-    Address,
-    Advertised,
+    MAX_TEXT,
+    MESSAGE_DATA,
+    SUBPROTOCOLS,
+    TIME,
+    Offer,
     PeerError,
     parse_channel,
     parse_text,
-    subscribe,
-    unsubscribe,
 )
 from hybridlog.live.sources.sequence_gaps import (
     SequenceGap,
@@ -38,9 +41,15 @@ _MAX_COMPLAINTS: Final = 100
 _NO_CHANNEL = re.compile(
     r"(?i)unknown channel\D{0,20}(\d{1,20})\b|channel\D{0,20}(\d{1,20}) is not available"
 )
+_LARGE: Final = 1 << 14  # bytes from which a second copy costs more than a view
 _MAX_REFUSALS: Final = 20
 _RETRY_S: Final = 0.02
+_SEND_S: Final = 3.0
 _NUMBER: Final = Struct("<I").unpack_from
+_HEAD: Final = Struct("<xIQ")
+_TIME: Final = Struct("<xQ")
+_CONTENT: Final = attrgetter("topic", "message_encoding", "schema", "metadata")
+_BINARY: Final = WSMsgType.BINARY
 
 
 class Notifier:
@@ -66,59 +75,133 @@ class Notifier:
 
 @dataclass(slots=True)
 class _Subscription:
-    """A subscription to a channel.
-
-    Attributes:
-        number: Number of the subscription.
-        offer: The channel.
-        refusals: Number of times that the server refused it.
-    """
+    """A subscription, and how often the server has refused it."""
 
     number: int
-    offer: Advertised
+    offer: Offer
     refusals: int = 0
 
 
-class Session:
-    """The channels and subscriptions of one connection.
+class Session(WSListener):
+    """One connection; picows calls it in the thread that reads.
 
     Args:
         sink: Takes the messages.
         notifier: Reports problems.
-        send: Sends a JSON message.
         missed: Topics of an earlier connection, with the time of its end, ns since the
             epoch. Topics that are available again are removed.
+
     """
 
-    def __init__(
-        self,
-        sink: Sink,
-        notifier: Notifier,
-        send: Callable[[str], None],
-        missed: dict[str, int],
-    ) -> None:
+    max_bytes: Final = 1 << 30  # of a message
+
+    def __init__(self, sink: Sink, notifier: Notifier, missed: dict[str, int]) -> None:
+        self.problem: Exception | None = None  # why the session ended the connection
         self._sink = sink
         self._take = sink.take
         self._notifier = notifier
-        self._send = send
         self._missed = missed
         self._next = 0
         self._routes: dict[int, tuple[Channel, SequenceGapDetector | None]] = {}
         self._subscriptions: dict[int, _Subscription] = {}
-        self._topics: dict[str, int] = {}
+        self._topics: Counter[str] = Counter()
         self._retired: deque[int] = deque()
-        self._is_full = False
-        self._retries: set[int] = set()
-        self._retry_at = 0.0
+        self._gathered: bytearray | None = None
+        self._gathered_is_text = False
+        self._loop = asyncio.get_running_loop()
+        self._transport: WSTransport
+        self._overdue: asyncio.TimerHandle
+
+    # The connection.
+
+    def on_ws_connected(self, transport: WSTransport) -> None:
+        """Check the protocol."""
+        self._transport = transport
+        transport.underlying_transport.set_write_buffer_limits(1)
+        if transport.response.headers.get("Sec-WebSocket-Protocol") not in SUBPROTOCOLS:
+            self._fail(
+                PeerError(
+                    "a websocket server that does not speak Foxglove; start foxglove_bridge or "
+                    "a program with the Foxglove SDK, and give its port"
+                )
+            )
+
+    def on_ws_frame(self, transport: WSTransport, frame: WSFrame) -> None:
+        """Take a frame."""
+        if self.problem is not None:
+            return
+        try:
+            kind, size = frame.msg_type, frame.payload_size
+            if frame.rsv1 or frame.rsv2 or frame.rsv3:
+                raise PeerError("violates the websocket protocol (reserved bits are set)")
+            if size > self.max_bytes:
+                return  # picows, which ends the connection, may still read it
+            if kind is _BINARY and frame.fin and self._gathered is None:
+                if size < _LARGE:
+                    self._binary(frame.get_payload_as_bytes())
+                else:
+                    self._binary(frame.get_payload_as_memoryview())
+            elif kind is WSMsgType.CLOSE:
+                if transport.is_close_frame_sent:
+                    transport.disconnect(graceful=False)
+                    return
+                transport.send_close(WSCloseCode.OK)
+                reason = frame.get_close_reason()
+                raise PeerError("closed the connection" + (f" ({reason})" if reason else ""))
+            elif kind not in {WSMsgType.PING, WSMsgType.PONG}:
+                self._gather(frame)
+        except Exception as error:
+            self._fail(error)
+
+    def pause_writing(self) -> None:
+        """Read on when the server reads, too."""
+        self._transport.underlying_transport.pause_reading()
+        error = PeerError(f"has not read for {_SEND_S:g} s")
+        self._overdue = self._loop.call_later(_SEND_S, self._fail, error)
+
+    def resume_writing(self) -> None:
+        """The server has read."""
+        self._overdue.cancel()
+        self._transport.underlying_transport.resume_reading()
+
+    def _fail(self, error: Exception) -> None:
+        self.problem = self.problem or error
+        self._transport.disconnect(graceful=False)
+
+    def _send(self, operation: str, **values: object) -> None:
+        self._transport.send(WSMsgType.TEXT, json.dumps({"op": operation, **values}))
+
+    def _subscribe(self, wanted: Iterable[_Subscription]) -> None:
+        asked = [{"id": each.number, "channelId": each.offer.id} for each in wanted]
+        self._send("subscribe", subscriptions=asked)
 
     # Messages.
 
-    def data(self, subscription: int, log_time: int, payload: bytes) -> None:
-        """Take a message."""
+    def _gather(self, frame: WSFrame) -> None:
+        """Take a text, or a message in pieces."""
+        if (frame.msg_type is WSMsgType.CONTINUATION) is (self._gathered is None):
+            raise PeerError("violates the websocket protocol (pieces of messages are mixed)")
+        if self._gathered is None:
+            self._gathered = bytearray()
+            self._gathered_is_text = frame.msg_type is WSMsgType.TEXT
+        limit = MAX_TEXT if self._gathered_is_text else self.max_bytes
+        if len(self._gathered) + frame.payload_size > limit:
+            kind = "JSON message" if self._gathered_is_text else "message in pieces"
+            raise PeerError(f"sends a {kind} of more than {limit} bytes")
+        self._gathered += frame.get_payload_as_memoryview()
+        if frame.fin:
+            whole, self._gathered = bytes(self._gathered), None
+            (self._text if self._gathered_is_text else self._binary)(whole)
+
+    def _binary(self, data: bytes | memoryview) -> None:
+        """Take a binary message."""
+        if len(data) < _HEAD.size or data[0] != MESSAGE_DATA:
+            self._other(data)
+            return
+        subscription, log_time = _HEAD.unpack_from(data)
         route = self._routes.get(subscription)
         if route is None:
-            self._ignored("of an unknown subscription")
-            self._notifier.complain("sends messages of an unknown subscription; they are ignored")
+            self._ignored("messages of an unknown subscription", "of an unknown subscription")
             return
         channel, gaps = route
         received = time.time_ns()
@@ -128,53 +211,32 @@ class Session:
                 "receive time"
             )
             log_time = received
+        payload = bytes(data[_HEAD.size :])
         self._take(channel, payload, received=received, sent=log_time)
         if gaps is not None and len(payload) >= 4:
             gaps.see(_NUMBER(payload)[0], received)
             if gaps.waiting:
                 self._report(channel.topic, gaps.confirmed())
 
-    def time(self, now: int) -> None:
-        """Take the server's time: that of a simulation, or of a log that it plays."""
-        self._sink.clock(now, received=time.time_ns())
+    def _other(self, data: bytes | memoryview) -> None:
+        """Take the server's time; answers to requests are not recorded."""
+        if not data:
+            self._ignored("an empty binary message")
+        elif data[0] == MESSAGE_DATA or (data[0] == TIME and len(data) < _TIME.size):
+            self._ignored(f"a message of {len(data)} bytes, shorter than its header")
+        elif data[0] == TIME:
+            self._sink.clock(_TIME.unpack_from(data)[0], received=time.time_ns())
 
-    def too_large(self, subscription: int, size: int) -> None:
-        """Note a skipped message that is larger than the limit."""
-        topic = self._topic_of(subscription)
-        if topic is None:
-            return
-        now = time.time_ns()
-        detail = f"a message of {size} bytes exceeds the limit of this source"
-        self._sink.lost(Loss(topic, Cause.UNREADABLE, 1, now, now, detail))
-        self._notifier.complain(
-            f"{topic!r} has messages that exceed the limit of this source; they are skipped"
-        )
-
-    def cut(self, subscription: int) -> None:
-        """Note that the connection broke in the middle of a message."""
-        topic = self._topic_of(subscription)
-        if topic is not None:
-            now = time.time_ns()
-            detail = "the connection broke in the middle of a message"
-            self._sink.lost(Loss(topic, Cause.CONNECTION, 1, now, now, detail))
-
-    def broken(self, reason: str) -> None:
-        """Note a malformed binary message."""
-        self._ignored("too short for a message")
-        self._notifier.complain(f"sends {reason}; it is ignored")
-
-    def _ignored(self, detail: str) -> None:
+    def _ignored(self, what: str, detail: str = "too short for a message") -> None:
         """Note a lost message of an unknown topic."""
         now = time.time_ns()
         self._sink.lost(Loss("", Cause.UNREADABLE, 1, now, now, detail))
-
-    def _topic_of(self, subscription: int) -> str | None:
-        route = self._routes.get(subscription)
-        return None if route is None else route[0].topic
+        are = "they are" if what.startswith("messages") else "it is"
+        self._notifier.complain(f"sends {what}; {are} ignored")
 
     # JSON messages.
 
-    def text(self, data: bytes) -> None:
+    def _text(self, data: bytes) -> None:
         """Handle a JSON message; operations that do not matter to a recorder are ignored."""
         try:
             message = parse_text(data)
@@ -193,34 +255,32 @@ class Session:
         if not isinstance(channels, list):
             self._notifier.complain("advertises something else than a list of channels")
             return
-        wanted: dict[int, int] = {}
+        wanted: list[_Subscription] = []
         for entry in channels:
             try:
                 offer = parse_channel(entry)
             except PeerError as error:
                 self._notifier.complain(str(error))
                 continue
-            number = self._offered(offer)
-            if number is not None:
-                wanted[number] = offer.id
+            subscription = self._offered(offer)
+            if subscription is not None:
+                wanted.append(subscription)
         if wanted:
-            self._send(subscribe(wanted))
+            self._subscribe(wanted)
 
-    def _offered(self, offer: Advertised) -> int | None:
-        """Number of a new subscription to a channel, None if it needs none."""
+    def _offered(self, offer: Offer) -> _Subscription | None:
+        """A new subscription to a channel, None if it needs none."""
         topic = offer.channel.topic
         known = self._subscriptions.get(offer.id)
         if known is not None:
-            if _are_equal(known.offer.channel, offer.channel):
+            if _CONTENT(known.offer.channel) == _CONTENT(offer.channel):
                 return None
-            self._send(unsubscribe(known.number))
+            self._send("unsubscribe", subscriptionIds=[known.number])
             self._retire(offer.id)
         if not self._sink.wants(topic, offer.type_name):
             return None
         if len(self._subscriptions) >= _MAX_CHANNELS:
-            if not self._is_full:
-                self._notifier.say(f"has more than {_MAX_CHANNELS} channels; the rest is ignored")
-            self._is_full = True
+            self._notifier.say(f"has more than {_MAX_CHANNELS} channels; the rest is ignored")
             return None
         if offer.problem:
             self._notifier.complain(
@@ -228,18 +288,18 @@ class Session:
                 "their fields cannot be searched"
             )
         gaps = SequenceGapDetector() if has_sequence_numbers(offer.channel) else None
-        number = self._next
+        subscription = _Subscription(self._next, offer)
         self._next += 1
-        self._subscriptions[offer.id] = _Subscription(number, offer)
-        self._routes[number] = (offer.channel, gaps)
-        self._topics[topic] = self._topics.get(topic, 0) + 1
+        self._subscriptions[offer.id] = subscription
+        self._routes[subscription.number] = (offer.channel, gaps)
+        self._topics[topic] += 1
         self._sink.topic_came(topic, offer.type_name, self._topics[topic])
         self._sink.expect(offer.channel)
         since = self._missed.pop(topic, None)
         if since is not None:
             detail = "the connection was down; messages of this time are unknown"
             self._sink.lost(Loss(topic, Cause.CONNECTION, None, since, time.time_ns(), detail))
-        return number
+        return subscription
 
     def _unadvertise(self, channels: object) -> None:
         if not isinstance(channels, list):
@@ -252,7 +312,6 @@ class Session:
     def _retire(self, channel_id: int) -> None:
         """Remove a channel. Late messages of it are still recorded."""
         gone = self._subscriptions.pop(channel_id)
-        self._is_full = False
         self._retired.append(gone.number)
         if len(self._retired) > _MAX_RETIRED:
             self._routes.pop(self._retired.popleft(), None)
@@ -279,22 +338,11 @@ class Session:
             topic = refused.offer.channel.topic
             self._notifier.complain(f"offers {topic!r}, but does not send it ({text})")
             return
-        self._retries.add(refused.offer.id)
-        self._retry_at = time.monotonic() + _RETRY_S * (refused.refusals - 1)
-        self.look()
+        self._loop.call_later(_RETRY_S * (refused.refusals - 1), self._retry, refused)
 
-    def look(self) -> None:
-        """Retry refused subscriptions when it is time."""
-        if not self._retries or time.monotonic() < self._retry_at:
-            return
-        wanted = {
-            self._subscriptions[number].number: number
-            for number in self._retries
-            if number in self._subscriptions
-        }
-        self._retries.clear()
-        if wanted:
-            self._send(subscribe(wanted))
+    def _retry(self, refused: _Subscription) -> None:
+        if self._subscriptions.get(refused.offer.id) is refused:
+            self._subscribe([refused])
 
     def _report(self, topic: str, gaps: list[SequenceGap]) -> None:
         """Notes messages that a publisher counted and that never came, in one row."""
@@ -304,11 +352,7 @@ class Session:
             self._sink.lost(Loss(topic, Cause.TRANSPORT, gap.missing, gap.first, gap.last, detail))
 
     def end(self, *, is_stopped: bool) -> None:
-        """End the session.
-
-        Args:
-            is_stopped: The source was stopped; otherwise the connection ended.
-        """
+        """End the session, as the source was stopped or the connection has ended."""
         now = time.time_ns()
         for channel, gaps in self._routes.values():
             if gaps is not None:
@@ -320,85 +364,3 @@ class Session:
         self._topics.clear()
         self._subscriptions.clear()
         self._routes.clear()
-
-
-def _are_equal(one: Channel, other: Channel) -> bool:
-    """Tells whether two channels are equal."""
-    return (one.topic, one.message_encoding, one.schema, one.metadata) == (
-        other.topic,
-        other.message_encoding,
-        other.schema,
-        other.metadata,
-    )
-
-
-_PAUSES_S: Final = (0.5, 1.0, 2.0, 4.0, 8.0, 15.0)
-_STABLE_S: Final = 10.0  # after a connection of this length the pauses are short again
-
-
-class Client:
-    """The client, which runs in the thread of a Foxglove source.
-
-    Raises:
-        UsageError: The address is invalid.
-    """
-
-    def __init__(
-        self,
-        sink: Sink,
-        address: Address,
-        max_message_bytes: int,
-        stop: threading.Event,
-        reached: Callable[[], None],
-    ) -> None:
-        websocket_uri(address)
-        self._sink = sink
-        self._notifier = Notifier(sink, address.shown)
-        self._address = address
-        self._limit = max_message_bytes
-        self._stop = stop
-        self._reached = reached
-        self._missed: dict[str, int] = {}
-
-    def run(self) -> None:
-        """Connect, read and reconnect until stopped."""
-        try:
-            self._run()
-        except BaseException as error:
-            if not self._stop.is_set():
-                self._sink.ended(f"{self._address.shown}: reading failed ({error!r})")
-            raise
-
-    def _run(self) -> None:
-        failures = 0
-        while not self._stop.is_set():
-            began = time.monotonic()
-            reason = self._connect()
-            if self._stop.is_set():
-                return
-            self._notifier.say(f"{reason}; trying again")
-            if time.monotonic() - began > _STABLE_S:
-                failures = 0
-            self._stop.wait(_PAUSES_S[min(failures, len(_PAUSES_S) - 1)])
-            failures += 1
-
-    def _connect(self) -> str:
-        """Make one connection, and read it to its end.
-
-        Returns:
-            The reason of the end, for the user.
-        """
-        try:
-            opened = open_websocket(self._address, self._stop.is_set)
-            with opened.socket:
-                self._reached()
-                connection = Connection(opened, self._limit, self._stop.is_set)
-                session = Session(self._sink, self._notifier, connection.send, self._missed)
-                try:
-                    return connection.read(session)
-                finally:
-                    session.end(is_stopped=self._stop.is_set())
-        except PeerError as error:
-            return str(error)
-        except StoppedError:
-            return ""

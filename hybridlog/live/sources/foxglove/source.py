@@ -23,37 +23,28 @@ from typing import Final
 
 from hybridlog.live.sources.base import LiveSource, Sink
 from hybridlog.live.sources.foxglove.protocol import parse_address, without_user
-from hybridlog_storage.errors import MissingDependencyError, UsageError
+from hybridlog_storage.errors import MissingDependencyError
 
 _JOIN_S: Final = 5.0
-_MIN_MESSAGE_BYTES: Final = 1 << 20
 
 
 class FoxgloveSource(LiveSource):
     """A client of one Foxglove WebSocket server. TLS certificates are checked.
 
     It reconnects with growing pauses. After that the server's channels may have other
-    numbers.
+    numbers. A message of more than 1 GiB ends a connection, and is noted in the loss ledger.
 
     Args:
         url: Address, such as `ws://robot:8765`, optionally with user and password. Proxies
             of the environment are not used.
-        max_message_bytes: Largest payload, at least 1 MiB. Larger messages are skipped and
-            noted in the loss ledger.
-
-    Raises:
-        UsageError: The limit is too small.
     """
 
     kind = "Foxglove"
 
-    def __init__(self, url: str, *, max_message_bytes: int = 1 << 30) -> None:
-        if max_message_bytes < _MIN_MESSAGE_BYTES:
-            raise UsageError("the maximum message size must be at least 1 MiB")
+    def __init__(self, url: str) -> None:
         self._url = url
         self.address = without_user(url)
         self.was_reached = False
-        self._limit = max_message_bytes
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
 
@@ -70,16 +61,16 @@ class FoxgloveSource(LiveSource):
 
         Raises:
             UsageError: The address is invalid.
-            MissingDependencyError: `websockets` is not installed.
+            MissingDependencyError: `picows` is not installed.
         """
         address = parse_address(self._url)
         try:
-            from hybridlog.live.sources.foxglove.session import Client
+            from hybridlog.live.sources.foxglove.connection import Client
         except ImportError as error:
             raise MissingDependencyError(
-                "recording from Foxglove needs websockets: pip install 'hybridlog[foxglove]'"
+                "recording from Foxglove needs picows: pip install 'hybridlog[foxglove]'"
             ) from error
-        client = Client(sink, address, self._limit, self._stop, self._reached)
+        client = Client(sink, address, self._stop, self._reached)
         self._thread = threading.Thread(target=client.run, name="hybridlog-foxglove", daemon=True)
         self._thread.start()
 
