@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 
 
 _MAX_DRAWN = 20  # recordings with sparklines; for more, reading their chunk tables takes long
-_DRAWN_WORK = 1 << 20  # see `density`: little is read for a sparkline
+_DRAWN_TIMES = 1 << 18  # see `density`: little is read for a sparkline
 _LETTERS = 40  # of the coverage bar and of the longest sparkline
 _OVER_TIME = "over time"
 
@@ -386,7 +386,7 @@ def _densities(store: Store, entry: RecordingEntry) -> Density | None:
     if begin == end:
         return None
     try:
-        return density(store.session, entry, (begin, end), _LETTERS, most_work=_DRAWN_WORK)
+        return density(store.session, entry, (begin, end), _LETTERS, max_times=_DRAWN_TIMES)
     except SegmentError as error:
         output.note(f"{entry.name}: {error}")
         return None

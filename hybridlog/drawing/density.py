@@ -1,36 +1,34 @@
-"""Counts of messages by pixel, for timelines, and gaps of topics. No payload is read.
+"""Counts of messages by pixel, for timelines, and gaps of topics, from sorted log times.
 
-They are counted as `chunk_counts` says. If too many message indexes would be read, the messages
-of a chunk are spread evenly over its time, and the counts are marked as estimates.
+The times of a topic are read once, and kept in the cache while there is room. No payload is read.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from hybridlog.drawing.chunk_parts import RecordedChunks
-from hybridlog.query.chunk_counts import Placed
+from hybridlog.query.answers.match_times import match_times
+from hybridlog.query.counters import Counters
 from hybridlog.query.periods import GAP_PERIODS, usual_period
-from hybridlog_storage.errors import SegmentError
-from hybridlog_storage.times import placed
+from hybridlog.query.question import Question
+from hybridlog_storage.errors import SegmentError, TopicError
+from hybridlog_storage.times import BEGIN, END, placed
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog.drawing.chunk_parts import RecordedChunks
-    from hybridlog.query.chunk_counts import Parts
     from hybridlog.session import Session
     from hybridlog_storage.catalog import RecordingEntry
 
-
-MAX_WORK: Final = 1 << 24
-"""Messages whose times are read for one picture; a chunk counts as `_CHUNK_WORK` more."""
-_CHUNK_WORK: Final = 1000
+MAX_TIMES: Final = 20_000_000
+"""As of `density`, of a timeline."""
+_SAMPLED: Final = 100_000  # steps that tell the usual one
+_LATEST: Final = np.iinfo(np.int64).max
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,7 +55,7 @@ def density(
     pixels: int,
     topics: Sequence[str] | None = None,
     *,
-    most_work: int = MAX_WORK,
+    max_times: int = MAX_TIMES,
 ) -> Density:
     """Counts of messages by pixel.
 
@@ -67,120 +65,102 @@ def density(
         span: Log time `[begin, end)`, ns.
         pixels: Number of parts of the span; their lengths differ by one nanosecond at most.
         topics: Full names; None for all topics of the recording.
-        most_work: As for `count`.
+        max_times: Messages of a topic whose times are read; of more, those of a chunk are
+            spread evenly.
     """
-    chunks = RecordedChunks(session, recording)
-    chosen = tuple(chunks.topics() if topics is None else topics)
-    edges = _edges(span, pixels)
-    counts, exact = count(chunks, chosen, edges, most_work=most_work)
-    return Density(chosen, edges, counts, exact)
-
-
-def _edges(span: tuple[int, int], pixels: int) -> NDArray[np.int64]:
     whole, rest = divmod(span[1] - span[0], pixels)
     numbers = np.arange(pixels + 1, dtype=np.int64)
-    return np.int64(span[0]) + numbers * whole + numbers * rest // pixels
+    edges = np.int64(span[0]) + numbers * whole + numbers * rest // pixels
+    chosen = sorted({one.topic for one in recording.channels}) if topics is None else topics
+    return _counted(session, recording, edges, chosen, max_times)
 
 
-def count(
-    chunks: RecordedChunks,
+def bins(
+    session: Session,
+    recording: RecordingEntry,
+    span: tuple[int, int],
+    pixels: int,
     topics: Sequence[str],
-    edges: NDArray[np.int64],
-    *,
-    since: int = 0,
-    most_work: int = MAX_WORK,
-) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Number of messages of some topics between neighbouring times.
+) -> Density:
+    """Counts of messages by bins of a power of two of nanoseconds, counted from the epoch.
+
+    So bins stay the same when a picture moves.
 
     Args:
-        chunks: The chunks of a recording.
-        topics: Full names, n.
-        edges: int64[p + 1], log times, ns, ascending.
-        since: Leave out as many parts of `chunks`; see `RecordedChunks.size`.
-        most_work: Estimate rather than read the times of more messages.
+        session: The open store.
+        recording: The recording.
+        span: Log time `[begin, end)`, ns.
+        pixels: Most bins that fit into the span.
+        topics: Full names.
 
     Returns:
-        int64[n, p]; and bool[n], False where counts are estimates.
+        Bins of equal length that cover the span: more than half as many as pixels, unless
+        a bin is one nanosecond, and one more than pixels at most.
+
+    Raises:
+        TopicError: The recording has no such topic.
     """
-    pixels = len(edges) - 1
-    counts = np.zeros((len(topics), pixels), np.int64)
+    unknown = {*topics}.difference(channel.topic for channel in recording.channels)
+    if unknown:
+        raise TopicError(f"{recording.name} has no topic {min(unknown)!r}.")
+    level = max(-(-(span[1] - span[0]) // pixels) - 1, 0).bit_length()
+    numbers = range(span[0] >> level, -(-span[1] >> level) + 1)
+    edges = np.array([min(number << level, _LATEST) for number in numbers], np.int64)
+    return _counted(session, recording, edges, topics)
+
+
+def _counted(
+    session: Session,
+    recording: RecordingEntry,
+    edges: NDArray[np.int64],
+    topics: Sequence[str],
+    max_times: int = MAX_TIMES,
+) -> Density:
+    counts = np.zeros((len(topics), len(edges) - 1), np.int64)
     exact = np.ones(len(topics), np.bool_)
-    parts = chunks.parts((int(edges[0]), int(edges[-1])), topics, since)
-    others = Placed.of(parts, edges).add_known(counts)
-
-    def times(segment: int, chunk: int) -> Mapping[int, NDArray[np.int64]]:
-        with suppress(SegmentError):
-            return chunks.times(segment, chunk)
-        return {}
-
-    if _work(others.parts) <= most_work:
-        others = others.add_read(edges, counts, times)
-    if len(others.low):
-        _add_estimated(others.parts, edges, counts)
-        exact[others.parts.topic] = False
-    return counts, exact
+    for row, topic in enumerate(topics):
+        times, is_exact = _times(session, recording, topic, max_times)
+        counts[row] = np.diff(np.searchsorted(times, edges))
+        exact[row] = is_exact
+    return Density(tuple(topics), edges, counts, exact)
 
 
-def reading_work(chunks: RecordedChunks, topics: Sequence[str], edges: NDArray[np.int64]) -> int:
-    """Cost of `count`: the messages whose times it reads, and `_CHUNK_WORK` for each chunk."""
-    placed = Placed.of(chunks.parts((int(edges[0]), int(edges[-1])), topics), edges)
-    return _work(placed.parts.take(~placed.is_whole & (placed.parts.messages > 2)))
+def periods(session: Session, recording: RecordingEntry, topics: Sequence[str]) -> list[float]:
+    """Usual time from one message of each topic to the next, ns; 0 where it is unknown."""
+    found = []
+    for topic in topics:
+        times, _ = _times(session, recording, topic)
+        rows = np.arange(0, len(times) - 1, 1 + len(times) // _SAMPLED)
+        found.append(usual_period(times[rows + 1] - times[rows]))
+    return found
 
 
-def _work(parts: Parts) -> int:
-    return int(parts.messages.sum()) + _CHUNK_WORK * len(parts.chunk_starts)
+def _times(
+    session: Session, recording: RecordingEntry, topic: str, max_times: int = MAX_TIMES
+) -> tuple[NDArray[np.int64], bool]:
+    """Log times of a topic, sorted, and whether they are all, as they are."""
+    messages = recording.messages_by_topic()[topic]
+    is_read = messages <= max_times
+
+    def read() -> tuple[NDArray[np.int64], bool]:
+        if is_read:
+            question = Question((topic,), (recording.id,))
+            with suppress(SegmentError):
+                found = match_times(session, question, Counters())
+                return _sorted(one.log_time for one in found), True
+        ids = [channel.id for channel in recording.channels if channel.topic == topic]
+        parts = session.parts(recording, ids, (BEGIN, END))
+        rows = zip(parts.first, parts.last, parts.messages, strict=True)
+        return _sorted(np.linspace(*row).astype(np.int64) for row in rows), False
+
+    tails = ((n, one.table.chunks[-1:].tobytes()) for n, one in recording.flushed.items())
+    state = recording.status, messages, frozenset((*recording.digests.items(), *tails))
+    key = recording.id, topic, state, is_read
+    return session.cache.made("times", *key, make=read, size_of=lambda one: one[0].nbytes)
 
 
-def _add_estimated(parts: Parts, edges: NDArray[np.int64], counts: NDArray[np.int64]) -> None:
-    """Spread the messages of each part evenly over its time."""
-    pixels = len(edges) - 1
-    found = np.zeros((counts.shape[0], pixels))
-    # Pixels of equal length, in which the parts begin and end.
-    length = (int(edges[-1]) - int(edges[0])) / pixels
-    begin, end = ((t - edges[0]) / length for t in (parts.first, placed(parts.last) + 1))
-    rate = parts.messages / np.maximum(end - begin, 1e-9)
-    begin, end = np.clip(begin, 0, pixels), np.clip(end, 0, pixels)
-    low = np.minimum(begin.astype(np.intp), pixels - 1)
-    high = np.minimum(end.astype(np.intp), pixels - 1)
-    # Nothing but the first and the last pixel of a part is covered in part.
-    is_one = low == high
-    np.add.at(found, (parts.topic, low), rate * np.where(is_one, end - begin, low + 1 - begin))
-    many = np.flatnonzero(~is_one)
-    topic, low, high = parts.topic[many], low[many], high[many]
-    np.add.at(found, (topic, high), rate[many] * (end[many] - high))
-    slope = np.zeros_like(found)
-    np.add.at(slope, (topic, low + 1), rate[many])
-    np.add.at(slope, (topic, high), -rate[many])
-    found += np.cumsum(slope, axis=1)
-    # Rounded so that nothing is lost or added in all.
-    whole = np.rint(np.cumsum(found, axis=1)).astype(np.int64)
-    counts += np.maximum(np.diff(whole, axis=1, prepend=0), 0)
-
-
-_SAMPLED: Final = 16  # chunks that are read for one topic
-
-
-def sampled_period(chunks: RecordedChunks, parts: Parts) -> float:
-    """The usual time from one message of a topic to the next, ns, in some of its chunks.
-
-    Returns:
-        0 if there is only one message, or none.
-    """
-    several = parts.take(parts.messages > 1)
-    steps = [np.empty(0, np.int64)]
-    if 2 * int(several.messages.sum()) >= int(parts.messages.sum()):
-        last = len(several.first) - 1
-        rows = np.unique(np.linspace(0, last, min(last + 1, _SAMPLED)).astype(np.intp))
-        for segment, chunk, channel in zip(
-            *(column[rows].tolist() for column in several[:3]), strict=True
-        ):
-            with suppress(SegmentError, KeyError):
-                times = chunks.times(segment, chunk)[channel]
-                steps.append(times[1:] - times[:-1])
-    else:
-        first = np.sort(parts.first)
-        steps.append(first[1:] - first[:-1])
-    return usual_period(np.concatenate(steps))
+def _sorted(parts: Iterable[NDArray[np.int64]]) -> NDArray[np.int64]:
+    return placed(np.sort(np.concatenate([np.empty(0, np.int64), *parts]), kind="stable"))
 
 
 def gaps(counts: NDArray[np.int64], edges: NDArray[np.int64], period: float) -> NDArray[np.intp]:

@@ -19,8 +19,6 @@ from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 from starlette.routing import Route
 
-from hybridlog.drawing.density_cache import DensityCache
-from hybridlog.drawing.match_cache import MatchCache
 from hybridlog.formats.slices import SliceCache
 from hybridlog.query.answers.match_times import next_time
 from hybridlog.record.losses import extent_of
@@ -59,7 +57,7 @@ class Context:
     Attributes:
         store: That store; at one moment while an answer is worked out.
         turns: Held by each answer that is worked out.
-        matches: Matches of the last questions.
+        matching: Held while matches are looked for.
         sql: Answers SQL.
         slices: MCAP files of selections.
     """
@@ -68,7 +66,7 @@ class Context:
         self.store = store
         self._looks = _Looks(store)
         self.turns = threading.BoundedSemaphore(MAX_WORKING)
-        self.matches = MatchCache(store.shared.cache)
+        self.matching = threading.Lock()
         self.sql = SqlProcess(store)
         self.slices = SliceCache()
 
@@ -77,11 +75,6 @@ class Context:
         found = copy(self)
         found.store = self.store.snapshot()
         return found
-
-    @property
-    def densities(self) -> DensityCache:
-        """Counts of messages by pixel."""
-        return DensityCache(self.store.session)
 
     def refresh(self, least_s: float = REFRESH_S) -> None:
         """See what other processes have recorded since, unless the last look was just now."""

@@ -10,7 +10,7 @@ from typing import Any, Final, Literal, TypeAlias, TypeVar, cast
 MAX_BYTES: Final = 224 << 20
 
 Kind: TypeAlias = Literal[
-    "chunk", "column", "density", "matches", "recording", "rebuilt", "table", "videos"
+    "chunk", "column", "matches", "rebuilt", "table", "times", "videos"
 ]
 Value = TypeVar("Value")
 

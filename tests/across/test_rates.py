@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 
 import hybridlog as hl
 from hybridlog.drawing.density import gaps as silent
-from hybridlog.drawing.density_cache import DensityCache
+from hybridlog.drawing.density import periods as periods_of
 from hybridlog.drawing.series import series
 from hybridlog.query import periods
 from hybridlog.query.answers.field_statistics import _Running
@@ -175,7 +175,7 @@ def test_bursts_are_no_gaps(tmp_path: Path) -> None:
         for pixels in (20_000, 1000, 200):
             (line,) = series(query, ["v"], pixels=pixels)
             assert int(np.isnan(line.least).sum()) == 1, pixels
-        (period,) = DensityCache(store.shared).periods(store.entry("a"), span, ["/burst"])
+        (period,) = periods_of(store.session, store.entry("a"), ["/burst"])
         assert period == 97 * MS
         edges = np.linspace(span[0], span[1], 5000).astype(np.int64)
         counts = np.histogram(times, edges)[0]

@@ -3,26 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
 
 import numpy as np
 import pytest
 
-import hybridlog as hl
-from hybridlog.drawing.match_cache import CachedMatches, MatchCache
-from hybridlog.drawing.matches import (
-    Match,
-    Matches,
-    QueriedMatches,
-    bands,
-    count_before,
-    matches_after,
-    matches_before,
-    ticks,
-)
+from hybridlog.drawing.matches import Match, Matches
 from hybridlog.query.answers.match_times import match_times
-from hybridlog_storage.cache import Cache
-from hybridlog_storage.errors import UsageError
+from hybridlog_storage.errors import ResourceError, UsageError
+from tests.limits import Limit
 
 from .conftest import BASE, MS, Drive
 
@@ -35,28 +23,12 @@ def matching(drive: Drive) -> list[Match]:
     return [Match(int(drive.times[n]), int(n + (n - 1) // 50 + 1)) for n in wanted]
 
 
-Made = Callable[[hl.Query], Matches]
-
-
-def kept(query: hl.Query) -> Matches:
-    found = CachedMatches.of(query, 1 << 30)
-    assert found is not None
-    return found
-
-
-@pytest.fixture(params=[QueriedMatches, kept], ids=["asked", "kept"])
-def made(request: pytest.FixtureRequest) -> Made:
-    """Makes matches of a query, those that are read and those that are kept in memory."""
-    found: Made = request.param
-    return found
-
-
-def test_ticks_count_each_match_once(drive: Drive, made: Made) -> None:
-    matches = made(drive.store.topic("drive").where(PREDICATE))
+def test_ticks_count_each_match_once(drive: Drive) -> None:
+    matches = Matches(drive.store.topic("drive").where(PREDICATE))
     times = [one.time for one in matching(drive)]
     whole = BASE, times[-1] + 1
     for pixels, span in ((1, whole), (97, whole), (500, (times[10], times[90])), (8, (0, BASE))):
-        found = ticks(matches, span, pixels)
+        found = matches.ticks(span, pixels)
         inside = [time for time in times if span[0] <= time < span[1]]
         want = Counter((time - span[0]) // found.width for time in inside)
         assert dict(zip(found.pixels.tolist(), found.counts.tolist(), strict=True)) == want
@@ -68,28 +40,28 @@ def test_ticks_count_each_match_once(drive: Drive, made: Made) -> None:
     assert len(times) > 500
 
 
-def test_ticks_of_many_blocks(drive: Drive, made: Made) -> None:
+def test_ticks_of_many_blocks(drive: Drive) -> None:
     """Elements of long arrays are asked of the messages, a chunk at a time."""
     query = drive.store.topic("drive").where("wide[3] > 0")
     wanted = drive.times[drive.wide[:, 3] > 0].tolist()
     assert len([*match_times(query.session, query.question, query.counters)]) > 3
-    found = ticks(made(query), (BASE, wanted[-1] + 1), 3)
+    found = Matches(query).ticks((BASE, wanted[-1] + 1), 3)
     want = Counter((time - BASE) // found.width for time in wanted)
     assert dict(zip(found.pixels.tolist(), found.counts.tolist(), strict=True)) == want
     assert found.first[0] == wanted[0]
 
 
-def test_bands_are_the_intervals_as_far_as_pixels_tell(drive: Drive, made: Made) -> None:
+def test_bands_are_the_intervals_as_far_as_pixels_tell(drive: Drive) -> None:
     query = drive.store.topic("drive").where("linear.z > 0.5")
     span = BASE + 1234, int(drive.times[-1]) + 10 * MS
     exact = [(i.begin_ns, i.end_ns) for i in query.between(*span).intervals()]
     assert len(exact) > 5
-    assert bands(made(query), span, 5000).tolist() == [list(one) for one in exact]
+    assert Matches(query).bands(span, 5000).tolist() == [list(one) for one in exact]
     alternating = drive.store.topic("drive").where("on == true")
     exact_width = int(drive.times[0]), int(drive.times[100])  # of 10 ms, as the bands' distance
     for pixels, picture in ((1, span), (10, span), (300, span), (100, exact_width)):
         all_of_it = [(i.begin_ns, i.end_ns) for i in alternating.between(*picture).intervals()]
-        found = bands(made(alternating), picture, pixels).tolist()
+        found = Matches(alternating).bands(picture, pixels).tolist()
         width = -(-(picture[1] - picture[0]) // pixels)
         want: list[list[int]] = []
         for begin, end in all_of_it:
@@ -99,59 +71,39 @@ def test_bands_are_the_intervals_as_far_as_pixels_tell(drive: Drive, made: Made)
                 want.append([begin, end])
         assert found == want
         assert len(found) <= pixels + 1
-    assert bands(made(query), (0, BASE - 1), 7).tolist() == []
+    assert Matches(query).bands((0, BASE - 1), 7).tolist() == []
 
 
-def test_bands_last_until_the_recording_ends(drive: Drive, made: Made) -> None:
+def test_bands_last_until_the_recording_ends(drive: Drive) -> None:
     query = drive.store.topic("loose").where("name exists")
     end = int(drive.times[-1])
-    assert bands(made(query), (end - 5 * MS, end + 1), 9).tolist() == [[end - 5 * MS, end + 1]]
+    assert Matches(query).bands((end - 5 * MS, end + 1), 9).tolist() == [[end - 5 * MS, end + 1]]
 
 
 @pytest.mark.parametrize("count", [1, 7, 5000])
-def test_matches_step_by_step(drive: Drive, made: Made, count: int) -> None:
-    matches = made(drive.store.topic("drive").where(PREDICATE))
+def test_matches_step_by_step(drive: Drive, count: int) -> None:
+    matches = Matches(drive.store.topic("drive").where(PREDICATE))
     want = matching(drive)
     middle = want[300]
     for place in (middle, Match(middle.time, -1), Match(BASE - 9, -1), Match(2**62, -1)):
         later = [one for one in want if one > place]
         earlier = [one for one in want if one < place]
-        assert matches_after(matches, place, count) == later[:count]
-        assert matches_before(matches, place, count) == earlier[-count:]
-        assert count_before(matches, place) == len(earlier)
+        assert matches.after(place, count) == later[:count]
+        assert matches.before(place, count) == earlier[-count:]
+        assert matches.count_before(place) == len(earlier)
 
 
 def test_pictures_without_width_are_refused(drive: Drive) -> None:
-    matches = QueriedMatches(drive.store.topic("drive"))
+    matches = Matches(drive.store.topic("drive"))
     for span, pixels in (((BASE, BASE + 1), 0), ((BASE, BASE), 9)):
         with pytest.raises(UsageError, match="at least one pixel"):
-            ticks(matches, span, pixels)
+            matches.ticks(span, pixels)
 
 
-def test_the_last_questions_are_kept(drive: Drive) -> None:
-    cache = MatchCache(Cache(2 * 2500 * 32))
-    asked: list[str] = []
-
-    def matches(text: str) -> Matches:
-        def ask() -> hl.Query:
-            asked.append(text)
-            return drive.store.topic("drive").where(text)
-
-        return cache.matches(text, ask)
-
-    assert matches("on == true") is matches("on == true")
-    assert matches("on == true").count_until(BASE + 10**12) == 2500
-    matches("on == false")
-    matches("y > 1200")  # few
-    matches("on == false")
-    assert asked == ["on == true", "on == false", "y > 1200"]
-    matches("on == true")
-    assert asked[3:] == ["on == true"]
-    # A match and its interval take 32 bytes.
-    cache = MatchCache(Cache(2 * (2500 * 32 - 1)))
-    asked.clear()
-    for _ in range(2):  # too many, which is known the second time
-        found = matches("ticks != 0 and on == true")
-        assert isinstance(found, QueriedMatches)
-        assert found.count_until(BASE + 10**12) == 2500
-    assert len(asked) == 3
+def test_more_matches_than_fit_are_refused(drive: Drive, limit: Limit) -> None:
+    count = len(matching(drive))
+    limit(matches=count)
+    assert Matches(drive.store.topic("drive").where(PREDICATE)).size >= 16 * count
+    limit(matches=count - 1)
+    with pytest.raises(ResourceError, match="write a narrower predicate"):
+        Matches(drive.store.topic("drive").where(PREDICATE))

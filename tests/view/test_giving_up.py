@@ -117,7 +117,7 @@ def test_a_question_that_is_given_up_waits_for_nothing(demo_store: hl.Store) -> 
             held.enter_context(shared.turns)
         said = asked_for(app, "ask", NEAR, leaves_after=0.1)
         assert b"The query was stopped" in said[1]["body"]
-    with shared.matches._asking:
+    with shared.matching:
         said = asked_for(app, "matches", QUESTIONS["matches"], leaves_after=0.1)
         assert b"The query was stopped" in said[1]["body"]
     said = asked_for(app, "matches", QUESTIONS["matches"], leaves_after=20.0)

@@ -4,21 +4,14 @@ from __future__ import annotations
 
 import threading
 from collections import defaultdict
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any, Final, cast
 
 import numpy as np
 
-from hybridlog.drawing.matches import (
-    Match,
-    QueriedMatches,
-    bands,
-    count_before,
-    matches_after,
-    matches_before,
-    ticks,
-)
+from hybridlog.drawing.matches import Match, Matches
 from hybridlog.query.answers.infer_fields import infer_fields
 from hybridlog.query.answers.match_times import match_times
 from hybridlog.query.asked import field_types
@@ -29,6 +22,7 @@ from hybridlog.query.topics import resolve
 from hybridlog.view.context import SQL_MEMORY, Context, route, start_of
 from hybridlog.view.question import program, question_of
 from hybridlog_storage.errors import HybridlogError, TopicError
+from hybridlog_storage.stopping import held
 from hybridlog_storage.times import BEGIN, END, span_of
 
 if TYPE_CHECKING:
@@ -36,7 +30,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from hybridlog.drawing.matches import Matches
     from hybridlog.sql.topic_view import Remarks
     from hybridlog.view.params import RequestParams
     from hybridlog.view.question import PageQuestion
@@ -72,16 +65,15 @@ def matches(context: Context, params: RequestParams) -> dict[str, Any]:
     question = question_of(context, params)
     start = start_of(question.recording)
     span, pixels = params.span(start), params.pixels()
-    found_matches = _matches(context, question)
-    found = ticks(found_matches, span, pixels)
-    held = bands(found_matches, span, pixels)
+    matching = _matches(context, question)
+    found, in_force = matching.ticks(span, pixels), matching.bands(span, pixels)
     return {
         "begin": span[0] - start,
         "width": found.width,
         "pixels": found.pixels.tolist(),
         "counts": found.counts.tolist(),
         "first": (found.first - start).tolist(),
-        "bands": (held - start).tolist(),
+        "bands": (in_force - start).tolist(),
     }
 
 
@@ -91,22 +83,25 @@ def match_list(context: Context, params: RequestParams) -> dict[str, Any]:
     start = start_of(question.recording)
     place = Match(params.moment(start), params.integer("seq", -1, END, -1))
     count = params.integer("count", 1, MAX_LISTED, MAX_LISTED)
-    find = {"later": matches_after, "earlier": matches_before}
-    found_matches = _matches(context, question)
-    found = find[params.word("direction", find, "later")](found_matches, place, count)
+    matching = _matches(context, question)
+    find = {"later": matching.after, "earlier": matching.before}
+    found = find[params.word("direction", find, "later")](place, count)
     return {
         "rows": [[str(one.time - start), one.seq] for one in found],
-        "before": count_before(found_matches, found[0]) if found else None,
+        "before": matching.count_before(found[0]) if found else None,
     }
 
 
 def _matches(context: Context, question: PageQuestion) -> Matches:
     recording = question.recording
-    if recording.status == "open":
-        return QueriedMatches(question.query())
-    params = question.topics, question.where, question.within
-    key = recording.id, recording.status, frozenset(recording.digests.items()), params
-    return context.matches.matches(key, question.query)
+    state = recording.status, recording.messages, frozenset(recording.digests.items())
+    key = recording.id, state, (question.topics, question.where, question.within)
+    with held(context.matching):  # a second client that asks the same waits
+        cache = context.store.shared.cache
+        return cache.made("matches", *key, make=lambda: Matches(question.query()), size_of=_size)
+
+
+_size: Callable[[Matches], int] = attrgetter("size")
 
 
 def completion(context: Context, params: RequestParams) -> dict[str, Any]:

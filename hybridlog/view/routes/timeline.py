@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from starlette.responses import Response
 
-from hybridlog.drawing.density import gaps
+from hybridlog.drawing.density import bins, gaps, periods
 from hybridlog.drawing.fields import fields_of
 from hybridlog.drawing.series import series as read_series
 from hybridlog.query.answers.infer_fields import SAMPLE
@@ -66,10 +66,11 @@ def timeline(context: Context, params: RequestParams) -> Response:
         raise UsageError(f"At most {MAX_BINS // max(len(topics), 1)} pixels for as many topics.")
     start = start_of(recording)
     span = params.span(start)
-    found = context.densities.density(recording, span, pixels, topics)
-    periods = context.densities.periods(recording, span, topics)
+    session = context.store.session
+    found = bins(session, recording, span, pixels, topics)
+    usual = periods(session, recording, topics)
     lanes, body = [], []
-    for counts, exact, period in zip(found.counts, found.exact.tolist(), periods, strict=True):
+    for counts, exact, period in zip(found.counts, found.exact.tolist(), usual, strict=True):
         silent = gaps(*_within(counts, found.edges, extent(recording)), period)
         small = _small(counts)
         lanes.append(
