@@ -50,6 +50,7 @@ from hybridlog_storage.manifest import (
 )
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_file import Sealed, sealed_channels, sealed_name
+from hybridlog_storage.segments.segment_format import group_of
 from hybridlog_storage.segments.segment_reader import SegmentReader, SegmentSummary
 from hybridlog_storage.summary import RecordingSummary, TopicType, hash_of, topics_to_json
 
@@ -166,11 +167,22 @@ class Inventory:
 
     @property
     def end(self) -> Mapping[str, Any] | None:
-        """The end of the recording: by its manifest, else by the last segment that states it."""
+        """The end of the recording: by its manifest, else by the segments that state it.
+
+        Of a group whose recorder was killed, each recovered segment says what it has lost.
+        """
         if self.manifest is not None and self.manifest.is_ended:
             return end_values(self.manifest)
         ends = [summary.end for _, summary in sorted(self.summaries.items()) if summary.end]
-        return ends[-1] if ends else None
+        cut = [end for end in ends if end.get("status") == "recovered"]
+        if len(ends) < 2 or not cut:
+            return ends[-1] if ends else None
+        return {
+            "status": "recovered",
+            "losses": [row for end in ends for row in end.get("losses", ())],
+            "cut_bytes": sum(end.get("cut_bytes", 0) for end in cut),
+            "damage": [text for end in cut for text in end.get("damage", ())],
+        }
 
     @property
     def is_proven(self) -> bool:
@@ -728,12 +740,29 @@ def channels_of(summaries: Iterable[SegmentSummary]) -> dict[int, Channel]:
     return channels
 
 
-def listed(sealed: Sealed) -> Callable[[Manifest], Manifest]:
-    """The change that lists a segment, in the place of the one of its number."""
+def listed(*segments: Sealed) -> Callable[[Manifest], Manifest]:
+    """The change that lists segments, in the place of those of their numbers."""
+    files = tuple(map(_file_of, segments))
+    numbers = {file.number for file in files}
+    channels = {
+        one.id: truth.Channel(one.topic, one.encoding, one.type)
+        for sealed in segments
+        for one in sealed.channels
+    }
+
+    def how(now: Manifest) -> Manifest:
+        others = (one for one in now.files if one.kind != "log" or one.number not in numbers)
+        known = {**channels, **now.channels}
+        return truth.with_totals(truth.replace(now, files=(*others, *files), channels=known))
+
+    return how
+
+
+def _file_of(sealed: Sealed) -> File:
     times = [time for one in sealed.channels for time in (one.first, one.last)]
-    file = File(
+    return File(
         sealed.segment,
-        sealed.segment,
+        sealed.group,
         sealed.file,
         "log",
         sealed.bytes,
@@ -746,16 +775,6 @@ def listed(sealed: Sealed) -> Callable[[Manifest], Manifest]:
             for one in sealed.channels
         },
     )
-    channels = {one.id: truth.Channel(one.topic, one.encoding, one.type) for one in sealed.channels}
-
-    def how(now: Manifest) -> Manifest:
-        others = tuple(
-            one for one in now.files if (one.kind, one.number) != (file.kind, file.number)
-        )
-        known = {**channels, **now.channels}
-        return truth.with_totals(truth.replace(now, files=(*others, file), channels=known))
-
-    return how
 
 
 def ended(end: Mapping[str, Any]) -> Callable[[Manifest], Manifest]:
@@ -832,7 +851,8 @@ def sealed_of(inventory: Inventory, number: int) -> Sealed:
     """An existing segment, as a manifest lists it."""
     summary, name = inventory.summaries[number], inventory.listing.sealed[number]
     channels = sealed_channels(summary.table.as_stored(), summary.channels)
-    return Sealed(number, name, summary.size, inventory.digest(number), channels)
+    group = group_of(summary.recording, number)
+    return Sealed(number, name, summary.size, inventory.digest(number), channels, group)
 
 
 def free_name_in(catalog: Catalog, name: str, but: str = "") -> str:

@@ -112,8 +112,8 @@ class Made:
         self.segments = [path for _, path in directory.segments(self.id)]
         assert len(self.segments) == segments
 
-    def _announce(self, sealed: Any) -> None:
-        self.change(listed(sealed))
+    def _announce(self, group: Any) -> None:
+        self.change(listed(*group))
         if self.end is not None:
             self.change(ended(self.end))
 

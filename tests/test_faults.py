@@ -12,7 +12,7 @@ import subprocess
 import sys
 import threading
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,7 +33,7 @@ from hybridlog_storage.manifest import replace as changed
 from hybridlog_storage.mongo.database import Database
 from hybridlog_storage.mongo.index_state import RECORDINGS, STORE, IndexState, Through
 from hybridlog_storage.mongo.mongod import EmbeddedMongod
-from hybridlog_storage.segments.segment_reader import SegmentReader
+from hybridlog_storage.segments.segment_reader import ChunkPlace, SegmentReader
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import independent, places
 from tests.calls import Calls
@@ -213,17 +213,18 @@ def test_what_was_cut_short_can_be_recorded_again(path: Path, robot: Path) -> No
         assert store.verify().findings == []
 
 
-def unsealed(store: hl.Store, size: int, *, listed: bool) -> None:
-    """The last segment as power found it: written so far, and not sealed.
+def unsealed(store: hl.Store, number: int, size: int, *, listed: bool) -> None:
+    """A segment of the last group as power found it: written so far, and not sealed.
 
     Args:
         store: With the recording `short`.
+        number: Number of the segment.
         size: Bytes of the segment that are on the disk.
         listed: Whether the manifest had listed it already, whole.
     """
     (entry,) = store.select(["short"])
-    last = chunk_entries(store.catalog, entry)[-1]
-    number, path = store.directory.segments(places.id_of(store.directory.path, "short"))[-1]
+    chunks = chunk_entries(store.catalog, entry)
+    path = places.segment(store.directory.path, "short", number)
     path.with_name(path.name + ".open").write_bytes(path.read_bytes()[:size])
     path.unlink()
     if not listed:
@@ -237,7 +238,19 @@ def unsealed(store: hl.Store, size: int, *, listed: bool) -> None:
     state = IndexState(store.database)
     # All chunks are in the index, and it is not done.
     state.put(entry, "open", turn=1)
-    state.put_through(entry.key, Through(last.segment, last.number, last.offset, entry.messages))
+    ends = {chunk.segment: (chunk.number, chunk.trailer_crc) for chunk in chunks}
+    state.put_through(entry.key, Through(0, ends, entry.messages))
+
+
+def last_with_chunks(store: hl.Store, least: int) -> tuple[int, Sequence[ChunkPlace]]:
+    """The last segment of `short` with so many chunks, and these."""
+    recording = places.id_of(store.directory.path, "short")
+    for number, path in reversed(store.directory.segments(recording)):
+        with SegmentReader(path, number) as reader:
+            chunks = reader.summary().chunks
+        if len(chunks) >= least:
+            return number, chunks
+    pytest.fail("no segment has so many")
 
 
 @pytest.mark.parametrize("listed", [False, True])
@@ -245,11 +258,8 @@ def test_the_index_may_be_ahead_of_the_file(
     store: hl.Store, said: Counter[Message], listed: bool
 ) -> None:
     """Power fails: the system had not written the file yet, but MongoDB its documents."""
-    number, path = store.directory.segments(places.id_of(store.directory.path, "short"))[-1]
-    with SegmentReader(path, number) as reader:
-        chunks = reader.summary().chunks
-    assert len(chunks) > 3
-    unsealed(store, chunks[-2].offset + 20, listed=listed)
+    number, chunks = last_with_chunks(store, 4)
+    unsealed(store, number, chunks[-2].offset + 20, listed=listed)
     with reopened(store) as opened:
         assert list(opened.repairs.recovered) == ["short"]
         messages = fetched(opened, "short")
@@ -275,7 +285,7 @@ def test_a_chunk_without_arrival_numbers_comes_after_the_earlier_segments(
         first = reader.summary().chunks[0]
         rest = {int(s) for c in reader.summary().chunks for s in reader.read_chunk(c).seq}
     earlier = before - rest
-    unsealed(store, first.offset + first.length + 3, listed=False)
+    unsealed(store, number, first.offset + first.length + 3, listed=False)
     with reopened(store) as opened:
         messages = fetched(opened, "short")
         assert not content(messages) - said

@@ -131,12 +131,13 @@ def test_a_pass_makes_room_and_leaves_counts_fields_and_pins(store: Path) -> Non
             for channel, part in log.parts.items()
             if manifest.channels[channel].topic == "/camera"
         )
+        if log.number != log.group
     ]
-    assert len(manifest.logs) - 2 <= len(free) < len(manifest.logs)
+    assert len(manifest.logs) // 2 - 2 <= len(free) < len(manifest.logs) // 2
     assert gone == free[: len(gone)]
     left = payloads(store)
     assert all(raw is None or raw == image(n) for n, raw in left.items())
-    assert all(left[n] is not None for n in (*range(8, 13), *range(100, COUNT)))
+    assert all(left[n] is not None for n in (*range(8, 13), *range(115, COUNT)))
     assert done["freed_bytes"] > 0.1 * used
     assert disk_bytes(store) < 0.9 * quota
     check_answers(store)
@@ -149,7 +150,7 @@ def test_topics_go_and_the_rest_of_their_segments_stays(
     store: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = keep("--topic", "/camera=0s", store=store).out
-    assert "/camera in segments" in out
+    assert "run: segments 1 to 21" in out
     assert "/camera older than 0s" in out
     assert {*payloads(store).values()} == {None}
     with hl.open(store, mongo="none") as opened:
@@ -207,7 +208,7 @@ def test_a_damaged_segment_stays_and_the_others_go(store: Path) -> None:
     assert "000001.mcap" in found.err
     assert "stay until the file is restored from a copy" in found.err
     logs = logs_of(store)
-    assert {n for n, log in logs.items() if "/camera" in log.expired} >= {0, 2, 3}
+    assert {n for n, log in logs.items() if "/camera" in log.expired} >= {3, 5, 7}
     assert not logs[1].expired
 
 
@@ -224,7 +225,8 @@ def test_a_plan_promises_what_goes(store: Path) -> None:
     done = keep(*words, store=store).json
     # What is left of a message takes some room.
     assert 0.85 < done["freed_bytes"] / step["bytes"] <= 1
-    assert step["segments"] == sorted(logs_of(store))
+    logs = logs_of(store)
+    assert step["segments"] == [number for number in sorted(logs) if number != logs[number].group]
     gone = sum(raw is None for raw in payloads(store).values())
     assert f"{gone} payloads deleted" in answer("ls", store=store).out
     assert answer("ls", "--json", store=store).json[0]["expired"] == gone

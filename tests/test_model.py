@@ -710,10 +710,12 @@ class Machine(RuleBasedStateMachine):
             kept = whole[: sum(is_in for _, is_in in zip(whole, cycle(indexed), strict=False))]
             half = [n for n in whole if n not in kept][:1]
             index.fall_back_to(kept, half if has_half else [])
-        for chunk in chunk_entries(self.store.catalog, entry):
-            if chunk.segment < number or (chunk.segment == number and chunk.number in kept):
-                through = Through(chunk.segment, chunk.number, chunk.offset, 0)
-                IndexState(self.store.database).put_through(entry.key, through)
+        through = {
+            chunk.segment: (chunk.number, chunk.trailer_crc)
+            for chunk in chunk_entries(self.store.catalog, entry)
+            if chunk.segment != number or chunk.number in kept
+        }
+        IndexState(self.store.database).put_through(entry.key, Through(0, through, 0))
         # The manifest lists the segment, or nothing from there on.
         change_manifest(path.parent, None if part == "sealed" else number, status="open")
         path.with_name(path.name + ".open").write_bytes(content[:cut])

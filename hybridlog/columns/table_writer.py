@@ -328,7 +328,7 @@ class TableWriter:
             else:
                 self._add_expired(chunk)
             self._seen[chunk.segment] += len(chunk.batch)
-            self._spill()
+            self._spill(chunk.segment)
             self._cut_sealed()
 
     def cut(self, segment: int, digest: str) -> None:
@@ -508,8 +508,12 @@ class TableWriter:
     def _pending(self) -> int:
         return sum(topic.size for topic in self._topics.values())
 
-    def _spill(self) -> None:
-        """Write rows of the largest topics if too many are waiting in memory."""
+    def _spill(self, current: int) -> None:
+        """Write rows of the largest topics if too many are waiting in memory.
+
+        Args:
+            current: A segment that is not closed.
+        """
         if not self._has_grown or self._pending < _PENDING:
             return
         self._has_grown = False
@@ -526,7 +530,7 @@ class TableWriter:
             for segment in sorted({piece.segment for piece in topic.pieces}):
                 with self._only(topic):
                     # Waiting rows of closed segments have no file to go to.
-                    place = segment if segment not in self._cut else max(self._seen)
+                    place = segment if segment not in self._cut else current
                     opened += self._write(topic, place, topic.take({segment}))
 
     def _write(self, topic: _Topic, segment: int, pieces: list[Piece]) -> int:

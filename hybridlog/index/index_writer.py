@@ -1,14 +1,15 @@
 """Makes tables, statistics and index documents of a recording, behind its recorder.
 
 `IndexWriter` reads the chunks that were flushed back from their segments, so memory does not
-grow with what waits. `DocumentSender` sends documents in the order of the file, so that one
-position says what the index has.
+grow with what waits. `DocumentSender` sends documents in the order of each file, so that one
+position a file says what the index has.
 """
 
 from __future__ import annotations
 
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
@@ -73,7 +74,7 @@ class IndexTarget:
 
 
 class DocumentSender:
-    """Sends the documents of a recording's chunks to the index, in the order of the file.
+    """Sends the documents of a recording's chunks to the index, in the order of each file.
 
     Attributes:
         through: What the index has.
@@ -100,7 +101,7 @@ class DocumentSender:
             self._collections.add(name)
 
     def add(self, documents: Sequence[Documents], entries: Sequence[ChunkEntry]) -> None:
-        """Add the documents of chunks that follow those added before.
+        """Add the documents of chunks of one segment that follow those added before.
 
         Raises:
             DatabaseError: An earlier sending has failed.
@@ -109,10 +110,16 @@ class DocumentSender:
             self._documents.setdefault(part.topic, []).extend(part.tables)
             self._size += part.size
         last, messages = entries[-1], sum(entry.messages for entry in entries)
-        messages += self.added.messages
-        self.added = Through(last.segment, last.number, last.offset, messages)
+        chunks = {**self.added.chunks, last.segment: (last.number, last.trailer_crc)}
+        self.added = Through(self.added.segment, chunks, self.added.messages + messages)
         if self._size >= _SEND_BYTES:
             self.send()
+
+    def end_segments(self, following: int) -> None:
+        """Note that all chunks of the segments before a number were added."""
+        if following > self.added.segment:
+            chunks = {n: last for n, last in self.added.chunks.items() if n >= following}
+            self.added = Through(following, chunks, self.added.messages)
 
     def send(self, *, wait: bool = False) -> None:
         """Send what was added, while more is made.
@@ -212,9 +219,11 @@ class IndexWriter:
         self._sealed: dict[int, str] = {}  # their digests
         self._flushed = 0  # messages
         self._unread = 0  # bytes since the last pass
-        self._next = 0, 0  # segment and number of the first chunk that is not decoded
-        self._stats: dict[int, Mapping[int, ChannelStats]] = {}  # of this segment, by chunk
-        self._reader: SegmentReader | None = None
+        self._decoded: Counter[int] = Counter()  # chunks of segments that are not read yet
+        self._counts: dict[int, int] = {}  # chunks of those that are read
+        self._next = 0  # the first one that is not
+        self._stats: dict[int, dict[int, Mapping[int, ChannelStats]]] = {}  # by segment and chunk
+        self._readers: dict[int, SegmentReader] = {}
         self._sender: DocumentSender | None = None
         if target.database is not None:
             self._sender = DocumentSender(entry, target.database, NOTHING)
@@ -241,8 +250,8 @@ class IndexWriter:
     @property
     def first_unread(self) -> int:
         """Number of the first segment that it may still read."""
-        sender, segment = self._sender, self._next[0]
-        return segment if sender is None else min(segment, sender.through.segment)
+        sender = self._sender
+        return self._next if sender is None else min(self._next, sender.through.segment)
 
     def submit(self, chunk: StoredChunk, channels: Mapping[int, Channel]) -> None:
         """Note a chunk that is in its segment."""
@@ -317,7 +326,8 @@ class IndexWriter:
             self._crash = error
         finally:
             self._stop_sending()
-            self._close_reader()
+            for segment in [*self._readers]:
+                self._close_reader(segment)
 
     def _prepare(self, topic: str) -> None:
         if self._sender is not None:
@@ -328,56 +338,57 @@ class IndexWriter:
         """Read what was flushed since the last pass."""
         if self.failure is not None and (has_ended or time.monotonic() >= self._retry_at):
             self._reconnect()
-        segment, first = self._next
+        # The digests first: what sealed segments have is known then.
+        sealed, first = dict(self._sealed), self._next
         if self._sender is not None:
-            added = self._sender.added
-            segment, first = min(self._next, (added.segment, added.chunk + 1))
-        while segment in self._places or segment < self._next[0]:
-            digest = self._sealed.get(segment)  # first: what it has is known then
-            reader = self._open(segment)
-            known = self._places.get(segment)
-            places = None if known is None else [*known]  # before the size of the file is read
-            reader.grow()
-            if places is None:
-                places = reader.summary().chunks
+            first = min(first, self._sender.added.segment)
+        for segment in sorted({*self._places, *(n for n in self._counts if n >= first)}):
             with self._noting_failure():
-                for group in self._read(reader, places[first:]):
+                for group in self._read(segment):
                     self._take(group)
                     if self._is_abandoned:
                         return
-            if self._sender is None and segment < self._next[0]:
-                segment, first = self._next
-                continue
-            if digest is None:
-                break
-            if segment == self._next[0]:
-                self._end_segment(segment, digest)
-            segment, first = segment + 1, 0
+            if segment in sealed:
+                self._end_segment(segment, sealed[segment])
+            if segment in self._counts:
+                self._close_reader(segment)
+                if self._sender is not None and self._sender.added.segment == segment:
+                    self._sender.end_segments(segment + 1)
         if self._sender is not None:
             with self._noting_failure():
                 self._sender.end() if has_ended else self._sender.send()
 
-    def _read(
-        self, reader: SegmentReader, places: Sequence[ChunkPlace]
-    ) -> Iterator[list[StoredChunk]]:
-        """The chunks at some places; small ones in groups."""
+    def _read(self, segment: int) -> Iterator[list[StoredChunk]]:
+        """The chunks of a segment that are missing here or in the index; small ones in groups."""
+        known = self._places.get(segment)
+        places = None if known is None else [*known]  # before the size of the file is read
+        start = count = self._counts.get(segment, 0)
+        if places is not None:
+            start, count = self._decoded[segment], len(places)
+        if self._sender is not None:
+            start = min(start, self._sender.added.following(segment))
+        if start >= count:
+            return
+        reader = self._open(segment)
+        reader.grow()
         group: list[StoredChunk] = []
         size = 0
-        for place in places:
+        for place in (reader.summary().chunks if places is None else places)[start:]:
             while self._pause_indexing():
                 time.sleep(_PAUSE_S)
             try:
                 chunk = reader.read_chunk(place)
             except SegmentError as error:
-                if (reader.number, place.number) < self._next:
+                is_known = (segment, place.number) in self.damage
+                if not is_known and (places is None or place.number < self._decoded[segment]):
                     # It was read before, and has expired meanwhile.
                     raise DatabaseError(
                         "MongoDB has lost documents of messages that have expired since; they "
                         "are made again when the recording has ended."
                     ) from error
-                self.damage[reader.number, place.number] = str(error)
+                self.damage[segment, place.number] = str(error)
                 continue
-            self.damage.pop((reader.number, place.number), None)
+            self.damage.pop((segment, place.number), None)
             size += len(chunk.batch.buffer)
             if group and size > _GROUP_BYTES:
                 yield group
@@ -388,48 +399,53 @@ class IndexWriter:
 
     def _take(self, chunks: Sequence[StoredChunk]) -> None:
         """Make rows and documents of chunks of one segment."""
-        new = [chunk for chunk in chunks if (chunk.segment, chunk.number) >= self._next]
+        segment = chunks[0].segment
+        is_read = segment not in self._places
+        new = [] if is_read else [c for c in chunks if c.number >= self._decoded[segment]]
         for chunk in new:
             with self._cpu_slots:
                 self._tables.add(chunk, self._channels)
         with self._cpu_slots:
             documents, entries = self._indexer.documents_of(chunks, self._channels)
         for entry in entries[len(chunks) - len(new) :]:
-            self._stats[entry.number] = entry.stats
-            self._next = entry.segment, entry.number + 1
+            self._stats.setdefault(segment, {})[entry.number] = entry.stats
+            self._decoded[segment] = entry.number + 1
         if self._sender is not None:
             with self._noting_failure():
                 self._sender.add(documents, entries)
 
     def _end_segment(self, segment: int, digest: str) -> None:
         """Store the decoding results of a segment, if all of it could be read."""
-        places = self._places.pop(segment)
-        if len(self._stats) == len(places):
-            rows = decoded_rows([self._stats[number] for number in range(len(places))])
+        places, stats = self._places.pop(segment), self._stats.pop(segment, {})
+        if len(stats) == len(places):
+            rows = decoded_rows([stats[number] for number in range(len(places))])
             with suppress(HybridlogError):  # it is derived, and the disk may be full
                 self._catalog.put_stamps(self._entry.id, [(segment, digest, rows)])
-        self._stats = {}
-        self._next = segment + 1, 0
+        del self._decoded[segment], self._sealed[segment]
+        self._counts[segment] = len(places)
+        while self._next in self._counts:
+            self._next += 1
 
     def _open(self, segment: int) -> SegmentReader:
         """The reader of a segment, which may still grow."""
-        if self._reader is not None and self._reader.number == segment:
-            return self._reader
-        self._close_reader()
+        reader = self._readers.get(segment)
+        if reader is not None:
+            return reader
         path = self._recording / f"{segment:06d}{OPEN_SUFFIX}"
         try:
-            self._reader = SegmentReader(path, segment, direct=True)
+            reader = SegmentReader(path, segment, direct=True)
         except SegmentError:  # it is sealed by now, and payloads of it may have expired
             manifest = manifests_at(self._recording).read(self._recording.name)
             log = manifest.logs.get(segment)
             sealed = path.with_name(sealed_name(segment) if log is None else log.name)
-            self._reader = SegmentReader(sealed, segment, direct=True)
-        return self._reader
+            reader = SegmentReader(sealed, segment, direct=True)
+        self._readers[segment] = reader
+        return reader
 
-    def _close_reader(self) -> None:
-        if self._reader is not None:
-            self._reader.close()
-            self._reader = None
+    def _close_reader(self, segment: int) -> None:
+        reader = self._readers.pop(segment, None)
+        if reader is not None:
+            reader.close()
 
     @contextmanager
     def _noting_failure(self) -> Iterator[None]:

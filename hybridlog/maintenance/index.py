@@ -24,7 +24,7 @@ from hybridlog_storage.errors import (
     TopicError,
 )
 from hybridlog_storage.mongo.collection_names import collection_of
-from hybridlog_storage.mongo.index_state import NOTHING, Indexed, IndexState, Through
+from hybridlog_storage.mongo.index_state import Indexed, IndexState, Through
 
 if TYPE_CHECKING:
     from typing import Any
@@ -192,7 +192,7 @@ class StoreIndex:
             for number, _, _ in entry.spans
             if number not in whole
             for chunk in range(len(catalog.table(entry, number).chunks))
-            if (number, chunk) > indexed.through[:2]
+            if not indexed.through.has(number, chunk)
         }
         damage = catalog.damage(entry.id)
         self._index(entry, indexed.through, missing, damage)
@@ -231,16 +231,18 @@ class StoreIndex:
         return Indexed(entry.id, "indexing", left, turn)
 
     def _fits(self, entry: RecordingEntry, through: Through) -> bool:
-        """True if the last indexed chunk is in the segments.
+        """True if the last indexed chunks are in the segments, with their arrival numbers.
 
         A power cut may remove chunks whose index documents are on the disk already.
         """
-        if through == NOTHING:
-            return True
-        if all(number != through.segment for number, _, _ in entry.spans):
-            return False
-        offsets = self.catalog.table(entry, through.segment).chunks["offset"]
-        return through.chunk < len(offsets) and bool(offsets[through.chunk] == through.offset)
+        there = {number for number, _, _ in entry.spans}
+        for segment, (chunk, crc) in through.chunks.items():
+            if segment not in there:
+                return False
+            found = self.catalog.table(entry, segment).chunks["trailer_crc"]
+            if chunk >= len(found) or found[chunk] != crc:
+                return False
+        return True
 
     def _index(
         self,

@@ -28,6 +28,7 @@ from hybridlog.entries import (
 from hybridlog.index.index_writer import INTERVAL_S, IndexTarget, IndexWriter
 from hybridlog.maintenance.index import finish
 from hybridlog.maintenance.retention import Rules
+from hybridlog.query.latching import depth_of
 from hybridlog.wording import parse_size
 from hybridlog_storage.catalog import RecordingEntry
 from hybridlog_storage.disk.directory import LOCK_WAIT_S
@@ -114,9 +115,10 @@ class Capture:
         self.catalog = catalog
         self._directory = directory
         self._no_index = no_index or (lambda _: False)
+        rules = Rules.of(directory.settings.retention)
         largest = min(
             settings.segment_size,
-            Rules.of(directory.settings.retention).segment_size,
+            rules.segment_size,
             remote_segment_size(directory.settings.remote),
         )
         settings = replace(settings, segment_size=int(largest))
@@ -163,6 +165,8 @@ class Capture:
             self.index.submit,
             settings,
             no_index=self._no_index,
+            is_named=lambda topic: rules.topic_rule(topic) is not None,
+            is_latched=lambda channel: depth_of(channel) > 0,
             on_sealing=self._announce,
             skip_compression=pressure.skip_compression if pressure else None,
             next_chunk_size=pressure.next_chunk_size if pressure else None,
@@ -194,7 +198,7 @@ class Capture:
         Returns:
             Why the index is not complete, None when it is.
         """
-        # From here on only the last segment is sealed, which announces the end.
+        # From here on only the last group is sealed, which announces the end.
         self.writer.flush()
         self._end = end
         self.writer.close(json_metadata(END_METADATA, end))
@@ -222,17 +226,18 @@ class Capture:
             raise
         return self._finish()
 
-    def _announce(self, sealed: Sealed) -> None:
-        """List a segment in the manifest before it gets its final name."""
+    def _announce(self, group: Sequence[Sealed]) -> None:
+        """List the segments of a group in the manifest before they get their final names."""
         end = self._end
-        change = listed(sealed)
+        change = listed(*group)
         if end is not None:
             self._change(lambda now: ended(end)(change(now)))
         else:
             self._change(change)
-        messages = sum(channel.messages for channel in sealed.channels)
-        self._tables.seal(sealed.segment, sealed.digest, messages)
-        self.index.seal(sealed)
+        for sealed in group:
+            messages = sum(channel.messages for channel in sealed.channels)
+            self._tables.seal(sealed.segment, sealed.digest, messages)
+            self.index.seal(sealed)
 
     def _change(self, how: Callable[[Manifest], Manifest]) -> None:
         self._directory.manifests.change(self.entry.id, how)

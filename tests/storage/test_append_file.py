@@ -77,7 +77,7 @@ def without(patch: pytest.MonkeyPatch) -> None:
         st.lists(
             st.one_of(
                 st.integers(0, 3 * BLOCK),
-                st.sampled_from([BLOCK - 1, BLOCK, BLOCK + 1, (4 << 20) - 1, (4 << 20) + 5]),
+                st.sampled_from([BLOCK - 1, BLOCK, BLOCK + 1, (1 << 20) - 1, (1 << 20) + 5]),
             ),
             max_size=4,
         ),

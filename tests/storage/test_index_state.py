@@ -228,7 +228,7 @@ def test_an_index_says_through_which_chunk_it_is(state: IndexState) -> None:
     before = indexed(state)
     assert before is not None
     assert before.through == NOTHING
-    for through in (Through(0, 5, 2**40, 7), Through(300, 0, 8, 2**40)):
+    for through in (Through(0, {0: (5, 2**40)}, 7), Through(9, {300: (0, 8), 9: (1, 2)}, 2**40)):
         state.put_through(ONE[-16:], through)
         assert indexed(state) == replace(before, through=through)
     state.put(recording(), "complete", turn=1, segments=DIGESTS)

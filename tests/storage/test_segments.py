@@ -119,8 +119,9 @@ def recorder(
     setup: SegmentSettings | None = None,
     **options: Any,
 ) -> RecordingWriter:
-    """A writer that puts its chunks into a list."""
+    """A writer that puts its chunks into a list, and all of them into first segments."""
     noted = [] if chunks is None else chunks
+    options.setdefault("is_latched", lambda _: True)
     return RecordingWriter(directory, RECORDING, lambda c, _: noted.append(c), setup, **options)
 
 
@@ -728,7 +729,8 @@ def small_writer(
         RECORDING,
         lambda chunk, _: steps.log.append(("told", f"chunk {chunk.number}")),
         SegmentSettings(sync=sync),
-        on_sealing=lambda sealed: steps.log.append(("list", sealed.file)),
+        is_latched=lambda _: True,
+        on_sealing=lambda group: steps.log.append(("list", *(one.file for one in group))),
     )
 
 
@@ -1000,10 +1002,10 @@ def test_a_segment_is_told_of_as_it_is(tmp_path: Path) -> None:
     writer = recorder(
         directory,
         setup=SegmentSettings(segment_size=3000),
-        on_sealing=lambda sealed: (
-            told.append(sealed),
+        on_sealing=lambda group: (
+            told.extend(group),
             # It lies there whole, under its old name.
-            sizes.append((directory / f"{sealed.file}.open").stat().st_size),
+            sizes.extend((directory / f"{one.file}.open").stat().st_size for one in group),
         )[0],
     )
     sizes: list[int] = []
@@ -1041,7 +1043,7 @@ def test_a_complete_segment_only_gets_its_name(tmp_path: Path, zeros: int) -> No
     told: list[Sealed] = []
     directory = tmp_path / "a"
     directory.mkdir()
-    writer = recorder(directory, on_sealing=told.append)
+    writer = recorder(directory, on_sealing=told.extend)
     writer.append(batch_of(many(50)), CHANNELS)
     (path,) = writer.close()  # without an end, as of a segment in the middle
     whole = path.read_bytes()
@@ -1088,14 +1090,14 @@ def test_when_the_manifest_fails_the_segment_is_sealed_later(tmp_path: Path) -> 
     told: list[Sealed] = []
     fails = True
 
-    def listing(sealed: Sealed) -> None:
+    def listing(*group: Sealed) -> None:
         if fails:
             raise DiskFullError("no room for a line")
-        told.append(sealed)
+        told.extend(group)
 
     directory = tmp_path / "a"
     directory.mkdir()
-    writer = recorder(directory, on_sealing=listing)
+    writer = recorder(directory, on_sealing=lambda group: listing(*group))
     writer.append(batch_of(many(50)), CHANNELS)
     with pytest.raises(DiskFullError, match="line"):
         writer.close()
@@ -1249,6 +1251,7 @@ def test_a_full_disk_costs_nothing_that_was_told_of(
     directory = tmp_path_factory.mktemp("full")
     first = data.draw(st.integers(0, 40))
     gives_up, returns = data.draw(st.booleans()), data.draw(st.booleans())
+    in_one = data.draw(st.booleans())
     chunks: list[StoredChunk] = []
     told: dict[str, Sealed] = {}
     system = Steps(fail_from=first, fail_until=first + 3 if returns else None)
@@ -1256,8 +1259,15 @@ def test_a_full_disk_costs_nothing_that_was_told_of(
         writer = recorder(
             directory,
             chunks,
-            SegmentSettings(chunk_size=1024, segment_size=8000, sync="chunk"),
-            on_sealing=lambda sealed: told.update({sealed.file: sealed}),
+            SegmentSettings(
+                chunk_size=1024,
+                segment_size=8000,
+                sync="chunk",
+                large_payload=600,
+                own_payload=50,
+            ),
+            is_latched=lambda channel: in_one or channel is CHANNELS[0],
+            on_sealing=lambda group: told.update({one.file: one for one in group}),
         )
         try:
             for n in range(40):

@@ -7,6 +7,7 @@ and each is read once. So each message comes once, also one with an earlier log 
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
@@ -82,10 +83,11 @@ class Following(Planner, Iterator["Message"]):
         self._scan = self._arrived = _Arrived(session, counters)
         self._takes = later(names)
         self._bounds: dict[str, Span] = {}
-        self._read = dict.fromkeys(ids, (0, 0))  # the last segment, and how many of its chunks
+        self._read = {one: Counter[int]() for one in ids}  # chunks, by segment
+        self._sealed: dict[str, set[int]] = {one: set() for one in ids}  # segments read as such
         self._marks: set[str] = set()  # ids of those that were read
         for entry in running if question.bounds is None else ():
-            self._read[entry.id] = max([0, *_segments(entry)]), 0
+            self._sealed[entry.id] |= _sealed(entry)
             _ = [*self._arrivals(entry, None)]
         _ = self.examples, self.ranks  # of this moment
         self._messages = (
@@ -138,15 +140,17 @@ class Following(Planner, Iterator["Message"]):
     def _arrivals(self, entry: RecordingEntry, bounds: Span | None) -> Iterator[Chunk]:
         """The chunks that have come since the last call, and may have messages in bounds."""
         clock = self.question.clock
-        last, read = self._read[entry.id]
+        read, sealed = self._read[entry.id], self._sealed[entry.id]
         timed = [c.id for c in entry.channels if c.has_publish_time]
-        for segment in sorted(_segments(entry) - {*range(last)}):
+        for segment in sorted((_sealed(entry) | entry.flushed.keys()) - {*sealed, MARKS_SEGMENT}):
             flushed = entry.flushed.get(segment)
             table = flushed.table if flushed else self.session.chunk_table(entry, segment)
             columns = ChunkColumns(segment, table)
-            is_new = columns.number >= (read if segment == last else 0)
+            is_new = columns.number >= read[segment]
             yield from columns.chunks(is_new & columns.within(bounds, clock, timed=timed))
-            self._read[entry.id] = segment, len(table.chunks)
+            read[segment] = len(table.chunks)
+            if flushed is None:
+                sealed.add(segment)
         if entry.marks:
             entry = without(entry, self._marks)
             self.session.show(entry)
@@ -174,9 +178,9 @@ class _Arrived(PayloadScan):
         return RecordingScan(part.recording, indexes, part.bounds, self.chunks[part.recording.id])
 
 
-def _segments(entry: RecordingEntry) -> set[int]:
-    """Numbers of the segments of a running recording."""
-    return {*map(int, entry.digests), *entry.flushed} - {MARKS_SEGMENT}
+def _sealed(entry: RecordingEntry) -> set[int]:
+    """Numbers of the sealed segments of a running recording."""
+    return {*map(int, entry.digests)}
 
 
 def _checked(question: Question) -> Question:

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 BLOCK = 4096
 """Bytes of a block; a multiple of every device's block size."""
-_STAGE = 4 << 20
+_STAGE = 1 << 20  # a recorder has up to 32 files open
 DIRECT: int = getattr(os, "O_DIRECT", 0)
 """Flag of direct reads and writes, 0 if not supported."""
 _OWN = 1 << 18  # bytes from which content is not staged; pool buffers start at a block
@@ -183,6 +183,15 @@ class AppendFile:
             position += done
             pieces = left_over(pieces, done)
 
+    def trim(self) -> None:
+        """Set the file's exact length.
+
+        Raises:
+            OSError: when the system refuses.
+        """
+        if os.fstat(self._fd).st_size != self.position:
+            files.system.truncate(self._fd, self.position)
+
     def finish(self, *, sync: bool) -> None:
         """Set the file's exact length and close it.
 
@@ -190,8 +199,7 @@ class AppendFile:
             OSError: when the system refuses.
         """
         try:
-            if os.fstat(self._fd).st_size != self.position:
-                files.system.truncate(self._fd, self.position)
+            self.trim()
             if sync:
                 self.sync()
         finally:

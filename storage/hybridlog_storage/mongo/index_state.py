@@ -4,7 +4,7 @@
 recording whether its index is complete, and from which segments it was made. The index is
 used only if both match, and in a replica set only if a majority of its members has them:
 then the documents, written before, cannot be lost. While a recording is being indexed, its
-mirror says through which chunk. That is written after the documents, so a killed server has
+mirror says through which chunks. That is written after the documents, so a killed server has
 not lost documents up to there.
 """
 
@@ -48,22 +48,29 @@ _MAX_NAMES: Final = (
 
 
 class Through(NamedTuple):
-    """A chunk up to which, in the order of the file, an index has all documents.
+    """The chunks of which an index has all documents.
 
     Attributes:
-        segment: Number of its segment.
-        chunk: Number in the segment; -1 for none.
-        offset: Byte of the chunk record.
-        messages: Number of messages up to there.
+        segment: Number of the first segment of which it may lack some.
+        chunks: Of that one and later ones, number of the last chunk that it has and CRC-32 of
+            its trailer, by number of the segment.
+        messages: Number of messages in all of them.
     """
 
     segment: int
-    chunk: int
-    offset: int
+    chunks: Mapping[int, tuple[int, int]]
     messages: int
 
+    def following(self, segment: int) -> int:
+        """Number of the first chunk of a segment, from `segment` on, that it may lack."""
+        return self.chunks[segment][0] + 1 if segment in self.chunks else 0
 
-NOTHING: Final = Through(0, -1, 0, 0)
+    def has(self, segment: int, chunk: int) -> bool:
+        """True if it has the documents of a chunk."""
+        return segment < self.segment or chunk < self.following(segment)
+
+
+NOTHING: Final = Through(0, {}, 0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +86,7 @@ class Indexed:
         span: First and last log time of its documents, ns, as far as known; None without any.
         shown: Name, tags, notes and marks in the mirror.
         damage: Chunks that could not be read for indexing: reason by segment and number.
-        through: Of an incomplete index, the last chunk that it has.
+        through: Of an incomplete index, what it has.
     """
 
     id: str
@@ -136,7 +143,7 @@ class IndexState:
                 (min(firsts), max(lasts)) if firsts and lasts else None,
                 {name: document.get(name) for name in _MAX_NAMES},
                 {(d["seg"], d["chunk"]): d["reason"] for d in index.get("damage") or ()},
-                Through(**index["through"]) if "through" in index else NOTHING,
+                _through_of(index["through"]) if "through" in index else NOTHING,
             )
         return found
 
@@ -204,8 +211,10 @@ class IndexState:
         return document == _mirrored(entry)
 
     def put_through(self, key: str, through: Through) -> None:
-        """Store that the index of a recording has all documents up to a chunk."""
-        self._db.update(RECORDINGS, {"_id": key}, {"$set": {"index.through": through._asdict()}})
+        """Store that the index of a recording has all documents of some chunks."""
+        chunks = {str(segment): [*last] for segment, last in through.chunks.items()}
+        document = {**through._asdict(), "chunks": chunks}
+        self._db.update(RECORDINGS, {"_id": key}, {"$set": {"index.through": document}})
 
     def clear(
         self,
@@ -253,6 +262,11 @@ class IndexState:
         mark = {"_id": "store", **values, "index": secrets.token_hex(8)}
         self._db.replace(STORE, {"_id": "store"}, mark)
         return mark
+
+
+def _through_of(document: Mapping[str, Any]) -> Through:
+    chunks = {int(segment): (last[0], last[1]) for segment, last in document["chunks"].items()}
+    return Through(document["segment"], chunks, document["messages"])
 
 
 def _mirrored(entry: RecordingEntry) -> dict[str, Any]:

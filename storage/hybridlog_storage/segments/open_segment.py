@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import struct
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
@@ -55,6 +56,7 @@ from hybridlog_storage.segments.segment_format import (
 from hybridlog_storage.segments.segment_reader import (
     ChunkPlace,
     SegmentReader,
+    check_arrivals,
     open_chunk,
 )
 from hybridlog_storage.segments.statements import loss_rows
@@ -200,6 +202,18 @@ class OpenSegment:
             if self.damaged == seen:
                 break
         return is_cut or (self.end, self.stopped, len(self.damaged)) != before
+
+    def next_seq(self) -> int:
+        """One more than the greatest arrival number so far."""
+        table, found = self.flushed.table, 0
+        bounds = table.part_bounds().tolist()
+        places = table.chunks[["offset", "length", "trailer"]].tolist()
+        for number, (offset, length, size) in enumerate(places):
+            count = int(table.parts["messages"][bounds[number] : bounds[number + 1]].sum())
+            with suppress(SegmentError):
+                trailer = self.reader.read(offset + length, size)
+                found = max(found, int(check_arrivals(trailer, offset, count).max(initial=-1)) + 1)
+        return found
 
     def is_cut(self) -> bool:
         """True if the writer took chunks back that were read, on a full disk."""
@@ -464,3 +478,14 @@ def _chunk_length(head: Buffer) -> int:
         return head_length(head) + compression_of(head)[1]
     except struct.error:
         return -1
+
+
+def next_seq_in(recording: Path, numbers: Iterable[int]) -> int:
+    """One more than the greatest arrival number in some segments of a recording."""
+    found = 0
+    for number in numbers:
+        with suppress(SegmentError):
+            segment = OpenSegment(recording, number, writing_s=0)
+            segment.follow()
+            found = max(found, segment.next_seq())
+    return found

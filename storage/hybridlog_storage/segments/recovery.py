@@ -9,7 +9,7 @@ gets that name.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -56,6 +56,7 @@ from hybridlog_storage.segments.segment_format import (
     Proof,
     arrival_record,
     channel_of,
+    group_of,
     index_order,
     json_metadata,
     json_of,
@@ -284,6 +285,7 @@ class _Rebuilder:
             check_format(value, self.segment.path)
             started = value.get("next_seq")
             self._next_seq = max(self._next_seq, started if isinstance(started, int) else 0)
+            self.segment.group = group_of(value, self.segment.number)
             self.has_recording = True
         self.has_end |= item.name == END_METADATA
 
@@ -386,7 +388,7 @@ class _Rebuilder:
             return b""
         return os.pread(self._fd, size, start)
 
-    def finish(self) -> None:
+    def finish(self, other_seq: Callable[[int], int]) -> None:
         """Cut incomplete records; rebuild the last chunk's trailer if only that is incomplete."""
         chunk, self._torn = self._torn, None
         if chunk is not None:
@@ -398,7 +400,9 @@ class _Rebuilder:
             self._cover(self.good_end)
             return
         count = len(chunk.batch)
-        seq = np.arange(self._next_seq, self._next_seq + count, dtype=np.int64)
+        # Those of other segments of the group may be greater than its own.
+        start = max(self._next_seq, other_seq(self.segment.group))
+        seq = np.arange(start, start + count, dtype=np.int64)
         self.segment.cut(chunk.end)
         self._mend_head(chunk)
         arrivals = self._arrivals(chunk, pack_arrivals(seq))
@@ -436,6 +440,7 @@ def recover_segment(
     on_sealing: OnSealing | None = None,
     *,
     recording: Mapping[str, object] | None = None,
+    other_seq: Callable[[int], int] = lambda _: 0,
 ) -> Recovered:
     """Cut, complete and seal one open segment.
 
@@ -444,6 +449,8 @@ def recover_segment(
         on_sealing: Called when the segment is complete and on the disk, before it gets its
             final name. If it fails, the file stays, and this can be called again.
         recording: Catalog entry of the recording, for a segment whose own is damaged.
+        other_seq: Returns one more than the greatest arrival number in the other segments of a
+            group; called if a chunk has lost its own.
 
     Raises:
         StoreError: It cannot be written, has another format, or is sealed already under its
@@ -461,7 +468,7 @@ def recover_segment(
             )
         found = _complete(path, number)
         if found is None:
-            return _rebuild(path, number, on_sealed, recording)
+            return _rebuild(path, number, on_sealed, recording, other_seq)
         on_sealed(found)
         durability.publish(path, final)
         return Recovered(final, sum(channel.messages for channel in found.channels))
@@ -487,7 +494,8 @@ def _complete(path: Path, number: int) -> Sealed | None:
     finally:
         file.close()
     channels = sealed_channels(summary.table, summary.channels)
-    return Sealed(number, sealed_name(number), summary.size, digest, channels)
+    group = group_of(summary.recording, number)
+    return Sealed(number, sealed_name(number), summary.size, digest, channels, group)
 
 
 def _proven_summary(path: Path, number: int) -> SegmentSummary | None:
@@ -504,7 +512,11 @@ def _proven_summary(path: Path, number: int) -> SegmentSummary | None:
 
 
 def _rebuild(
-    path: Path, number: int, on_sealed: OnSealing, recording: Mapping[str, object] | None
+    path: Path,
+    number: int,
+    on_sealed: OnSealing,
+    recording: Mapping[str, object] | None,
+    other_seq: Callable[[int], int],
 ) -> Recovered:
     """Seal a segment with its readable records."""
     damage: list[str] = []
@@ -524,7 +536,7 @@ def _rebuild(
                     "Move it out of the store, and see what is left with `mcap recover`."
                 )
             cut_bytes = end - rebuilder.good_end
-            rebuilder.finish()
+            rebuilder.finish(other_seq)
         if not rebuilder.has_recording:
             segment.add_recording(recording or {})
         if damage or not rebuilder.has_end:
@@ -575,7 +587,7 @@ def _is_rebuilt(path: Path, number: int, digest: str) -> bool:
             _follow(file, segment.position, rebuilder)
             if damage or not rebuilder.has_recording:
                 return False
-            rebuilder.finish()
+            rebuilder.finish(lambda _: 0)
         if segment.complete().digest != digest:
             return False
         segment.sync()

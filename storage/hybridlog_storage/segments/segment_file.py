@@ -31,6 +31,7 @@ from hybridlog_storage.segments.attachments import Attachment
 from hybridlog_storage.segments.chunk import PackedChunk, StoredChunk
 from hybridlog_storage.segments.chunk_table import ChunkTable, TableBuilder
 from hybridlog_storage.segments.segment_format import (
+    ARRIVAL_HEAD,
     CHUNK_HEAD,
     CHUNK_TABLE_OPCODE,
     CONTENT_ELSEWHERE,
@@ -104,6 +105,7 @@ class Sealed:
         bytes: Its size.
         digest: BLAKE3 of all its bytes.
         channels: Channels with messages, by channel id.
+        group: Number of the first segment of its group.
     """
 
     segment: int
@@ -111,6 +113,7 @@ class Sealed:
     bytes: int
     digest: str
     channels: tuple[SealedChannel, ...]
+    group: int
 
 
 OnSealing = Callable[[Sealed], None]
@@ -156,11 +159,15 @@ class SegmentFile:
         path: The file; its name ends in `.mcap.open`.
         number: Number of the segment.
         file: The open file; a new one, or one whose records will be noted.
+        group: Number of the first segment of its group; its own by default.
     """
 
-    def __init__(self, path: Path, number: int, file: AppendFile) -> None:
+    def __init__(
+        self, path: Path, number: int, file: AppendFile, *, group: int | None = None
+    ) -> None:
         self.path = path
         self.number = number
+        self.group = number if group is None else group
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, tuple[int, Channel]] = {}
         self.table = TableBuilder()
@@ -184,6 +191,7 @@ class SegmentFile:
         recording: Mapping[str, object],
         next_seq: int = 0,
         *,
+        group: int | None = None,
         sync: bool = False,
     ) -> SegmentFile:
         """Start a new segment file.
@@ -193,6 +201,7 @@ class SegmentFile:
             number: Segment number, also the file's name.
             recording: Catalog entry of the recording, stored in the file.
             next_seq: One more than the greatest arrival number in the segments before.
+            group: Number of the first segment of its group; its own by default.
             sync: Return once the file's name is on the disk.
 
         Raises:
@@ -204,7 +213,7 @@ class SegmentFile:
             file = AppendFile.create(path)
         except OSError as error:
             raise durability.explain(error, path, "creating") from error
-        segment = cls(path, number, file)
+        segment = cls(path, number, file, group=group)
         head = [MAGIC, record_bytes(Header(profile=PROFILE, library=LIBRARY))]
         try:
             segment._write(head)
@@ -266,7 +275,8 @@ class SegmentFile:
 
     def add_recording(self, recording: Mapping[str, object], next_seq: int = 0) -> None:
         """Append the metadata of the recording and of the segment."""
-        about = {"segment": self.number, "format": FORMAT_VERSION, "next_seq": next_seq}
+        about = {"segment": self.number, "group": self.group, "format": FORMAT_VERSION}
+        about["next_seq"] = next_seq
         self.add_metadata(json_metadata(RECORDING_METADATA, {**recording, **about}))
 
     def add_metadata(self, record: Metadata) -> None:
@@ -312,24 +322,20 @@ class SegmentFile:
         """Note an attachment that is in the file already, by its index record."""
         self._attachment_indexes.append(index)
 
-    def append_chunks(self, chunks: Sequence[PackedChunk], end: int) -> list[StoredChunk]:
-        """Append chunks with their message indexes and arrival numbers in one write.
+    def end_behind(self, chunk: PackedChunk, at: int) -> int:
+        """Byte of the file where a chunk ends that is appended when the file has `at` bytes."""
+        trailer = sum(map(len, chunk.indexes.values())) + ARRIVAL_HEAD + len(chunk.arrivals)
+        padding = self._padding(chunk.data, at, len(chunk.head))
+        return at + len(padding) + len(chunk.head) + len(chunk.data) + trailer
 
-        Args:
-            chunks: At least one.
-            end: Byte of the file at or behind which only the first chunk may begin.
-
-        Returns:
-                The appended chunks, a prefix of `chunks`.
-        """
+    def append_chunks(self, chunks: Sequence[PackedChunk]) -> list[StoredChunk]:
+        """Append chunks with their message indexes and arrival numbers in one write."""
         parts: list[Buffer] = []
         stored: list[StoredChunk] = []
         paddings: list[bytes] = []
         at = self.position
         size, crc = self.table.unproven
         for chunk in chunks:
-            if stored and at >= end:
-                break
             padding = self._padding(chunk.data, at, len(chunk.head))
             offset = at + len(padding)
             length = len(chunk.head) + len(chunk.data)
@@ -356,7 +362,7 @@ class SegmentFile:
                 )
             )
         self._append(parts)
-        for chunk, padding, place in zip(chunks, paddings, stored, strict=False):
+        for chunk, padding, place in zip(chunks, paddings, stored, strict=True):
             self.table.other(padding)
             self.note_chunk(
                 ChunkSummary(
@@ -498,6 +504,11 @@ class SegmentFile:
             StoreError: It cannot be written, or a sealed segment of this number exists.
             DiskFullError: No room for the summary; the file is unchanged.
         """
+        on_sealing(self.prepare(sync=sync))
+        return self.publish()
+
+    def prepare(self, *, sync: bool) -> Sealed:
+        """Complete and close the file, as the first part of `seal`; may be repeated."""
         final = self.path.with_name(sealed_name(self.number))
         try:
             if self.path != final and _is_there(final):
@@ -509,11 +520,23 @@ class SegmentFile:
             if not self._finished:
                 self._file.finish(sync=sync)
                 self._finished = True
-            on_sealing(sealed)
+        except OSError as error:
+            raise durability.explain(error, final, "sealing") from error
+        return sealed
+
+    def publish(self, *, sync: bool = True) -> Path:
+        """Give the file its final name, as the last part of `seal`; may be repeated.
+
+        Args:
+            sync: Return once the name is on the disk.
+        """
+        final = self.path.with_name(sealed_name(self.number))
+        try:
             if self.path != final:
                 files.rename(self.path, final)
                 self.path = final
-            files.sync_folder(final.parent)
+            if sync:
+                files.sync_folder(final.parent)
         except OSError as error:
             raise durability.explain(error, final, "sealing") from error
         return final
@@ -536,8 +559,18 @@ class SegmentFile:
             self.position,
             self._digest(),
             sealed_channels(table, channels),
+            self.group,
         )
         return self._sealed
+
+    def trim(self) -> None:
+        """Give a complete file its length: of several, before the first is forced to the disk."""
+        if self._finished:
+            return
+        try:
+            self._file.trim()
+        except OSError as error:
+            raise durability.explain(error, self.path, "sealing") from error
 
     def finish(self) -> None:
         """Force a complete file to the disk and close it, without giving it another name.

@@ -87,6 +87,8 @@ CONTENT_ELSEWHERE: Final = {
 INDEX_HEAD: Final = struct.Struct("<BQHI")
 PROOF: Final = struct.Struct("<QQIIIII")
 """Fields of an arrival record: those of `Proof`, then a CRC-32 of the record."""
+ARRIVAL_HEAD: Final = RECORD_HEAD.size + PROOF.size
+"""Bytes of an arrival record without its numbers."""
 
 _INDEX_ENTRY = RowType(("log_time", "<u8"), ("offset", "<u8"))
 _MAX_ARRIVALS = 1 << 27
@@ -380,6 +382,12 @@ def arrival_record(proof: Proof, packed: Buffer = b"") -> bytes:
     own = crc32(packed, crc32(fields))
     head = RECORD_HEAD.pack(ARRIVAL_OPCODE, PROOF.size + len(packed))
     return b"".join((head, fields, own.to_bytes(4, "little"), packed))
+
+
+def group_of(recording: Mapping[str, object], number: int) -> int:
+    """The group of a segment by its metadata; its own number where they say none."""
+    group = recording.get("group")
+    return group if isinstance(group, int) and 0 <= group <= number else number
 
 
 def proof_of(body: Buffer) -> Proof:

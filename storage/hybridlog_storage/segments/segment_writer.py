@@ -1,10 +1,10 @@
-"""Writes a recording: groups messages into chunks, and chunks into segments.
+"""Writes a recording: messages into chunks, and chunks into groups of segments.
 
 A channel with large payloads has chunks of its own, bounded in bytes and in log time. A
 slice of a scan therefore reads little else. Channels with small payloads share chunks. Worker
-threads compress, another thread writes. Chunks reach the file in the order in which they
-were closed, each with its indexes in one write. Only then the indexer gets them: **log
-first, index second**.
+threads compress, another thread writes. Chunks reach the segments of the group in the order in
+which they were closed, each with its indexes in one write. Only then the indexer gets them:
+**log first, index second**.
 """
 
 from __future__ import annotations
@@ -29,8 +29,9 @@ from hybridlog_storage.segments.attachments import Attachment
 from hybridlog_storage.segments.chunk import PackedChunk, StoredChunk, pack
 from hybridlog_storage.segments.chunk_builder import ChunkBuilder
 from hybridlog_storage.segments.compression import Compressor
-from hybridlog_storage.segments.segment_file import OnSealing, SegmentFile
+from hybridlog_storage.segments.segment_file import Sealed, SegmentFile
 from hybridlog_storage.segments.segment_format import entries_of, last_time_of
+from hybridlog_storage.segments.segment_group import FIRST, Division, Key, SegmentGroup
 from hybridlog_storage.stopping import safe_point
 
 if TYPE_CHECKING:
@@ -39,8 +40,6 @@ if TYPE_CHECKING:
     _Count = TypeVar("_Count", int, NDArray[np.int64])
 from hybridlog_storage.threads import Threads
 
-_MAX_CHUNKS = 1 << 14  # chunks of a segment: its reader needs a kilobyte of memory for each
-_MAX_PARTS = 1 << 20  # sum over a segment's chunks of their channels, which the summary lists
 PACKERS = 2
 """Threads that pack chunks."""
 AT_WORK = 8
@@ -64,13 +63,16 @@ class SegmentSettings:
         chunk_span_ns: Log time after which a chunk of a large-payload channel closes.
         span_size: Bytes of content below which such a chunk may span 256 times as much: small
             chunks compress badly, and reading one whole costs little.
-        large_payload: Mean payload bytes from which a channel gets chunks of its own.
+        large_payload: Mean payload bytes from which a channel gets chunks of its own, outside
+            of the first segment of a group.
+        own_payload: Mean payload bytes from which a topic gets a segment of its own in the
+            first group, once it has two messages and 16 times so many bytes.
         compression: Codec of chunks that can be compressed.
         level: zstd level.
-        segment_size: Bytes of file at which the next segment starts, if it has not after
-            16,384 chunks.
-        segment_span_s: Seconds after which the next segment starts; None for no such bound.
-        sync: Forces data to the disk at every chunk, when a segment is sealed, or never
+        segment_size: Bytes of a group of segments at which the next one starts, if it has not
+            after 16,384 chunks of a segment.
+        segment_span_s: Seconds after which the next group starts; None for no such bound.
+        sync: Forces data to the disk at every chunk, when a group is sealed, or never
             (the operating system decides).
     """
 
@@ -78,6 +80,7 @@ class SegmentSettings:
     chunk_span_ns: int = 250_000_000
     span_size: int = 1 << 20
     large_payload: int = 1024
+    own_payload: int = 16 << 10
     compression: Literal["zstd", "lz4", "none"] = "zstd"
     level: int = 3
     segment_size: int = 4 << 30
@@ -132,10 +135,13 @@ class RecordingWriter:
             waits for a slow disk.
         no_index: Returns whether the messages of a topic get no documents in MongoDB; None
             for no topic. The segments keep that.
-        on_sealing: Called when a segment is complete and, unless `sync` is never, on the
-            disk, before it gets its final name. Called on a writer thread or by `give_up`.
-            An exception stops the writer like a failed write.
-        on_sealed: The same, once it has its final name.
+        is_named: Returns whether a rule names a topic, which then has segments of its own; None
+            for no topic.
+        is_latched: Returns whether the messages of a channel stay in the first segments; None
+            for no channel.
+        on_sealing: Called when a group is complete and, unless `sync` is never, on the disk,
+            before its segments get their final names. Called on a writer thread or by
+            `close_truncated`. An exception stops the writer like a failed write.
     """
 
     def __init__(
@@ -150,8 +156,9 @@ class RecordingWriter:
         cpu_slots: BoundedSemaphore | None = None,
         on_written: Callable[[], None] | None = None,
         no_index: Callable[[str], bool] | None = None,
-        on_sealing: OnSealing | None = None,
-        on_sealed: OnSealing | None = None,
+        is_named: Callable[[str], bool] | None = None,
+        is_latched: Callable[[Channel], bool] | None = None,
+        on_sealing: Callable[[Sequence[Sealed]], None] | None = None,
     ) -> None:
         self.settings = settings or SegmentSettings()
         self.totals = RecordingTotals()
@@ -165,6 +172,7 @@ class RecordingWriter:
         self._known: dict[Channel, _Known] = {}
         self._schema_ids: dict[Schema, int] = {}
         self._clusters: dict[int, ChunkBuilder] = {}
+        self._movable: set[int] = set()  # ids of channels that need not be in the first segment
         self._compressor = Compressor(self.settings.compression, self.settings.level)
         self._pool = Threads(PACKERS, "hybridlog-pack")
         self._disk = Threads(1, "hybridlog-disk")
@@ -174,8 +182,10 @@ class RecordingWriter:
         self._next_chunk_size = next_chunk_size or (lambda: chunk_size)
         self._on_written = on_written
         self._no_index = no_index or (lambda _: False)
-        self._on_sealing: OnSealing = on_sealing or (lambda _: None)
-        self._on_sealed: OnSealing = on_sealed or (lambda _: None)
+        self._is_latched = is_latched or (lambda _: False)
+        self._on_sealing: Callable[[Sequence[Sealed]], None] = on_sealing or (lambda _: None)
+        large, own = self.settings.large_payload, self.settings.own_payload
+        self._division = Division(own, large, is_named or (lambda _: False))
         self._closed_bytes = 0
         self._stored_bytes = 0
         self._packed: deque[Future[PackedChunk]] = deque()  # in file order
@@ -183,9 +193,8 @@ class RecordingWriter:
         self._broken: BaseException | None = None
         self._next_seq = 0
         self._stored_seq = 0
-        self._segment: SegmentFile | None = None
+        self._group: SegmentGroup | None = None
         self._number = 0
-        self._opened = 0.0
         self._closed: list[Path] = []
         self._synced = 0
         self._syncing: Future[None] | None = None
@@ -300,7 +309,7 @@ class RecordingWriter:
         self._limit_queue(limit=4)
 
     def close(self, end: Metadata | None = None) -> list[Path]:
-        """Flush and seal the last segment; return the paths of all segments.
+        """Flush and seal the last group; return the paths of all segments.
 
         Args:
             end: The last metadata record, with the end of the recording.
@@ -327,11 +336,11 @@ class RecordingWriter:
         self._shut_down()
         if not self.written.total():
             raise DiskFullError("No space left for any message. Free some, and record again.")
-        if self._segment is not None and self._segment.is_complete:
+        if self._group is not None and self._group.first.is_complete:
             self._seal()
-        segment = self._open_segment()
+        first = self._open_group().first
         for extra in extras:
-            segment.add_metadata(extra)
+            first.add_metadata(extra)
         self._seal()
 
     def written_of(self, channel: Channel) -> int:
@@ -348,9 +357,9 @@ class RecordingWriter:
         """Stop at once; sealed segments and flushed chunks stay."""
         self._broken = self._broken or StoreError("The recording was stopped.")
         self._shut_down()
-        if self._segment is not None:
-            self._segment.abandon()
-            self._segment = None
+        if self._group is not None:
+            self._group.abandon()
+            self._group = None
 
     def _shut_down(self) -> None:
         self._pool.shutdown(wait=True, cancel_futures=True)
@@ -364,7 +373,10 @@ class RecordingWriter:
         if channel.schema is not None:
             schema_id = self._schema_ids.setdefault(channel.schema, len(self._schema_ids) + 1)
         channel_id = len(self._known) + 1
-        cluster = channel_id if mean >= self.settings.large_payload else _SHARED
+        is_alone = mean >= self.settings.large_payload or self._division.is_named(channel.topic)
+        cluster = channel_id if is_alone else _SHARED
+        if is_alone and not self._is_latched(channel):
+            self._movable.add(channel_id)
         known = self._known[channel] = _Known(channel_id, schema_id, cluster)
         if channel.is_indexed and self._no_index(channel.topic):
             channel = replace(channel, is_indexed=False)
@@ -486,38 +498,60 @@ class RecordingWriter:
             self._broken = error
             raise
 
-    def _next_chunks(self, segment: SegmentFile) -> list[PackedChunk]:
+    def _next_chunks(self) -> list[tuple[SegmentFile, PackedChunk]]:
         """The first chunk, once it is packed, and the packed chunks behind it.
 
         After each blocking call this thread waits for the interpreter lock. So many waiting
-        chunks are written at once; the file is the same either way.
+        chunks are written at once; the files are the same either way.
         """
-        first = self._packed[0].result()
-        self._define(segment, [c for c in first.indexes if c not in segment.channels])
-        chunks, size = [first], len(first.data)
-        while size < _WRITTEN_AT_ONCE and len(chunks) < len(self._packed):
+        group = self._open_group()
+        chunk = self._packed[0].result()
+        topic, key = self._place_of(chunk)
+        segment = group.segment(key)
+        self._define(segment, [c for c in chunk.indexes if c not in segment.channels])
+        chunks: list[tuple[SegmentFile, PackedChunk]] = []
+        ends: dict[SegmentFile, int] = {}
+        size, left = 0, self.settings.segment_size - group.position
+        while True:
+            if topic is not None:
+                self._division.note(topic, chunk, key)
+            chunks.append((segment, chunk))
+            size += len(chunk.data)
+            before = ends.get(segment, segment.position)
+            ends[segment] = segment.end_behind(chunk, before)
+            left -= ends[segment] - before
+            if size >= _WRITTEN_AT_ONCE or left <= 0 or len(chunks) == len(self._packed):
+                return chunks
             following = self._packed[len(chunks)]
             if not following.done() or following.exception() is not None:
-                break
+                return chunks
             chunk = following.result()
-            if not chunk.indexes.keys() <= segment.channels.keys():
-                break
-            chunks.append(chunk)
-            size += len(chunk.data)
-        return chunks
+            topic, key = self._place_of(chunk)
+            found = group.segments.get(key)
+            if found is None or not chunk.indexes.keys() <= found.channels.keys():
+                return chunks
+            segment = found
+
+    def _place_of(self, chunk: PackedChunk) -> tuple[str | None, Key]:
+        """The topic of a chunk of one channel, and its segment; no topic in the first one."""
+        number = next(iter(chunk.indexes))
+        if number not in self._movable:
+            return None, FIRST
+        topic = self.channels[number].topic
+        return topic, self._division.key(topic, chunk)
 
     def _add(self, record: Metadata | Attachment) -> None:
-        segment = self._open_segment()
+        group = self._open_group()
         if isinstance(record, Metadata):
-            segment.add_metadata(record)
+            group.first.add_metadata(record)
             return
-        segment.add_attachment(record)
-        if segment.position >= self.settings.segment_size:
+        group.first.add_attachment(record)
+        if group.position >= self.settings.segment_size:
             self._seal()
 
     def _define_rest(self) -> None:
-        """Define the channels without messages in the last segment."""
-        self._define(self._open_segment(), [c for c in self.channels if not self.written[c]])
+        """Define the channels without messages in the last group."""
+        self._define(self._open_group().first, [c for c in self.channels if not self.written[c]])
 
     def _define(self, segment: SegmentFile, channel_ids: Sequence[int]) -> None:
         channels = [(number, self.channels[number]) for number in channel_ids]
@@ -527,26 +561,31 @@ class RecordingWriter:
         )
 
     def _write(self) -> None:
-        segment = self._open_segment()
-        chunks = self._next_chunks(segment)
-        stored = segment.append_chunks(chunks, self.settings.segment_size)
-        for _ in stored:
+        chunks = self._next_chunks()
+        by_segment: dict[SegmentFile, list[PackedChunk]] = {}
+        for segment, chunk in chunks:
+            by_segment.setdefault(segment, []).append(chunk)
+        stored: dict[int, StoredChunk] = {}  # by the identity of the chunk
+        try:
+            for segment, own in by_segment.items():
+                places = segment.append_chunks(own)
+                stored.update(zip(map(id, own), places, strict=True))
+                if self.settings.sync == "chunk":
+                    segment.sync()
+        finally:  # on a full disk, what is in the other segments counts
+            for _, chunk in chunks:
+                if id(chunk) in stored:
+                    self._publish(chunk, stored[id(chunk)])
+        for _ in chunks:
             self._packed.popleft()
-        if self.settings.sync == "chunk":
-            segment.sync()
-        elif self.settings.sync == "seal" and not segment.direct:
-            self._sync_behind(segment)
-        for chunk, place in zip(chunks, stored, strict=False):
-            self._publish(chunk, place)
-        span = self.settings.segment_span_s
-        is_old = span is not None and time.monotonic() - self._opened >= span
-        is_full = segment.position >= self.settings.segment_size
-        has_many = segment.chunks >= _MAX_CHUNKS or segment.table.parts >= _MAX_PARTS
-        if is_old or is_full or has_many:
+        group = self._open_group()
+        if self.settings.sync == "seal" and not group.first.direct:
+            self._sync_behind(group)
+        if group.is_full(self.settings.segment_size, self.settings.segment_span_s):
             self._seal()
 
     def _publish(self, chunk: PackedChunk, stored: StoredChunk) -> None:
-        """Report that a chunk is in the file."""
+        """Report that a chunk is in its segment."""
         self.totals.chunks += 1
         for channel_id, data in chunk.indexes.items():
             self.written[channel_id] += entries_of(data)
@@ -557,11 +596,12 @@ class RecordingWriter:
         if self._on_written is not None:
             self._on_written()
 
-    def _sync_behind(self, segment: SegmentFile) -> None:
-        """Force long segments to the disk as they grow, so that sealing them is fast."""
-        if segment.position - self._synced >= _SYNC_STRIDE and self._syncing is None:
-            self._synced = segment.position
-            self._syncing = self._pool.submit(segment.sync)
+    def _sync_behind(self, group: SegmentGroup) -> None:
+        """Force long groups to the disk as they grow, so that sealing them is fast."""
+        position = group.position
+        if position - self._synced >= _SYNC_STRIDE and self._syncing is None:
+            self._synced = position
+            self._syncing = self._pool.submit(group.sync)
         elif self._syncing is not None and self._syncing.done():
             self._finish_sync()
 
@@ -570,26 +610,31 @@ class RecordingWriter:
         if syncing is not None:
             syncing.result()
 
-    def _open_segment(self) -> SegmentFile:
-        if self._segment is None:
-            self._segment = SegmentFile.create(
-                self._directory,
-                self._number,
-                self._recording,
-                self._stored_seq,
-                sync=self.settings.sync == "chunk",
-            )
-            self._number += 1
-            self._opened = time.monotonic()
-        return self._segment
+    def _open_group(self) -> SegmentGroup:
+        if self._group is None:
+            self._group = SegmentGroup(self._create)
+        return self._group
+
+    def _create(self, group: int | None) -> SegmentFile:
+        segment = SegmentFile.create(
+            self._directory,
+            self._number,
+            self._recording,
+            self._stored_seq,
+            group=group,
+            sync=self.settings.sync == "chunk",
+        )
+        self._number += 1
+        return segment
 
     def _seal(self) -> None:
-        segment = self._open_segment()
+        group = self._open_group()
         self._finish_sync()
         self._synced = 0
-        sync = self.settings.sync != "never"
-        self._closed.append(segment.seal(sync=sync, on_sealing=self._on_sealing))
-        self._on_sealed(segment.complete())
-        self.totals.stored_bytes += segment.position
-        self.totals.segments += 1
-        self._segment = None
+        self._on_sealing(group.prepare(sync=self.settings.sync != "never"))
+        segments = [*group.segments.values()]
+        self._closed += [segment.publish(sync=segment is segments[-1]) for segment in segments]
+        self.totals.stored_bytes += group.position
+        self.totals.segments += len(segments)
+        self._division.begin()
+        self._group = None

@@ -1,0 +1,312 @@
+"""Groups: the segments of a recording that are opened and sealed together."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+
+from hybridlog_storage.errors import DiskFullError
+from hybridlog_storage.messages import Channel
+from hybridlog_storage.segments.chunk import StoredChunk
+from hybridlog_storage.segments.open_segment import next_seq_in
+from hybridlog_storage.segments.recovery import recover_segment
+from hybridlog_storage.segments.segment_file import Sealed, SegmentFile
+from hybridlog_storage.segments.segment_format import END_METADATA, group_of, json_metadata
+from hybridlog_storage.segments.segment_reader import SegmentReader
+from hybridlog_storage.segments.segment_writer import RecordingWriter, SegmentSettings
+from tests.storage.test_segments import RECORDING, Row, batch_of, problems
+
+TOPICS = [Channel(f"/{n}", "json", None) for n in range(40)]
+NAMED, LATCHED = TOPICS[38], TOPICS[39]
+SMALL = SegmentSettings(
+    chunk_size=1024, large_payload=100, own_payload=200, segment_size=20_000, sync="never"
+)
+
+
+class Recorded:
+    """What a writer has told of."""
+
+    def __init__(self, folder: Path, setup: SegmentSettings = SMALL, **options: Any) -> None:
+        folder.mkdir(exist_ok=True)
+        self.folder = folder
+        self.chunks: list[StoredChunk] = []
+        self.groups: list[list[Sealed]] = []
+        self.rows: list[Row] = []
+        options.setdefault("on_sealing", lambda group: self.groups.append([*group]))
+        self.writer = RecordingWriter(
+            folder,
+            RECORDING,
+            lambda chunk, _: self.chunks.append(chunk),
+            setup,
+            is_named=lambda topic: topic == NAMED.topic,
+            is_latched=lambda channel: channel is LATCHED,
+            **options,
+        )
+
+    def append(self, rows: Sequence[Row]) -> None:
+        self.rows += rows
+        self.writer.append(batch_of(rows), TOPICS)
+
+    def write(self, topic: int, size: int, count: int = 1) -> None:
+        for _ in range(count):
+            n = len(self.rows)
+            self.append([(topic, os.urandom(size), n, n, n)])
+        self.writer.flush()
+
+    def close(self) -> list[Path]:
+        return self.writer.close(json_metadata(END_METADATA, {"status": "complete"}))
+
+    def topics(self) -> list[dict[int, set[str]]]:
+        """The topics of each segment, by number, group by group."""
+        return [
+            {sealed.segment: {one.topic for one in sealed.channels} for sealed in group}
+            for group in self.groups
+        ]
+
+
+def read_in(folder: Path) -> list[tuple[int, tuple[str, bytes, int]]]:
+    """Messages of all sealed segments with their arrival numbers, in this order."""
+    found = []
+    for path in folder.glob("*.mcap"):
+        with SegmentReader(path, int(path.stem)) as reader:
+            summary = reader.summary()
+            for chunk in map(reader.read_chunk, summary.chunks):
+                for row, seq in enumerate(chunk.seq.tolist()):
+                    topic = summary.channels[int(chunk.batch.channel[row])].topic
+                    message = topic, bytes(chunk.batch.payload(row)), int(chunk.batch.log_time[row])
+                    found.append((seq, message))
+    return sorted(found)
+
+
+def of_rows(rows: Sequence[Row]) -> list[tuple[str, bytes, int]]:
+    return [(TOPICS[topic].topic, payload, at) for topic, payload, at, *_ in rows]
+
+
+MESSAGE = st.tuples(
+    st.one_of(st.integers(0, 6), st.integers(0, 39)),
+    st.one_of(st.integers(0, 90), st.integers(100, 900)).map(os.urandom),
+    st.integers(0, 2**40),
+    st.integers(0, 2**40),
+    st.integers(0, 2**32 - 1),
+)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    batches=st.lists(st.lists(MESSAGE, max_size=60), max_size=8),
+    flushes=st.booleans(),
+    size=st.sampled_from([1, 6000, 1 << 20]),
+)
+def test_messages_come_back_in_total_order_byte_for_byte(
+    tmp_path_factory: pytest.TempPathFactory, batches: list[list[Row]], flushes: bool, size: int
+) -> None:
+    setup = SegmentSettings(
+        chunk_size=1024, large_payload=100, own_payload=50, segment_size=size, sync="never"
+    )
+    made = Recorded(tmp_path_factory.mktemp("r") / "r", setup)
+    for rows in batches:
+        made.append(rows)
+        if flushes:
+            made.writer.flush()
+    paths = made.close()
+    found = read_in(made.folder)
+    assert [seq for seq, _ in found] == [*range(len(made.rows))]
+    assert [message for _, message in found] == of_rows(made.rows)
+    # What was told of each chunk is where it says.
+    assert sum(len(chunk.batch) for chunk in made.chunks) == len(made.rows)
+    official: Counter[tuple[str, bytes, int]] = Counter()
+    for path in paths:
+        assert problems(path) == []
+        with path.open("rb") as stream:
+            for _, channel, message in make_reader(stream, validate_crcs=True).iter_messages():
+                official[channel.topic, message.data, message.log_time] += 1
+    assert official == Counter(of_rows(made.rows))
+    # Groups follow one another, and each begins with its first segment.
+    numbers = [sealed.segment for group in made.groups for sealed in group]
+    assert numbers == [*range(len(paths))] == sorted(int(path.stem) for path in paths)
+    for group in made.groups:
+        assert {sealed.group for sealed in group} == {group[0].segment}
+        assert len(group) <= 32
+        for sealed in group:
+            with SegmentReader(made.folder / sealed.file, sealed.segment) as reader:
+                said = reader.summary().recording
+            assert group_of(said, sealed.segment) == sealed.group
+        for sealed in group[1:]:
+            assert LATCHED.topic not in {one.topic for one in sealed.channels}
+        own = [s for s in group[1:] if {one.topic for one in s.channels} == {NAMED.topic}]
+        assert len(own) <= 1
+        assert all(
+            sealed in own or NAMED.topic not in {one.topic for one in sealed.channels}
+            for sealed in group
+        )
+
+
+def test_where_topics_lie(tmp_path: Path) -> None:
+    made = Recorded(tmp_path / "r", SegmentSettings(**{**vars_of(SMALL), "segment_size": 1 << 20}))
+    made.write(0, 50, 5)  # small
+    made.write(1, 5000)  # large, and alone, as a map is
+    made.write(2, 400, 20)  # of its own size, once it has more
+    made.write(2, 400, 20)
+    made.write(3, 150, 40)  # larger than small
+    made.write(38, 10)  # named
+    made.write(39, 5000, 3)  # latched
+    made.close()
+    (found,) = made.topics()
+    assert found == {
+        0: {"/0", "/39"},
+        1: {"/1", "/2", "/3"},
+        2: {"/2"},
+        3: {"/38"},
+    }
+
+
+def vars_of(setup: SegmentSettings) -> dict[str, Any]:
+    return {name: getattr(setup, name) for name in SegmentSettings.__dataclass_fields__}
+
+
+def test_the_next_group_goes_by_the_one_before(tmp_path: Path) -> None:
+    """The topics with the most bytes have segments, among those of large messages."""
+    made = Recorded(tmp_path / "r", SegmentSettings(**{**vars_of(SMALL), "segment_size": 60_000}))
+    for topic in range(20):
+        made.write(topic, 110, 3 + topic)
+    assert made.groups == []
+    while not made.groups:  # small, and much of it
+        made.write(30, 90)
+    for topic in (*range(20), 31):
+        made.write(topic, 110)
+    made.close()
+    first, second = made.topics()
+    assert [*first.values()] == [{"/30"}, {f"/{n}" for n in range(20)}]
+    low, together, *own = second.values()
+    assert low == set()
+    assert together == {"/0", "/1", "/2", "/3", "/31"}
+    assert own == [{f"/{n}"} for n in range(4, 20)]
+
+
+def test_a_group_has_at_most_32_segments(tmp_path: Path) -> None:
+    made = Recorded(tmp_path / "r", SegmentSettings(**{**vars_of(SMALL), "segment_size": 1 << 30}))
+    for topic in range(38):
+        made.write(topic, 900, 6)
+    made.close()
+    (found,) = made.topics()
+    assert len(found) == 18
+    assert [len(topics) for topics in found.values()].count(1) == 16
+
+
+def test_killed_with_several_open_segments(tmp_path: Path) -> None:
+    """Each is recovered by itself, and a chunk that has lost its arrival numbers comes last."""
+    made = Recorded(tmp_path / "r", SegmentSettings(**{**vars_of(SMALL), "segment_size": 1 << 30}))
+    for _ in range(10):
+        made.write(0, 50)
+        made.write(1, 700, 3)
+        made.write(2, 300, 6)
+    made.writer.abort()
+    opened = sorted(made.folder.glob("*.open"))
+    assert len(opened) > 3
+    # The last chunks of two segments lose what lies behind them.
+    torn = {chunk.segment: chunk for chunk in made.chunks if chunk.segment in {0, 2}}
+    for number, chunk in torn.items():
+        os.truncate(opened[number], chunk.offset + chunk.length + 5)
+    told: list[Sealed] = []
+    numbers = {*range(len(opened))}
+    for path in opened:
+        number = int(path.name[:6])
+        recover_segment(
+            path,
+            told.append,
+            other_seq=lambda group, own=number: next_seq_in(
+                made.folder, (n for n in numbers - {own} if n >= group)
+            ),
+        )
+    assert {sealed.group for sealed in told} == {0}
+    found = read_in(made.folder)
+    assert len({seq for seq, _ in found}) == len(found) == len(made.rows)
+    assert Counter(message for _, message in found) == Counter(of_rows(made.rows))
+    moved = {seq for chunk in torn.values() for seq in chunk.seq.tolist()}
+    same = [(seq, message) for seq, message in enumerate(of_rows(made.rows)) if seq not in moved]
+    assert found[: len(same)] == same
+
+
+def test_a_group_that_cannot_be_listed_is_sealed_later(tmp_path: Path) -> None:
+    tries: list[list[str]] = []
+
+    def listing(group: Sequence[Sealed]) -> None:
+        tries.append([sealed.file for sealed in group])
+        if len(tries) == 1:
+            raise DiskFullError("no room for a line")
+
+    made = Recorded(tmp_path / "r", on_sealing=listing)
+    made.write(0, 50)
+    made.write(1, 900, 5)
+    with pytest.raises(DiskFullError, match="line"):
+        made.close()
+    assert {path.suffix for path in made.folder.iterdir()} == {".open"}
+    made.writer.close_truncated([json_metadata(END_METADATA, {"status": "damaged"})])
+    assert tries[0] == tries[1] == ["000000.mcap", "000001.mcap", "000002.mcap"]
+    assert tries[2] == ["000003.mcap"]
+    assert [message for _, message in read_in(made.folder)] == of_rows(made.rows)
+
+
+def test_the_end_lies_in_the_first_segment_after_a_full_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One that cannot be completed keeps the others open, so that the end has a place."""
+    made = Recorded(tmp_path / "r")
+    made.write(0, 50)
+    made.write(1, 900, 5)
+    real, fails = SegmentFile.complete, [True]
+
+    def complete(segment: SegmentFile) -> Sealed:
+        if segment.number == 1 and fails:
+            fails.clear()
+            raise DiskFullError("no room for a summary")
+        return real(segment)
+
+    monkeypatch.setattr(SegmentFile, "complete", complete)
+    with pytest.raises(DiskFullError, match="summary"):
+        made.close()
+    made.writer.close_truncated([json_metadata(END_METADATA, {"status": "damaged"})])
+    assert [[sealed.segment for sealed in group] for group in made.groups] == [[0, 1, 2]]
+    with SegmentReader(made.folder / "000000.mcap", 0) as reader:
+        assert reader.summary().end == {"status": "damaged"}
+
+
+def test_what_came_into_other_segments_counts_on_a_full_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = Recorded(tmp_path / "r", on_written=lambda: None)
+    made.write(0, 50)
+    made.write(1, 150)
+    real, go_on = SegmentFile.append_chunks, threading.Event()
+
+    def append(segment: SegmentFile, chunks: Any) -> Any:
+        go_on.wait(60)
+        if segment.number == 0 and segment.chunks > 1:
+            raise DiskFullError("no room")
+        return real(segment, chunks)
+
+    monkeypatch.setattr(SegmentFile, "append_chunks", append)
+    for topic, size in ((0, 1100), (1, 1100), (0, 1100), (1, 1100)):
+        made.append([(topic, os.urandom(size), 0, 0, 0)])
+    while not all(future.done() for future in made.writer._packed):
+        time.sleep(0.01)
+    go_on.set()
+    with pytest.raises(DiskFullError):
+        made.writer.flush()
+    counts = Counter(int(n) for chunk in made.chunks for n in chunk.batch.channel)
+    assert [made.writer.written_of(TOPICS[one]) for one in (0, 1)] == [counts[1], counts[2]]
+    assert counts[2] > 1
+    made.writer.abort()
+    for path in made.folder.glob("*.open"):
+        recover_segment(path)
+    assert len(read_in(made.folder)) == counts.total()
