@@ -31,7 +31,7 @@ from hybridlog_storage.catalog import CATALOG, RecordingEntry
 from hybridlog_storage.errors import DatabaseError, IndexChangedError, SegmentError, StoreError
 from hybridlog_storage.manifest import replace as changed
 from hybridlog_storage.mongo.database import Database
-from hybridlog_storage.mongo.index_state import RECORDINGS, STORE, IndexState, Through
+from hybridlog_storage.mongo.index_state import RECORDINGS, STORE, IndexState
 from hybridlog_storage.mongo.mongod import EmbeddedMongod
 from hybridlog_storage.segments.segment_reader import ChunkPlace, SegmentReader
 from hybridlog_storage.segments.segment_writer import SegmentSettings
@@ -223,7 +223,6 @@ def unsealed(store: hl.Store, number: int, size: int, *, listed: bool) -> None:
         listed: Whether the manifest had listed it already, whole.
     """
     (entry,) = store.select(["short"])
-    chunks = chunk_entries(store.catalog, entry)
     path = places.segment(store.directory.path, "short", number)
     path.with_name(path.name + ".open").write_bytes(path.read_bytes()[:size])
     path.unlink()
@@ -238,8 +237,8 @@ def unsealed(store: hl.Store, number: int, size: int, *, listed: bool) -> None:
     state = IndexState(store.database)
     # All chunks are in the index, and it is not done.
     state.put(entry, "open", turn=1)
-    ends = {chunk.segment: (chunk.number, chunk.trailer_crc) for chunk in chunks}
-    state.put_through(entry.key, Through(0, ends, entry.messages))
+    others = {n: digest for n, digest in entry.digests.items() if n != str(number)}
+    state.put_segments(entry.key, others)
 
 
 def last_with_chunks(store: hl.Store, least: int) -> tuple[int, Sequence[ChunkPlace]]:

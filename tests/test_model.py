@@ -49,11 +49,10 @@ from hybridlog_storage.errors import TimeError, TopicError
 from hybridlog_storage.manifest import Manifest
 from hybridlog_storage.manifest import replace as changed
 from hybridlog_storage.manifests import MANIFEST_OLD
-from hybridlog_storage.mongo.index_state import IndexState, Through
+from hybridlog_storage.mongo.index_state import IndexState
 from hybridlog_storage.mongo.mongod import EmbeddedMongod
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import places
-from tests.storage.chunk_entries import chunk_entries
 
 pytestmark = pytest.mark.mongo("embedded")
 
@@ -710,12 +709,9 @@ class Machine(RuleBasedStateMachine):
             kept = whole[: sum(is_in for _, is_in in zip(whole, cycle(indexed), strict=False))]
             half = [n for n in whole if n not in kept][:1]
             index.fall_back_to(kept, half if has_half else [])
-        through = {
-            chunk.segment: (chunk.number, chunk.trailer_crc)
-            for chunk in chunk_entries(self.store.catalog, entry)
-            if chunk.segment != number or chunk.number in kept
-        }
-        IndexState(self.store.database).put_through(entry.key, Through(0, through, 0))
+        others = {n: digest for n, digest in entry.digests.items() if n != str(number)}
+        if others:
+            IndexState(self.store.database).put_segments(entry.key, others)
         # The manifest lists the segment, or nothing from there on.
         change_manifest(path.parent, None if part == "sealed" else number, status="open")
         path.with_name(path.name + ".open").write_bytes(content[:cut])

@@ -23,7 +23,7 @@ from hybridlog_storage.catalog import decoded_rows
 from hybridlog_storage.errors import DatabaseError, HybridlogError, SegmentError
 from hybridlog_storage.manifests import manifests_at
 from hybridlog_storage.mongo.collection_names import collection_of
-from hybridlog_storage.mongo.index_state import NOTHING, IndexState, Through
+from hybridlog_storage.mongo.index_state import IndexState
 from hybridlog_storage.segments.segment_file import OPEN_SUFFIX, sealed_name
 from hybridlog_storage.segments.segment_reader import ChunkPlace, SegmentReader
 from hybridlog_storage.threads import Threads
@@ -74,15 +74,18 @@ class IndexTarget:
 
 
 class DocumentSender:
-    """Sends the documents of a recording's chunks to the index, in the order of each file.
+    """Sends the documents of a recording's chunks to the index.
 
     Attributes:
-        through: What the index has.
-        added: The same with what is being sent, or waits for more.
+        messages: Number of those whose documents it has sent.
+        segments: Numbers of the segments whose documents are all in the index.
     """
 
-    def __init__(self, entry: RecordingEntry, database: Database, through: Through) -> None:
-        self.through = self.added = through
+    def __init__(self, entry: RecordingEntry, database: Database) -> None:
+        self.messages = 0
+        self.segments: set[int] = set()
+        self._added = 0  # messages, and segments, since the last sending
+        self._ended: dict[str, str] = {}
         self._key = entry.key
         self._database = database
         self._collections: set[str] = set()  # that exist
@@ -101,7 +104,7 @@ class DocumentSender:
             self._collections.add(name)
 
     def add(self, documents: Sequence[Documents], entries: Sequence[ChunkEntry]) -> None:
-        """Add the documents of chunks of one segment that follow those added before.
+        """Add the documents of chunks.
 
         Raises:
             DatabaseError: An earlier sending has failed.
@@ -109,17 +112,13 @@ class DocumentSender:
         for part in documents:
             self._documents.setdefault(part.topic, []).extend(part.tables)
             self._size += part.size
-        last, messages = entries[-1], sum(entry.messages for entry in entries)
-        chunks = {**self.added.chunks, last.segment: (last.number, last.trailer_crc)}
-        self.added = Through(self.added.segment, chunks, self.added.messages + messages)
+        self._added += sum(entry.messages for entry in entries)
         if self._size >= _SEND_BYTES:
             self.send()
 
-    def end_segments(self, following: int) -> None:
-        """Note that all chunks of the segments before a number were added."""
-        if following > self.added.segment:
-            chunks = {n: last for n, last in self.added.chunks.items() if n >= following}
-            self.added = Through(following, chunks, self.added.messages)
+    def end_segment(self, number: int, digest: str) -> None:
+        """Note that all chunks of a segment were added."""
+        self._ended[str(number)] = digest
 
     def send(self, *, wait: bool = False) -> None:
         """Send what was added, while more is made.
@@ -132,9 +131,10 @@ class DocumentSender:
         """
         if self._sending is not None:
             self._sending.result()
-        if self.added != self.through:
-            documents, self._documents, self._size = self._documents, {}, 0
-            self._sending = self._thread.submit(self._send, documents, self.added)
+        if self._added or self._ended:
+            sent = self._documents, self._added, self._ended
+            self._documents, self._added, self._ended, self._size = {}, 0, {}, 0
+            self._sending = self._thread.submit(self._send, *sent)
             if wait:
                 self._sending.result()
 
@@ -152,7 +152,12 @@ class DocumentSender:
         """Stop sending."""
         self._thread.shutdown(wait=True, cancel_futures=True)
 
-    def _send(self, documents: Mapping[str, list[NDArray[np.uint8]]], through: Through) -> None:
+    def _send(
+        self,
+        documents: Mapping[str, list[NDArray[np.uint8]]],
+        messages: int,
+        segments: Mapping[str, str],
+    ) -> None:
         self.prepare(documents.keys())
         for topic, tables in documents.items():
             if not tables:
@@ -162,8 +167,10 @@ class DocumentSender:
             lengths = np.repeat(widths, counts).astype(np.int64)
             self._database.insert_raw(collection_of(topic), data, len(lengths), lengths=lengths)
             self._sent += len(data)
-        IndexState(self._database).put_through(self._key, through)
-        self.through = through
+        if segments:
+            IndexState(self._database).put_segments(self._key, segments)
+        self.messages += messages
+        self.segments.update(map(int, segments))
 
 
 class IndexWriter:
@@ -221,12 +228,17 @@ class IndexWriter:
         self._unread = 0  # bytes since the last pass
         self._decoded: Counter[int] = Counter()  # chunks of segments that are not read yet
         self._counts: dict[int, int] = {}  # chunks of those that are read
-        self._next = 0  # the first one that is not
+        self._digests: dict[int, str] = {}  # of these
+        self._messages: Counter[int] = Counter()  # of each segment
+        self._added: Counter[int] = Counter()  # chunks of each that this sender got
+        self._whole: set[int] = set()  # segments of which it got all
+        self._had: set[int] = set()  # those that the index had before it
+        self._next = 0  # the first one that is not read
         self._stats: dict[int, dict[int, Mapping[int, ChannelStats]]] = {}  # by segment and chunk
         self._readers: dict[int, SegmentReader] = {}
         self._sender: DocumentSender | None = None
         if target.database is not None:
-            self._sender = DocumentSender(entry, target.database, NOTHING)
+            self._sender = DocumentSender(entry, target.database)
         self._indexed = 0
         self._retry_at = 0.0
         self._renewed: list[Database] = []
@@ -240,7 +252,7 @@ class IndexWriter:
     @property
     def indexed(self) -> int:
         """Number of messages that the index has."""
-        return self._indexed if self._sender is None else self._sender.through.messages
+        return self._indexed + (0 if self._sender is None else self._sender.messages)
 
     @property
     def missed(self) -> int:
@@ -251,7 +263,10 @@ class IndexWriter:
     def first_unread(self) -> int:
         """Number of the first segment that it may still read."""
         sender = self._sender
-        return self._next if sender is None else min(self._next, sender.through.segment)
+        if sender is None:
+            return self._next
+        has = self._had | sender.segments
+        return next((n for n in range(self._next) if n not in has), self._next)
 
     def submit(self, chunk: StoredChunk, channels: Mapping[int, Channel]) -> None:
         """Note a chunk that is in its segment."""
@@ -260,6 +275,7 @@ class IndexWriter:
         self._channels = channels
         self._places.setdefault(chunk.segment, []).append(_place_of(chunk))
         self._flushed += len(chunk.batch)
+        self._messages[chunk.segment] += len(chunk.batch)
         self._unread += len(chunk.batch.buffer)
         if self._unread >= _INTERVAL_BYTES:
             self._unread = 0
@@ -339,10 +355,9 @@ class IndexWriter:
         if self.failure is not None and (has_ended or time.monotonic() >= self._retry_at):
             self._reconnect()
         # The digests first: what sealed segments have is known then.
-        sealed, first = dict(self._sealed), self._next
-        if self._sender is not None:
-            first = min(first, self._sender.added.segment)
-        for segment in sorted({*self._places, *(n for n in self._counts if n >= first)}):
+        sealed = dict(self._sealed)
+        behind = self._counts if self._sender is not None else ()
+        for segment in sorted({*self._places, *behind} - self._whole):
             with self._noting_failure():
                 for group in self._read(segment):
                     self._take(group)
@@ -352,8 +367,9 @@ class IndexWriter:
                 self._end_segment(segment, sealed[segment])
             if segment in self._counts:
                 self._close_reader(segment)
-                if self._sender is not None and self._sender.added.segment == segment:
-                    self._sender.end_segments(segment + 1)
+                if self._sender is not None:
+                    self._sender.end_segment(segment, self._digests[segment])
+                    self._whole.add(segment)
         if self._sender is not None:
             with self._noting_failure():
                 self._sender.end() if has_ended else self._sender.send()
@@ -366,7 +382,7 @@ class IndexWriter:
         if places is not None:
             start, count = self._decoded[segment], len(places)
         if self._sender is not None:
-            start = min(start, self._sender.added.following(segment))
+            start = min(start, self._added[segment])
         if start >= count:
             return
         reader = self._open(segment)
@@ -411,6 +427,7 @@ class IndexWriter:
             self._stats.setdefault(segment, {})[entry.number] = entry.stats
             self._decoded[segment] = entry.number + 1
         if self._sender is not None:
+            self._added[segment] = chunks[-1].number + 1
             with self._noting_failure():
                 self._sender.add(documents, entries)
 
@@ -422,7 +439,7 @@ class IndexWriter:
             with suppress(HybridlogError):  # it is derived, and the disk may be full
                 self._catalog.put_stamps(self._entry.id, [(segment, digest, rows)])
         del self._decoded[segment], self._sealed[segment]
-        self._counts[segment] = len(places)
+        self._counts[segment], self._digests[segment] = len(places), digest
         while self._next in self._counts:
             self._next += 1
 
@@ -463,7 +480,7 @@ class IndexWriter:
     def _stop_sending(self) -> None:
         if self._sender is not None:
             self._sender.close()
-            self._indexed, self._sender = self._sender.through.messages, None
+            self._indexed, self._sender = self.indexed, None
 
     def _reconnect(self) -> None:
         """Go on after a failure of the database, from what a new connection has."""
@@ -477,12 +494,14 @@ class IndexWriter:
             if indexed is None:  # it was unavailable when the recording began
                 state.put(self._entry, "open", turn=1)
             # A killed server has lost what was not in its journal yet.
-            through = NOTHING if indexed is None else indexed.through
+            has = {int(number) for number in indexed.segments} if indexed is not None else set()
         except DatabaseError as error:
             self._fail(error)
             return
         self.database, self.failure = database, None
-        self._sender = DocumentSender(self._entry, database, through)
+        self._whole, self._had, self._added = set(has), has, Counter()
+        self._indexed = sum(self._messages[number] for number in has)
+        self._sender = DocumentSender(self._entry, database)
 
 
 def _place_of(chunk: StoredChunk) -> ChunkPlace:

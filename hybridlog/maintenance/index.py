@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from hybridlog.columns.payload_files import walk
 from hybridlog.columns.table_writer import TableWriter
@@ -24,7 +24,8 @@ from hybridlog_storage.errors import (
     TopicError,
 )
 from hybridlog_storage.mongo.collection_names import collection_of
-from hybridlog_storage.mongo.index_state import Indexed, IndexState, Through
+from hybridlog_storage.mongo.index_state import Indexed, IndexState
+from hybridlog_storage.times import END
 
 if TYPE_CHECKING:
     from typing import Any
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.summary import RecordingSummary
 
 
+_DISORDER_NS: Final = 3600 * 10**9  # what a crash has cut may be so much earlier than the rest
 Place = tuple[int, int]
 """Number of a segment, and number of a chunk in it."""
 
@@ -192,10 +194,9 @@ class StoreIndex:
             for number, _, _ in entry.spans
             if number not in whole
             for chunk in range(len(catalog.table(entry, number).chunks))
-            if not indexed.through.has(number, chunk)
         }
         damage = catalog.damage(entry.id)
-        self._index(entry, indexed.through, missing, damage)
+        self._index(entry, missing, damage)
         catalog.put_damage(entry.id, damage)
         entry = finish(directory, catalog, self.database, recording, turn=indexed.turn)
         if not entry.is_decoded:  # documents indexed before
@@ -206,16 +207,9 @@ class StoreIndex:
         """Remove documents from the index that do not fit the segments; return what it has."""
         state = self._state
         indexed = state.one(entry.key)
-        if (
-            indexed is not None
-            and indexed.state in {"open", "indexing"}
-            and self._fits(entry, indexed.through)
-            and all(entry.digests.get(n) == digest for n, digest in indexed.segments.items())
-        ):
-            return indexed
         turn = 1 if indexed is None else indexed.turn + 1
         left: dict[str, str] = {}
-        if indexed is not None and indexed.state in {"complete", "clearing"}:
+        if indexed is not None:
             left = {n: d for n, d in indexed.segments.items() if entry.digests.get(n) == d}
         if indexed is not None and indexed.state == "complete" and left == dict(indexed.segments):
             state.put(entry, "indexing", turn=turn, segments=left)
@@ -230,24 +224,9 @@ class StoreIndex:
         state.put(entry, "indexing", turn=turn, segments=left)
         return Indexed(entry.id, "indexing", left, turn)
 
-    def _fits(self, entry: RecordingEntry, through: Through) -> bool:
-        """True if the last indexed chunks are in the segments, with their arrival numbers.
-
-        A power cut may remove chunks whose index documents are on the disk already.
-        """
-        there = {number for number, _, _ in entry.spans}
-        for segment, (chunk, crc) in through.chunks.items():
-            if segment not in there:
-                return False
-            found = self.catalog.table(entry, segment).chunks["trailer_crc"]
-            if chunk >= len(found) or found[chunk] != crc:
-                return False
-        return True
-
     def _index(
         self,
         entry: RecordingEntry,
-        through: Through,
         missing: Collection[Place],
         damage: dict[Place, str],
     ) -> None:
@@ -257,7 +236,7 @@ class StoreIndex:
         directory, catalog = self.directory, self.catalog
         topics = tables.missing(directory, entry)
         writer = TableWriter(directory.path, entry.id, entry.name, topics=topics, is_new=False)
-        indexer, sender = ChunkIndexer(entry.id), DocumentSender(entry, self.database, through)
+        indexer, sender = ChunkIndexer(entry.id), DocumentSender(entry, self.database)
         sent = time.monotonic()
         # A chunk that is indexed already may be missing in the tables all the same.
         in_tables = tables.channels_of(entry, topics)
@@ -286,6 +265,7 @@ class StoreIndex:
                         sender.send()
                         sent = time.monotonic()
                 writer.cut(number, entry.digests[str(number)])
+                sender.end_segment(number, entry.digests[str(number)])
                 if stats and len(stats) == len(catalog.table(entry, number).chunks):
                     rows = decoded_rows(stats.values())
                     catalog.put_stamps(entry.id, [(number, entry.digests[str(number)], rows)])
@@ -392,7 +372,8 @@ def _clear_documents(
     """Remove the documents of a recording.
 
     They are where the mirror of a complete index says, or where its entry says; at any time
-    if the mirror has none. Without a complete mirror, all documents are looked through.
+    if the mirror has none. Of an incomplete one, some may be later than the entry says, since a
+    crash has cut the recording. Without mirror or entry, all documents are looked through.
 
     Args:
         database: The index.
@@ -401,7 +382,8 @@ def _clear_documents(
         entry: Its entry; None if it has no files any more.
         but: Segments whose documents stay.
     """
-    if indexed is None or indexed.state != "complete":
+    is_complete = indexed is not None and indexed.state == "complete"
+    if indexed is None or not (is_complete or entry is not None):
         IndexState(database).clear(key, but=but)
         return
     topics, span = set(indexed.topics), indexed.span
@@ -409,6 +391,8 @@ def _clear_documents(
         topics |= {channel.topic for channel in entry.channels}
         if span is not None and entry.span is not None:
             span = min(span[0], entry.span[0]), max(span[1], entry.span[1])
+        if not is_complete:
+            span = None if entry.span is None else (entry.span[0] - _DISORDER_NS, END - 1)
     IndexState(database).clear(key, topics, span, but)
 
 

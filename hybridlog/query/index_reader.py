@@ -46,6 +46,7 @@ _TOO_LARGE: Filter = {"_meta.error": {"$regex": "take more than [0-9]+ MiB$"}}
 _T = TypeVar("_T")
 Query = tuple[str, Filter]
 """A collection and a filter."""
+_Indexed = Mapping[str, tuple[int, Mapping[str, str]]]
 
 
 class Found(NamedTuple):
@@ -143,7 +144,7 @@ class IndexReader:
             try:
                 indexed = IndexState(database).segments(keys)
                 found = ask(_Asked(database, parts, indexed))
-                if IndexState(database).segments(keys) == indexed:
+                if _turns(IndexState(database).segments(keys)) == _turns(indexed):
                     return found
             except ConnectionLostError as error:
                 failure = error
@@ -159,7 +160,7 @@ class _Asked:
         self,
         database: Database,
         parts: Sequence[Part],
-        indexed: Mapping[str, tuple[int, Mapping[str, str]]],
+        indexed: _Indexed,
     ) -> None:
         self.database = database
         self._parts = parts
@@ -230,6 +231,10 @@ class _Asked:
                     condition.update(_on_clock(clock, bounds))
                 found.append((collection_of(topic), _joined(condition, own)))
         return found
+
+
+def _turns(indexed: _Indexed) -> dict[str, int]:
+    return {key: turn for key, (turn, _) in indexed.items()}
 
 
 def _predicate(part: Part) -> Predicate:

@@ -32,7 +32,6 @@ from hybridlog_storage.errors import DatabaseError, DiskFullError, UsageError
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.mongo.collection_names import collection_of
 from hybridlog_storage.mongo.database import Database
-from hybridlog_storage.mongo.index_state import NOTHING, IndexState
 from hybridlog_storage.segments import segment_writer
 from hybridlog_storage.segments.segment_file import SegmentFile
 from hybridlog_storage.segments.segment_writer import AT_WORK, RecordingWriter, SegmentSettings
@@ -546,7 +545,6 @@ def test_what_a_mongod_had_lost_when_it_died_is_indexed_again_and_counted_once(
         recording.write(speech, text(b"lost"), log_time=1)
         wait_for(lambda: recording.lag == 0 and recording.stored[0] == 1)
         database, key = store.shared.index.database_for("This"), recording.id[-16:]
-        IndexState(database).put_through(key, NOTHING)
         assert database.delete(collection_of("/speech"), {"_meta.rec": key}) == 1
         kill_mongod(store.directory.path)
         recording.write(speech, text(b"after"), log_time=2, publish_time=3)

@@ -14,7 +14,7 @@ from msgspec import UNSET
 import hybridlog as hl
 from hybridlog.live.recorder import RecorderOptions
 from hybridlog_storage.messages import Channel, Schema
-from hybridlog_storage.mongo.index_state import NOTHING, IndexState
+from hybridlog_storage.mongo.index_state import RECORDINGS
 from hybridlog_storage.settings import write_settings
 from tests import places
 from tests.indexed import documents_of
@@ -82,7 +82,8 @@ def test_documents_that_mongodb_loses_after_their_messages_expired_are_made_agai
         database = store.connect()
         # Or what is sent now would say anew what is there.
         wait_for(lambda: not recorder.look().lag)
-        IndexState(database).put_through(folder.name[-16:], NOTHING)
+        nothing = {"$set": {"index.segments": {}}}
+        database.update(RECORDINGS, {"_id": folder.name[-16:]}, nothing)
         database.checkpoint()
         kill_mongod(path)
         wait_for(lambda: say(1) or "have expired since" in recorder.look().index_failure)

@@ -14,12 +14,10 @@ from hybridlog_storage.mongo.collection_names import CATALOG_PREFIX
 from hybridlog_storage.mongo.database import Database
 from hybridlog_storage.mongo.index_documents import key_bound
 from hybridlog_storage.mongo.index_state import (
-    NOTHING,
     RECORDINGS,
     STORE,
     Indexed,
     IndexState,
-    Through,
 )
 
 ONE, OTHER = "0123456789abcdef" * 2, "fedcba9876543210" * 2
@@ -223,18 +221,13 @@ def test_whoever_asks_sees_that_documents_were_about_to_go(state: IndexState) ->
     assert seen == [(0, {}), (0, DIGESTS), (1, {}), (1, DIGESTS)]
 
 
-def test_an_index_says_through_which_chunk_it_is(state: IndexState) -> None:
+def test_an_index_says_which_segments_it_has(state: IndexState) -> None:
     state.put(recording(), "open", turn=1)
-    before = indexed(state)
-    assert before is not None
-    assert before.through == NOTHING
-    for through in (Through(0, {0: (5, 2**40)}, 7), Through(9, {300: (0, 8), 9: (1, 2)}, 2**40)):
-        state.put_through(ONE[-16:], through)
-        assert indexed(state) == replace(before, through=through)
-    state.put(recording(), "complete", turn=1, segments=DIGESTS)
-    after = indexed(state)
-    assert after is not None
-    assert after.through == NOTHING
+    for number, digest in DIGESTS.items():
+        state.put_segments(ONE[-16:], {number: digest})
+    found = indexed(state)
+    assert found is not None
+    assert (found.state, found.segments) == ("open", DIGESTS)
 
 
 # Documents.

@@ -3,9 +3,8 @@
 `hybridlog.recordings` mirrors the catalog for other programs. It also states for each
 recording whether its index is complete, and from which segments it was made. The index is
 used only if both match, and in a replica set only if a majority of its members has them:
-then the documents, written before, cannot be lost. While a recording is being indexed, its
-mirror says through which chunks. That is written after the documents, so a killed server has
-not lost documents up to there.
+then the documents, written before, cannot be lost. A segment is noted after its documents, so
+a killed server has not lost any of them.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ import secrets
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from itertools import chain
-from typing import Any, Final, Literal, NamedTuple
+from typing import Any, Final, Literal
 
 from hybridlog_storage.catalog import RecordingEntry
 from hybridlog_storage.mongo.collection_names import CATALOG_PREFIX, collection_of
@@ -47,32 +46,6 @@ _MAX_NAMES: Final = (
 """Values of an entry that may change while its segments stay."""
 
 
-class Through(NamedTuple):
-    """The chunks of which an index has all documents.
-
-    Attributes:
-        segment: Number of the first segment of which it may lack some.
-        chunks: Of that one and later ones, number of the last chunk that it has and CRC-32 of
-            its trailer, by number of the segment.
-        messages: Number of messages in all of them.
-    """
-
-    segment: int
-    chunks: Mapping[int, tuple[int, int]]
-    messages: int
-
-    def following(self, segment: int) -> int:
-        """Number of the first chunk of a segment, from `segment` on, that it may lack."""
-        return self.chunks[segment][0] + 1 if segment in self.chunks else 0
-
-    def has(self, segment: int, chunk: int) -> bool:
-        """True if it has the documents of a chunk."""
-        return segment < self.segment or chunk < self.following(segment)
-
-
-NOTHING: Final = Through(0, {}, 0)
-
-
 @dataclass(frozen=True, slots=True)
 class Indexed:
     """The state of a recording's index.
@@ -86,7 +59,6 @@ class Indexed:
         span: First and last log time of its documents, ns, as far as known; None without any.
         shown: Name, tags, notes and marks in the mirror.
         damage: Chunks that could not be read for indexing: reason by segment and number.
-        through: Of an incomplete index, what it has.
     """
 
     id: str
@@ -97,7 +69,6 @@ class Indexed:
     span: tuple[int, int] | None = None
     shown: Mapping[str, Any] = field(default_factory=dict)
     damage: Mapping[tuple[int, int], str] = field(default_factory=dict)
-    through: Through = NOTHING
 
     def mirrors(self, entry: RecordingEntry) -> bool:
         """True if the mirror of a recording with the same segments is current."""
@@ -143,7 +114,6 @@ class IndexState:
                 (min(firsts), max(lasts)) if firsts and lasts else None,
                 {name: document.get(name) for name in _MAX_NAMES},
                 {(d["seg"], d["chunk"]): d["reason"] for d in index.get("damage") or ()},
-                _through_of(index["through"]) if "through" in index else NOTHING,
             )
         return found
 
@@ -210,11 +180,15 @@ class IndexState:
         document = {name: found[name] for name in found if name not in {"_id", "index"}}
         return document == _mirrored(entry)
 
-    def put_through(self, key: str, through: Through) -> None:
-        """Store that the index of a recording has all documents of some chunks."""
-        chunks = {str(segment): [*last] for segment, last in through.chunks.items()}
-        document = {**through._asdict(), "chunks": chunks}
-        self._db.update(RECORDINGS, {"_id": key}, {"$set": {"index.through": document}})
+    def put_segments(self, key: str, segments: Mapping[str, str]) -> None:
+        """Store that the index of a recording has all documents of some segments.
+
+        Args:
+            key: Its key.
+            segments: Their digests, by number as text.
+        """
+        digests = {f"index.segments.{number}": digest for number, digest in segments.items()}
+        self._db.update(RECORDINGS, {"_id": key}, {"$set": digests})
 
     def clear(
         self,
@@ -262,11 +236,6 @@ class IndexState:
         mark = {"_id": "store", **values, "index": secrets.token_hex(8)}
         self._db.replace(STORE, {"_id": "store"}, mark)
         return mark
-
-
-def _through_of(document: Mapping[str, Any]) -> Through:
-    chunks = {int(segment): (last[0], last[1]) for segment, last in document["chunks"].items()}
-    return Through(document["segment"], chunks, document["messages"])
 
 
 def _mirrored(entry: RecordingEntry) -> dict[str, Any]:
