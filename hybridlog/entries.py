@@ -173,7 +173,8 @@ class Inventory:
         """
         if self.manifest is not None and self.manifest.is_ended:
             return end_values(self.manifest)
-        ends = [summary.end for _, summary in sorted(self.summaries.items()) if summary.end]
+        said = (summary.end for _, summary in sorted(self.summaries.items()))
+        ends: list[Mapping[str, Any]] = [end for end in said if end]
         cut = [end for end in ends if end.get("status") == "recovered"]
         if len(ends) < 2 or not cut:
             return ends[-1] if ends else None
@@ -363,6 +364,7 @@ def describe(catalog: Catalog, inventory: Inventory, *, is_open: bool = False) -
     if lost or ours:
         entry.end["losses"] = joined([*entry.end.get("losses", ()), *lost]) + ours
     for number, summary in inventory.summaries.items():
+        entry.held[str(number)] = np.unique(summary.table.parts["channel"]).tolist()
         entry.digests[str(number)] = summary.content(inventory.digest(number))
         name = inventory.listing.sealed[number]
         if name != sealed_name(number):

@@ -539,7 +539,7 @@ class Session:
         """Chunks that may hold messages of some channels in a time range."""
         found: list[Chunk] = []
         timed = [c.id for c in recording.channels if c.has_publish_time]
-        for number, first, last in recording.spans:
+        for number, first, last in recording.spans_with(channels):
             is_beside = bounds is not None and not (
                 min(first, END - 1) < bounds[1] and last >= bounds[0]
             )
@@ -557,7 +557,7 @@ class Session:
         Yields:
             A chunk, and the greatest log time, ns, that it or any later chunk may hold.
         """
-        spans = sorted(recording.spans, key=lambda span: span[1])
+        spans = sorted(recording.spans_with(channels), key=lambda span: span[1])
         spans = [span for span in spans if span[1] <= latest]
         lasts = [BEGIN, *accumulate((last for _, _, last in spans), max)]
         for place in reversed(range(len(spans))):
@@ -622,7 +622,7 @@ class Session:
         """
         ids = np.array([*channels], np.int64)
         found = [np.empty((0, 6), np.int64)]
-        for number, first, last in recording.spans:
+        for number, first, last in recording.spans_with(channels):
             if min(first, END - 1) < span[1] and last >= span[0]:
                 rows = part_rows(number, self.chunk_table(recording, number))
                 inside = (placed(rows[:, 4]) < span[1]) & (rows[:, 5] >= span[0])

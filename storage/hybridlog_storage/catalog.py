@@ -189,6 +189,7 @@ class RecordingEntry:
             (ns).
         pins: What is never deleted to make room: `id`, `from`, `to`, `topics`, `reason`.
         spans: Number, first and last log time (ns) of each segment that has messages.
+        held: Ids of the channels with messages in each sealed segment, by its number as text.
         digests: Digest of each valid segment as it was sealed, by its number as text.
         files: Names of the files of those with expired chunks.
         is_decoded: Whether messages were decoded. Otherwise header stamps, and messages that
@@ -217,6 +218,7 @@ class RecordingEntry:
     marks: list[dict[str, Any]] = field(default_factory=list)
     pins: list[dict[str, Any]] = field(default_factory=list)
     spans: list[tuple[Int, Int, Int]] = field(default_factory=list)
+    held: dict[str, list[Int]] = field(default_factory=dict)
     digests: dict[str, str] = field(default_factory=dict)
     files: dict[str, str] = field(default_factory=dict)
     is_decoded: bool = False
@@ -255,6 +257,15 @@ class RecordingEntry:
         firsts = [c.stats.first for c in self.channels if c.stats.first is not None]
         lasts = [c.stats.last for c in self.channels if c.stats.last is not None]
         return (min(firsts), max(lasts)) if firsts else None
+
+    def spans_with(self, channels: Collection[int]) -> list[tuple[int, int, int]]:
+        """The spans of segments that may have messages of some channels."""
+        wanted = {*channels}
+        return [
+            span
+            for span in self.spans
+            if (held := self.held.get(str(span[0]))) is None or not wanted.isdisjoint(held)
+        ]
 
     def to_document(self) -> dict[str, Any]:
         """The entry as a mapping of plain values."""

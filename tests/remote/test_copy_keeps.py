@@ -32,7 +32,7 @@ def robot(tmp_path: Path) -> hl.Store:
     """A store with a recording of three segments."""
     store = hl.open(tmp_path / "robot", mongo="none", create=True)
     noise = np.random.default_rng(1)
-    settings = SegmentSettings(chunk_size=4096, segment_size=45_000)
+    settings = SegmentSettings(chunk_size=4096, segment_size=45_000, large_payload=4096)
     with store.start("run", settings=settings) as run:
         for number in range(COUNT):
             scan = struct.pack("<II", number, 500) + noise.random(500, np.float32).tobytes()

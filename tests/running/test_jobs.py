@@ -245,8 +245,8 @@ def read_only(jobs: Jobs, path: Path, patch: pytest.MonkeyPatch) -> Iterator[Non
 def damaged(jobs: Jobs, path: Path, _: pytest.MonkeyPatch) -> Iterator[None]:
     """Chunks of a topic that no job asks for are damaged, and the index of none."""
     shutil.copytree(jobs.path, path)
-    (segment,) = places.folder(path, "run").glob("*.mcap")
-    data = segment.read_bytes()
+    segments = places.folder(path, "run").glob("*.mcap")
+    (segment, data), *_ = ((one, found) for one in segments if NOISE in (found := one.read_bytes()))
     for _ in range(3):
         data = data.replace(NOISE, b"DAMAGE" * (len(NOISE) // 6) + b"D" * (len(NOISE) % 6), 1)
     segment.write_bytes(data)

@@ -122,7 +122,7 @@ class RunningTables:
         entry = part.recording
         ids = [channel.channel_id for channel in part.channels]
         stats: dict[int, dict[int, ChannelStats]] = {}
-        for number, _, _ in entry.spans:
+        for number, _, _ in entry.spans_with(ids):
             table = self._session.chunk_table(entry, number)
             rows = table.parts[np.isin(table.parts["channel"], ids)]
             stats[number] = channel_totals(replace(table, parts=rows), None)

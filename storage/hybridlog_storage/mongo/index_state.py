@@ -241,6 +241,7 @@ class IndexState:
 def _mirrored(entry: RecordingEntry) -> dict[str, Any]:
     """An entry as MongoDB accepts it."""
     document = entry.to_document()
+    del document["held"]
     text = (
         len(part)
         for channel in entry.channels
