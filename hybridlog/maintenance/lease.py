@@ -10,9 +10,10 @@ import os
 import platform
 import secrets
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from msgspec.structs import replace
 
 from hybridlog_storage.errors import StoreError, UsageError
 from hybridlog_storage.settings import EMBEDDED, is_uri, read_settings, write_settings

@@ -13,10 +13,13 @@ import re
 import stat
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, TypeGuard
+from typing import Annotated, Any, Final, TypeGuard
 from urllib.parse import quote
+
+from msgspec import Meta, Struct, ValidationError, convert
+from msgspec.structs import replace
 
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import StoreError, UsageError, unreadable
@@ -48,8 +51,7 @@ LOGIN_CURE: Final = (
 """The cure for a password that is missing or readable by others."""
 
 
-@dataclass(frozen=True, slots=True)
-class StoreSettings:
+class StoreSettings(Struct, frozen=True):
     """The content of `hybridlog.toml`.
 
     Attributes:
@@ -64,14 +66,14 @@ class StoreSettings:
         remote: The table `[remote]`, the same; None without it.
     """
 
-    store_id: str
+    store_id: Annotated[str, Meta(min_length=1)]
     mongo: str | None = None
     requires: tuple[str, ...] = ()
     optional: tuple[str, ...] = ()
     arrays: tuple[str, ...] = ()
     cache_mb: int | None = None
-    retention: Mapping[str, Any] = field(default_factory=dict)
-    remote: Mapping[str, Any] | None = None
+    retention: dict[str, Any] = {}
+    remote: dict[str, Any] | None = None
 
 
 def read_settings(path: Path) -> StoreSettings:
@@ -100,37 +102,20 @@ def _settings(path: Path | str, file: Path, values: Mapping[str, object]) -> Sto
             f"The store {path} is of format {version}, and this hybridlog knows format {FORMAT}. "
             "Use the hybridlog that wrote it."
         )
-    requires = _names(file, values, "requires")
-    unknown = [name for name in requires if name not in FEATURES]
+    try:
+        found = convert(values, StoreSettings)
+        if found.cache_mb is not None:
+            checked_cache_mb(found.cache_mb, "cache_mb")
+    except (ValidationError, UsageError) as error:
+        raise StoreError(f"{file} is malformed: {error}") from error
+    unknown = [name for name in found.requires if name not in FEATURES]
     if unknown:
         names = ", ".join(repr(name[:80]) for name in unknown[:5])
         raise StoreError(
             f"The store {path} requires {names}, which this hybridlog does not know. Install a "
             "newer hybridlog."
         )
-    store_id = values.get("store_id")
-    if not isinstance(store_id, str) or not store_id:
-        raise StoreError(f"{file} names no store_id.")
-    mongo = _stored_uri(file, values.get("mongo"))
-    cache_mb = values.get("cache_mb")
-    if cache_mb is not None:
-        try:
-            cache_mb = checked_cache_mb(cache_mb, f"{file}: cache_mb")
-        except UsageError as error:
-            raise StoreError(str(error)) from None
-    optional = _names(file, values, "optional")
-    retention, remote = _table(file, values, "retention"), _table(file, values, "remote")
-    arrays = _names(file, values, "arrays")
-    return StoreSettings(
-        store_id, mongo, requires, optional, arrays, cache_mb, retention or {}, remote
-    )
-
-
-def _table(file: Path, values: Mapping[str, Any], name: str) -> dict[str, Any] | None:
-    table = values.get(name)
-    if table is not None and not isinstance(table, dict):
-        raise StoreError(f"{file}: {name} must be a table, [{name}].")
-    return table
+    return replace(found, mongo=_stored_uri(file, found.mongo))
 
 
 def write_settings(path: Path, settings: StoreSettings) -> None:
@@ -287,13 +272,9 @@ def _is_secret(option: str) -> bool:
     return "password" in name or "passphrase" in name or "token" in value
 
 
-def _stored_uri(file: Path, mongo: object) -> str | None:
-    if mongo is None or mongo == EMBEDDED:
-        return None
-    if not isinstance(mongo, str):
-        raise StoreError(f"{file}: mongo must be a URI in quotes.")
-    if mongo == NONE:
-        return NONE
+def _stored_uri(file: Path, mongo: str | None) -> str | None:
+    if not is_uri(mongo):
+        return None if mongo == EMBEDDED else mongo
     try:
         clean = without_password(mongo)
     except UsageError as error:
@@ -381,14 +362,6 @@ def _parsed(content: bytes, file: Path) -> dict[str, object]:
         return tomllib.loads(content.decode())
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise StoreError(f"{file} is damaged: {error}. Restore it or correct it.") from error
-
-
-def _names(file: Path, values: Mapping[str, object], key: str) -> tuple[str, ...]:
-    """A list of names."""
-    found = values.get(key, [])
-    if not isinstance(found, list) or not all(isinstance(name, str) for name in found):
-        raise StoreError(f"{file}: {key} must be a list of names in quotes.")
-    return tuple(found)
 
 
 def _as_toml(value: object) -> str:

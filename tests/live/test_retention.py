@@ -5,11 +5,11 @@ from __future__ import annotations
 import random
 import struct
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from msgspec import UNSET
+from msgspec.structs import replace
 
 import hybridlog as hl
 from hybridlog.live.recorder import RecorderOptions

@@ -29,6 +29,8 @@ from itertools import takewhile
 from pathlib import Path
 from typing import Any, ClassVar, Final, NamedTuple
 
+from msgspec import structs
+
 from hybridlog_storage.cells import Cells
 from hybridlog_storage.disk import durability, files
 from hybridlog_storage.errors import HeldError, StoreError, TopicError, unreadable
@@ -225,7 +227,7 @@ class StoreDirectory:
             StoreError: They cannot be written.
         """
         with self.manifests.creating():
-            settings = replace(read_settings(self.path), **changes)
+            settings = structs.replace(read_settings(self.path), **changes)
             try:
                 write_settings(self.path, settings)
             except OSError as error:
