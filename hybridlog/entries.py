@@ -11,15 +11,14 @@ from __future__ import annotations
 import os
 import time
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Final, Literal, cast
 
 import numpy as np
-from msgspec import ValidationError, convert, to_builtins
+from msgspec import UNSET, ValidationError, convert, to_builtins
 
-from hybridlog.columns.layout import PAYLOAD_PARTS
 from hybridlog.record.losses import Cause, extent_of, joined, topics_of
 from hybridlog.schema.states import State, expired_messages
 from hybridlog_storage import manifest as truth
@@ -32,7 +31,6 @@ from hybridlog_storage.catalog import (
     content_of,
     spans_of,
 )
-from hybridlog_storage.disk.directory import PAYLOADS
 from hybridlog_storage.errors import (
     CatalogError,
     ManifestError,
@@ -40,7 +38,6 @@ from hybridlog_storage.errors import (
     StoreError,
 )
 from hybridlog_storage.manifest import (
-    Fields,
     File,
     Manifest,
     Source,
@@ -49,9 +46,10 @@ from hybridlog_storage.manifest import (
     loss_of,
 )
 from hybridlog_storage.messages import Channel
-from hybridlog_storage.segments.segment_file import Sealed, sealed_channels, sealed_name
+from hybridlog_storage.segments.gone_log import GoneLog, open_log
+from hybridlog_storage.segments.segment_file import Sealed, is_rows, sealed_channels, sealed_name
 from hybridlog_storage.segments.segment_format import group_of
-from hybridlog_storage.segments.segment_reader import SegmentReader, SegmentSummary
+from hybridlog_storage.segments.segment_reader import SegmentSummary
 from hybridlog_storage.summary import RecordingSummary, TopicType, hash_of, topics_to_json
 
 if TYPE_CHECKING:
@@ -138,16 +136,10 @@ class Inventory:
         return next(filter(None, names), self.folder)
 
     @property
-    def fields(self) -> dict[str, Fields]:
-        """Files of fields of expired messages, as manifest and segments list them."""
-        found: dict[str, Fields] = {}
-        for summary in self.summaries.values():
-            files = (summary.compacted or {}).get("files", ())
-            found.update({file["file"]: Fields(**file) for file in files})
-        if self.manifest is not None:
-            found = {path: f for path, f in found.items() if path not in self.manifest.deleted}
-            found |= {file.file: file for file in self.manifest.fields}
-        return found
+    def rows(self) -> list[File]:
+        """The files of rows that the manifest lists."""
+        files = () if self.manifest is None else self.manifest.files
+        return [file for file in files if file.kind == "rows"]
 
     @property
     def logs(self) -> Mapping[int, File]:
@@ -162,7 +154,7 @@ class Inventory:
         """
         if number in self.logs:
             return self.logs[number].digest
-        with SegmentReader(self.path / self.listing.sealed[number], number) as reader:
+        with open_log(self.path / self.listing.sealed[number], number) as reader:
             return reader.digest()
 
     @property
@@ -212,7 +204,7 @@ def inventory_of(
     """
     path = directory.recording(folder)
     listed = manifest.logs if manifest is not None else {}
-    listing = listing.choosing(file.name for file in listed.values())
+    listing = listing.choosing(manifest)
     found = Inventory(folder, path, listing, manifest)
     for number, name in listing.sealed.items():
         try:
@@ -231,11 +223,13 @@ def inventory_of(
         elif manifest is not None and number not in listed:
             reason = "the manifest does not list it"
             found.misfits.append(Misfit(number, name, reason, is_unlisted=True))
+    rows = {} if manifest is None else manifest.rows
     for number, file in listed.items():
         if number not in found.summaries and number not in listing.open:
-            found.lost.append(file)
+            found.lost += rows.get(number) or [file]
             if number not in listing.sealed:
-                found.misfits.append(Misfit(number, "", f"{file.name} is missing"))
+                what = file.name if file.is_here else f"what is left of {file.name}"
+                found.misfits.append(Misfit(number, "", f"{what} is missing"))
     found.misfits.sort(key=lambda misfit: misfit.segment)
     return found
 
@@ -251,7 +245,7 @@ def steady_inventory(directory: StoreDirectory, recording: str) -> Inventory:
     """
     for _ in range(_TRIES):
         found = take_inventory(directory, recording)
-        if not (found.misfits or found.lost or _losses_of_fields(found)):
+        if not (found.misfits or found.lost or _losses_of_rows(found)):
             return found
         if directory.listing(recording).print == found.listing.print:
             return found
@@ -282,8 +276,6 @@ def _difference(
     if its_number != number:
         return f"it is segment {its_number} of this recording"
     log = inventory.logs.get(number)
-    if log is not None and inventory.listing.sealed[number] != log.name:
-        return f"the manifest lists {log.name} in its place"
     if log is not None and (summary.size, _parts_of(summary)) != (log.bytes, log.parts):
         return "it is not the segment that the manifest lists: an older or a changed one"
     return None
@@ -314,7 +306,7 @@ def read_summary(path: Path, number: int) -> SegmentSummary:
     Raises:
         SegmentError: It has no readable summary, or cannot be opened.
     """
-    with SegmentReader(path, number) as reader:
+    with open_log(path, number) as reader:
         return reader.summary()
 
 
@@ -349,25 +341,26 @@ def describe(catalog: Catalog, inventory: Inventory, *, is_open: bool = False) -
     for summary in inventory.summaries.values():
         channels.update(summary.channels)
         lost += summary.losses
-        entry.stored_bytes += summary.size
         entry.chunks += len(summary.table.chunks)
         entry.attachments += len(summary.attachments)
         entry.metadata_records += len(summary.metadata)
     entry.segments = len(inventory.summaries)
-    entry.stored_bytes += sum(file["bytes"] for file in entry.payloads)
+    entry.stored_bytes = sum(size for _, _, size in entry.rows)
     entry.end = dict(end) if end is not None else {}
     ours = [row for sealed in inventory.lost for row in _losses_of_segment(inventory, sealed)]
-    ours += _losses_of_fields(inventory)
+    ours += _losses_of_rows(inventory)
     ours += _losses_of_chunks(inventory, catalog.damage(inventory.id))
-    has_losses = bool(ours) or any(row["cause"] == Cause.SEGMENT for row in _rows_of(end))
+    has_losses = bool(ours) or any(row["cause"] == Cause.SEGMENT for row in _ledger(end))
     entry.status = _status(inventory, end, is_open=is_open, has_losses=has_losses)
     if lost or ours:
         entry.end["losses"] = joined([*entry.end.get("losses", ()), *lost]) + ours
     for number, summary in inventory.summaries.items():
         entry.held[str(number)] = np.unique(summary.table.parts["channel"]).tolist()
-        entry.digests[str(number)] = summary.content(inventory.digest(number))
+        entry.digests[str(number)] = inventory.digest(number)
         name = inventory.listing.sealed[number]
-        if name != sealed_name(number):
+        if name == sealed_name(number):
+            entry.stored_bytes += summary.size
+        else:
             entry.files[str(number)] = name
     entry.spans = [
         span
@@ -389,7 +382,7 @@ def describe(catalog: Catalog, inventory: Inventory, *, is_open: bool = False) -
     )
 
 
-def _rows_of(end: Mapping[str, Any] | None) -> Iterable[Mapping[str, Any]]:
+def _ledger(end: Mapping[str, Any] | None) -> Iterable[Mapping[str, Any]]:
     return () if end is None else end.get("losses", ())
 
 
@@ -514,10 +507,15 @@ def _base(inventory: Inventory) -> RecordingEntry:
         source=_source_of(manifest.source),
         created=manifest.created,
         status="open",
-        payloads=[to_builtins(file) for file in inventory.fields.values()],
+        rows=[(file.name, topic_of(file, manifest), file.bytes) for file in inventory.rows],
         copies=sorted({file.copy for file in manifest.files if file.copy}),
         **_said(manifest),
     )
+
+
+def topic_of(rows: File, manifest: Manifest) -> str:
+    """The topic of a file of rows."""
+    return manifest.channels[next(iter(rows.parts))].topic
 
 
 def _said(manifest: Manifest) -> dict[str, Any]:
@@ -629,9 +627,12 @@ def _status(
 
 
 def _losses_of_segment(inventory: Inventory, file: File) -> list[dict[str, Any]]:
-    """Rows of the loss ledger for a listed segment that is not readable."""
+    """Rows of the loss ledger for a listed file that is not readable."""
     reasons = [m.reason for m in inventory.misfits if m.segment == file.number]
-    reason = "; ".join(reasons) or "it cannot be read"
+    return _losses_of_file(inventory, file, "; ".join(reasons) or "it cannot be read")
+
+
+def _losses_of_file(inventory: Inventory, file: File, reason: str) -> list[dict[str, Any]]:
     channels = inventory.manifest.channels if inventory.manifest is not None else {}
     lost: list[dict[str, Any]] = [
         {
@@ -647,34 +648,15 @@ def _losses_of_segment(inventory: Inventory, file: File) -> list[dict[str, Any]]
     return [_loss(file.name, reason, c, length=file.bytes) for c in lost or [nothing]]
 
 
-def _losses_of_fields(inventory: Inventory) -> list[dict[str, Any]]:
-    """Rows for missing or changed files of fields of expired messages."""
+def _losses_of_rows(inventory: Inventory) -> list[dict[str, Any]]:
+    """Rows of the loss ledger for missing or changed files of rows, where others are there."""
     rows = []
-    for file in inventory.fields.values():
-        size = inventory.listing.payloads.get(file.file)
-        if size == file.bytes or (size is None and PAYLOAD_PARTS in inventory.listing.others):
-            continue  # or it is about to get its name
-        spans = [span for s in inventory.summaries.values() if (span := _span_of(s, file))]
-        if spans:
+    for file in inventory.rows:
+        size = inventory.listing.rows.get(file.name)
+        if size != file.bytes and file.number in inventory.summaries:
             problem = "is missing" if size is None else "has another size"
-            lost = {
-                "topic": file.topic,
-                "messages": file.messages,
-                "first": min(first for first, _ in spans),
-                "last": max(last for _, last in spans),
-            }
-            name = f"{PAYLOADS}/{file.file}"
-            rows.append(_loss(name, f"a file of fields {problem}", lost, length=file.bytes))
+            rows += _losses_of_file(inventory, file, f"a file of rows {problem}")
     return rows
-
-
-def _span_of(summary: SegmentSummary, file: Fields) -> tuple[int, int] | None:
-    """First and last log time of messages that need a file: expired ones of its topic."""
-    table = summary.table
-    needs_file = np.repeat(table.is_expired, table.chunks["parts"])
-    channels = [n for n, channel in summary.channels.items() if channel.topic == file.topic]
-    parts = table.parts[needs_file & np.isin(table.parts["channel"], channels)]
-    return (int(parts["first"].min()), int(parts["last"].max())) if len(parts) else None
 
 
 def _losses_of_chunks(
@@ -817,9 +799,12 @@ def made_again(inventory: Inventory, old: Manifest | None) -> Manifest:
         SegmentError: Nothing says what recording it is.
     """
     made = old or described(inventory)
-    names = {number: log.name for number, log in made.logs.items()}
-    sealed = inventory.listing.sealed
-    numbers = [n for n in inventory.summaries if names.get(n) != sealed[n]]
+    numbers = [
+        number
+        for number, name in inventory.listing.sealed.items()
+        if number in inventory.summaries
+        and (number not in made.logs or made.logs[number].is_here == is_rows(name))
+    ]
     made = _listing_of(inventory, numbers)(made)
     end = inventory.end
     if end is not None and not made.is_ended:
@@ -828,33 +813,38 @@ def made_again(inventory: Inventory, old: Manifest | None) -> Manifest:
 
 
 def _listing_of(inventory: Inventory, numbers: Iterable[int]) -> Callable[[Manifest], Manifest]:
-    found = [sealed_of(inventory, number) for number in numbers]
+    found = [(sealed_of(inventory, number), *_rows_of(inventory, number)) for number in numbers]
 
     def how(now: Manifest) -> Manifest:
-        for one in found:
-            if one.segment not in now.logs:
-                now = listed(one)(now)
-            what = {"name": one.file, "bytes": one.bytes, "digest": one.digest}
-            expired = tuple(_expired_topics(inventory, one.segment))
-            now = truth.with_file(now, one.segment, expired=expired, **what)
-        fields = {**{one.file: one for one in now.fields}, **inventory.fields}
-        there = tuple(file for path, file in fields.items() if path not in now.deleted)
-        return truth.replace(now, fields=there)
+        for sealed, log, rows in found:
+            if sealed.segment not in now.logs:
+                now = listed(sealed)(now)
+            line = log or truth.replace(now.logs[sealed.segment], gone=UNSET, copy="")
+            now = truth.with_rows(now, line, rows)
+        return now
 
     return how
 
 
-def _expired_topics(inventory: Inventory, number: int) -> list[str]:
-    summary = inventory.summaries[number]
-    return summary.topics_in(one for one in summary.chunks if one.is_expired)
+def _rows_of(inventory: Inventory, number: int) -> tuple[File | None, Sequence[File]]:
+    """What the files of rows of a log say: its line of the manifest, and theirs."""
+    name = inventory.listing.sealed[number]
+    if not is_rows(name):
+        return None, ()
+    from hybridlog.columns.rows_file import lines_of
+
+    with GoneLog(inventory.path / name, number) as reader:
+        log = reader.log
+    others = sorted(n for n in inventory.listing.rows if int(n[:6]) == number and n != name)
+    return log, lines_of(inventory.path, log, [name, *others])
 
 
 def sealed_of(inventory: Inventory, number: int) -> Sealed:
     """An existing segment, as a manifest lists it."""
-    summary, name = inventory.summaries[number], inventory.listing.sealed[number]
+    summary = inventory.summaries[number]
     channels = sealed_channels(summary.table.as_stored(), summary.channels)
-    group = group_of(summary.recording, number)
-    return Sealed(number, name, summary.size, inventory.digest(number), channels, group)
+    group, digest = group_of(summary.recording, number), inventory.digest(number)
+    return Sealed(number, sealed_name(number), summary.size, digest, channels, group)
 
 
 def free_name_in(catalog: Catalog, name: str, but: str = "") -> str:

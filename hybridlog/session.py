@@ -734,9 +734,9 @@ class Session:
     def expired_fields(
         self, recording: RecordingEntry, topic: str, chunks: Collection[tuple[int, int]]
     ) -> TopicTable:
-        """The fields of a topic in expired chunks, see `RecordingPayloads.expired_fields`."""
-        contents = self.shared.contents(recording)
-        return contents.expired_fields(topic, chunks, self.tables.opened)
+        """The fields of a topic in chunks that are gone, see `RecordingRows.expired_fields`."""
+        rows = self.shared.rows(recording)
+        return rows.expired_fields(topic, chunks, self.tables.opened)
 
     def table(self, recording: RecordingEntry, topic: str) -> TopicTable | None:
         """The table of a topic; None without one. `Shared.mend` creates a missing one again."""

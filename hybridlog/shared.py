@@ -9,7 +9,7 @@ from collections.abc import Collection
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from hybridlog.columns.payload_files import RecordingPayloads, open_segment
+from hybridlog.columns.recording_logs import RecordingRows
 from hybridlog.entries import with_marks
 from hybridlog.maintenance.opening import StoreFiles, open_catalog
 from hybridlog.maintenance.report import RepairReport
@@ -20,6 +20,7 @@ from hybridlog_storage.catalog import file_of, schema_hash
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import StoreError, UsageError
 from hybridlog_storage.lazy import lazy
+from hybridlog_storage.segments.gone_log import open_log
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -70,7 +71,7 @@ class Shared(ABC):
         self.channels: dict[str, tuple[RecordingEntry, dict[str, list[RecordedChannel]]]] = {}
         self.columns: dict[tuple[str, int, frozenset[int]], tuple[ChunkTable, ChunkColumns]] = {}
         self._segments: dict[tuple[str, str], SegmentReader] = {}
-        self._contents: dict[tuple[Path, frozenset[tuple[str, str]]], RecordingPayloads] = {}
+        self._rows: dict[tuple[Path, frozenset[tuple[str, str]]], RecordingRows] = {}
         self._tables_tried: set[tuple[str, str]] = set()  # looked for, and noted if missing
         self._opening = threading.Lock()
 
@@ -137,7 +138,7 @@ class Shared(ABC):
             topics = {channel.topic for channel in entry.channels} if entry is not None else set()
             self._tables_tried -= {(recording, topic) for topic in topics}
         with self._opening:
-            self._contents.clear()
+            self._rows.clear()
             for key in [key for key in self._segments if key[0] in recordings]:
                 del self._segments[key]
         self.columns.clear()
@@ -147,7 +148,7 @@ class Shared(ABC):
 
     def _drop_files(self) -> None:
         with self._opening:
-            self._contents.clear()
+            self._rows.clear()
             self._segments.clear()  # each is closed by the last thread that reads from it
         self.cache.drop("chunk")
         self._tables_tried.clear()
@@ -218,22 +219,20 @@ class Shared(ABC):
             if reader is None:
                 _make_room(self._segments)
                 path = self.directory.recording(entry.id)
-                reader = self._segments[key] = open_segment(
-                    path / name, number, self._contents_of(entry)
-                )
+                reader = self._segments[key] = open_log(path / name, number, self._rows_of(entry))
             return reader
 
-    def contents(self, entry: RecordingEntry) -> RecordingPayloads:
-        """What is left of expired chunks, shared by the segments of a recording as it is now."""
+    def rows(self, entry: RecordingEntry) -> RecordingRows:
+        """What is left of logs that are gone, shared by all of a recording as it is now."""
         with self._opening:
-            return self._contents_of(entry)
+            return self._rows_of(entry)
 
-    def _contents_of(self, entry: RecordingEntry) -> RecordingPayloads:
+    def _rows_of(self, entry: RecordingEntry) -> RecordingRows:
         key = self.directory.recording(entry.id), frozenset(entry.files.items())
-        found = self._contents.get(key)
+        found = self._rows.get(key)
         if found is None:
-            _make_room(self._contents)
-            found = self._contents[key] = RecordingPayloads(key[0], cache=self.cache)
+            _make_room(self._rows)
+            found = self._rows[key] = RecordingRows(key[0], cache=self.cache)
         return found
 
     def note_missing_table(self, recording: RecordingEntry, topic: str) -> None:

@@ -1,4 +1,4 @@
-"""Fields of expired messages, read by the section about them in `docs/format.md` alone.
+"""Rows of messages whose log is gone, read by the section about them in `docs/format.md` alone.
 
 `pyarrow` reads Parquet; what they mean is from the page.
 """
@@ -7,9 +7,8 @@ from __future__ import annotations
 
 import json
 import re
-import struct
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,46 +27,35 @@ def demand(condition: bool, what: str) -> None:
 
 
 class Columns:
-    """The files of one recording.
+    """The files of rows of one log.
 
     Args:
-        folder: Its `payloads`.
-        listed: The files that the manifest lists, by path.
+        folder: Folder of the recording.
+        listed: The files, as the manifest lists them.
         recording: Id of the recording.
     """
 
-    def __init__(
-        self, folder: Path, listed: Mapping[str, Mapping[str, Any]], recording: str
-    ) -> None:
+    def __init__(self, folder: Path, listed: Sequence[Mapping[str, Any]], recording: str) -> None:
         self._folder = folder
         self._listed = listed
         self._recording = recording
 
-    def left(self, segment: int, chunk: int) -> list[tuple[int, int, bytes]]:
-        """What is left of the messages of an expired chunk, as records in its order.
-
-        Each has the place where its record was, and the bytes that its payload had.
-        """
-        found: dict[int, tuple[int, int, bytes]] = {}
-        for path, listed in self._listed.items():
-            file, about = self._checked(self._folder / path, listed)
-            for group, chunks in enumerate(about["payloads"]["chunks"]):
-                rows = [(s, c) for s, c, count in chunks for _ in range(count)]
-                if (segment, chunk) not in rows:
-                    continue
-                for place, row in zip(rows, file.read_row_group(group).to_pylist(), strict=True):
-                    ref = row["ref"]
-                    demand((ref["seg"], ref["chunk"]) == place, "the chunk of a row")
-                    if place == (segment, chunk):
-                        head = row["channel"], ref["sequence"], row["t"], row["pub"]
-                        size = 22 + len(ref["left"])
-                        record = struct.pack("<BQHIQQ", 5, size, *head) + ref["left"]
-                        found[ref["off"]] = ref["off"] - 31, ref["len"], record
-        return [found[at] for at in sorted(found)]
+    def left(self, chunk: int) -> list[dict[str, Any]]:
+        """The rows of a chunk, in the order of its messages."""
+        found: list[dict[str, Any]] = []
+        for listed in self._listed:
+            file, about = self._checked(self._folder / listed["name"], listed)
+            for group, chunks in enumerate(about["of_rows"]["chunks"]):
+                numbers = [number for number, count in chunks for _ in range(count)]
+                if chunk in numbers:
+                    rows = file.read_row_group(group).to_pylist()
+                    pairs = zip(numbers, rows, strict=True)
+                    found += [row for number, row in pairs if number == chunk]
+        return sorted(found, key=lambda row: row["ref"]["off"])
 
     def _checked(self, path: Path, listed: Mapping[str, Any]) -> tuple[pq.ParquetFile, Any]:
         """A file whose checksums are right, and what it says of itself."""
-        demand(path.is_file(), "a file of fields is missing")
+        demand(path.is_file(), "a file of rows is missing")
         data = path.read_bytes()
         demand(len(data) == listed["bytes"] and data[-4:] == b"PAR1", "the size of a file")
         begin = len(data) - 8 - int.from_bytes(data[-8:-4], "little")
@@ -84,6 +72,8 @@ class Columns:
         blocks = [data[at : min(at + (32 << 10), begin)] for at in range(0, begin, 32 << 10)]
         checksums = "".join(f"{zlib.crc32(block):08x}" for block in blocks)
         demand(checksums == about["checksums"], "the checksum of a block")
-        rows = {listed["topic"]: [listed["messages"], 0, 0, 0]}
-        demand(section["topics"] == rows, "the rows of a file")
+        (counts,) = section["topics"].values()
+        rows = sum(part[0] for part in listed["parts"].values())
+        demand(counts == [rows, 0, 0, 0], "the rows of a file")
+        demand(about["of_rows"]["parts"] == listed["parts"], "the parts of a file")
         return file, about

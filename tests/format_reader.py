@@ -14,6 +14,7 @@ import re
 import struct
 import tomllib
 import zlib
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
@@ -159,7 +160,7 @@ class Manifest:
         self.marks: list[dict[str, Any]] = said.get("marks", [])
         self.topics = {int(n): about["topic"] for n, about in said.get("channels", {}).items()}
         self.logs = {one["number"]: one for one in said.get("files", ()) if one["kind"] == "log"}
-        self.fields = {one["file"]: one for one in said.get("fields", ())}
+        self.rows = [one for one in said.get("files", ()) if one["kind"] == "rows"]
         empty = {
             "topic": None, "count": None, "from": None, "to": None, "reason": "", "file": "",
             "offset": None, "length": None,
@@ -192,15 +193,12 @@ class Segment:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.columns: Columns | None = None
-        self.data = path.read_bytes()
-        data = self.data
+        self.data = data = self._read(path)
         demand(len(data) > 8 + 29 + 8 and data[-8:] == MAGIC, "no magic at the end")
         opcode, length, start, offsets, crc = struct.unpack_from("<BQQQI", data, len(data) - 37)
         demand((opcode, length) == (0x02, 20), "no footer")
         demand(8 <= start <= offsets <= len(data) - 37, "a footer that leads elsewhere")
         demand(zlib.crc32(data[start : len(data) - 12]) == crc, "the checksum of the summary")
-        self.digest = blake3(data).hexdigest()
         self.schemas: dict[int, tuple[str, str, bytes]] = {}
         self.channels: dict[int, tuple[int, str, str, dict[str, str]]] = {}
         self._metadata: list[tuple[int, int, str]] = []
@@ -235,11 +233,13 @@ class Segment:
         assert table is not None
         self._table(table, start)
         self.about = self._json("hybridlog.recording")[0]
-        compacted = next(iter(self._json("hybridlog.compacted")), {})
-        self.content: str = compacted.get("digest", self.digest)
-        """Its digest before payloads expired, by which derived data know it."""
         self.end = next(iter(self._json("hybridlog.end")), None)
         self.losses = [row for said in self._json("hybridlog.losses") for row in said["rows"]]
+
+    def _read(self, path: Path) -> bytes:
+        data = path.read_bytes()
+        self.digest = blake3(data).hexdigest()
+        return data
 
     def _table(self, body: bytes, start: int) -> None:
         n, m, k = struct.unpack_from("<III", body)
@@ -268,15 +268,9 @@ class Segment:
             demand(bool(parts) and channels == sorted(set(channels)), "the parts of a chunk")
             demand(chunk.first == min(p.first for p in parts), "the first time of a chunk")
             demand(chunk.last == max(p.last for p in parts), "the last time of a chunk")
-            for part in parts if self._opcode(number) == 0x06 else ():
+            for part in parts:
                 counts[part.channel] = counts.get(part.channel, 0) + part.messages
         demand(counts == {c: n for c, n in self._counts.items() if n}, "the statistics")
-
-    def _opcode(self, number: int) -> int:
-        return self.data[self.chunks[number].offset]
-
-    def is_expired(self, number: int) -> bool:
-        return self._opcode(number) in {0x94, 0x95}
 
     def parts_of(self, number: int) -> list[Part]:
         before = sum(chunk.parts for chunk in self.chunks[:number])
@@ -337,16 +331,8 @@ class Segment:
         demand(zlib.crc32(record) == place.crc, "the checksum of a chunk")
         is_indexed = zlib.crc32(trailer) == place.trailer_crc
         ((_, opcode, body),) = records(record)
-        demand(opcode in {0x06, 0x94, 0x95}, "no chunk")
-        left: list[tuple[int, bytes]] = []
-        if opcode in {0x94, 0x95}:
-            left = self._expired(number, Content(body[: 36 if opcode == 0x94 else -1]), place)
-            content = b"".join(record for _, record in left)
-        else:
-            content = self._content(Content(body), place)
-        messages = list(records(content))
-        if left:  # at the places where they were
-            messages = [(at, *m[1:]) for (at, _), m in zip(left, messages, strict=True)]
+        demand(opcode == 0x06, "no chunk")
+        messages = list(records(self._content(Content(body), place)))
         *indexes, (_, opcode, arrivals) = records(trailer)
         demand(opcode == 0x90, "no arrival record")
         owner, size, *checksums, own = struct.unpack_from("<QQIIIII", arrivals)
@@ -366,39 +352,26 @@ class Segment:
             seq += step
             channel, sequence, log_time, publish = struct.unpack_from("<HIQQ", message)
             heads.append((channel, log_time, at))
-            schema, topic, encoding, metadata = self.channels[channel]
-            known = "hybridlog.no_publish_time" not in metadata
-            yield at + 31, Told(
-                seq, topic, encoding, self.schemas[schema] if schema else None,
-                log_time, publish if known else None, sequence, message[22:],
-            )  # fmt: skip
+            yield at + 31, self._told(seq, channel, log_time, publish, sequence, message[22:])
         if is_indexed:
             listed = [row for _, opcode, index in indexes for row in self._index(opcode, index)]
             demand(sorted(heads) == sorted(listed), "the message indexes")
-        if not left:
-            self._compare(number, messages)
+        self._compare(number, messages)
 
     @staticmethod
     def _head(record: bytes) -> int:
-        if record[0] in {0x94, 0x95}:
-            return len(record)
         body = Content(record[37:])
         return 37 + 4 + len(body.text()) + 8
 
-    def _expired(self, number: int, body: Content, place: Chunk) -> list[tuple[int, bytes]]:
-        """What is left of messages as records, and where they were in the content."""
-        times = body.take("<Q"), body.take("<Q")
-        demand(times == (place.first, place.last), "the times of an expired chunk")
-        size, _, before = body.take("<Q"), body.take("<I"), body.take("<Q")
-        demand(not body.rest() and before > 0, "the record of an expired chunk")
-        assert self.columns is not None
-        try:
-            left = self.columns.left(self.about["segment"], number)
-        except WrongColumnsError as error:
-            raise Damaged(str(error)) from error
-        ends = [at + 31 + length for at, length, _ in left]
-        demand([0, *ends] == [*(at for at, _, _ in left), size], "places of expired messages")
-        return [(at, record) for at, _, record in left]
+    def _told(
+        self, seq: int, channel: int, log_time: int, publish: int, sequence: int, payload: bytes
+    ) -> Told:
+        schema, topic, encoding, metadata = self.channels[channel]
+        known = "hybridlog.no_publish_time" not in metadata
+        return Told(
+            seq, topic, encoding, self.schemas[schema] if schema else None,
+            log_time, publish if known else None, sequence, payload,
+        )  # fmt: skip
 
     @staticmethod
     def _content(body: Content, place: Chunk) -> bytes:
@@ -440,6 +413,51 @@ class Segment:
         demand(not by_channel, "a channel without a part")
 
 
+class GoneSegment(Segment):
+    """One that is gone: its metadata and summary, and the rows of its messages.
+
+    Args:
+        path: Its first file of rows.
+        rows: All of them, as the manifest lists them.
+        recording: Id of its recording.
+    """
+
+    def __init__(self, path: Path, rows: Sequence[Mapping[str, Any]], recording: str) -> None:
+        self._rows = Columns(path.parent, rows, recording)
+        super().__init__(path)
+
+    def _read(self, path: Path) -> bytes:
+        data = path.read_bytes()
+        size, crc, length = struct.unpack_from("<IIQ", data, 12)
+        demand(data[:12] == b"PAR1hbl-rows", "no file of rows")
+        front = data[28 : 28 + length]
+        demand(zlib.crc32(front) == crc and len(front) == length, "the front of a file of rows")
+        self.line: dict[str, Any] = json.loads(front[:size])
+        self.digest = self.line["digest"]
+        found, at = bytearray(self.line["bytes"]), size
+        while at < length:
+            place, own = struct.unpack_from("<QQ", front, at)
+            found[place : place + own] = front[at + 16 : at + 16 + own]
+            at += 16 + own
+        return bytes(found)
+
+    def check_others(self) -> None:
+        """They are gone, too."""
+
+    def chunk(self, number: int) -> Iterator[tuple[int, Told]]:
+        try:
+            left = self._rows.left(number)
+        except WrongColumnsError as error:
+            raise Damaged(str(error)) from error
+        counts = {part.channel: part.messages for part in self.parts_of(number)}
+        demand(Counter(row["channel"] for row in left) == counts, "the rows of a chunk")
+        for row in left:
+            ref = row["ref"]
+            demand((ref["seg"], ref["chunk"]) == (self.line["number"], number), "a row")
+            about = row["seq"], row["channel"], row["t"], row["pub"]
+            yield ref["off"], self._told(*about, ref["sequence"], ref["left"])
+
+
 # --- recordings -----------------------------------------------------------------------
 
 
@@ -450,7 +468,7 @@ def _manifest_of(path: Path) -> Path:
 class Recording:
     """A recording: its manifest, the segments that are believed, what follows from both."""
 
-    _NAME: ClassVar = re.compile(r"(\d{6}|[1-9]\d{6,})(\.[1-9]\d*)?\.mcap(\.open)?")
+    _NAME: ClassVar = re.compile(r"(\d{6})\.mcap(\.open)?")
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -463,15 +481,21 @@ class Recording:
             if match is None or not file.is_file():
                 continue
             number = int(match[1])
-            if match[3]:
+            if match[2]:
                 self.open.add(number)
                 continue
-            if number in sealed if number not in listed else listed[number]["name"] != file.name:
+            if number in listed and (
+                listed[number]["name"] != file.name or "gone" in listed[number]
+            ):
                 continue
             try:
                 sealed[number] = Segment(file)
             except Damaged:
                 sealed[number] = None
+        for number, log in listed.items():
+            own = [row for row in self.manifest.rows if row["number"] == number]
+            if "gone" in log and (path / own[0]["name"]).is_file():
+                sealed[number] = GoneSegment(path / own[0]["name"], own, self.manifest.id)
         self.id = self.manifest.id
         self.segments = {
             number: segment
@@ -479,12 +503,10 @@ class Recording:
             if segment is not None and self._is_believed(number, segment, listed.get(number))
         }
         self.unlisted = {number for number in self.segments if number not in listed}
-        for segment in self.segments.values():
-            segment.columns = Columns(path / "payloads", self.manifest.fields, self.id)
         self.end = self._end()
         self.damage = dict(self._damage())
         self.lost = [*self._lost_segments(listed), *self._lost_chunks()]
-        self.lost += self._lost_fields()
+        self.lost += self._lost_rows()
         self.status = self._status()
 
     def _is_believed(self, number: int, segment: Segment, listed: Mapping[str, Any] | None) -> bool:
@@ -514,18 +536,26 @@ class Recording:
         for number, file in listed.items():
             if number in self.segments or number in self.open:
                 continue
-            row = _row(file["name"], None, file["bytes"], 0, None, None, None)
-            parts = {n: part for n, part in file.get("parts", {}).items() if part[0]}
-            for channel, (count, _, first, last) in parts.items():
-                topic = self.manifest.topics[int(channel)]
-                yield _row(file["name"], None, file["bytes"], count, topic, first, last)
-            if not parts:
-                yield row
+            if "gone" in file:
+                rows = [row for row in self.manifest.rows if row["number"] == number]
+                for one in rows:
+                    yield from self._lost_file(one)
+                continue
+            yield from self._lost_file(file)
+
+    def _lost_file(self, file: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+        row = _row(file["name"], None, file["bytes"], 0, None, None, None)
+        parts = {n: part for n, part in file.get("parts", {}).items() if part[0]}
+        for channel, (count, _, first, last) in parts.items():
+            topic = self.manifest.topics[int(channel)]
+            yield _row(file["name"], None, file["bytes"], count, topic, first, last)
+        if not parts:
+            yield row
 
     def _lost_chunks(self) -> Iterator[dict[str, Any]]:
         for number, chunk in self.damage:
             segment = self.segments[number]
-            if segment.is_expired(chunk):
+            if isinstance(segment, GoneSegment):
                 continue
             place = segment.chunks[chunk]
             for part in segment.parts_of(chunk):
@@ -533,20 +563,12 @@ class Recording:
                 about = (part.messages, topic, part.first, part.last)
                 yield _row(segment.path.name, place.offset, place.length, *about)
 
-    def _lost_fields(self) -> Iterator[dict[str, Any]]:
-        gone: dict[str, list[Part]] = {}
-        for segment in self.segments.values():
-            for chunk in range(len(segment.chunks)):
-                for part in segment.parts_of(chunk) if segment.is_expired(chunk) else ():
-                    gone.setdefault(segment.channels[part.channel][1], []).append(part)
-        for file in self.manifest.fields.values():
-            path = self.path / "payloads" / file["file"]
+    def _lost_rows(self) -> Iterator[dict[str, Any]]:
+        for file in self.manifest.rows:
+            path = self.path / file["name"]
             is_there = path.is_file() and path.stat().st_size == file["bytes"]
-            parts = gone.get(file["topic"], [])
-            if parts and not is_there:
-                times = min(p.first for p in parts), max(p.last for p in parts)
-                about = (file["messages"], file["topic"], *times)
-                yield _row(f"payloads/{file['file']}", None, file["bytes"], *about)
+            if not is_there and file["number"] in self.segments:
+                yield from self._lost_file(file)
 
     def _status(self) -> str:
         if self._is_recorded() and (self.end is None or self.open):

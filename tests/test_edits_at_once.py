@@ -171,16 +171,16 @@ def test_what_was_protected_first_outlasts_retention(
             begun.wait()
             time.sleep(lasted * (0, 0.2, 0.5)[number % 3] * chance.random())
             edits[protect](store)
-            whole = {n for n, file in places.manifest(path, "run").logs.items() if not file.expired}
+            whole = {n for n, file in places.manifest(path, "run").logs.items() if file.is_here}
             keeper.join()
             lasted = min(lasted, time.monotonic() - at)
             assert passed.is_set()
             logs = places.manifest(path, "run").logs
-            assert {n for n, file in logs.items() if not file.expired} == whole
+            assert {n for n, file in logs.items() if file.is_here} == whole
             outcomes.add(len(whole))
             # Nor in the next pass.
             store.keep(rules)
             logs = places.manifest(path, "run").logs
-            assert {n for n, file in logs.items() if not file.expired} == whole
+            assert {n for n, file in logs.items() if file.is_here} == whole
             assert not store.verify().findings
     assert len(outcomes) > 1 or rounds < 20

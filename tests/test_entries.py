@@ -36,7 +36,7 @@ from hybridlog.maintenance.report import RepairReport
 from hybridlog_storage.catalog import CATALOG, Catalog, RecordingEntry
 from hybridlog_storage.disk.directory import StoreDirectory
 from hybridlog_storage.errors import CatalogError, ManifestError, SegmentError, StoreError
-from hybridlog_storage.manifest import File, Loss, Manifest, Note, Part, Source, new_id, with_file
+from hybridlog_storage.manifest import File, Loss, Manifest, Note, Part, Source, new_id, with_rows
 from hybridlog_storage.manifest import replace as changed
 from hybridlog_storage.manifests import MANIFEST_OLD
 from hybridlog_storage.messages import Batch, Channel, Schema
@@ -484,7 +484,8 @@ def test_what_a_crash_took_of_a_listed_segment(made: Made) -> None:
     parts = {
         n: changed_part(part, 10 if topics[n] != "/c" else 0) for n, part in there.parts.items()
     }
-    made.change(lambda now: with_file(now, 3, bytes=9, digest=f"{5:064x}", parts=parts))
+    other = changed(there, bytes=9, digest=f"{5:064x}", parts=parts)
+    made.change(lambda now: with_rows(now, other, ()))
     losses = tuple(lost_in_crash(made.manifest(), sealed))
     made.change(lambda now: changed(listed(sealed)(now), losses=losses, status="damaged"))
     assert made.inventory().misfits == []

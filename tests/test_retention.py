@@ -7,13 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from msgspec import UNSET
 
 import hybridlog as hl
 from hybridlog.maintenance.keep import pin_of
 from hybridlog.maintenance.retention import Held, Plan, Rules, held_of, plan
 from hybridlog.record.capture import remote_segment_size
 from hybridlog_storage.errors import UsageError
-from hybridlog_storage.manifest import Channel, File, Manifest, Part
+from hybridlog_storage.manifest import Channel, File, Manifest, Part, replace
 
 DAY = 86_400 * 10**9
 NOW = 20_000 * DAY  # 2024
@@ -21,20 +22,40 @@ MB = 10**6
 CAMERA, SCAN = "/camera/front", "/scan"
 
 
-def sealed(number: int, age: float, last: int | None = None, **other: Any) -> File:
-    """A segment of 10 MB, 8 of them of a camera, that was written so many days ago.
+SIZES = {CAMERA: 8 * MB, SCAN: 2 * MB}
+
+
+def sealed(
+    number: int,
+    age: float,
+    *topics: str,
+    last: int | None = None,
+    group: int = 999,
+    **other: Any,
+) -> File:
+    """A log of 8 MB of a camera, or 2 MB of a scan, or both, that was written so many days ago.
 
     Args:
         number: Its number.
         age: Days.
+        topics: Its topics; by default a camera in even ones, and a scan in odd ones.
         last: Log time of all its messages; None for the day before it was written.
+        group: Number of its group.
         other: Further attributes.
     """
     at = NOW - round(age * DAY)
     span = (at - DAY, at - 1) if last is None else (last, last)
-    parts = {n: Part(9, size, *span) for n, size in enumerate((8 * MB, 2 * MB))}
-    name, digest = f"{number:06d}.mcap", f"{number:064x}"
-    return File(number, number, name, "log", 10 * MB, digest, at, *span, parts, **other)
+    own = topics or ([CAMERA, SCAN][number % 2],)
+    parts = {[*SIZES].index(topic): Part(9, SIZES[topic], *span) for topic in own}
+    name, digest, size = f"{number:06d}.mcap", f"{number:064x}", sum(SIZES[one] for one in own)
+    return File(number, group, name, "log", size, digest, at, *span, parts, **other)
+
+
+def gone(number: int, age: float) -> list[File]:
+    """The lines of one that has expired."""
+    log = sealed(number, age, gone="expired")
+    rows = replace(log, name=f"{number:06d}.rows.parquet", kind="rows", gone=UNSET)
+    return [log, rows]
 
 
 def held(name: str, *files: File, ended: bool = True, **values: Any) -> Held:
@@ -58,15 +79,20 @@ def told(found: Plan) -> list[tuple[str, tuple[int, ...], tuple[str, ...], str]]
     return [(one.recording, one.segments, one.topics, one.reason) for one in found.steps]
 
 
-OLD = held("old", sealed(0, 50), sealed(1, 40), sealed(2, 20))
-NEW = held("new", sealed(0, 10), sealed(1, 5))
+def both(*ages: float) -> list[File]:
+    """A log of the camera and one of the scan of each age."""
+    return [sealed(n, age) for n, age in enumerate(age for age in ages for _ in range(2))]
+
+
+OLD = held("old", *both(50, 40, 20))
+NEW = held("new", *both(10, 5))
 
 
 def test_payloads_of_topics_go_at_their_age_and_segments_at_theirs() -> None:
     rules = {"max-age": "30d", "topic": {"/camera/**": "7d"}}
     assert told(made(rules, NEW, OLD)) == [
-        ("old", (0, 1), (), "older than 30d"),
-        ("old", (2,), (CAMERA,), "/camera/** older than 7d"),
+        ("old", (0, 1, 2, 3), (), "older than 30d"),
+        ("old", (4,), (CAMERA,), "/camera/** older than 7d"),
         ("new", (0,), (CAMERA,), "/camera/** older than 7d"),
     ]
     assert [one.bytes for one in made(rules, OLD).steps] == [20 * MB, 8 * MB]
@@ -79,15 +105,15 @@ def test_payloads_of_topics_go_at_their_age_and_segments_at_theirs() -> None:
         # Below 80 % of 100 MB nothing, then the camera, above 90 % whole segments.
         (80, 99, []),
         (81, 99, [("old", (0,), (CAMERA,))]),
-        (90, 99, [("old", (0, 1), (CAMERA,))]),
-        (91, 99, [("old", (0, 1), ())]),
-        (121, 99, [("old", (0, 1, 2), ()), ("new", (0, 1), ())]),
+        (90, 99, [("old", (0, 2), (CAMERA,))]),
+        (91, 99, [("old", (0, 1, 2), ())]),
+        (121, 99, [("old", (0, 1, 2, 3, 4, 5), ()), ("new", (0, 1, 2), ())]),
         # Free space acts alike: 20 MB are to stay free.
         (1, 25, []),
         (1, 24, [("old", (0,), (CAMERA,))]),
         (1, 19, [("old", (0,), ())]),
-        (1, 5, [("old", (0, 1), ())]),
-        (95, 5, [("old", (0, 1), ())]),
+        (1, 5, [("old", (0, 1, 2, 3), ())]),
+        (95, 5, [("old", (0, 1, 2, 3), ())]),
     ],
 )
 def test_when_room_is_short_the_oldest_goes(used: int, free: int, steps: list[Any]) -> None:
@@ -112,54 +138,64 @@ def test_topics_go_in_the_order_of_their_rules() -> None:
     found = made(rules, NEW, OLD, used=98.5 * MB - 9 * MB)
     # 9.5 MB: the scan of all five segments is 10 MB; nothing of the camera goes.
     assert told(found) == [
-        ("old", (0, 1, 2), ("/scan",), "scan: more than 80% of 100.0 MB is used"),
-        ("new", (0, 1), ("/scan",), "scan: more than 80% of 100.0 MB is used"),
+        ("old", (1, 3, 5), ("/scan",), "scan: more than 80% of 100.0 MB is used"),
+        ("new", (1, 3), ("/scan",), "scan: more than 80% of 100.0 MB is used"),
     ]
 
 
 def test_what_went_does_not_go_again() -> None:
-    once = held("old", sealed(0, 50, retained=None), sealed(1, 40, retained=(CAMERA,)))
+    once = held("old", *gone(0, 50), sealed(1, 50))
     assert told(made({"topic": {CAMERA: "7d"}}, once)) == []
-    found = made({"max-age": "30d"}, once)
-    assert told(found) == [("old", (1,), (), "older than 30d")]
-    # All topics of a segment are gone, and what shared chunks with others is left.
-    both = held("old", sealed(1, 40, retained=(CAMERA, SCAN)))
-    assert told(made({"max-age": "30d"}, both)) == [("old", (1,), (), "older than 30d")]
+    assert told(made({"max-age": "30d"}, once)) == [("old", (1,), (), "older than 30d")]
 
 
-def test_all_topics_of_a_segment_are_the_segment() -> None:
-    found = made({"topic": {"/**": "7d"}}, OLD)
-    assert told(found) == [("old", (0, 1, 2), (), "/** older than 7d")]
+def test_the_first_log_of_a_group_stays() -> None:
+    first = held("old", sealed(0, 50, group=0), sealed(1, 50, group=0))
+    assert told(made({"max-age": "30d"}, first)) == [("old", (1,), (), "older than 30d")]
+    found = made({"quota": "1MB"}, first, used=100 * MB)
+    assert [one.segments for one in found.steps] == [(1,)]
+    assert found.is_short
+    assert "small topics" in found.warnings[0]
+
+
+def test_a_topic_that_shares_its_log_goes_with_it() -> None:
+    shared = held("old", sealed(0, 50, CAMERA, SCAN), sealed(2, 20))
+    found = made({"topic": {CAMERA: "7d"}}, shared)
+    assert told(found) == [("old", (2,), (CAMERA,), "/camera/front older than 7d")]
+    assert found.warnings == [
+        "/camera/front: older files have other topics, too, and go with these. A rule for a "
+        "topic holds for files that are opened after it."
+    ]
+    found = made({"topic": {"/**": "7d"}}, shared)
+    assert told(found) == [("old", (0, 2), (CAMERA, SCAN), "/** older than 7d")]
+    assert not found.warnings
 
 
 @pytest.mark.parametrize(
-    ("pin", "whole", "topics"),
+    ("pin", "left"),
     [
-        ({}, [], []),
-        ({"span": (NOW - 41 * DAY, NOW - 40 * DAY)}, [0, 2], [0, 2]),
-        # Half-open: it ends where the second segment begins.
-        ({"span": (None, NOW - 41 * DAY)}, [1, 2], [1, 2]),
-        ({"span": (NOW - 40 * DAY, None)}, [0, 1], [0, 1]),
-        ({"topics": [SCAN]}, [], [0, 1, 2]),
-        ({"topics": [CAMERA], "span": (NOW - 30 * DAY, None)}, [0, 1], [0, 1]),
-        ({"topics": ["/other"]}, [0, 1, 2], [0, 1, 2]),
+        ({}, []),
+        ({"span": (NOW - 41 * DAY, NOW - 40 * DAY)}, [0, 1, 4, 5]),
+        # Half-open: it ends where the second ones begin.
+        ({"span": (None, NOW - 41 * DAY)}, [2, 3, 4, 5]),
+        ({"span": (NOW - 40 * DAY, None)}, [0, 1, 2, 3]),
+        ({"topics": [SCAN]}, [0, 2, 4]),
+        ({"topics": [CAMERA], "span": (NOW - 30 * DAY, None)}, [0, 1, 2, 3, 5]),
+        ({"topics": ["/other"]}, [0, 1, 2, 3, 4, 5]),
     ],
 )
-def test_what_a_pin_touches_never_goes(
-    pin: dict[str, Any], whole: list[int], topics: list[int]
-) -> None:
-    files = sealed(0, 50), sealed(1, 40), sealed(2, 20)
+def test_what_a_pin_touches_never_goes(pin: dict[str, Any], left: list[int]) -> None:
+    files = both(50, 40, 20)
     pins = (pin_of("a", pin.get("span", (None, None)), pin.get("topics"), ""),)
-    for rules, left in (({"max-age": "1d"}, whole), ({"topic": {CAMERA: "1d"}}, topics)):
+    for rules in ({"max-age": "1d"}, {"topic": {CAMERA: "1d"}}):
         found = made(
             {**rules, "quota": "1MB", "fields-age": "10d"}, held("r", *files, pins=pins), used=1e9
         )
-        assert [n for one in found.steps for n in one.segments if not one.topics] == whole
-        assert {n for one in found.steps for n in one.segments} == {*left}
+        assert sorted(n for one in found.steps for n in one.segments) == left
     assert found.pins == 1
     assert found.is_short
     without = held("r", *files)
-    assert [one.segments for one in made({"max-age": "1d"}, without).steps] == [(0, 1, 2)]
+    assert [one.segments for one in made({"max-age": "1d"}, without).steps] == [(0, 1, 2, 3, 4, 5)]
 
 
 def test_nothing_pinned_is_no_reason() -> None:
@@ -168,7 +204,7 @@ def test_nothing_pinned_is_no_reason() -> None:
 
 
 def test_a_tag_keeps_a_recording_and_is_told_like_pins() -> None:
-    tagged = held("old", sealed(0, 50), tags={"keep": "yes"})
+    tagged = held("old", sealed(0, 50, CAMERA, SCAN), tags={"keep": "yes"})
     for tag in ("keep=yes", "keep"):
         rules = {"max-age": "1d", "fields-age": "1d", "quota": "10MB", "never-tag": [tag]}
         found = made(rules, tagged, NEW, used=20 * MB)
@@ -185,8 +221,8 @@ def test_fields_go_with_their_recording() -> None:
     assert (
         told(made(rules, OLD, NEW))
         == [
-            ("new", (0, 1), (), "older than 1d"),
-            ("old", (0, 1, 2), (), "older than 1d"),
+            ("new", (0, 1, 2, 3), (), "older than 1d"),
+            ("old", (0, 1, 2, 3, 4, 5), (), "older than 1d"),
         ][::-1]
     )
     rules["fields-age"] = "20d"
@@ -212,7 +248,7 @@ def test_fields_go_with_their_recording() -> None:
 def test_ages_in_spite_of_clocks(ages: list[int], last: int | None, old: list[int]) -> None:
     files = [sealed(number, age) for number, age in enumerate(ages)]
     if last is not None:
-        files[0] = sealed(0, ages[0], NOW + last * DAY)
+        files[0] = sealed(0, ages[0], last=NOW + last * DAY)
     found = made({"max-age": "30d"}, held("r", *files))
     assert [n for one in found.steps for n in one.segments] == old
     # By room they go all the same, in their order.

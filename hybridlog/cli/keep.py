@@ -247,6 +247,8 @@ def _told(step: Step) -> str:
     if step.segments:
         first, last = step.segments[0], step.segments[-1]
         what = f"segment {first}" if first == last else f"segments {first} to {last}"
+        if len(step.segments) <= last - first:
+            what = f"{len(step.segments)} of {what}"
         if step.topics:
             what = f"{listed(step.topics)} in {what}"
     return f"{step.recording}: {what}, about {output.size(step.bytes)}: {step.reason}"

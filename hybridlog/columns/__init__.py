@@ -1,1 +1,1 @@
-"""Messages as columns in Parquet files: tables of topics, and fields of expired messages."""
+"""Messages as columns in Parquet files: tables of topics, and rows of logs that are gone."""

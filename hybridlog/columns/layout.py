@@ -5,8 +5,7 @@ tables/<type>~<shape8>/shared-<number>.parquet   several recordings
 tables/<type>~<shape8>/<id>-<number>.parquet     a long topic of one recording
 tables.part/r<id>/                               unfinished files
 tables.part/r<id>/<type>~<shape8>/               sealed segments of a recording in progress
-recordings/<id>/payloads/fields=<collection>/<schema8>-<number>.parquet
-recordings/<id>/payloads.part/                unfinished files
+recordings/<id>/000002.rows.parquet           what is left of the messages of a log
 ```
 
 A folder of `tables` has the rows of all ended recordings of one message type. All of its
@@ -63,8 +62,6 @@ ABOUT: Final = b"hybridlog"
 VERSION: Final = 2
 RESERVED: Final = frozenset(OWN_COLUMNS)
 """Names that no column of a field has."""
-PAYLOAD_PARTS: Final = "payloads.part"
-"""Folder of a recording that holds unfinished files of fields."""
 POINTS: Final = "points"
 """Column of the points of clouds, a list for each of their fields."""
 _ODD: Final = re.compile(r"[^A-Za-z0-9_]")
@@ -134,17 +131,6 @@ def table_schema_of(channel: Channel) -> str:
 def topics_of(entry: RecordingEntry) -> set[str]:
     """Topics of a recording that have messages."""
     return {c.topic for c in entry.channels if c.stats.messages}
-
-
-def payload_file(folder: str, schema: str, number: int) -> str:
-    """Path of a file below `payloads`.
-
-    Args:
-        folder: Folder of the topic.
-        schema: Hash of what determines the columns.
-        number: Number of files of the topic before.
-    """
-    return f"{folder}/{schema[:8]}-{number:06d}.parquet"
 
 
 def column_names(
@@ -240,7 +226,7 @@ class About:
         body: Bytes before the footer.
         checksums: CRC-32 of each block of the body, 8 hexadecimal digits each.
         version: Version of the format.
-        payloads: What a file of fields needs besides; empty in a table.
+        of_rows: What a file of rows says of them besides; empty in a table.
     """
 
     recordings: Sequence[Section]
@@ -249,7 +235,7 @@ class About:
     body: int = 0
     checksums: str = field(default="", repr=False)
     version: int = VERSION
-    payloads: Mapping[str, Any] = field(default_factory=dict, repr=False)
+    of_rows: Mapping[str, Any] = field(default_factory=dict, repr=False)
 
     @property
     def rows(self) -> int:

@@ -75,6 +75,7 @@ class ParquetFileWriter:
             have statistics: DuckDB answers wrongly from those of floats with NaN among them.
         reused: Row groups of the file that this one replaces.
         in_front: True to write the new row groups in front of the kept ones.
+        front: Bytes in front of the row groups, which no reader of Parquet looks at.
 
     Raises:
         OSError: the file cannot be created.
@@ -89,6 +90,7 @@ class ParquetFileWriter:
         is_all: bool = False,
         reused: ReusedBytes | None = None,
         in_front: bool = False,
+        front: bytes = b"",
     ) -> None:
         self.path = path
         self._bounds: list[tuple[int, int, int, int, int]] = []
@@ -116,6 +118,8 @@ class ParquetFileWriter:
                 column_encoding=encodings,
                 write_statistics=[leaf for leaf in kinds if leaf in ordered],
             )
+            if front:
+                self._file.write(front)
             self._behind = reused if in_front else None
             if reused is not None and not in_front:
                 self._put(reused)
@@ -139,14 +143,14 @@ class ParquetFileWriter:
         self,
         sections: Sequence[Section],
         *,
-        payloads: Mapping[str, Any] | None = None,
+        rows: Mapping[str, Any] | None = None,
         sync: bool = False,
     ) -> tuple[int, str]:
         """Finish the file.
 
         Args:
             sections: The recordings with rows in it, in its order.
-            payloads: What a file of fields needs besides.
+            rows: What a file of rows says of them besides.
             sync: True to force it to the disk.
 
         Returns:
@@ -167,9 +171,7 @@ class ParquetFileWriter:
             # Keys of rows of several topics are no bounds.
             is_one = sum(len(section.topics) for section in sections) == 1
             bounds = self._bounds if is_one else [(one[0], 0, 0, 0, 0) for one in self._bounds]
-            about = About(
-                sections, tuple(bounds), span, body, checksums, payloads=dict(payloads or {})
-            )
+            about = About(sections, tuple(bounds), span, body, checksums, of_rows=dict(rows or {}))
             self._writer.add_key_value_metadata(
                 {ABOUT.decode(): about.to_json(), _SEALED_BY: _BLANK.decode()}
             )

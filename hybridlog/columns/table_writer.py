@@ -479,7 +479,7 @@ class TableWriter:
 
     def _add_expired(self, chunk: StoredChunk) -> None:
         """Make rows of what is left of expired messages."""
-        from hybridlog.columns.field_files import rows_of
+        from hybridlog.columns.rows_file import rows_of
 
         messages = Messages.of(chunk, 0)
         for rows, columns in chunk.fields or ():

@@ -18,12 +18,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from hybridlog.columns.recording_logs import RecordingRows
 from hybridlog.index.indexing import ChunkIndexer
 from hybridlog_storage.catalog import decoded_rows
 from hybridlog_storage.errors import DatabaseError, HybridlogError, SegmentError
 from hybridlog_storage.manifests import manifests_at
 from hybridlog_storage.mongo.collection_names import collection_of
 from hybridlog_storage.mongo.index_state import IndexState
+from hybridlog_storage.segments.gone_log import open_log
 from hybridlog_storage.segments.segment_file import OPEN_SUFFIX, sealed_name
 from hybridlog_storage.segments.segment_reader import ChunkPlace, SegmentReader
 from hybridlog_storage.threads import Threads
@@ -453,9 +455,9 @@ class IndexWriter:
             reader = SegmentReader(path, segment, direct=True)
         except SegmentError:  # it is sealed by now, and payloads of it may have expired
             manifest = manifests_at(self._recording).read(self._recording.name)
-            log = manifest.logs.get(segment)
-            sealed = path.with_name(sealed_name(segment) if log is None else log.name)
-            reader = SegmentReader(sealed, segment, direct=True)
+            rows = manifest.rows.get(segment, [])
+            sealed = path.with_name(rows[0].name if rows else sealed_name(segment))
+            reader = open_log(sealed, segment, RecordingRows(self._recording, rows))
         self._readers[segment] = reader
         return reader
 

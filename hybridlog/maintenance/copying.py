@@ -25,7 +25,6 @@ from hybridlog_storage.errors import (
     StoreError,
     UsageError,
 )
-from hybridlog_storage.manifest import replace
 from hybridlog_storage.remote.bucket import Bucket
 
 if TYPE_CHECKING:
@@ -221,17 +220,12 @@ class _Copying:
             files.make_folders(into)
             path, numbers = self._directory.recording(now.id), [log.number for log in logs]
             try:
-                made = without_payloads(path, now, numbers, into)
+                made = without_payloads(path, now, numbers, into, self._directory.address)
             except DiskFullError:
                 raise
             except StoreError as error:  # it is damaged, or has changed meanwhile
                 raise RefusedError(str(error)) from error
-            address = self._directory.address
-            logs = [
-                log if log == now.logs[log.number] else replace(log, copy=address)
-                for log in made.files
-            ]
-            yield replace(made, files=tuple(logs)), Directory(Path(place))
+            yield made, Directory(Path(place))
 
     def _copy(self, one: RecordingSummary) -> None:
         report, name = self._report, f"Recording {one.name!r} of {self._directory.place}"
@@ -273,7 +267,7 @@ class _Copying:
     def _let_go(self, one: RecordingSummary, digests: Mapping[int, str]) -> None:
         """Let payloads expire here whose copies were proved there just now."""
         logs = self._source.manifests.read(one.id).logs
-        left = len(logs.keys() - digests.keys())
+        left = len({n for n, log in logs.items() if log.is_here} - digests.keys())
         if left:
             self._report.problems.append(
                 f"Payloads of {counted(left, 'segment')} of {one.name} stay: their copies in "

@@ -9,7 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from hybridlog.columns.payload_files import walk
+from hybridlog.columns.recording_logs import walk
 from hybridlog.columns.table_writer import TableWriter
 from hybridlog.entries import put_entry, take_inventory
 from hybridlog.index.indexing import ChunkIndexer

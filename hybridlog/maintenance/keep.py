@@ -9,13 +9,11 @@ from __future__ import annotations
 import shutil
 import threading
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Final
-
-from msgspec import UNSET
 
 from hybridlog.maintenance.expiry import expire
 from hybridlog.maintenance.retention import (
@@ -24,7 +22,7 @@ from hybridlog.maintenance.retention import (
     Rules,
     Step,
     held_of,
-    pinned_topics,
+    is_pinned,
     plan,
 )
 from hybridlog.maintenance.sizes import disk_bytes
@@ -40,7 +38,7 @@ from hybridlog_storage.errors import (
     StoreError,
     TopicError,
 )
-from hybridlog_storage.manifest import Pin, with_file
+from hybridlog_storage.manifest import Pin
 from hybridlog_storage.settings import read_settings
 
 if TYPE_CHECKING:
@@ -173,7 +171,7 @@ class Keeper:
             found, now = KeepReport(self.plan(Rules())), time.time_ns()
             for held in self._held(now):
                 if held.id == recording and not rules.is_never(held.tags):
-                    going = [s for s in held.segments if s.number in digests and not s.pinned]
+                    going = [s for s in held.segments if s.number in digests and not s.is_pinned]
                     numbers = tuple(one.number for one in going)
                     size = sum(one.size for one in going)
                     if numbers:
@@ -259,18 +257,18 @@ class Keeper:
             yield
 
     def _expire(self, step: Step, rules: Rules, progress: Progress | None) -> int:
-        check, topics = partial(_check, step, rules), step.topics or None
-        with self._directory.at_hand(step.id, step.segments, check) as here:
+        check = partial(_check, step, rules)
+        with self._directory.at_hand(step.id, step.segments, check) as (here, version):
             done = expire(
                 here,
                 step.id,
                 step.segments,
-                topics,
                 digests=step.digests,
+                copy=step.copy,
                 check=check,
+                version=version,
                 progress=progress,
             )
-            here.manifests.change(step.id, partial(_retained, step, {*done.segments}))
         self._changed(step.id)
         return done.freed
 
@@ -289,22 +287,8 @@ def _check(step: Step, rules: Rules, manifest: Manifest) -> None:
         log = manifest.logs.get(number)
         if log is None:
             raise StoreError(f"{step.recording}: segment {number} was replaced meanwhile.")
-        pinned = pinned_topics(log, manifest)
-        if pinned & {*step.topics} if step.topics else pinned:
+        if is_pinned(log, manifest):
             raise StoreError(f"{step.recording}: a pin was set meanwhile.")
-
-
-def _retained(step: Step, thinned: Collection[int], manifest: Manifest) -> Manifest:
-    """Note what a step was applied to: payloads of its topics are gone, and where copies are."""
-    for number in step.segments:
-        log = manifest.logs[number]
-        known = () if log.retained is UNSET else log.retained
-        after = None
-        if step.topics and known is not None:
-            after = tuple(sorted({*known, *step.topics}))
-        copy = step.copy if step.copy and number in thinned else log.copy
-        manifest = with_file(manifest, number, retained=after, copy=copy)
-    return manifest
 
 
 def may_hold(entry: RecordingEntry, begin: int | None, end: int | None) -> bool:

@@ -17,8 +17,6 @@ from typing import TYPE_CHECKING, Any
 
 from msgspec import to_builtins
 
-from hybridlog.columns import payload_files
-from hybridlog.columns.layout import PAYLOAD_PARTS
 from hybridlog.entries import (
     NO_MANIFEST,
     describe_now,
@@ -41,7 +39,6 @@ from hybridlog_storage.errors import (
     TopicError,
 )
 from hybridlog_storage.manifest import Manifest, replace
-from hybridlog_storage.segments.segment_file import number_of
 
 if TYPE_CHECKING:
     from hybridlog.entries import Inventory
@@ -309,10 +306,17 @@ def _is_current(
     """True if a catalog row still matches the files."""
     if looks != listing.print:
         return False
-    if listing.open or entry.status == "open" or any(map(is_left_over, listing.others)):
+    if listing.open or entry.status == "open" or _has_left_over(entry, listing):
         holder = directory.holder(entry.id)
         return holder is not None and (holder.is_recording or entry.status != "open")
     return True
+
+
+def _has_left_over(entry: RecordingEntry, listing: Listing) -> bool:
+    """True if files are left from an interrupted step."""
+    rows = {name for name, _, _ in entry.rows}
+    is_expiring = listing.rows.keys() - rows or {*map(str, listing.sealed)} & entry.files.keys()
+    return bool(is_expiring) or any(map(is_left_over, listing.others))
 
 
 def _lost(directory: StoreDirectory, name: str) -> str:
@@ -322,7 +326,7 @@ def _lost(directory: StoreDirectory, name: str) -> str:
         inventory_of(directory, name, listing, None)
     except StoreError as error:
         return str(error)
-    if listing.sealed or listing.open:
+    if listing.sealed or listing.rows or listing.open:
         return NO_MANIFEST.format(name)
     return "it has neither a manifest nor a segment, but other files"
 
@@ -355,9 +359,11 @@ def recover(directory: StoreDirectory, recording: str, report: RepairReport) -> 
         return False
     clear_away(directory, recording)
     listing = directory.listing(recording)
-    if PAYLOAD_PARTS in listing.others or manifest.deleted:
-        payload_files.publish(path, manifest)
-    payload_files.remove_replaced(path, (*listing.sealed.values(), *listing.others), manifest)
+    for one in listing.left_over(manifest):
+        try:
+            files.unlink(path / one)
+        except OSError as error:
+            raise durability.explain(error, path / one, "removing") from error
     recovered = recover_segments(directory, recording, listing, manifest)
     inventory = take_inventory(directory, recording)
     is_empty = not (inventory.listing.sealed or manifest.logs or manifest.marks)
@@ -380,8 +386,6 @@ def recover(directory: StoreDirectory, recording: str, report: RepairReport) -> 
 
 def is_left_over(name: str) -> bool:
     """True if a file in a recording's directory is left from an interrupted step."""
-    if name == PAYLOAD_PARTS or number_of(name) is not None:
-        return True
     return any(pattern.fullmatch(name) for pattern in (_LEFT_OVER, _MOVING))
 
 

@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from hybridlog.columns.payload_files import open_segment
+from hybridlog.columns.recording_logs import RecordingRows
 from hybridlog.entries import (
     free_name_in,
     inventory_of,
@@ -22,12 +22,14 @@ from hybridlog.maintenance.opening import finish_moves, moving_name, recover_seg
 from hybridlog.maintenance.verify import RESTORE, damaged_files
 from hybridlog_storage.catalog import file_of
 from hybridlog_storage.disk import durability, files
-from hybridlog_storage.disk.directory import LOCK_WAIT_S, PAYLOADS
+from hybridlog_storage.disk.directory import LOCK_WAIT_S
 from hybridlog_storage.errors import HeldError, ManifestError, SegmentError, StoreError, TopicError
 from hybridlog_storage.manifest import replace
 from hybridlog_storage.mongo.index_state import IndexState
+from hybridlog_storage.segments.gone_log import open_log
 from hybridlog_storage.segments.recovery import rebuild_summary
 from hybridlog_storage.segments.segment_check import SegmentCheck
+from hybridlog_storage.segments.segment_file import is_rows
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -110,9 +112,11 @@ def _damage(path: Path, inventory: Inventory) -> Iterator[Repaired]:
     """Read every byte of segments and columns; damage in them can only be restored."""
     for file, problem in damaged_files(path, inventory):
         what = f"{problem}; {RESTORE}"
-        yield Repaired(inventory.name, f"{PAYLOADS}/{file}", what, is_cured=False)
+        yield Repaired(inventory.name, file, what, is_cured=False)
     for number in inventory.summaries:
         name = inventory.listing.sealed[number]
+        if is_rows(name):
+            continue
         digest = inventory.digest(number)
         with SegmentCheck(path / name, digest) as check:
             problems = list(check.problems())
@@ -222,7 +226,8 @@ def _is_restored(directory: StoreDirectory, catalog: Catalog, entry: RecordingEn
     """True if an unreadable chunk is readable again, after its file was restored."""
     for number, chunk in catalog.damage(entry.id):
         path = directory.recording(entry.id) / file_of(entry, number)
-        with suppress(SegmentError), open_segment(path, number) as reader:
+        rows = RecordingRows(path.parent)
+        with suppress(SegmentError), open_log(path, number, rows) as reader:
             reader.read_chunk(reader.summary().chunks[chunk])
             return True
     return False

@@ -1,21 +1,17 @@
 """Rules of retention, and the plan: what goes, in what order, and why.
 
 The plan is a pure function. It knows recordings by their manifests: sizes of segments, and
-topics, times and bytes of their channels. Nothing is deleted here; see `keep.py`.
+topics and times of their channels. Nothing is deleted here; see `keep.py`.
 """
 
 from __future__ import annotations
 
 import math
-from collections import Counter
-from collections.abc import Collection, Iterable, Mapping, Sequence
-from collections.abc import Set as AbstractSet
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
-from msgspec import UNSET
-
-from hybridlog.maintenance.expiry import MIN_BYTES
+from hybridlog.maintenance.expiry import may_go
 from hybridlog.query.choice import Choice
 from hybridlog.query.times import parse_duration
 from hybridlog.query.topics import matcher
@@ -167,29 +163,21 @@ def _topic_rule(topic: str, topics: Mapping[str, Any]) -> TopicRule:
 
 @dataclass(frozen=True, slots=True)
 class HeldSegment:
-    """Payloads of a sealed segment that are still there.
+    """A log that may go before its recording.
 
     Attributes:
         number: Its number.
         written: When it was written, or the time of its last message if that is later, ns.
         size: Bytes of its file.
-        topics: Payload bytes of each topic that may go: that of small messages stay.
-        pinned: Topics of which a pin keeps messages.
-        small: Payload bytes of topics of small messages.
+        topics: Its topics.
+        is_pinned: Whether a pin keeps messages of it.
     """
 
     number: int
     written: int
     size: int
-    topics: Mapping[str, int]
-    pinned: frozenset[str] = frozenset()
-    small: int = 0
-
-    def share(self, topics: AbstractSet[str]) -> int:
-        """About the bytes of the file that payloads of some topics take."""
-        whole = sum(self.topics.values()) + self.small
-        part = sum(self.topics[topic] for topic in topics)
-        return round(self.size * part / whole) if whole else self.size
+    topics: frozenset[str]
+    is_pinned: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,7 +190,8 @@ class Held:
         created: When it began, ns.
         written: When its last segment was written, or its last message if that is later, ns.
         tags: Its tags.
-        segments: Segments with payloads, in their order.
+        size: Bytes of all its files.
+        segments: Logs that may go, in their order: not those of small topics, which stay.
         is_ended: Whether it has ended.
         pins: Number of its pins.
     """
@@ -212,6 +201,7 @@ class Held:
     created: int
     written: int
     tags: Mapping[str, str]
+    size: int
     segments: Sequence[HeldSegment]
     is_ended: bool = True
     pins: int = 0
@@ -233,10 +223,11 @@ def held_of(manifest: Manifest, now: int) -> Held:
         # A segment is not newer than those that follow it, whatever the clock was.
         later = min(later, written)
         last = max(last, written)
-        expired = () if log.retained is UNSET else log.retained
-        if parts and expired is not None:
-            segment = _segment(log, later, manifest, expired)
-            found += [segment] if segment.topics or not segment.small else []
+        if may_go(log):
+            topics = frozenset(topic for topic, _ in parts)
+            found.append(
+                HeldSegment(log.number, later, log.bytes, topics, is_pinned(log, manifest))
+            )
     found.reverse()
     return Held(
         manifest.id,
@@ -244,6 +235,7 @@ def held_of(manifest: Manifest, now: int) -> Held:
         manifest.created,
         last,
         manifest.tags,
+        sum(file.bytes for file in manifest.files if file.is_here),
         found,
         manifest.is_ended,
         len(manifest.pins),
@@ -256,29 +248,13 @@ def _parts_of(log: File, manifest: Manifest) -> list[tuple[str, Part]]:
     return [(channels[n].topic, part) for n, part in log.parts.items() if part.messages]
 
 
-def _segment(log: File, written: int, manifest: Manifest, expired: Collection[str]) -> HeldSegment:
-    topics: Counter[str] = Counter()
-    messages: Counter[str] = Counter()
-    for topic, part in _parts_of(log, manifest):
-        if topic not in expired:
-            topics[topic] += part.bytes
-            messages[topic] += part.messages
-    # Chunks with few stored bytes a message stay. How well each is compressed, nobody knows yet.
-    packed = min(log.bytes / max(sum(topics.values()), 1), 1)
-    small = [t for t, count in topics.items() if count * packed < MIN_BYTES * messages[t]]
-    stays = sum(topics.pop(topic) for topic in small)
-    pinned = frozenset(pinned_topics(log, manifest))
-    return HeldSegment(log.number, written, log.bytes, topics, pinned, stays)
-
-
-def pinned_topics(log: File, manifest: Manifest) -> set[str]:
-    """Topics of a log of which a pin keeps messages."""
-    return {
-        topic
+def is_pinned(log: File, manifest: Manifest) -> bool:
+    """True if a pin keeps messages of a log."""
+    return any(
+        _touches(pin, topic, part)
         for topic, part in _parts_of(log, manifest)
         for pin in manifest.pins
-        if _touches(pin, topic, part)
-    }
+    )
 
 
 def _touches(pin: Pin, topic: str, part: Part) -> bool:
@@ -298,7 +274,7 @@ class Step:
         recording: Name of the recording.
         id: Its id.
         segments: Numbers of the segments; empty for the whole recording, with its fields.
-        topics: Topics whose payloads go; empty for all.
+        topics: Their topics, if a rule for them lets the segments go; else empty.
         bytes: About the bytes that become free.
         reason: Why it goes.
         before: The time before which it was written, ns.
@@ -377,13 +353,13 @@ class _Planning:
         self._freed = 0
         self._gone: set[str] = set()  # recordings
         self._pieces: list[_Piece] = []
-        self._expired: dict[tuple[str, int], set[str]] = {}  # topics by recording and segment
-        self._whole: set[tuple[str, int]] = set()
+        self._shared: set[str] = set()  # topics of rules, in segments with others
+        self._going: set[tuple[str, int]] = set()  # recordings and numbers of segments
 
     def made(self) -> Plan:
         kept = [one for one in self._held if self._rules.is_never(one.tags)]
         others = [one for one in self._held if not self._rules.is_never(one.tags)]
-        pinned = [s for one in others for s in one.segments if s.pinned]
+        pinned = [s for one in others for s in one.segments if s.is_pinned]
         self._plan.pins = sum(one.pins for one in self._held)
         self._plan.pinned_bytes = sum(s.size for one in kept for s in one.segments)
         self._plan.pinned_bytes += sum(s.size for s in pinned)
@@ -409,8 +385,8 @@ class _Planning:
         for one in others:
             if one.is_ended and not one.pins and self._is_older(one.written, age_ns):
                 self._gone.add(one.id)
-                count, reason = sum(s.size for s in one.segments), f"fields older than {age}"
-                self._step(Step(one.name, one.id, (), (), count, reason, one.written))
+                reason = f"fields older than {age}"
+                self._step(Step(one.name, one.id, (), (), one.size, reason, one.written))
 
     def _by_age(self) -> None:
         age = self._rules.max_age
@@ -424,8 +400,6 @@ class _Planning:
 
     def _by_room(self) -> None:
         if self._short(_SEGMENTS_FROM, 1.0) > 0:
-            # Writing a segment again without a topic needs room for one: they go at once, and
-            # several, since each deletion makes files of fields.
             need = self._short(_TOPICS_FROM, _TOPICS_BELOW)
             self._segments(self._pieces, self._reason(_SEGMENTS_FROM, 1.0), need)
         for rule in self._rules.topics:
@@ -452,68 +426,51 @@ class _Planning:
         return f"less than {size(times * (rules.min_free or 0))} is free"
 
     def _segments(self, pieces: Iterable[_Piece], reason: str, need: float) -> None:
-        """Let whole segments go until enough is free."""
-        chosen: list[tuple[_Piece, int]] = []
+        """Let segments go until enough is free."""
+        self._group(self._chosen(pieces, need), (), reason)
+
+    def _chosen(self, pieces: Iterable[_Piece], need: float) -> Iterator[_Piece]:
+        """Those of some pieces that may go, until enough is free."""
         for piece in pieces:
             if need <= 0:
-                break
-            key, segment = (piece.held.id, piece.segment.number), piece.segment
-            left = segment.topics.keys() - self._expired.get(key, set())
-            if not (key in self._whole or segment.pinned):
-                self._whole.add(key)
-                chosen.append((piece, segment.share(left)))
-                need -= chosen[-1][1]
-        self._group(chosen, (), reason)
+                return
+            key = piece.held.id, piece.segment.number
+            if key not in self._going and not piece.segment.is_pinned:
+                self._going.add(key)
+                need -= piece.segment.size
+                yield piece
 
     def _topics(self, pieces: Iterable[_Piece], rule: TopicRule, reason: str, need: float) -> None:
-        """Let payloads of the topics of a rule go until enough is free."""
-        by_topics: dict[tuple[str, ...], list[tuple[_Piece, int]]] = {}
+        """Let segments with no other topics than those of a rule go until enough is free."""
+        own: list[_Piece] = []
         for piece in pieces:
-            if need <= 0:
-                break
-            segment = piece.segment
-            key = piece.held.id, segment.number
-            if key in self._whole:
-                continue
-            gone = self._expired.setdefault(key, set())
-            topics = {
-                topic
-                for topic in segment.topics.keys() - segment.pinned - gone
-                if self._rules.topic_rule(topic) is rule
-            }
-            if topics:
-                gone |= topics
-                share = segment.share(topics)
-                is_whole = topics == segment.topics.keys() and not segment.small
-                names = () if is_whole else tuple(sorted(topics))
-                by_topics.setdefault(names, []).append((piece, share))
-                need -= share
-        for names, chosen in by_topics.items():
-            self._group(chosen, names, reason)
+            fits = {t for t in piece.segment.topics if self._rules.topic_rule(t) is rule}
+            if fits == piece.segment.topics:
+                own.append(piece)
+            else:
+                self._shared |= fits
+        chosen = [*self._chosen(own, need)]
+        topics = sorted({topic for piece in chosen for topic in piece.segment.topics})
+        self._group(chosen, tuple(topics), reason)
 
-    def _group(
-        self, chosen: Iterable[tuple[_Piece, int]], topics: tuple[str, ...], reason: str
-    ) -> None:
+    def _group(self, chosen: Iterable[_Piece], topics: tuple[str, ...], reason: str) -> None:
         """Make steps of the pieces of one recording; each is done as a whole."""
-        groups: list[list[tuple[_Piece, int]]] = []
-        latest: dict[str, list[tuple[_Piece, int]]] = {}  # of each recording
-        for piece, share in chosen:
+        groups: list[list[_Piece]] = []
+        latest: dict[str, list[_Piece]] = {}  # of each recording
+        for piece in chosen:
             group = latest.get(piece.held.id)
-            if group is None or share + sum(count for _, count in group) > _STEP_BYTES:
+            size = piece.segment.size
+            if group is None or size + sum(one.segment.size for one in group) > _STEP_BYTES:
                 group = latest[piece.held.id] = []
                 groups.append(group)
-            group.append((piece, share))
+            group.append(piece)
         for group in groups:
-            self._add(group, topics, reason)
-
-    def _add(
-        self, group: Sequence[tuple[_Piece, int]], topics: tuple[str, ...], reason: str
-    ) -> None:
-        held = group[0][0].held
-        numbers = tuple(sorted(piece.segment.number for piece, _ in group))
-        written = max(piece.segment.written for piece, _ in group)
-        count = sum(share for _, share in group)
-        self._step(Step(held.name, held.id, numbers, topics, count, reason, written))
+            held = group[0].held
+            numbers = tuple(sorted(piece.segment.number for piece in group))
+            written = max(piece.segment.written for piece in group)
+            count = sum(piece.segment.size for piece in group)
+            own = tuple(t for t in topics if any(t in piece.segment.topics for piece in group))
+            self._step(Step(held.name, held.id, numbers, own, count, reason, written))
 
     def _step(self, step: Step) -> None:
         self._freed += step.bytes
@@ -527,11 +484,16 @@ class _Planning:
                 f"What is pinned takes {size(pinned)} of the quota of {size(quota)}: "
                 "`hybridlog keep --pins` lists the pins, --unpin removes one."
             )
+        if self._shared:
+            plan_.warnings.append(
+                f"{listed(sorted(self._shared))}: older files have other topics, too, and go with "
+                "these. A rule for a topic holds for files that are opened after it."
+            )
         left = self._short(_SEGMENTS_FROM, 1.0)
         plan_.is_short = left > 0
         if left > 0:
             plan_.warnings.append(
                 f"{size(left)} more should be deleted, but all that is left must stay: it is "
-                "pinned, being recorded, small messages, or fields, tables and the index. "
+                "pinned, being recorded, small topics, or fields, tables and the index. "
                 "--fields-age and `hybridlog rm` delete whole recordings."
             )

@@ -63,7 +63,7 @@ class Size:
 
     @property
     def total_bytes(self) -> int:
-        """Sum of segments, fields of expired messages, tables and MongoDB."""
+        """Sum of segments, files of rows, tables and MongoDB."""
         return self.segment_bytes + self.column_bytes + self.table_bytes + (self.index_bytes or 0)
 
 
@@ -112,8 +112,8 @@ def sizes_of(
     for entry in entries:
         segments = _segment_bytes(directory, catalog, entry)
         columns: Counter[str] = Counter()
-        for file in entry.payloads:
-            columns[file["topic"]] += file["bytes"]
+        for _, topic, size in entry.rows:
+            columns[topic] += size
         messages = entry.messages_by_topic()
         payload: Counter[str] = Counter()
         for channel in entry.channels:
@@ -171,6 +171,8 @@ def _segment_bytes(
     """Bytes of the segments by topic; the rest under the empty name."""
     by_channel = np.zeros(max((c.id for c in entry.channels), default=0) + 1)
     for number, _, _ in entry.spans:
+        if str(number) in entry.files:  # it is gone
+            continue
         try:
             table = catalog.table(entry, number)
         except CatalogError:
@@ -181,7 +183,7 @@ def _segment_bytes(
     whole: Counter[str] = Counter()
     for channel in entry.channels:
         whole[channel.topic] += round(float(by_channel[channel.id]))
-    columns = sum(file["bytes"] for file in entry.payloads)
+    columns = sum(size for _, _, size in entry.rows)
     whole[""] += max(0, entry.stored_bytes - columns - whole.total())
     return whole
 

@@ -10,7 +10,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from hybridlog.columns.layout import PARTS, parts_folder, topics_of, type_prefix
-from hybridlog.columns.payload_files import walk
+from hybridlog.columns.recording_logs import walk
 from hybridlog.maintenance.report import reporter
 from hybridlog_storage.catalog import files_of
 from hybridlog_storage.disk import files

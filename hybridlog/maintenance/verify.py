@@ -8,18 +8,19 @@ from dataclasses import dataclass, field
 from shlex import quote
 from typing import TYPE_CHECKING
 
-from hybridlog.columns import field_files
-from hybridlog.columns.payload_files import RecordingPayloads, walk
+from hybridlog.columns import rows_file
+from hybridlog.columns.recording_logs import RecordingRows, walk
 from hybridlog.entries import describe, steady_inventory
 from hybridlog.maintenance import tables
 from hybridlog.maintenance.index import documents_in
-from hybridlog_storage.disk.directory import LOCK, PAYLOADS
+from hybridlog_storage.disk.directory import LOCK
 from hybridlog_storage.errors import ManifestError, SegmentError, StoreError
 from hybridlog_storage.manifest import encode
 from hybridlog_storage.mongo.collection_names import collection_of
 from hybridlog_storage.mongo.index_documents import between
 from hybridlog_storage.mongo.index_state import IndexState
 from hybridlog_storage.segments.segment_check import SegmentCheck
+from hybridlog_storage.segments.segment_file import is_rows
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -36,7 +37,7 @@ _REPAIR = "run `hybridlog verify --repair`"
 RESTORE = "restore the file from a copy"
 _COPY_AGAIN = "`hybridlog copy --check` from a store that has it brings it back"
 _RESTORE_LOST = f"{RESTORE}; `hybridlog info --losses` lists the lost messages"
-_KNOWN = frozenset({LOCK, PAYLOADS})
+_KNOWN = frozenset({LOCK})
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,13 +113,12 @@ def verify(
 
 
 def damaged_files(path: Path, inventory: Inventory) -> Iterator[tuple[str, str]]:
-    """Read every byte of the files of fields; yield damaged ones and their problems."""
-    payloads = RecordingPayloads(path, list(inventory.fields.values()))
-    for file in inventory.fields.values():
+    """Read every byte of the files of rows; yield damaged ones and their problems."""
+    for file in inventory.rows:
         try:
-            payloads.reader(file).check()
+            rows_file.RowsFile(path, file).check()
         except StoreError as error:
-            yield file.file, str(error).removesuffix(field_files.RESTORE)
+            yield file.name, str(error).removesuffix(rows_file.RESTORE)
 
 
 class _Index:
@@ -184,7 +184,7 @@ class _Check:
         self._recording = self._name = recording
         self._result = result
         self._path = directory.recording(recording)
-        self._contents = RecordingPayloads(self._path)
+        self._rows = RecordingRows(self._path)
         self._lost: Counter[str] = Counter()  # messages of chunks that cannot be read
         self._is_damaged = False
         self._has_index = False
@@ -209,7 +209,7 @@ class _Check:
         self._name = inventory.name
         self._manifest(inventory.manifest)
         self._files(inventory, is_held=is_held)
-        self._payloads(inventory)
+        self._check_rows(inventory)
         total = sum(summary.size for summary in inventory.summaries.values())
         before = 0
         for number, name in inventory.listing.sealed.items():
@@ -252,8 +252,8 @@ class _Check:
     def _files(self, inventory: Inventory, *, is_held: bool) -> None:
         for misfit in inventory.misfits:
             place = misfit.file or f"segment {misfit.segment}"
-            can_mend = misfit.is_unlisted or misfit.belongs is not None
-            self.found(place, misfit.reason, _REPAIR if can_mend or misfit.file else _RESTORE_LOST)
+            cure = _REPAIR if misfit.file else _RESTORE_LOST
+            self.found(place, misfit.reason, RESTORE if is_rows(misfit.file) else cure)
         for name in inventory.listing.open.values():
             if not is_held:
                 self.found(name, "a crash has left it open", "open the store with write permission")
@@ -261,19 +261,12 @@ class _Check:
             if name not in _KNOWN and not name.endswith(".damaged"):
                 self.found(name, "it is not a file of a recording", "move it out of the store")
 
-    def _payloads(self, inventory: Inventory) -> None:
-        """Check every byte of the files of fields."""
-        listed = inventory.fields
-        if not listed and PAYLOADS not in inventory.listing.others:
-            return
+    def _check_rows(self, inventory: Inventory) -> None:
+        """Check every byte of the files of rows."""
         for file, problem in damaged_files(self._path, inventory):
             self._is_damaged = True
-            self.found(f"{PAYLOADS}/{file}", problem, RESTORE)
-        self._result.bytes_read += sum(file.bytes for file in listed.values())
-        for name in inventory.listing.payloads:
-            if name not in listed:
-                cure = "move it out of the store"
-                self.found(f"{PAYLOADS}/{name}", "the manifest does not list it", cure)
+            self.found(file, problem, RESTORE)
+        self._result.bytes_read += sum(file.bytes for file in inventory.rows)
 
     def _segment(
         self,
@@ -286,16 +279,12 @@ class _Check:
         summary = inventory.summaries.get(number)
         try:
             log = inventory.logs.get(number)
-            with SegmentCheck(self._path / name, "" if log is None else log.digest) as check:
-                for offset, problem in check.problems(tell):
-                    self._is_damaged = True
-                    is_data = check.summary is not None and offset < check.summary.table.end
-                    cure = RESTORE if is_data else _REPAIR
-                    self.found(f"{name} byte {offset}", problem, cure)
+            if not is_rows(name):
+                self._check_bytes(name, "" if log is None else log.digest, tell)
             if summary is None:
                 return
             known = {number: summary}
-            for segment in walk(self._path, {number: name}, self._contents, known=known):
+            for segment in walk(self._path, {number: name}, self._rows, known=known):
                 for place, chunk in segment.chunks():
                     if isinstance(chunk, SegmentError):
                         self._unreadable(summary, place)
@@ -315,6 +304,14 @@ class _Check:
         for part in summary.table.parts[bounds[place.number] : bounds[place.number + 1]]:
             topic = summary.channels[int(part["channel"])].topic
             self._lost[collection_of(topic)] += int(part["messages"])
+
+    def _check_bytes(self, name: str, digest: str, tell: Callable[[int], None]) -> None:
+        with SegmentCheck(self._path / name, digest) as check:
+            for offset, problem in check.problems(tell):
+                self._is_damaged = True
+                is_data = check.summary is not None and offset < check.summary.table.end
+                cure = RESTORE if is_data else _REPAIR
+                self.found(f"{name} byte {offset}", problem, cure)
 
     @property
     def _rebuild(self) -> str:

@@ -8,7 +8,7 @@ Its payload begins with 40 bytes: the size (u64, little-endian) and the SHA-256 
 dropped payload. The BSON elements of the index document without `_meta` follow.
 
 Of an expired message, whose payload was deleted to make room, a byte and the same elements
-follow, or the reason why its payload could not be read. Files of fields hold this.
+follow, or the reason why its payload could not be read. Files of rows hold this.
 """
 
 from __future__ import annotations

@@ -35,8 +35,9 @@ from hybridlog_storage.lazy import RowType
 from hybridlog_storage.messages import MARKS_CHANNEL, Channel, Schema
 from hybridlog_storage.ordering import run_starts
 from hybridlog_storage.segments.chunk_table import ChunkTable
+from hybridlog_storage.segments.gone_log import GoneLog, open_log
 from hybridlog_storage.segments.segment_file import sealed_name
-from hybridlog_storage.segments.segment_reader import ChunkPlace, SegmentReader
+from hybridlog_storage.segments.segment_reader import ChunkPlace
 from hybridlog_storage.summary import (
     Int,
     RecordingSummary,
@@ -179,7 +180,7 @@ class RecordingEntry:
             the recording), or `unproven` (the manifest was lost).
         end: The state at its end: losses, damage.
         channels: Its channels.
-        stored_bytes: Size of its segments and of the fields of its expired messages.
+        stored_bytes: Size of its segments and of its files of rows.
         segments: Number of segments.
         chunks: Number of chunks.
         attachments: Number of attachments of its log.
@@ -191,11 +192,10 @@ class RecordingEntry:
         spans: Number, first and last log time (ns) of each segment that has messages.
         held: Ids of the channels with messages in each sealed segment, by its number as text.
         digests: Digest of each valid segment as it was sealed, by its number as text.
-        files: Names of the files of those with expired chunks.
+        files: Of those that are gone, the names of their first files of rows.
         is_decoded: Whether messages were decoded. Otherwise header stamps, and messages that
         do not fit their definition, are unknown.
-        payloads: Files with fields of expired messages: `file`, `bytes`, `digest`, `topic`,
-            `messages`.
+        rows: Name, topic and bytes of each file of rows.
         copies: Addresses of stores with copies that have more payloads.
         flushed: Content of segments that are not sealed, and of marks, by number, at one moment;
             the catalog's file does not have it.
@@ -222,7 +222,7 @@ class RecordingEntry:
     digests: dict[str, str] = field(default_factory=dict)
     files: dict[str, str] = field(default_factory=dict)
     is_decoded: bool = False
-    payloads: list[dict[str, Any]] = field(default_factory=list)
+    rows: list[tuple[str, str, Int]] = field(default_factory=list)
     copies: list[str] = field(default_factory=list)
     flushed: dict[int, Flushed] = field(default_factory=dict)
 
@@ -271,7 +271,8 @@ class RecordingEntry:
         """The entry as a mapping of plain values."""
         found: dict[str, Any] = to_builtins(replace(self, flushed={}))
         del found["flushed"]
-        return {**found, "spans": [[*span] for span in self.spans]}
+        spans, rows = [[*span] for span in self.spans], [[*one] for one in self.rows]
+        return {**found, "spans": spans, "rows": rows}
 
 
 @dataclass(frozen=True, slots=True)
@@ -798,12 +799,13 @@ class Catalog:
     ) -> tuple[ChunkTable, NDArray[np.void] | None]:
         path = self._store / _RECORDINGS / entry.id / file_of(entry, number)
         try:
-            with SegmentReader(path, number) as reader:
+            with open_log(path, number) as reader:
+                is_ours = not isinstance(reader, GoneLog) or reader.digest() == digest
                 summary = reader.summary()
         except SegmentError as error:
             raise CatalogError(str(error)) from error
         said = summary.recording.get("id"), summary.recording.get("segment")
-        is_ours = said == (entry.id, number) and summary.content(digest) == digest
+        is_ours &= said == (entry.id, number)
         if not is_ours or {*spans_of(number, summary.table)} - {*entry.spans}:
             raise CatalogError(f"Segment {path} has changed since the store was opened.")
         return summary.table, self.stamps(entry, number, summary.table)
@@ -881,7 +883,7 @@ def schema_hash(schema: Schema) -> str:
 
 
 def file_of(entry: RecordingEntry, number: int) -> str:
-    """Name of the file of a sealed segment."""
+    """Name of the file of a sealed segment; of one that is gone, of its first file of rows."""
     return entry.files.get(str(number)) or sealed_name(number)
 
 

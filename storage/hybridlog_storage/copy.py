@@ -12,11 +12,11 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from hybridlog_storage.copy_places import RECORDINGS, RefusedError, Sending
-from hybridlog_storage.disk.directory import PAYLOADS, ListedFile, listed_files
+from hybridlog_storage.disk.directory import ListedFile, listed_files
 from hybridlog_storage.errors import ManifestError, RecordingExistsError, StoreError
 from hybridlog_storage.manifest import Manifest, replace
 from hybridlog_storage.manifests import MANIFEST_LOCK, WRITER_LOCK
-from hybridlog_storage.merging import check_origin, merged, needs_fields, wanted
+from hybridlog_storage.merging import check_origin, merged, wanted
 from hybridlog_storage.stopping import pause, safe_point
 
 if TYPE_CHECKING:
@@ -161,7 +161,7 @@ class _Copy:
                 logs = [here.logs[log.number] for log in logs]
             copied = Copied(here, there is None, lacking=_lacking(here, there))
             self._bring(here, there, logs, sizes, copied)
-            copied.manifest = self._publish(here, there, {log.name for log in logs})
+            copied.manifest = self._publish(here, there, {log.number for log in logs})
             self._clear(there, copied.manifest, sizes)
             if self._how.proved is not None:
                 self._how.proved(self._proved_logs(here))
@@ -195,7 +195,7 @@ class _Copy:
                     f"{here.name} in {target.address} has lost its manifest, and has payloads "
                     f"that are not here, in {', '.join(more)}. It stays as it is."
                 )
-            return replace(here, name=self._how.named(here.name, here.id), files=(), fields=())
+            return replace(here, name=self._how.named(here.name, here.id), files=())
 
         if target.mends:
             return target.manifests.restore(here.id, make)
@@ -204,7 +204,8 @@ class _Copy:
 
     def _more(self, sizes: Mapping[str, int]) -> list[str]:
         """Logs there that are larger than those of their numbers here."""
-        here = {f"{number:06d}": log.bytes for number, log in self._here.logs.items()}
+        logs = self._here.logs.items()
+        here = {f"{number:06d}": log.bytes for number, log in logs if log.is_here}
         return sorted(
             path
             for path, size in sizes.items()
@@ -223,11 +224,10 @@ class _Copy:
         target = self._target
         ours = {one.path: one for one in listed_files(here)}
         listed = {one.path: one for one in ([] if there is None else listed_files(there))}
-        new = [ours[log.name] for log in logs]
-        if needs_fields(logs):
-            fields = (one for path, one in ours.items() if path.startswith(f"{PAYLOADS}/"))
-            new += [one for one in fields if one.path not in listed]
-        kept = merged(here, there, {log.name for log in logs})
+        numbers = {log.number for log in logs}
+        names = (f.name for f in here.files if f.is_here and f.number in numbers)
+        new = [ours[name] for name in names]
+        kept = merged(here, there, numbers)
         old = [listed[one.path] for one in listed_files(kept) if one.path in listed]
         self._new = {one.path for one in new}
         doubtful = [one for one in old if self._must_prove or sizes.get(one.path) != one.bytes]
@@ -263,7 +263,7 @@ class _Copy:
             self._due = max(self._due, now) + size / self._how.limit_rate
             pause(max(self._due - now, 0.0))
 
-    def _publish(self, here: Manifest, there: Manifest | None, names: set[str]) -> Manifest:
+    def _publish(self, here: Manifest, there: Manifest | None, brought: set[int]) -> Manifest:
         manifests = self._target.manifests
         self._check_files()
         if there is None:
@@ -275,7 +275,7 @@ class _Copy:
                 return made
             except RecordingExistsError:
                 pass  # another process was faster
-        return manifests.change(here.id, lambda now: merged(here, now, names))
+        return manifests.change(here.id, lambda now: merged(here, now, brought))
 
     def _check_files(self) -> None:
         """Raise if files are no longer there: a removal that ends takes them along."""
@@ -298,25 +298,22 @@ class _Copy:
             self._target.drop(f"{RECORDINGS}/{now.id}/{path}")
 
     def _proved_logs(self, here: Manifest) -> dict[int, str]:
-        """Digests here of logs whose copies were proved, and that the manifest there still lists.
-
-        A copy that has lost no payloads has those of each later version, too.
-        """
+        """Digests here of logs whose copies were proved, and that are still listed there."""
         there = self._target.manifests.read(here.id).logs
         return {
             number: log.digest
             for number, log in here.logs.items()
-            if number in there
-            and self._proved.get(there[number].name) == there[number].digest
-            and (there[number].digest == log.digest or not there[number].expired)
+            if log.is_here
+            and number in there
+            and there[number].is_here
+            and self._proved.get(there[number].name) == log.digest
         }
 
 
 def _lacking(here: Manifest, there: Manifest | None) -> list[int]:
-    if there is None or there.lacks_payloads:
-        return []
+    known = {} if there is None else there.logs
     return [
         number
         for number, log in here.logs.items()
-        if number in there.logs and {*there.logs[number].expired} - {*log.expired}
+        if log.is_here and number in known and known[number].gone == "expired"
     ]

@@ -21,9 +21,7 @@ from hybridlog_storage.disk import durability, files
 from hybridlog_storage.disk.directory import (
     LOCK,
     LOCK_WAIT_S,
-    PAYLOADS,
     StoreDirectory,
-    payload_names,
 )
 from hybridlog_storage.errors import (
     ObjectChangedError,
@@ -260,8 +258,7 @@ class Directory(Source):
         """As of `Place`."""
         path = self._path / RECORDINGS / recording
         try:
-            inside = {f"{PAYLOADS}/{name}": about for name, about in payload_names(path).items()}
-            found = files.names(path) | inside
+            found = files.names(path)
         except FileNotFoundError:
             return {}
         except OSError as error:

@@ -40,8 +40,7 @@ PinId = Annotated[str, Meta(pattern=r"\A[^\s/\0]{1,64}\Z")]
 Id = Annotated[str, Meta(pattern=r"\A[a-z0-9](-?[a-z0-9]){0,63}-[0-9a-f]{16}\Z")]
 Digest = Annotated[str, Meta(pattern=r"\A[0-9a-f]{64}\Z")]
 """BLAKE3 of all bytes of a file."""
-FileName = Annotated[str, Meta(pattern=r"\A[0-9]{6}(\.[a-z0-9_-]{1,64})?\.(mcap|parquet)\Z")]
-FieldsName = Annotated[str, Meta(pattern=r"\A(?!\.)[^/\0]{1,255}/(?!\.)[^/\0]{1,255}\Z")]
+FileName = Annotated[str, Meta(pattern=r"\A[0-9]{6}(\.[a-z0-9_-]{1,64}){0,2}\.(mcap|parquet)\Z")]
 Tags = dict[Key, Text]
 
 
@@ -114,7 +113,8 @@ class File(Record, frozen=True):
         number: Its number; blob references name it.
         group: Number of the group of files that was opened and sealed together.
         name: Its name.
-        kind: `log` has messages; `rows` has the fields of those of the log of its number.
+        kind: `log` has messages; `rows` has what is left of those of the log of its number, which
+            is gone.
         bytes: Its size.
         digest: BLAKE3 of its bytes.
         written: When it was sealed, ns since the epoch.
@@ -122,10 +122,7 @@ class File(Record, frozen=True):
         last: Of its last message.
         parts: What it has of each channel.
         gone: Why the file is no longer here; absent while it is.
-        copy: Address of a store with a copy that has payloads which are not here: they expired
-            since it was proved, or are to be copied later.
-        expired: Topics whose payloads have expired, at least some of them.
-        retained: Topics that a rule was applied to; None for all; absent for none.
+        copy: Address of a store with a copy of a file that is gone.
     """
 
     number: Number
@@ -140,31 +137,11 @@ class File(Record, frozen=True):
     parts: dict[ChannelNumber, Part] = {}
     gone: Literal["expired", "elsewhere"] | UnsetType = UNSET
     copy: Text = ""
-    expired: tuple[Topic, ...] = ()
-    retained: tuple[Topic, ...] | UnsetType | None = UNSET
 
     @property
     def is_here(self) -> bool:
         """True unless it has expired, or was left elsewhere."""
         return self.gone is UNSET
-
-
-class Fields(Record, frozen=True):
-    """A file with the fields of messages whose payloads have expired.
-
-    Attributes:
-        file: Its path below the recording's `payloads`.
-        bytes: Its size.
-        digest: BLAKE3 of its bytes.
-        topic: The topic.
-        messages: Number of messages in it.
-    """
-
-    file: FieldsName
-    bytes: Count
-    digest: Digest
-    topic: Topic
-    messages: Count
 
 
 class Note(Record, frozen=True):
@@ -257,9 +234,6 @@ class Manifest(Record, frozen=True):
         losses: Its loss ledger.
         cut_bytes: Bytes that were cut off after its recorder was killed: records not yet whole.
         damage: What else was wrong then, in words.
-        fields: Files with the fields of messages whose payloads have expired.
-        deleted: Such files that others have replaced.
-        lacks_payloads: Whether it is a copy whose payloads have not been copied yet.
     """
 
     id: Id
@@ -278,14 +252,20 @@ class Manifest(Record, frozen=True):
     losses: tuple[Loss, ...] = ()
     cut_bytes: Count = 0
     damage: tuple[Text, ...] = ()
-    fields: tuple[Fields, ...] = ()
-    deleted: tuple[FieldsName, ...] = ()
-    lacks_payloads: bool = False
 
     @property
     def logs(self) -> dict[int, File]:
         """Its logs by number."""
         return {file.number: file for file in self.files if file.kind == "log"}
+
+    @property
+    def rows(self) -> dict[int, list[File]]:
+        """Files with what is left of the messages of logs that are gone, by number of the log."""
+        found: dict[int, list[File]] = {}
+        for file in self.files:
+            if file.kind == "rows":
+                found.setdefault(file.number, []).append(file)
+        return found
 
     @property
     def is_ended(self) -> bool:
@@ -302,11 +282,11 @@ class Manifest(Record, frozen=True):
             raise ValueError("two files have one name")
         if any(int(file.name[:6]) != file.number for file in self.files):
             raise ValueError("a file has the number of another one")
-        if len({(file.kind, file.number) for file in self.files}) < len(self.files):
-            raise ValueError("two files have one number")
-        paths = {file.file for file in self.fields}
-        if len(paths) < len(self.fields) or not paths.isdisjoint(self.deleted):
-            raise ValueError("a file of fields is listed twice, or was replaced")
+        logs = self.logs
+        if len(logs) < sum(file.kind == "log" for file in self.files):
+            raise ValueError("two logs have one number")
+        if self.rows.keys() != {log.number for log in logs.values() if not log.is_here}:
+            raise ValueError("a log is gone without its rows, or has rows and is here")
         for ids in ([mark.id for mark in self.marks], [pin.id for pin in self.pins]):
             if len({*ids}) < len(ids):
                 raise ValueError("two marks or pins have one id")
@@ -396,7 +376,7 @@ def loss_of(row: Mapping[str, Any]) -> Loss:
 def with_totals(manifest: Manifest) -> Manifest:
     """The manifest with the totals of its channels as its files have them."""
     parts: dict[int, list[Part]] = {number: [] for number in manifest.channels}
-    for file in manifest.files:
+    for file in manifest.logs.values():
         for number, part in file.parts.items():
             parts[number].append(part)
     channels = {
@@ -419,13 +399,49 @@ def with_mark(manifest: Manifest, mark: Mark) -> Manifest:
     return replace(manifest, uncounted_marks=manifest.uncounted_marks + 1)
 
 
-def with_file(manifest: Manifest, number: int, **values: object) -> Manifest:
-    """The manifest with other values of the log of a number."""
-    files = [
-        replace(one, **values) if one.kind == "log" and one.number == number else one
-        for one in manifest.files
-    ]
-    return replace(manifest, files=tuple(files))
+def with_rows(manifest: Manifest, log: File, rows: Iterable[File]) -> Manifest:
+    """The manifest with another line of a log, and with these rows of it."""
+    others = (f for f in manifest.files if f.kind == "log" or f.number != log.number)
+    files = [log if f.kind == "log" and f.number == log.number else f for f in others]
+    return replace(manifest, files=(*files, *rows))
+
+
+def rows_line(log: File, name: str, size: int, digest: str, parts: Mapping[int, Part]) -> File:
+    """The line of a file of rows.
+
+    Args:
+        log: The line of the log.
+        name: Name of the file.
+        size: Its bytes.
+        digest: BLAKE3 of them.
+        parts: What it has of each channel.
+    """
+    return replace(
+        log,
+        name=name,
+        kind="rows",
+        bytes=size,
+        digest=digest,
+        first=min(part.first for part in parts.values() if part.first is not None),
+        last=max(part.last for part in parts.values() if part.last is not None),
+        parts=dict(parts),
+        gone=UNSET,
+        copy="",
+    )
+
+
+def encode_file(file: File) -> bytes:
+    """The line of a file as JSON."""
+    return json.encode(file)
+
+
+def decode_file(data: bytes) -> File:
+    """The opposite.
+
+    Raises:
+        ValueError: It is none.
+    """
+    return json.decode(data, type=File)
 
 
 def encode(manifest: Manifest) -> bytes:

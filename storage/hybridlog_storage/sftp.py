@@ -35,7 +35,7 @@ from hybridlog_storage.copy_places import (
     read,
     readable,
 )
-from hybridlog_storage.disk.directory import LOCK, LOCK_WAIT_S, PAYLOADS
+from hybridlog_storage.disk.directory import LOCK, LOCK_WAIT_S
 from hybridlog_storage.errors import (
     HeldError,
     HybridlogError,
@@ -177,7 +177,7 @@ class Server(Place):
     def sizes(self, recording: str) -> dict[str, int]:
         """As of `Place`."""
         folder = f"{RECORDINGS}/{recording}"
-        found = self.listed(folder) | self.listed(f"{folder}/{PAYLOADS}/*/*")
+        found = self.listed(folder)
         self._found = {
             name if name.startswith(folder) else f"{folder}/{name}": size
             for name, size in found.items()

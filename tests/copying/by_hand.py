@@ -16,7 +16,6 @@ from hybridlog_storage.copy_places import BucketStore, Directory, Place, Source
 from hybridlog_storage.disk.directory import listed_files
 from hybridlog_storage.manifest import (
     Channel,
-    Fields,
     File,
     Loss,
     Manifest,
@@ -24,6 +23,7 @@ from hybridlog_storage.manifest import (
     Pin,
     new_id,
     replace,
+    with_rows,
 )
 from hybridlog_storage.remote.bucket import Bucket
 from hybridlog_storage.settings import StoreSettings, write_settings
@@ -40,24 +40,23 @@ PAIRS = [
     ("bucket", "directory"),
 ]
 MORE_PAIRS = [*PAIRS, ("bucket", "bucket"), ("bucket", "shell")]
-FIELDS = "payloads/fields=a b;\"'[/x-000000.parquet"
 SIZES = {
     "000000.mcap": 3000,
     "000001.mcap": 200_000,
     "000002.mcap": 350_000,
-    "000003.1.mcap": 2000,
     "000004.mcap": 150_000,
-    FIELDS: 1000,
-    "000001.x.mcap": 300,
-    "000002.x.mcap": 300,
-    "000004.x.mcap": 200,
-    "payloads/fields=x/x-000001.parquet": 900,
+    "000003.rows.parquet": 2000,
+    "000003.1.rows.parquet": 1000,
+    "000001.7.rows.parquet": 300,
+    "000002.7.rows.parquet": 300,
+    "000004.7.rows.parquet": 200,
+    "000001.rows.parquet": 400,
+    "000004.rows.parquet": 500,
 }
 NAMES = [*SIZES][:6]
-"""Files of a whole recording."""
+"""Files of a whole recording, of which a log has expired."""
 TOTAL = sum(SIZES[name] for name in NAMES)
-FIRST = ["000000.mcap", "000001.x.mcap", "000002.x.mcap", "000003.1.mcap", "000004.x.mcap"]
-FIRST += [FIELDS, [*SIZES][-1]]
+FIRST = ["000000.mcap", *[*SIZES][4:9]]
 """What is sent of it if payloads are left for later."""
 
 
@@ -71,24 +70,20 @@ def listed(name: str) -> File:
         number,
         number,
         name,
-        "log",
+        "log" if name.endswith(".mcap") else "rows",
         len(content),
         blake3(content).hexdigest(),
         1,
         parts={0: Part(10, 20)},
-        expired=("/scan",) if name.count(".") > 1 else (),
     )
-
-
-def fields(name: str) -> Fields:
-    content = bytes_of(name)
-    path, digest = name.removeprefix("payloads/"), blake3(content).hexdigest()
-    return Fields(path, len(content), digest, "/scan", 5)
 
 
 def recording(count: int = 5, status: str = "complete") -> Manifest:
     """One with the first logs."""
     channel = Channel("/scan", "ros1", "a/Scan", messages=10 * count, bytes=100 * count)
+    files = {int(name[:6]): listed(name) for name in NAMES[:4]}
+    gone = File(3, 3, "000003.mcap", "log", 1, "3" * 64, 1, parts=files[0].parts, gone="expired")
+    logs = [{**files, 3: gone}[number] for number in range(count)]
     return Manifest(
         RECORDING,
         "run",
@@ -96,8 +91,7 @@ def recording(count: int = 5, status: str = "complete") -> Manifest:
         tags={"a": "b"},
         pins=(Pin("0" * 16),),
         channels={0: channel},
-        files=tuple(map(listed, NAMES[:5][:count])),
-        fields=(fields(FIELDS),) if count > 3 else (),
+        files=(*logs, *map(listed, NAMES[4:] if count > 3 else ())),
         losses=(Loss("transport", count=count),),
         status=status,  # type: ignore[arg-type]
     )
@@ -108,20 +102,13 @@ def without_payloads(now: Manifest, logs: list[File]) -> Iterator[tuple[Manifest
     """What is sent of a recording whose payloads are to come later."""
     with tempfile.TemporaryDirectory() as place:
         store = Store(Directory(Path(place)), Path(place), None)
-        small = {int(name[:6]): name for name in FIRST if name[7:8] == "x"}
-        made = []
         for log in logs:
-            if log.number in small:
-                name = small[log.number]
-                store.write(f"recordings/{now.id}/{name}", bytes_of(name))
-                made.append(replace(listed(name), copy="s3://lab/store"))
-        store.write(f"recordings/{now.id}/{FIRST[-1]}", bytes_of(FIRST[-1]))
-        files = {**now.logs, **{log.number: log for log in made}}
-        new = (*now.fields, fields(FIRST[-1])) if made else now.fields
-        yield (
-            replace(now, files=tuple(files.values()), fields=new, lacks_payloads=bool(made)),
-            store.source,
-        )
+            rows = f"{log.number:06d}.7.rows.parquet"
+            if rows in FIRST and log.is_here:
+                store.write(f"recordings/{now.id}/{rows}", bytes_of(rows))
+                line = replace(log, gone="elsewhere", copy="s3://lab/store")
+                now = with_rows(now, line, [listed(rows)])
+        yield now, store.source
 
 
 RECORDING = new_id("run")

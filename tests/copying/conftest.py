@@ -44,12 +44,13 @@ def robots(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path / "store"
 
 
-def expire(store: hl.Store, name: str, segments: Sequence[int] = ()) -> None:
-    """Delete the payloads of segments of a recording; without, of all."""
+def expire(store: hl.Store, name: str, which: Sequence[int] = ()) -> None:
+    """Delete logs of a recording, by their places among those that may go; all by default."""
     directory, recording = store.directory, places.id_of(store.directory.path, name)
     with directory.writing(recording):
-        numbers = segments or [*directory.listing(recording).sealed]
-        expiry.expire(directory, recording, numbers, min_bytes=0)
+        logs = directory.manifests.read(recording).logs
+        numbers = [number for number, log in logs.items() if log.number != log.group]
+        expiry.expire(directory, recording, [numbers[n] for n in which] or numbers)
     store.shared.catch_up()
 
 

@@ -137,7 +137,7 @@ def test_names_there(make: Makes, kind: str) -> None:
     assert isinstance(target.place, Server)
     assert target.place.names() == set()
     for name in ('a"b', "back\\slash", "\u00e4 \U0001f916", "tab\there"):
-        one = replace(recording(), id=new_id("x"), name=name, files=(), fields=())
+        one = replace(recording(), id=new_id("x"), name=name, files=())
         source.place.manifests.create(one)
         copy(source.source, target.place, one.id)
     assert target.place.names() == {'a"b', "back\\slash", "\u00e4 \U0001f916", "tab\there"}

@@ -8,7 +8,6 @@ import time
 from pathlib import Path
 
 import pytest
-from msgspec import UNSET
 from msgspec.structs import replace
 
 import hybridlog as hl
@@ -41,9 +40,9 @@ def store_with(path: Path, **rules: str) -> hl.Store:
 
 
 def has_expired(folder: Path) -> bool:
-    """True once a rule was applied to a segment of a recording."""
+    """True once a segment of a recording has gone."""
     manifest = places.read_in(folder)
-    return manifest is not None and any(log.retained is not UNSET for log in manifest.logs.values())
+    return manifest is not None and any(not log.is_here for log in manifest.logs.values())
 
 
 def test_rules_that_are_written_while_it_runs_hold(tmp_path: Path) -> None:

@@ -112,8 +112,7 @@ def test_a_changed_byte_is_seen() -> None:
 FILE = {"number": 0, "group": 0, "name": "000000.mcap", "kind": "log", "bytes": 1,
         "digest": DIGEST, "written": 1}  # fmt: skip
 
-FIELDS = {"file": "fields=a/1-000000.parquet", "bytes": 1, "digest": DIGEST, "topic": "/a",
-          "messages": 1}  # fmt: skip
+ROWS = {**FILE, "name": "000000.rows.parquet", "kind": "rows"}
 
 
 @pytest.mark.parametrize(
@@ -143,8 +142,10 @@ FIELDS = {"file": "fields=a/1-000000.parquet", "bytes": 1, "digest": DIGEST, "to
         {"files": [FILE, FILE]},
         {"files": [FILE, {**FILE, "name": "000000.1.mcap"}]},
         {"files": [{**FILE, "digest": f"sha256:{DIGEST}"}]},
-        {"fields": [FIELDS, FIELDS]},
-        {"fields": [FIELDS], "deleted": [FIELDS["file"]]},
+        {"files": [FILE, ROWS]},
+        {"files": [ROWS]},
+        {"files": [{**FILE, "gone": "expired"}]},
+        {"files": [{**FILE, "gone": "expired"}, ROWS, ROWS]},
         {"files": [{**FILE, "parts": {"3": [1, 1]}}]},
         {"files": [{**FILE, "first": 2, "last": 1}]},
         {"files": [{**FILE, "gone": "lost"}]},

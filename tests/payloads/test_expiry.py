@@ -16,12 +16,12 @@ import pytest
 from blake3 import blake3
 
 import hybridlog as hl
-from hybridlog.entries import put_entry
+from hybridlog.entries import put_entry, topic_of
 from hybridlog.maintenance import expiry
 from hybridlog.maintenance.expiry import Expired
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import IncompleteError, PayloadError, StoreError
-from hybridlog_storage.manifest import replace, with_file
+from hybridlog_storage.manifest import replace, with_rows
 from tests import places
 from tests.cli.within import answer
 from tests.copies import bring
@@ -31,22 +31,15 @@ from tests.payloads.logs import COUNT
 TOPICS = ["/cloud", "/image", "/number", "/scan"]
 
 
-def expire(
-    store: Path,
-    segments: Collection[int],
-    topics: Collection[str] | None = None,
-    *,
-    is_worth: bool = False,
-    max_files: int = expiry.MAX_FILES,
-) -> Expired:
-    """Delete payloads of the only recording of a store."""
+def expire(store: Path, groups: Collection[int]) -> Expired:
+    """Delete logs of the only recording of a store: those of its first or of its second group."""
     with hl.open(store) as opened:
         (entry,) = opened.recordings()
+        logs = opened.directory.manifests.read(entry.id).logs.values()
+        firsts = sorted({log.group for log in logs})
+        numbers = [log.number for log in logs if firsts.index(log.group) in groups]
         with opened.directory.writing(entry.id, entry.name):
-            least = expiry.MIN_BYTES if is_worth else 0
-            found = expiry.expire(
-                opened.directory, entry.id, segments, topics, min_bytes=least, max_files=max_files
-            )
+            found = expiry.expire(opened.directory, entry.id, numbers)
             put_entry(opened.directory, opened.catalog, entry.id)
     return found
 
@@ -78,8 +71,8 @@ def recording_of(store: Path) -> Path:
     return places.folder(store, "log")
 
 
-def field_files(store: Path) -> list[Path]:
-    return [*recording_of(store).glob("payloads/*/*")]
+def row_files(store: Path) -> list[Path]:
+    return sorted(recording_of(store).glob("*.rows.parquet"))
 
 
 def payloads(path: Path, topic: str) -> list[bytes | str]:
@@ -94,25 +87,18 @@ def payloads(path: Path, topic: str) -> list[bytes | str]:
     return found
 
 
-STEPS: dict[str, list[tuple[list[int], list[str] | None]]] = {
-    "a segment": [([0], None)],
-    "a topic": [([0, 1], ["/cloud"])],
-    "a topic, then a segment": [([0], ["/cloud"]), ([0], None)],
-    "all, one after the other": [([0], None), ([1], ["/scan"]), ([0, 1], None)],
-}
+STEPS = {"a group": [[0]], "one after the other": [[0], [1]], "all": [[0, 1]]}
 
 
 @pytest.mark.parametrize("steps", STEPS.values(), ids=STEPS)
-def test_answers_stay_when_payloads_go(
-    copy: Path, steps: list[tuple[list[int], list[str] | None]]
-) -> None:
+def test_answers_stay_when_payloads_go(copy: Path, steps: list[list[int]]) -> None:
     before, raw = answers(copy), {topic: payloads(copy, topic) for topic in TOPICS}
     gone = dict.fromkeys(TOPICS, 0)
-    for segments, topics in steps:
-        done = expire(copy, segments, topics)
+    for segments in steps:
+        done = expire(copy, segments)
         for topic, count in done.messages.items():
             gone[topic] += count
-        assert expire(copy, segments, topics).segments == []
+        assert expire(copy, segments).segments == []
     assert answers(copy) == before
     shutil.rmtree(copy / "tables")
     assert answers(copy) == before
@@ -132,55 +118,50 @@ def logs(store: Path) -> dict[str, bytes]:
 
 
 def test_a_file_never_changes(copy: Path) -> None:
-    """What is left of a segment is another file, and what derives from it stays valid."""
+    """What derives from a log stays valid when it goes."""
     with hl.open(copy, mongo="none") as store:
         digests = store.recordings()[0].digests
-    names = [{"000000.mcap", "000001.mcap"}]
-    seen = logs(copy)
-    for topics in (["/cloud"], None):
-        expire(copy, [0], topics)
-        there = logs(copy)
-        assert all(seen.get(name, data) == data for name, data in there.items())
-        seen |= there
-        names.append({*there})
-        listed = places.manifest(copy, "log")
-        for file in listed.files:
-            assert (len(there[file.name]), blake3(there[file.name]).hexdigest()) == (
-                file.bytes, file.digest,
-            )  # fmt: skip
-        for file in listed.fields:
-            data = (recording_of(copy) / "payloads" / file.file).read_bytes()
-            assert (len(data), blake3(data).hexdigest()) == (file.bytes, file.digest)
-        with hl.open(copy, mongo="none") as store:
-            (entry,) = store.recordings()
-            assert (entry.digests, [*entry.files.values()]) == (digests, [listed.logs[0].name])
-    assert names[1:] == [{f"000000.{n}.mcap", "000001.mcap"} for n in (1, 2)]
+    whole, lines = logs(copy), places.manifest(copy, "log").logs
+    expire(copy, [0])
+    assert logs(copy) == {name: data for name, data in whole.items() if name != "000001.mcap"}
+    listed = places.manifest(copy, "log")
+    assert listed.logs == {**lines, 1: replace(lines[1], gone="expired")}
+    for file in listed.rows[1]:
+        data = (recording_of(copy) / file.name).read_bytes()
+        assert (len(data), blake3(data).hexdigest()) == (file.bytes, file.digest)
+    numbers = {file.name: topic_of(file, listed) for file in listed.rows[1]}
+    assert [*numbers] == ["000001.rows.parquet", "000001.1.rows.parquet"]
+    assert {*numbers.values()} == {"/scan", "/cloud"}
+    with hl.open(copy, mongo="none") as store:
+        (entry,) = store.recordings()
+        assert (entry.digests, entry.files) == (digests, {"1": "000001.rows.parquet"})
 
 
-def test_what_is_left_of_a_replaced_segment_is_removed_by_the_next_writer(copy: Path) -> None:
+def test_what_an_expiry_left_is_removed_by_the_next_writer(copy: Path) -> None:
     whole, right = logs(copy), answers(copy)
     expire(copy, [0])
-    thin = logs(copy)
-    segment = recording_of(copy) / "000000.mcap"
-    for beside in (segment, segment.with_name("000000.7.mcap")):
-        beside.write_bytes(whole["000000.mcap"])
+    left, rows = logs(copy), row_files(copy)
+    segment = recording_of(copy) / "000001.mcap"
+    loose = recording_of(copy) / "000003.rows.parquet"
+    for beside, data in ((segment, whole["000001.mcap"]), (loose, b"half")):
+        beside.write_bytes(data)
         with hl.open(copy, mongo="none", read_only=True) as store:
             assert store.topic("/cloud").count() == COUNT
             assert store.recordings()[0].status == "complete"
         assert beside.exists()
         assert answers(copy) == right
-        assert logs(copy) == thin
-    # What the manifest lists is gone: nothing else of it is removed.
-    (recording_of(copy) / "000000.1.mcap").unlink()
-    segment.write_bytes(whole["000000.mcap"])
+        assert (logs(copy), row_files(copy)) == (left, rows)
+    # What the manifest lists in its place is gone: nothing else of it is removed.
+    (recording_of(copy) / "000001.rows.parquet").unlink()
+    segment.write_bytes(whole["000001.mcap"])
     with hl.open(copy, mongo="none") as store:
         assert store.recordings()[0].status == "damaged"
-        (found,) = (one for one in store.verify().findings if one.place == "000000.mcap")
-        assert found.problem == "the manifest lists 000000.1.mcap in its place"
+        found = {one.place: one.problem for one in store.verify().findings}
+        assert found["segment 1"] == "what is left of 000001.mcap is missing"
     assert segment.exists()
 
 
-@pytest.mark.parametrize("old", ["without", "thin", "whole"])
+@pytest.mark.parametrize("old", ["without", "gone", "whole"])
 def test_a_lost_manifest_is_made_again_of_what_has_expired(copy: Path, old: str) -> None:
     right = answers(copy)
     before = places.manifest_of(recording_of(copy)).read_bytes()
@@ -198,24 +179,24 @@ def test_a_lost_manifest_is_made_again_of_what_has_expired(copy: Path, old: str)
     assert answers(copy) | {"status": 0} == right | {"status": 0}
     made = places.manifest(copy, "log")
     assert made.status == "unproven"
-    assert {*made.fields} == {*listed.fields}
-    for log in made.files:
-        was = listed.logs[log.number]
-        assert (log.name, log.bytes, log.digest) == (was.name, was.bytes, was.digest)
-        assert log.expired == was.expired
+    when = {one.name: one.written for one in listed.files}  # which no file of a log says
+    found = [replace(one, written=when[one.name]) for one in made.files]
+    assert sorted(found, key=str) == sorted(listed.files, key=str)
 
 
-@pytest.mark.parametrize("kind", ["log", "fields"])
+@pytest.mark.parametrize("kind", ["log", "rows"])
 def test_another_file_than_the_listed_one_is_found(copy: Path, kind: str) -> None:
     """Also if it has the size of the listed one, and all of its own checksums are right."""
     expire(copy, [0])
     listed = places.manifest(copy, "log")
     if kind == "log":
-        changed, place = with_file(listed, 1, digest="0" * 64), "000001.mcap byte "
+        one = replace(listed.logs[3], digest="0" * 64)
+        changed, place = with_rows(listed, one, ()), "000003.mcap byte "
     else:
-        one = replace(listed.fields[0], digest="0" * 64)
-        changed = replace(listed, fields=(one, *listed.fields[1:]))
-        place = f"payloads/{one.file}"
+        first, *others = listed.rows[1]
+        one = replace(first, digest="0" * 64)
+        changed = with_rows(listed, listed.logs[1], [one, *others])
+        place = one.name
     places.write_in(recording_of(copy), changed)
     with hl.open(copy, mongo="none") as store:
         assert store.recordings()[0].status == "complete"
@@ -264,11 +245,11 @@ def test_a_death_at_any_step_is_finished_or_undone(copy: Path, tmp_path: Path, s
     while not lived:
         place = tmp_path / f"at {step}"
         shutil.copytree(copy, place)
-        lived = die_at(step, partial(expire, place, [0, 1], max_files=0))
+        lived = die_at(step, partial(expire, place, [0, 1]))
         with hl.open(place, mongo="none") as store:  # finishes or undoes it
             assert not store.verify().findings
-            listed = {log.name for log in places.manifest(place, "log").files}
-            assert logs(place).keys() == listed
+            listed = {file.name for file in places.manifest(place, "log").files if file.is_here}
+            assert logs(place).keys() | {path.name for path in row_files(place)} == listed
             states = [message.state.value for message in store.all_topics()]
         assert answers(place) == right
         seen.add(states.count("expired"))
@@ -280,7 +261,7 @@ def test_a_death_at_any_step_is_finished_or_undone(copy: Path, tmp_path: Path, s
         shutil.rmtree(place)
         step += stride
     assert step > 40
-    assert len(seen) == 3  # none, those of a segment, those of both
+    assert len(seen) > 3  # none, those of a log, of several, of all
 
 
 def test_what_is_left_is_copied_checked_and_never_made_again(copy: Path, tmp_path: Path) -> None:
@@ -298,65 +279,28 @@ def test_what_is_left_is_copied_checked_and_never_made_again(copy: Path, tmp_pat
         store.verify(repair=True)
     assert answers(copy) | {"status": 0} == right | {"status": 0}
     with hl.open(other, mongo="none") as store:
-        path = next((places.folder(other, "log") / "payloads").glob("fields=scan/*"))
+        manifest = places.manifest(other, "log")
+        rows = manifest.rows[1][1]
+        assert topic_of(rows, manifest) == "/cloud"
+        path = places.folder(other, "log") / rows.name
         whole = path.read_bytes()
         path.write_bytes(whole[:900] + bytes([whole[900] ^ 1]) + whole[901:])
         found = [one.place for one in store.verify().findings]
-        assert f"payloads/fields=scan/{path.name}" in found
+        assert path.name in found
         shutil.rmtree(other / "tables")
     with hl.open(other, mongo="none") as store:
         with pytest.raises(StoreError, match="Restore the file from a copy"):
-            store.sql("select angle_min from scan").rows()
+            store.sql("select width from cloud").rows()
         path.unlink()
     with hl.open(other, mongo="none") as store:
         (entry,) = store.recordings()
         assert entry.status == "damaged"
         (loss,) = entry.end["losses"]
-        assert (loss["topic"], loss["count"]) == ("/scan", COUNT)
-        assert store.topic("/scan").count() == COUNT
+        (part,) = rows.parts.values()
+        assert (loss["topic"], loss["count"], loss["file"]) == ("/cloud", part.messages, path.name)
+        assert store.topic("/cloud").count() == COUNT
         store.remove("log")
         assert not store.recordings()
-
-
-def test_files_of_fields_are_joined(copy: Path, tmp_path: Path) -> None:
-    before = answers(copy)
-    for segment in (0, 1):
-        expire(copy, [segment], max_files=0)
-    listed = places.read_in(recording_of(copy))
-    assert listed is not None
-    assert sorted(file.topic for file in listed.fields) == TOPICS
-    assert len(listed.deleted) > len(TOPICS)
-    there = {str(p.relative_to(recording_of(copy) / "payloads")) for p in field_files(copy)}
-    assert there == {file.file for file in listed.fields}
-    assert answers(copy) == before
-    with hl.open(copy, mongo="none") as store, hl.open(tmp_path / "o", create=True) as other:
-        assert store.verify().findings == []
-        bring(other, copy)
-        assert other.verify().findings == []
-    # One that has lost its manifest knows from the one before which files were joined.
-    with hl.open(copy, mongo="none") as store:
-        store.edit("log", note="looked at")
-    (places.manifest_of(recording_of(copy))).unlink()
-    with hl.open(copy, mongo="none") as store:
-        store.verify(repair=True)
-        assert [one.place for one in store.verify().findings] == ["manifest"]
-    made = places.read_in(recording_of(copy))
-    assert made is not None
-    assert (made.fields, made.deleted) == (listed.fields, listed.deleted)
-    after = answers(copy)
-    assert {key: after[key] for key in before if key != "status"} == {
-        key: before[key] for key in before if key != "status"
-    }
-
-
-def test_payloads_stay_where_that_frees_no_room(copy: Path) -> None:
-    right = answers(copy)
-    done = expire(copy, [0, 1], is_worth=True)
-    assert "/number" not in done.messages
-    assert done.messages["/image"] == COUNT // 10
-    assert done.freed > 0
-    assert answers(copy) == right
-    assert all(isinstance(one, bytes) for one in payloads(copy, "/number"))
 
 
 def test_strict_answers_need_payloads(copy: Path) -> None:
@@ -390,7 +334,6 @@ def test_the_second_reader_tells_what_is_left(copy: Path) -> None:
     with hl.open(copy, mongo="none") as store:
         fields = {message.seq: message.fields for message in store.all_topics()}
     before = {message.seq: message for message in told()}
-    expire(copy, [0], ["/scan"])
     expire(copy, [0])
     gone = 0
     for message in told():

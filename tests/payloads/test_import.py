@@ -1,4 +1,4 @@
-"""`import` of recordings with fields of expired messages: what is listed, and nothing else."""
+"""A copy of a recording with files of rows: what is listed, and nothing else."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def thin(plain: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A store whose scans and clouds have expired."""
     path = tmp_path_factory.mktemp("thin") / "store"
     shutil.copytree(plain, path)
-    expire(path, [0, 1], ["/cloud", "/scan"])
+    expire(path, [0, 1])
     return path
 
 
@@ -40,9 +40,9 @@ def mine(tmp_path: Path) -> Iterator[hl.Store]:
 
 
 def files_of(store: Path) -> dict[str, int]:
-    """Sizes of the segments and files of fields of the recording."""
+    """Sizes of the segments and files of rows of the recording."""
     recording = recording_of(store)
-    found = [*recording.glob("*.mcap"), *recording.glob("payloads/*/*")]
+    found = [*recording.glob("*.mcap"), *recording.glob("*.rows.parquet")]
     return {str(path.relative_to(recording)): path.stat().st_size for path in found}
 
 
@@ -61,9 +61,7 @@ def cut(path: Path) -> None:
 
 
 @pytest.mark.parametrize("fault", [flip, cut, Path.unlink])
-@pytest.mark.parametrize(
-    "name", ["payloads/fields=cloud/*", "payloads/fields=scan/*", "000001.1.mcap"]
-)
+@pytest.mark.parametrize("name", ["000001.rows.parquet", "000001.1.rows.parquet", "000000.mcap"])
 def test_a_source_that_was_mended_is_imported(
     source: Path, mine: hl.Store, thin: Path, name: str, fault: Callable[[Path], None]
 ) -> None:
@@ -84,22 +82,15 @@ def test_a_source_that_was_mended_is_imported(
 
 def test_only_what_is_listed_is_copied(source: Path, mine: hl.Store, thin: Path) -> None:
     recording = recording_of(source)
-    for name in (
-        "secret",
-        "000000.mcap.old",
-        "payloads/loose",
-        "payloads/fields=scan/more.parquet",
-    ):
+    for name in ("secret", "000000.mcap.old", "000000.rows.parquet"):
         (recording / name).write_bytes(b"not listed")
-    (recording / "payloads" / "fields=other").mkdir()
-    (recording / "payloads" / "fields=other" / "link").symlink_to("/etc/passwd")
+    (recording / "link").symlink_to("/etc/passwd")
     report = bring(mine, source)
     assert report.copied == ["log"]
     assert report.bytes_copied == sum(files_of(thin).values())
     assert files_of(mine.directory.path) == files_of(thin)
     names = {path.name for path in recording_of(mine.directory.path).iterdir()}
-    segments = {name for name in files_of(thin) if name.endswith(".mcap")}
-    assert names - {"manifest.lock"} == {"payloads", "writer.lock", *segments}
+    assert names - {"manifest.lock"} == {"writer.lock", *files_of(thin)}
     assert mine.recordings()[0].status == "complete"
     assert not mine.verify().findings
 
@@ -110,11 +101,10 @@ def test_what_an_earlier_import_left_is_checked(source: Path, mine: hl.Store, th
     shutil.copytree(recording_of(source), hidden)
     for name in ("manifest.lock", "manifest.old"):
         (hidden / name).unlink()  # they come when all else is whole
-    shutil.copy(hidden / "000000.1.mcap", hidden / "000077.mcap")
-    (hidden / "payloads" / "fields=scan" / "stale.parquet").write_bytes(b"stale")
-    for path in hidden.glob("payloads/fields=cloud/*"):
-        flip(path)
-    cut(hidden / "000001.1.mcap")
+    shutil.copy(hidden / "000000.mcap", hidden / "000077.mcap")
+    (hidden / "000000.rows.parquet").write_bytes(b"stale")
+    flip(hidden / "000001.1.rows.parquet")
+    cut(hidden / "000001.rows.parquet")
     assert bring(mine, source).copied == ["log"]
     assert files_of(mine.directory.path) == files_of(thin)
     assert mine.recordings()[0].status == "complete"

@@ -199,7 +199,7 @@ def test_files_that_were_replaced_are_looked_for_once_more(
         assert store.entry("one").segments > 2
         recording = store.entry("one").id
         with writer.directory.writing(recording):
-            expire(writer.directory, recording, [0, 2], min_bytes=0)
+            expire(writer.directory, recording, [0, 2])
         assert ASKS[name](store) == 200
 
 

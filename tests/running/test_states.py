@@ -108,7 +108,7 @@ def test_all_payloads_of_a_copy_have_expired(running: Running, tmp_path: Path) -
     with hl.open(copied, mongo=NO_MONGODB) as store:
         entry = store.entry(LABEL)
         with store.directory.writing(entry.id):
-            expire(store.directory, entry.id, [*map(int, entry.digests)], min_bytes=0)
+            expire(store.directory, entry.id, [*map(int, entry.digests)])
         store.refresh()
         check_expired(store, known)
     shutil.rmtree(copied / "tables")
@@ -122,13 +122,13 @@ def test_payloads_expire_while_it_is_recorded(tmp_path: Path) -> None:
         known = running.flushed()
         entry = running.before.entry(LABEL)
         sealed = sorted(map(int, entry.digests))
-        expire(running.store.directory, entry.id, sealed[:1], min_bytes=0)
+        expire(running.store.directory, entry.id, sealed[:1])
         check_expired(running.before, known)
-        expire(running.store.directory, entry.id, sealed[:3], ["/cam", "/arm"], min_bytes=0)
+        expire(running.store.directory, entry.id, sealed[:3])
         running.write(30)
         known = running.flushed()
         check_expired(running.before, known)
-        expire(running.store.directory, entry.id, sealed, min_bytes=0)
+        expire(running.store.directory, entry.id, sealed)
         known = running.flushed()
         check_expired(running.before, known)
     with hl.open(tmp_path / "store") as store:

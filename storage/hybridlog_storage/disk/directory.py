@@ -19,10 +19,9 @@ import hashlib
 import os
 import re
 import secrets
-import stat
 import sys
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from itertools import takewhile
@@ -43,7 +42,12 @@ from hybridlog_storage.manifests import (
     DiskManifests,
     Manifests,
 )
-from hybridlog_storage.segments.segment_file import OPEN_SUFFIX, SEALED_SUFFIX, number_of
+from hybridlog_storage.segments.segment_file import (
+    OPEN_SUFFIX,
+    SEALED_SUFFIX,
+    is_rows,
+    number_of,
+)
 from hybridlog_storage.settings import NAME as SETTINGS
 from hybridlog_storage.settings import StoreSettings, read_settings, write_settings
 from hybridlog_storage.stopping import pause
@@ -51,8 +55,6 @@ from hybridlog_storage.stopping import pause
 LOCK: Final = WRITER_LOCK
 LOCK_WAIT_S: Final = 10.0
 """Seconds that a command waits for another one that holds its recording."""
-PAYLOADS: Final = "payloads"
-"""Folder of a recording that holds the fields of its expired messages."""
 _RECORDINGS: Final = "recordings"
 _OF_MANIFEST: Final = frozenset({MANIFEST_LOCK, MANIFEST_OLD, f".{MANIFEST_OLD}"})
 _TICK_NS: Final = 50_000_000
@@ -72,8 +74,7 @@ class ListedFile(NamedTuple):
 def listed_files(manifest: Manifest) -> list[ListedFile]:
     """All files that a manifest lists, without those that are gone."""
     here = (one for one in manifest.files if one.is_here)
-    found = [ListedFile(one.name, one.bytes, one.digest) for one in here]
-    return found + [ListedFile(f"{PAYLOADS}/{o.file}", o.bytes, o.digest) for o in manifest.fields]
+    return [ListedFile(one.name, one.bytes, one.digest) for one in here]
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,10 +95,11 @@ class Listing:
     """Content of a recording's directory.
 
     Attributes:
-        sealed: Names of sealed segments, by number; of several, the one with the least version.
+        sealed: Names of sealed segments, by number; of those that are gone, of their first file of
+            rows once `choosing` has told.
         open: Names of segments that were never sealed, by number.
         others: All other names.
-        payloads: Sizes of files of fields, by path below `payloads`.
+        rows: Sizes of files of rows, by name.
         look: As of `StoreDirectory.looks`, before the names were read.
         print: A value that changes whenever a relevant file changes.
     """
@@ -105,18 +107,40 @@ class Listing:
     sealed: Mapping[int, str]
     open: Mapping[int, str]
     others: tuple[str, ...]
-    payloads: Mapping[str, int]
+    rows: Mapping[str, int]
     look: str
     print: str
 
-    def choosing(self, names: Iterable[str]) -> Listing:
-        """The same, with these of several sealed segments of one number."""
-        chosen = {int(name[:6]): name for name in {*names} & {*self.others}}
-        chosen = {number: name for number, name in chosen.items() if number in self.sealed}
-        if not chosen:
-            return self
-        others = {*self.others, *(self.sealed[number] for number in chosen)} - {*chosen.values()}
-        return replace(self, sealed={**self.sealed, **chosen}, others=tuple(sorted(others)))
+    def choosing(self, manifest: Manifest | None) -> Listing:
+        """The same as a manifest says; what it does not list, or says is gone, is among others."""
+        sealed = dict(self.sealed)
+        if manifest is None:
+            wanted: dict[int, str] = {}
+            for name in sorted(self.rows, key=lambda name: (len(name), name)):
+                if int(name[:6]) not in sealed:
+                    wanted.setdefault(int(name[:6]), name)
+            return replace(self, sealed=dict(sorted((sealed | wanted).items())))
+        rows, listed = manifest.rows, set[str]()
+        for number, log in manifest.logs.items():
+            if not log.is_here:
+                names = [file.name for file in rows[number]]
+                listed.update(names)
+                sealed.pop(number, None)
+                if names[0] in self.rows:
+                    sealed[number] = names[0]
+        others = {*self.others, *self.sealed.values(), *self.rows} - {*sealed.values()} - listed
+        return replace(self, sealed=dict(sorted(sealed.items())), others=tuple(sorted(others)))
+
+    def left_over(self, manifest: Manifest) -> list[str]:
+        """Files that an expiry has left: rows of logs that are here, logs whose rows are whole."""
+        found, rows = [], manifest.rows
+        for number, log in manifest.logs.items():
+            names = {file.name: file.bytes for file in rows.get(number, ())}
+            found += [n for n in self.rows if int(n[:6]) == number and n not in names]
+            is_whole = all(self.rows.get(name) == size for name, size in names.items())
+            if not log.is_here and is_whole and number in self.sealed:
+                found.append(self.sealed[number])
+        return found
 
 
 class StoreDirectory:
@@ -316,15 +340,18 @@ class StoreDirectory:
         recording: str,
         segments: Collection[int] = (),
         check: Callable[[Manifest], object] = lambda _: None,
-    ) -> Iterator[StoreDirectory]:
+    ) -> Iterator[tuple[StoreDirectory, int]]:
         """A directory where files of a recording can be changed, within `writing`: this one.
 
         Args:
             recording: Its id.
             segments: Numbers of the segments that are changed.
             check: Called with the newest manifest before it is changed; raises to leave it.
+
+        Yields:
+            The directory, and a number for the names of new files of rows.
         """
-        yield self
+        yield self, 0
 
     def listed_bytes(self) -> int | None:
         """Bytes of all files, by manifests alone; None where the disk says it."""
@@ -359,40 +386,37 @@ class StoreDirectory:
         path = self.recording(recording)
         look = self._look_of(recording)
         manifest = look.split(" ", 3)[-1]
-        found, payloads = {}, {}
+        found = {}
         try:
             found = files.names(path)
-            if PAYLOADS in found:
-                payloads = payload_names(path)
         except FileNotFoundError:
             pass
         except OSError as error:
             raise unreadable(error, path) from error
         opened: dict[int, str] = {}
         others = []
-        versions: dict[int, dict[int, str]] = {}
+        sealed: dict[int, str] = {}
+        rows: dict[str, int] = {}
         looks = hashlib.blake2b(digest_size=16)
         looks.update(f"{manifest}\n".encode())
         for name, about in sorted(found.items()):
-            number, version, kind = _numbered(name)
+            number, kind = _numbered(name)
             if kind == OPEN_SUFFIX:
                 opened[number] = name
                 looks.update(f"{name}\n".encode())
             elif kind == SEALED_SUFFIX:
-                versions.setdefault(number, {})[version] = name
+                sealed[number] = name
+            elif is_rows(name):
+                rows[name] = about.st_size
             elif name not in _OF_MANIFEST:
                 others.append(name)
-            if kind == SEALED_SUFFIX:
+            if kind == SEALED_SUFFIX or name in rows:
                 looks.update(f"{name} {_file_look(about)}\n".encode())
-        for name, about in sorted(payloads.items()):
-            looks.update(f"{name} {_file_look(about)}\n".encode())
-        sealed = {number: names.pop(min(names)) for number, names in sorted(versions.items())}
-        others += (name for names in versions.values() for name in names.values())
         return Listing(
-            sealed,
+            dict(sorted(sealed.items())),
             dict(sorted(opened.items())),
             tuple(sorted(others)),
-            {name: about.st_size for name, about in sorted(payloads.items())},
+            rows,
             look,
             looks.hexdigest(),
         )
@@ -567,27 +591,10 @@ def _is_a_tick_ago(changed: int) -> bool:
     return abs(time.time_ns() - changed) > _TICK_NS
 
 
-def payload_names(recording: Path, folder: str = PAYLOADS) -> dict[str, os.stat_result]:
-    """Files of fields of a recording, by path below their folder.
-
-    Raises:
-        OSError: It cannot be read.
-    """
-    found: dict[str, os.stat_result] = {}
-    with suppress(FileNotFoundError):
-        for topic, about in files.names(recording / folder).items():
-            if not stat.S_ISDIR(about.st_mode):
-                found[topic] = about
-                continue
-            inside = files.names(recording / folder / topic)
-            found.update({f"{topic}/{name}": status for name, status in inside.items()})
-    return found
-
-
-def _numbered(name: str) -> tuple[int, int, str]:
-    """Number, version and suffix of a segment's file; an empty suffix for other files."""
+def _numbered(name: str) -> tuple[int, str]:
+    """Number and suffix of a segment's file; an empty suffix for other files."""
     sealed = name.removesuffix(OPEN_SUFFIX) + SEALED_SUFFIX if name.endswith(OPEN_SUFFIX) else name
     found = number_of(sealed)
-    if found is None or (sealed != name and found[1]):
-        return 0, 0, ""
-    return *found, SEALED_SUFFIX if sealed == name else OPEN_SUFFIX
+    if found is None:
+        return 0, ""
+    return found, SEALED_SUFFIX if sealed == name else OPEN_SUFFIX

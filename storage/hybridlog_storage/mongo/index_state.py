@@ -40,7 +40,7 @@ _MAX_NAMES: Final = (
     "notes",
     "marks",
     "pins",
-    "payloads",
+    "rows",
     "stored_bytes",
 )
 """Values of an entry that may change while its segments stay."""

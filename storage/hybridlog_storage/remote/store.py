@@ -34,7 +34,6 @@ from hybridlog_storage.cells import Cells, drop, put
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk import files
 from hybridlog_storage.disk.directory import (
-    PAYLOADS,
     Listing,
     StoreDirectory,
     gone,
@@ -48,11 +47,10 @@ from hybridlog_storage.errors import (
     RecordingGoneError,
     StoreError,
 )
-from hybridlog_storage.manifest import Manifest, decode, encode, with_file
+from hybridlog_storage.manifest import Manifest, decode, encode, with_rows
 from hybridlog_storage.manifests import BucketManifests
 from hybridlog_storage.remote.blocks import LOST, BlockCache, inode_of
 from hybridlog_storage.remote.bucket import Bucket, Object
-from hybridlog_storage.segments.segment_file import sealed_name
 from hybridlog_storage.settings import NAME as SETTINGS
 from hybridlog_storage.settings import NONE, StoreSettings, read_settings, settings_text
 
@@ -529,14 +527,14 @@ class RemoteDirectory(StoreDirectory):
         manifest = self.manifests.find(recording)
         if manifest is None:
             raise ManifestError(f"{recording} has no manifest. {BucketManifests.cure}")
-        logs = (one for _, one in sorted(manifest.logs.items()) if one.is_here)
-        sealed = {one.number: one.name for one in logs if one.name not in lost}
-        fields = (one for one in manifest.fields if f"{PAYLOADS}/{one.file}" not in lost)
-        payloads = {one.file: one.bytes for one in fields}
+        sealed = {n: one.name for n, one in sorted(manifest.logs.items()) if one.is_here}
+        sealed = {number: name for number, name in sealed.items() if name not in lost}
+        files = (one for own in manifest.rows.values() for one in own)
+        rows = {one.name: one.bytes for one in files if one.name not in lost}
         # What people say of a recording makes no other files of it.
         plain = truth.replace(manifest, name="-", tags={}, notes=(), marks=(), pins=(), changes=0)
         state = truth.hasher(encode(plain) + repr(sorted(lost)).encode()).hexdigest()
-        return Listing(sealed, {}, (PAYLOADS,) if payloads else (), payloads, look, state)
+        return Listing(sealed, {}, (), rows, look, state)
 
     def listed_bytes(self) -> int:
         """Bytes of all files that manifests list, and of tables."""
@@ -576,7 +574,7 @@ class RemoteDirectory(StoreDirectory):
         recording: str,
         segments: Collection[int] = (),
         check: Callable[[Manifest], object] = lambda _: None,
-    ) -> Iterator[StoreDirectory]:
+    ) -> Iterator[tuple[StoreDirectory, int]]:
         """As of a directory: a hidden one on the disk, of which all that is new becomes objects.
 
         Raises:
@@ -584,27 +582,18 @@ class RemoteDirectory(StoreDirectory):
         """
         before = self.manifests.read(recording)
         objects = self.source.files_of(before)
-        logs = {number: before.logs[number] for number in segments}
         # Others may do the same, so all that is made here has names of its own.
-        own = 1 + secrets.randbelow(9 * 10**8)
-        names = {number: sealed_name(number, own) for number in logs}
+        version = 1 + secrets.randbelow(9 * 10**8)
         with tempfile.TemporaryDirectory(prefix="hybridlog-") as place:
             here = StoreDirectory.create(Path(place) / "store")
-            begun = truth.replace(before, deleted=(f"-/-{own}.parquet",))
-            for number, name in names.items():
-                begun = with_file(begun, number, name=name)
-            here.manifests.create(begun)
+            here.manifests.create(before)
             folder = here.recording(recording)
-            for number, log in logs.items():
-                self._fetch(objects[log.name], folder / names[number])
-            for one in before.fields:
-                path = f"{PAYLOADS}/{one.file}"
-                self._fetch(objects[path], folder / path)
-            yield here
+            for number in segments:
+                if number in before.logs and before.logs[number].is_here:
+                    name = before.logs[number].name
+                    self._fetch(objects[name], folder / name)
+            yield here, version
             after = here.manifests.read(recording)
-            for number, name in names.items():
-                if after.logs[number].name == name:  # it has stayed
-                    after = with_file(after, number, name=logs[number].name)
             made = self.source.files_of(after)
             new = [path for path in made if path not in objects]
             try:
@@ -648,18 +637,12 @@ def _brought(
         StoreError: Files that were changed are others by now.
     """
     check(now)
-    logs = {n: one for n, one in after.logs.items() if one != before.logs[n]}
-    gone = [one for one in before.fields if one not in after.fields]
-    if any(now.logs.get(n) != before.logs[n] for n in logs) or any(
-        one not in now.fields for one in gone
-    ):
-        raise StoreError(f"Files of {now.name} were replaced meanwhile. Try again.")
-    fields = [one for one in now.fields if one not in gone]
-    return truth.replace(
-        now,
-        files=tuple(logs.get(one.number, one) if one.kind == "log" else one for one in now.files),
-        fields=(*fields, *(one for one in after.fields if one not in before.fields)),
-    )
+    for number, log in after.logs.items():
+        if log != before.logs[number]:
+            if now.logs.get(number) != before.logs[number]:
+                raise StoreError(f"Files of {now.name} were replaced meanwhile. Try again.")
+            now = with_rows(now, log, after.rows[number])
+    return now
 
 
 def _objects(body: bytes) -> list[Object]:

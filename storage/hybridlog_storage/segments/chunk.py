@@ -111,15 +111,17 @@ def pack(
 
 
 class ExpiredMessages(NamedTuple):
-    """The remains of the messages of an expired chunk.
+    """The remains of the messages of a chunk whose log is gone.
 
     Attributes:
-        batch: The messages; `channel` holds ids of channels of expired messages.
-        fields: Rows of the batch, and the columns of their table that fields have, an Arrow
+        batch: The messages; `channel` holds the ids as the log had them.
+        seq: int64[n], arrival numbers.
+        fields: Rows of the batch, and the columns of their table that rows files have, an Arrow
             struct each; a pair for each topic.
     """
 
     batch: Batch
+    seq: NDArray[np.int64]
     fields: Sequence[tuple[NDArray[np.intp], Any]]
 
 

@@ -20,7 +20,7 @@ from hybridlog_storage.lazy import RowType
 from hybridlog_storage.messages import EXPIRED_IDS
 from hybridlog_storage.ordering import run_starts
 from hybridlog_storage.segments.compression import decompress
-from hybridlog_storage.segments.segment_format import ADDED_IDS, checked_frame
+from hybridlog_storage.segments.segment_format import checked_frame
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -106,18 +106,10 @@ class ChunkTable:
         np.cumsum(self.chunks["parts"], out=bounds[1:])
         return bounds
 
-    @property
-    def is_expired(self) -> NDArray[np.bool_]:
-        """bool[n], True for chunks whose payloads were deleted."""
-        return np.isin(self.chunks["length"], [*ADDED_IDS])
-
-    def with_expired(self) -> ChunkTable:
-        """The table with the messages of expired chunks on channels of their own."""
-        if not self.is_expired.any():
-            return self
-        parts, length = self.parts.copy(), np.repeat(self.chunks["length"], self.chunks["parts"])
-        for size, added in ADDED_IDS.items():
-            parts["channel"][length == size] += added
+    def with_added(self, added: int) -> ChunkTable:
+        """The table with all messages on channels whose ids are greater by a number."""
+        parts = self.parts.copy()
+        parts["channel"] += added
         return replace(self, parts=parts)
 
     def as_stored(self) -> ChunkTable:

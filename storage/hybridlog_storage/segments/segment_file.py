@@ -32,30 +32,22 @@ from hybridlog_storage.segments.chunk import PackedChunk, StoredChunk
 from hybridlog_storage.segments.chunk_table import ChunkTable, TableBuilder
 from hybridlog_storage.segments.segment_format import (
     ARRIVAL_HEAD,
-    CHUNK_HEAD,
     CHUNK_TABLE_OPCODE,
-    CONTENT_ELSEWHERE,
     FORMAT_VERSION,
-    INDEX_HEAD,
     LIBRARY,
     MAGIC,
     PROFILE,
-    PROOF,
     RECORDING_METADATA,
     ChunkSummary,
     Proof,
     arrival_record,
     channel_record,
     chunk_index_record,
-    compression_of,
     definitions_chunk,
-    head_length,
     json_metadata,
     padding_record,
-    proof_of,
     record_bytes,
     schema_record,
-    split_trailer,
 )
 
 if TYPE_CHECKING:
@@ -66,7 +58,9 @@ if TYPE_CHECKING:
 
 OPEN_SUFFIX = ".mcap.open"
 SEALED_SUFFIX = ".mcap"
-_SEALED = re.compile(r"(?P<number>[0-9]{6,9})(\.(?P<version>[1-9][0-9]{0,8}))?\.mcap")
+ROWS_SUFFIX = ".rows.parquet"
+_SEALED = re.compile(r"(?P<number>[0-9]{6})\.mcap")
+_ROWS = re.compile(r"[0-9]{6}(\.[1-9][0-9]{0,9})?\.rows\.parquet")
 _SMALL_DEFINITIONS = 1024  # bytes of definitions that are not compressed
 
 
@@ -120,18 +114,25 @@ OnSealing = Callable[[Sealed], None]
 """Called when a segment is complete and on the disk, before it gets its final name."""
 
 
-def sealed_name(number: int, version: int = 0) -> str:
-    """File name of a sealed segment; it has a version once payloads of it have expired."""
-    return f"{number:06d}{f'.{version}' if version else ''}{SEALED_SUFFIX}"
+def sealed_name(number: int) -> str:
+    """File name of a sealed segment."""
+    return f"{number:06d}{SEALED_SUFFIX}"
 
 
-def number_of(name: str) -> tuple[int, int] | None:
-    """Number and version of a sealed segment, by the name of its file; None for other files."""
+def number_of(name: str) -> int | None:
+    """Number of a sealed segment, by the name of its file; None for other files."""
     found = _SEALED.fullmatch(name)
-    if found is None:
-        return None
-    number, version = int(found["number"]), int(found["version"] or 0)
-    return (number, version) if sealed_name(number, version) == name else None
+    return None if found is None else int(found["number"])
+
+
+def is_rows(name: str) -> bool:
+    """True for the name of a file of rows."""
+    return _ROWS.fullmatch(name) is not None
+
+
+def rows_name(number: int, version: int = 0) -> str:
+    """Name of a file with what is left of the messages of a log that is gone."""
+    return f"{number:06d}{f'.{version}' if version else ''}{ROWS_SUFFIX}"
 
 
 def sealed_channels(
@@ -318,10 +319,6 @@ class SegmentFile:
         """Note an attachment that is in the file already."""
         self._attachment_indexes.append(attachment.index(offset, length))
 
-    def note_attachment_index(self, index: AttachmentIndex) -> None:
-        """Note an attachment that is in the file already, by its index record."""
-        self._attachment_indexes.append(index)
-
     def end_behind(self, chunk: PackedChunk, at: int) -> int:
         """Byte of the file where a chunk ends that is appended when the file has `at` bytes."""
         trailer = sum(map(len, chunk.indexes.values())) + ARRIVAL_HEAD + len(chunk.arrivals)
@@ -381,50 +378,6 @@ class SegmentFile:
                 trailer_crc=place.trailer_crc,
             )
         return stored
-
-    def append_stretch(self, pieces: Iterable[Buffer]) -> None:
-        """Append checked bytes of another segment that belong to no chunk."""
-        length = crc = 0
-        for piece in pieces:
-            self._append([piece])
-            length, crc = length + len(piece), crc32(piece, crc)
-        self.table.stretch(length, crc)
-
-    def append_copy(self, record: Buffer, trailer: Buffer, parts: NDArray[np.void]) -> None:
-        """Append a chunk of another segment, or the record of an expired one.
-
-        Args:
-            record: Its record.
-            trailer: Message indexes and arrival numbers, as they stand in the other segment.
-            parts: `PART`[c], statistics of each channel in it.
-
-        Raises:
-            SegmentError: It is damaged.
-        """
-        indexes, body = split_trailer(trailer)
-        offset = self.position
-        head = crc32(record[: head_length(record)])
-        proof = proof_of(body)._replace(chunk=offset, head=head, record=crc32(record))
-        arrivals = arrival_record(proof, body[PROOF.size :])
-        own = bytes(trailer[: len(trailer) - len(arrivals)]) + arrivals
-        _, _, first, last, size, _ = CHUNK_HEAD.unpack_from(record)
-        self._append([record, own])
-        checksums = {"crc": proof.record, "trailer_crc": crc32(own)}
-        if record[0] in CONTENT_ELSEWHERE:
-            self.table.chunk(
-                offset=offset,
-                length=len(record),
-                trailer=len(own),
-                first=first,
-                last=last,
-                parts=parts,
-                **checksums,
-            )
-            return
-        compression, compressed = compression_of(record)
-        sizes = {channel: INDEX_HEAD.size + rows.nbytes for channel, rows in indexes}
-        chunk = ChunkSummary(first, last, offset, len(record), sizes, compression, compressed, size)
-        self.note_chunk(chunk, parts, trailer=len(own), **checksums)
 
     def append_trailer(self, trailer: bytes) -> None:
         """Append indexes and arrival numbers of a chunk that a crash cut off."""

@@ -34,7 +34,7 @@ from hybridlog_storage.mcap.mcap_content import (
     MESSAGE_HEAD,
     RECORD_HEAD,
 )
-from hybridlog_storage.messages import EXPIRED_IDS, Batch, Buffer, Channel, Schema
+from hybridlog_storage.messages import Batch, Buffer, Channel, Schema
 from hybridlog_storage.ordering import run_starts
 from hybridlog_storage.segments.compression import decompress
 
@@ -63,27 +63,7 @@ PADDING_OPCODE: Final = 0x91
 CHUNK_TABLE_OPCODE: Final = 0x92
 """Record of the summary: the chunk table, see `chunk_table`."""
 
-EXPIRED_OPCODE: Final = 0x94
-"""Record in place of a chunk whose payloads were deleted; what is left lies in files of fields."""
-NOT_COPIED_OPCODE: Final = 0x95
-"""The same, of payloads that are to be copied later."""
-COMPACTED_METADATA: Final = "hybridlog.compacted"
-"""Metadata record of a segment with expired chunks."""
-DATA_END_SIZE: Final = 13
-"""Bytes of the record of the end of the data."""
 CHUNK_HEAD: Final = struct.Struct("<BQQQQI")
-_EXPIRED_TAIL = struct.Struct("<Q")  # bytes of the chunk record that was there
-EXPIRED_SIZE: Final = CHUNK_HEAD.size + _EXPIRED_TAIL.size
-"""Bytes of the record of an expired chunk; every chunk record has more."""
-NOT_COPIED_SIZE: Final = EXPIRED_SIZE + 1
-"""The same of one that is to be copied later: chunk tables have no opcodes, only sizes."""
-ADDED_IDS: Final = {EXPIRED_SIZE: EXPIRED_IDS, NOT_COPIED_SIZE: 2 * EXPIRED_IDS}
-"""What is added to ids of channels of expired chunks, by the bytes of their records."""
-CONTENT_ELSEWHERE: Final = {
-    EXPIRED_OPCODE: EXPIRED_SIZE,
-    NOT_COPIED_OPCODE: NOT_COPIED_SIZE,
-}
-"""Bytes of the records in place of chunks, by opcode."""
 INDEX_HEAD: Final = struct.Struct("<BQHI")
 PROOF: Final = struct.Struct("<QQIIIII")
 """Fields of an arrival record: those of `Proof`, then a CRC-32 of the record."""
@@ -244,26 +224,9 @@ def compression_of(record: Buffer) -> tuple[str, int]:
 
 
 def head_length(record: Buffer) -> int:
-    """Bytes of a chunk record before its content; all of that of an expired chunk."""
-    if record[0] in CONTENT_ELSEWHERE:
-        return CONTENT_ELSEWHERE[record[0]]
+    """Bytes of a chunk record before its content."""
     (name,) = struct.unpack_from("<I", record, CHUNK_HEAD.size)
     return int(CHUNK_HEAD.size + 4 + name + 8)
-
-
-def expired_record(chunk: Buffer) -> bytes:
-    """The record in place of a chunk record whose payloads are deleted."""
-    _, _, first, last, size, crc = CHUNK_HEAD.unpack_from(chunk)
-    length = EXPIRED_SIZE - RECORD_HEAD.size
-    head = CHUNK_HEAD.pack(EXPIRED_OPCODE, length, first, last, size, crc)
-    return head + _EXPIRED_TAIL.pack(len(chunk))
-
-
-def not_copied_record(chunk: Buffer) -> bytes:
-    """The record in place of a chunk record whose payloads are copied later; see above."""
-    record = expired_record(chunk)
-    length = NOT_COPIED_SIZE - RECORD_HEAD.size
-    return RECORD_HEAD.pack(NOT_COPIED_OPCODE, length) + record[RECORD_HEAD.size :] + b"\0"
 
 
 def padding_record(size: int) -> bytes:

@@ -9,11 +9,11 @@ from __future__ import annotations
 import os
 import stat
 import struct
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, Protocol, Self, TypeVar
+from typing import TYPE_CHECKING, Any, BinaryIO, Self
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -33,7 +33,7 @@ from hybridlog_storage.mcap.mcap_content import (
     parse_content,
     read_record,
 )
-from hybridlog_storage.messages import Buffer, Channel, with_expired
+from hybridlog_storage.messages import EXPIRED_IDS, MARKS_CHANNEL, Buffer, Channel, with_expired
 from hybridlog_storage.ordering import distinct
 from hybridlog_storage.segments.attachments import (
     MAX_HEAD,
@@ -41,15 +41,12 @@ from hybridlog_storage.segments.attachments import (
     FileHandle,
     parse_attachment,
 )
-from hybridlog_storage.segments.chunk import ExpiredMessages, StoredChunk
+from hybridlog_storage.segments.chunk import StoredChunk
 from hybridlog_storage.segments.chunk_table import ChunkTable
 from hybridlog_storage.segments.compression import FilePart, decompress
 from hybridlog_storage.segments.segment_format import (
-    ADDED_IDS,
     CHUNK_HEAD,
     CHUNK_TABLE_OPCODE,
-    COMPACTED_METADATA,
-    CONTENT_ELSEWHERE,
     END_METADATA,
     FORMAT_VERSION,
     LOSSES_METADATA,
@@ -67,7 +64,7 @@ from hybridlog_storage.segments.segment_format import (
     messages_at,
     split_trailer,
 )
-from hybridlog_storage.segments.statements import compacted_of, end_of, loss_rows
+from hybridlog_storage.segments.statements import end_of, loss_rows
 from hybridlog_storage.stopping import check_wanted
 
 if TYPE_CHECKING:
@@ -76,7 +73,6 @@ if TYPE_CHECKING:
 
     from hybridlog_storage.messages import Batch
 
-_T = TypeVar("_T")
 _FOOTER = struct.Struct("<BQQQI")  # head, start of the summary and of its offsets, checksum
 _TAIL = _FOOTER.size + len(MAGIC)
 _MAX_SUMMARY = 1 << 30
@@ -112,7 +108,7 @@ class ChunkPlace:
     @property
     def is_expired(self) -> bool:
         """True if its payloads were deleted, or are to be copied later."""
-        return self.length in ADDED_IDS
+        return EXPIRED_IDS <= self.channels[0] < MARKS_CHANNEL
 
     def stored(
         self,
@@ -145,14 +141,12 @@ class SegmentSummary:
     Attributes:
         recording: Catalog entry of the recording at the start of the segment.
         end: The end of the recording; None except in its last segment.
-        channels: Channels by id, and those of expired messages, see `EXPIRED_IDS`.
+        channels: Channels by id, and those of messages without payload, see `EXPIRED_IDS`.
         schema_ids: Id of each channel's schema, 0 without one, by channel id.
         counts: Number of messages by channel id.
         losses: Rows of the loss ledger written with its messages.
         attachments: Attachments of the source, in file order.
         metadata: Metadata records of the source, in file order.
-        compacted: `digest` of a segment before chunks expired, and the `files` of fields that
-            it needs; None in others.
         table: The chunk table.
         size: Bytes of the file.
     """
@@ -165,7 +159,6 @@ class SegmentSummary:
     losses: list[dict[str, Any]]
     attachments: list[AttachmentIndex]
     metadata: list[MetadataIndex]
-    compacted: dict[str, Any] | None
     table: ChunkTable
     size: int
 
@@ -173,19 +166,6 @@ class SegmentSummary:
     def chunks(self) -> list[ChunkPlace]:
         """Position of each chunk, in file order."""
         return places_of(self.table)
-
-    def content(self, digest: str) -> str:
-        """Its digest before chunks of it expired, by which tables and the index know it.
-
-        Args:
-            digest: That of its file.
-        """
-        return (self.compacted or {}).get("digest", digest)  # type: ignore[no-any-return]
-
-    def topics_in(self, chunks: Iterable[ChunkPlace]) -> list[str]:
-        """Topics of some chunks, in order."""
-        numbers = {number for chunk in chunks for number in chunk.channels}
-        return sorted({self.channels[number].topic for number in numbers})
 
 
 @dataclass(slots=True)
@@ -200,17 +180,6 @@ class _Records:
     table: Buffer | None
 
 
-class Contents(Protocol):
-    """Finds what is left of chunks that are not in the segment. The caller checks it."""
-
-    def expired(self, segment: int, chunk: int) -> ExpiredMessages:
-        """The remains of an expired chunk.
-
-        Raises:
-            SegmentError: It is missing or damaged.
-        """
-
-
 class SegmentReader:
     """One sealed segment file.
 
@@ -219,24 +188,16 @@ class SegmentReader:
         number: Its number in the recording.
         direct: Read past the page cache, if the file system allows it: for data that was
             just written that way and will not be read again soon.
-        contents: Has what is left of expired chunks.
 
     Raises:
             SegmentError: The file is missing or cannot be opened.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        number: int,
-        *,
-        direct: bool = False,
-        contents: Contents | None = None,
-    ) -> None:
+    _added = 0  # to ids of channels
+
+    def __init__(self, path: Path, number: int, *, direct: bool = False) -> None:
         self.path = path
         self.number = number
-        self._contents = contents
-        self._places: list[ChunkPlace] | None = None
         self._direct = direct and bool(DIRECT)
         cure = "Restore the file, or run `hybridlog verify` for a list of what is affected."
         try:
@@ -315,7 +276,8 @@ class SegmentReader:
         """
         with self._explained():
             start, tail = self._tail()
-            return self._table(_records(tail[: len(tail) - _TAIL]), start).with_expired()
+            table = self._table(_records(tail[: len(tail) - _TAIL]), start)
+            return table.with_added(self._added) if self._added else table
 
     @contextmanager
     def _explained(self) -> Iterator[None]:
@@ -376,20 +338,17 @@ class SegmentReader:
                     check_format(found[index.name], self.path)
                 else:
                     found[index.name] = dict(end_of(found[index.name]))
-            elif index.name == COMPACTED_METADATA:
-                value = json_of(self.metadata(table, index))
-                found[index.name] = dict(compacted_of(value))
             elif index.name == LOSSES_METADATA:
                 losses += loss_rows(json_of(self.metadata(table, index)))
         if RECORDING_METADATA not in found:
             raise SegmentError(f"{self.path} is no segment of a hybridlog store.")
         stated = records.statistics.channel_message_counts if records.statistics else {}
         is_known = {*table.parts["channel"].tolist()} <= records.channels.keys()
-        if _listed_counts(table) != {c: n for c, n in stated.items() if n} or not is_known:
+        if _counts(table) != {c: n for c, n in stated.items() if n} or not is_known:
             raise _NoSummaryError("its statistics and its chunk table differ")
-        table = table.with_expired()
-        totals = table.by_channel()
-        counts = dict(zip(totals["channel"].tolist(), totals["messages"].tolist(), strict=True))
+        if self._added:
+            table = table.with_added(self._added)
+        counts = _counts(table)
         channels = {i: channel_of(r, records.schemas) for i, r in records.channels.items()}
         return SegmentSummary(
             recording=found[RECORDING_METADATA],
@@ -400,7 +359,6 @@ class SegmentReader:
             losses=losses,
             attachments=records.attachments,
             metadata=[i for i in records.metadata if not i.name.startswith(OUR_NAMES)],
-            compacted=found.get(COMPACTED_METADATA),
             table=table,
             size=self.size,
         )
@@ -469,25 +427,18 @@ class SegmentReader:
         Raises:
                 SegmentError: It is missing or damaged; the message names file and offset.
         """
-        return self._at_its_place(place, self._read_chunk)
-
-    def _read_chunk(self, place: ChunkPlace) -> StoredChunk:
+        check_wanted()
         data = self.read(place.offset, place.length + place.trailer)
         record, trailer = data[: place.length], data[place.length :]
         try:
             if crc32(record) != place.crc:
                 raise SegmentError("its checksum differs")
-            compressed, fields = 0, None
-            if len(record) in ADDED_IDS:
-                left = self._expired(place, record)
-                batch, fields = left.batch, left.fields
-            else:
-                content, compressed = open_chunk(record)
-                batch = self._messages(place, content, trailer)
+            content, compressed = open_chunk(record)
+            batch = self._messages(place, content, trailer)
             seq = check_arrivals(trailer, place.offset, len(batch))
         except SegmentError as error:
             raise self._damaged(place, error) from error
-        return place.stored(self.number, batch, seq, compressed, fields)
+        return place.stored(self.number, batch, seq, compressed)
 
     def _messages(self, place: ChunkPlace, content: Buffer, trailer: memoryview) -> Batch:
         """The messages of a chunk; damaged message indexes are ignored."""
@@ -497,47 +448,6 @@ class SegmentReader:
         if found is None:
             raise SegmentError("its message indexes do not fit its messages")
         return found
-
-    def _expired(self, place: ChunkPlace, record: memoryview) -> ExpiredMessages:
-        """The remains of an expired chunk: as many messages as it has, of its channels."""
-        opcode, length, *_ = CHUNK_HEAD.unpack_from(record)
-        is_one = CONTENT_ELSEWHERE.get(opcode) == len(record) == length + RECORD_HEAD.size
-        if not is_one:
-            raise SegmentError("no chunk record is there")
-        if self._contents is None:
-            raise SegmentError("its fields lie in files of fields")
-        left = self._contents.expired(self.number, place.number)
-        batch = left.batch
-        batch.channel = batch.channel + np.int32(ADDED_IDS[len(record)])
-        times = (place.first, place.last)
-        is_all = (
-            len(batch)
-            and {*distinct(batch.channel).tolist()} == {*place.channels}
-            and (int(batch.log_time.min()), int(batch.log_time.max())) == times
-        )
-        if not is_all:
-            raise SegmentError("its messages are not those in the files of fields")
-        return left
-
-    def _at_its_place(self, place: ChunkPlace, read: Callable[[ChunkPlace], _T]) -> _T:
-        """Read something of a chunk, whose place may be listed as before a rewriting.
-
-        A segment is written again when chunks expire. Numbers of chunks stay.
-        """
-        check_wanted()
-        try:
-            return read(place)
-        except SegmentError:
-            if self._places is None:
-                self._places = []
-                with suppress(SegmentError):
-                    self._places = places_of(self.table())
-            if place.number >= len(self._places):
-                raise
-            now = self._places[place.number]
-            if (now.offset, now.length) == (place.offset, place.length):
-                raise
-            return read(now)
 
     def _damaged(self, place: ChunkPlace, error: SegmentError) -> SegmentError:
         return SegmentError(f"Chunk at byte {place.offset} of {self.path} is damaged: {error}")
@@ -553,13 +463,10 @@ class SegmentReader:
         Raises:
             SegmentError: They are missing or damaged; the message names file and offset.
         """
-        return self._at_its_place(place, self._read_times)
-
-    def _read_times(self, place: ChunkPlace) -> dict[int, NDArray[np.int64]]:
+        check_wanted()
         trailer = self.read(place.offset + place.length, place.trailer)
         if crc32(trailer) == place.trailer_crc:
-            added = ADDED_IDS.get(place.length, 0)
-            return {number + added: times for number, times in message_times(trailer).items()}
+            return message_times(trailer)
         batch = self.read_chunk(place).batch
         channels = distinct(batch.channel).tolist()
         return {c: np.sort(batch.log_time[batch.channel == c]) for c in channels}
@@ -680,11 +587,9 @@ _WANTED = frozenset(
 )
 
 
-def _listed_counts(table: ChunkTable) -> dict[int, int]:
-    """Messages of each channel in chunks with their content."""
-    is_here = ~np.isin(table.chunks["length"], [*CONTENT_ELSEWHERE.values()])
-    rows = np.repeat(is_here, table.chunks["parts"])
-    totals = replace(table, parts=table.parts[rows]).by_channel()
+def _counts(table: ChunkTable) -> dict[int, int]:
+    """Messages of each channel in a table."""
+    totals = table.by_channel()
     return dict(zip(totals["channel"].tolist(), totals["messages"].tolist(), strict=True))
 
 

@@ -9,7 +9,7 @@ from typing import Any, Literal, TypedDict
 from msgspec import convert
 
 from hybridlog_storage.errors import SegmentError
-from hybridlog_storage.manifest import Count, Digest, FieldsName, Nanoseconds, Text, Topic
+from hybridlog_storage.manifest import Count, Nanoseconds, Text, Topic
 
 LossRow = TypedDict(
     "LossRow",
@@ -37,23 +37,6 @@ class End(TypedDict, total=False):
     damage: list[Text]
 
 
-class FieldsRow(TypedDict):
-    """A file with fields of expired messages."""
-
-    file: FieldsName
-    bytes: Count
-    digest: Digest
-    topic: Topic
-    messages: Count
-
-
-class Compacted(TypedDict):
-    """A segment with expired chunks: its digest before, and files that it needs."""
-
-    digest: Digest
-    files: list[FieldsRow]
-
-
 def end_of(value: object) -> dict[str, Any]:
     """The end of a recording, see `End`.
 
@@ -63,15 +46,6 @@ def end_of(value: object) -> dict[str, Any]:
     found: dict[str, Any] = _checked(value, End)
     _check_spans(found.get("losses", []))
     return found
-
-
-def compacted_of(value: object) -> dict[str, Any]:
-    """The statement of a segment with expired chunks, see `Compacted`.
-
-    Raises:
-        SegmentError: It is damaged.
-    """
-    return _checked(value, Compacted)  # type: ignore[no-any-return]
 
 
 def loss_rows(value: Mapping[str, object]) -> list[dict[str, Any]]:

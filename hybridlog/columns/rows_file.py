@@ -1,4 +1,4 @@
-"""Files with what is left of expired messages: the rows of their table, and their documents.
+"""Files of rows: what is left of the messages of a log that is gone.
 
 Such a file has the columns of a table, in the order of the chunks. Its `ref` also has the
 sender's sequence number, and `left`: size, hash and index document of each message
@@ -19,6 +19,7 @@ import pyarrow.compute as pc
 from hybridlog.columns.column_file import ColumnFile
 from hybridlog.columns.fields import FieldShape, without
 from hybridlog.columns.layout import OWN_COLUMNS
+from hybridlog.columns.parquet_file import ParquetFileReader
 from hybridlog.columns.rows import Messages, own_columns
 from hybridlog.columns.rows import Piece as TablePiece
 from hybridlog.schema.arrow_columns import structs
@@ -27,17 +28,16 @@ from hybridlog.schema.reduced_codec import expired_payloads
 from hybridlog.schema.states import State, state_of
 from hybridlog_storage.cache import Cache
 from hybridlog_storage.errors import StoreError
+from hybridlog_storage.manifest import File, Part, hasher, rows_line
 from hybridlog_storage.messages import Batch
-from hybridlog_storage.mongo.collection_names import collection_of
 from hybridlog_storage.segments.chunk import ExpiredMessages
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
 
-    from hybridlog_storage.manifest import Fields
     from hybridlog_storage.messages import Channel
     from hybridlog_storage.segments.chunk import StoredChunk
 
@@ -45,16 +45,10 @@ _OWN: Final = frozenset(OWN_COLUMNS)
 RESTORE: Final = " Restore it from a copy; `hybridlog verify` shows what is affected."
 
 
-def fields_folder(topic: str) -> str:
-    """Name of the folder of what is left of a topic's expired messages."""
-    return f"fields={collection_of(topic)}"
-
-
-class FieldColumns:
+class RowColumns:
     """Turns messages of one type into rows of what is left of them."""
 
     def __init__(self, channel: Channel) -> None:
-        self.folder = fields_folder(channel.topic)
         self._codec = codec_for(channel)
         self._is_reduced = state_of(channel.message_encoding) is State.REDUCED
         self._shape = FieldShape()
@@ -112,35 +106,33 @@ class Place(NamedTuple):
     rows: int
 
 
-class FieldFile(ColumnFile):
-    """One file with what is left of the expired messages of a topic. Thread safe.
+class RowsFile(ColumnFile):
+    """One file of rows: messages of a topic. Thread safe.
 
     Attributes:
-        listed: As the manifest lists it.
-        places: Rows of each chunk, by segment and number.
+        listed: Its line of the manifest.
+        topic: Its topic.
+        places: Rows of each chunk, by number.
 
     Raises:
         StoreError: It is missing, damaged, or another file than the listed one.
     """
 
-    def __init__(self, folder: Path, listed: Fields, cache: Cache | None = None) -> None:
+    def __init__(self, folder: Path, listed: File, cache: Cache | None = None) -> None:
         self.listed = listed
         self._cache = cache or Cache()
-        path = folder / listed.file
+        path = folder / listed.name
         try:
             super().__init__(path)
         except FileNotFoundError as error:
-            raise StoreError(f"The file of fields {path} is missing.{RESTORE}") from error
-        rows = sum(
-            one.topics[listed.topic].rows
-            for one in self.about.recordings
-            if listed.topic in one.topics
-        )
-        if (self.size_bytes, rows) != (listed.bytes, listed.messages):
+            raise StoreError(f"The file of rows {path} is missing.{RESTORE}") from error
+        rows = sum(part.messages for part in listed.parts.values())
+        if (self.size_bytes, self.about.rows) != (listed.bytes, rows):
             raise self._other()
         try:
-            self.places = self._read_places(self.about.payloads["chunks"])
-        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            ((self.topic, _),) = self.about.recordings[0].topics.items()
+            self.places = self._read_places(self.about.of_rows["chunks"])
+        except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
             raise StoreError(f"The description in {path} is invalid: {error!r}.") from error
 
     def check(self) -> str:
@@ -152,29 +144,29 @@ class FieldFile(ColumnFile):
 
     def _other(self) -> StoreError:
         return StoreError(
-            f"The file of fields {self.path} is not the one that the manifest lists.{RESTORE}"
+            f"The file of rows {self.path} is not the one that the manifest lists.{RESTORE}"
         )
 
-    def _read_places(self, chunks: Any) -> dict[tuple[int, int], Place]:
-        found: dict[tuple[int, int], Place] = {}
+    def _read_places(self, chunks: Any) -> dict[int, Place]:
+        found: dict[int, Place] = {}
         if len(chunks) != self.groups:
             raise ValueError("its row groups and its chunks differ")
         for group, inside in enumerate(chunks):
             at = 0
-            for segment, chunk, rows in inside:
-                found[int(segment), int(chunk)] = Place(group, at, int(rows))
+            for chunk, rows in inside:
+                found[int(chunk)] = Place(group, at, int(rows))
                 at += int(rows)
             if at != self.about.bounds[group][0]:
                 raise ValueError("its row groups and its chunks differ")
         return found
 
-    def rows(self, segment: int, chunk: int) -> pa.StructArray:
+    def rows(self, chunk: int) -> pa.StructArray:
         """The rows of a chunk; a struct has all columns.
 
         Raises:
             StoreError: They are damaged.
         """
-        place = self.places[segment, chunk]
+        place = self.places[chunk]
         return self._group(place).slice(place.begin, place.rows)
 
     def _group(self, place: Place) -> pa.StructArray:
@@ -187,27 +179,23 @@ class FieldFile(ColumnFile):
         ).combine_chunks()
 
 
-def newest(files: Sequence[FieldFile], chunk: tuple[int, int]) -> list[FieldFile]:
-    """Files with rows of a chunk, without those whose rows a later one has again.
-
-    An expiry that a crash has stopped may have written the same rows before.
+def lines_of(folder: Path, log: File, names: Iterable[str]) -> list[File]:
+    """Lines of a manifest for files of rows that no manifest lists.
 
     Args:
-        files: The files, in the order of the manifest.
-        chunk: Segment and number of the chunk.
+        folder: Their folder.
+        log: The line of their log.
+        names: Their names, the first one first.
 
     Raises:
-        StoreError: One is damaged.
+        StoreError: One cannot be read.
     """
-    if len(files) == 1:
-        return [*files]
-    found: list[FieldFile] = []
-    seen = np.empty(0, np.int64)
-    for file in reversed(files):
-        offset = file.rows(*chunk).field("ref").field("off").to_numpy(zero_copy_only=False)
-        if not np.isin(offset, seen).any():
-            seen = np.concatenate([seen, offset])
-            found.append(file)
+    found = []
+    for name in names:
+        about = ParquetFileReader(folder / name).about
+        data = (folder / name).read_bytes()
+        parts = {int(n): Part(*part) for n, part in about.of_rows["parts"].items()}
+        found.append(rows_line(log, name, len(data), hasher(data).hexdigest(), parts))
     return found
 
 
@@ -239,7 +227,7 @@ def rows_of(columns: pa.StructArray) -> Rows:
 
 
 def expired_messages(parts: Sequence[pa.StructArray]) -> ExpiredMessages:
-    """The remains of the messages of a chunk, in its order."""
+    """What is left of the messages of a chunk, in its order."""
     batches = [_batch(part) for part in parts]
     offset = np.concatenate([batch.places[0] for batch in batches])
     order = np.argsort(offset, kind="stable")
@@ -260,7 +248,11 @@ def expired_messages(parts: Sequence[pa.StructArray]) -> ExpiredMessages:
         np.concatenate([b.sequence for b in batches])[order],
         np.concatenate([np.stack(b.places, axis=1) for b in batches])[order],
     )
-    return ExpiredMessages(batch, fields)
+    return ExpiredMessages(batch, np.concatenate([*map(_arrivals, parts)])[order], fields)
+
+
+def _arrivals(part: pa.StructArray) -> NDArray[np.int64]:
+    return part.field("seq").to_numpy(zero_copy_only=False).astype(np.int64)
 
 
 def _batch(part: pa.StructArray) -> Batch:

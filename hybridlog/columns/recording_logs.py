@@ -1,0 +1,181 @@
+"""The logs of a recording: those that are here, and what is left of those that are gone."""
+
+from __future__ import annotations
+
+import threading
+from collections import defaultdict
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from hybridlog_storage.cache import Cache
+from hybridlog_storage.errors import SegmentError, StoreError
+from hybridlog_storage.lazy import lazy
+from hybridlog_storage.manifests import manifests_at
+from hybridlog_storage.segments.gone_log import open_log
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+    from pathlib import Path
+
+    from hybridlog.columns.column_file import OpenFiles
+    from hybridlog.columns.rows_file import RowsFile
+    from hybridlog.columns.topic_table import TopicTable
+    from hybridlog_storage.manifest import File
+    from hybridlog_storage.segments.chunk import ExpiredMessages, StoredChunk
+    from hybridlog_storage.segments.segment_reader import (
+        ChunkPlace,
+        SegmentReader,
+        SegmentSummary,
+    )
+
+
+class RecordingRows:
+    """The files of rows of one recording. Thread safe.
+
+    Nothing is read before it is needed.
+
+    Args:
+        recording: The recording's directory.
+        listed: The files; None for those that its manifest lists.
+        cache: Keeps rows that were read.
+    """
+
+    def __init__(
+        self, recording: Path, listed: Sequence[File] | None = None, cache: Cache | None = None
+    ) -> None:
+        self._recording = recording
+        self._given = listed
+        self._cache = cache or Cache()
+        self._readers: dict[int, list[RowsFile]] = {}  # by number of the log
+        self._problems: dict[int, str] = {}  # of files that cannot be read
+        self._lock = threading.RLock()
+
+    @lazy
+    def _listed(self) -> Mapping[int, Sequence[File]]:
+        """The files by number of their log.
+
+        Raises:
+            StoreError: The manifest cannot be read.
+        """
+        listed = self._given
+        if listed is None:
+            manifest = manifests_at(self._recording).find(self._recording.name)
+            listed = () if manifest is None else manifest.files
+        found: defaultdict[int, list[File]] = defaultdict(list)
+        for file in listed:
+            if file.kind == "rows":
+                found[file.number].append(file)
+        return found
+
+    def left(self, log: int, chunk: int) -> ExpiredMessages:
+        """What is left of a chunk.
+
+        Raises:
+            SegmentError: It is missing or damaged.
+        """
+        from hybridlog.columns.rows_file import expired_messages
+
+        try:
+            found = [file.rows(chunk) for file in self._of(log) if chunk in file.places]
+            if not found:
+                raise SegmentError(self._problems.get(log) or "its rows are in no file")
+            return expired_messages(found)
+        except SegmentError:
+            raise
+        except StoreError as error:
+            raise SegmentError(str(error)) from error
+
+    def expired_fields(
+        self, topic: str, chunks: Collection[tuple[int, int]], opened: OpenFiles
+    ) -> TopicTable:
+        """The fields of a topic in chunks of logs that are gone as a table, in no order."""
+        from hybridlog.columns.column_file import FIRST, LAST, TablePart
+        from hybridlog.columns.layout import TopicCounts
+        from hybridlog.columns.topic_table import TopicTable
+
+        parts = [
+            TablePart(file, *file.places[chunk], FIRST, LAST)
+            for log, chunk in chunks
+            for file in self._of(log)
+            if file.topic == topic and chunk in file.places
+        ]
+        return TopicTable(topic, parts, TopicCounts(sum(part.rows for part in parts)), opened)
+
+    def _of(self, log: int) -> list[RowsFile]:
+        """The files of rows of a log, but for damaged or missing ones."""
+        from hybridlog.columns.rows_file import RowsFile
+
+        with self._lock:
+            found = self._readers.get(log)
+            if found is None:
+                found = self._readers[log] = []
+                for listed in self._listed.get(log, ()):
+                    try:
+                        found.append(RowsFile(self._recording, listed, self._cache))
+                    except StoreError as error:
+                        self._problems[log] = str(error)
+            return found
+
+
+@dataclass(frozen=True, slots=True)
+class WalkedSegment:
+    """A segment in a walk over a recording.
+
+    Attributes:
+        number: Its number.
+        reader: Reads it.
+        summary: Its footer.
+        begin: Bytes of the segments before it.
+        report: Told the bytes of the walk behind each chunk that was read.
+    """
+
+    number: int
+    reader: SegmentReader
+    summary: SegmentSummary
+    begin: int
+    report: Callable[[int], None]
+
+    def chunks(
+        self, is_wanted: Callable[[ChunkPlace], bool] = lambda _: True
+    ) -> Iterator[tuple[ChunkPlace, StoredChunk | SegmentError]]:
+        """The wanted chunks in order; what is wrong with those that cannot be read."""
+        for place in self.summary.chunks:
+            if not is_wanted(place):
+                continue
+            found: StoredChunk | SegmentError
+            try:
+                found = self.reader.read_chunk(place)
+            except SegmentError as error:
+                found = error
+            yield place, found
+            self.report(self.begin + place.offset + place.length)
+
+
+def walk(
+    recording: Path,
+    names: Mapping[int, str],
+    rows: RecordingRows | None = None,
+    report: Callable[[int], None] = lambda _: None,
+    *,
+    known: Mapping[int, SegmentSummary] | None = None,
+) -> Iterator[WalkedSegment]:
+    """Open sealed segments of a recording, one after the other.
+
+    Args:
+        recording: The recording's directory.
+        names: Names of the segments, or of their first files of rows, by number.
+        rows: What is left of those that are gone; None for what the manifest lists.
+        report: As for `WalkedSegment`; told at the end of each segment, too.
+        known: Footers that were read before.
+
+    Raises:
+        SegmentError: One cannot be opened.
+    """
+    rows = rows or RecordingRows(recording)
+    begin = 0
+    for number, name in names.items():
+        with open_log(recording / name, number, rows) as reader:
+            summary = (known or {}).get(number) or reader.summary()
+            yield WalkedSegment(number, reader, summary, begin, report)
+            begin += reader.size
+            report(begin)

@@ -1,0 +1,190 @@
+"""Writes the files of rows of a log."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+import pyarrow as pa
+
+from hybridlog.columns.layout import Section, TopicCounts, table_schema_of
+from hybridlog.columns.parquet_file import ParquetFileWriter
+from hybridlog.columns.rows_file import RowColumns
+from hybridlog.schema.states import State, state_of
+from hybridlog_storage.disk import durability
+from hybridlog_storage.manifest import Part, rows_line
+from hybridlog_storage.ordering import distinct
+from hybridlog_storage.segments.segment_file import rows_name
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from hybridlog_storage.manifest import File
+    from hybridlog_storage.messages import Channel
+    from hybridlog_storage.segments.chunk import StoredChunk
+
+_GROUP_BYTES: Final = 4 << 20  # of a row group in memory
+_LEVEL: Final = 3  # of zstd: 9 takes 1 to 5 % less, for much more time
+_MAX_OPEN = 8  # files of different columns: each row group of them waits in memory
+_Kind = tuple[str, str, bool]  # topic, hash of its definition, whether messages are reduced
+
+
+@dataclass(slots=True)
+class _OpenFile:
+    """A file that is being written.
+
+    Attributes:
+        name: Its name.
+        topic: Its topic.
+        writer: Writes it.
+        tables: Rows that wait for a row group.
+        waiting: Their bytes.
+        pending: Number and rows of each chunk among them.
+        chunks: The same of each row group.
+        parts: Messages, bytes, first and last time by channel.
+    """
+
+    name: str
+    topic: str
+    writer: ParquetFileWriter | None = None
+    tables: list[pa.Table] = field(default_factory=list)
+    waiting: int = 0
+    pending: list[tuple[int, int]] = field(default_factory=list)
+    chunks: list[list[tuple[int, int]]] = field(default_factory=list)
+    parts: defaultdict[int, list[Part]] = field(default_factory=lambda: defaultdict(list))
+
+
+class RowsWriter:
+    """Writes what is left of the messages of a log.
+
+    Args:
+        folder: A folder named by the id of the recording, in which nobody else writes such files.
+        log: Line of the log in its manifest.
+        channels: Its channels by id.
+        front: Beginning of the first file, see `gone_log`.
+        version: Number in the name of the first file; others have those that follow.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        log: File,
+        channels: Mapping[int, Channel],
+        front: bytes,
+        version: int = 0,
+    ) -> None:
+        self._folder = folder
+        self._log = log
+        self._channels = channels
+        self._front = front
+        self._version = version
+        self._columns: dict[_Kind, RowColumns] = {}
+        self._open: dict[tuple[_Kind, pa.Schema], _OpenFile] = {}
+        self.names: list[str] = []
+        """Names of the files, the first one first."""
+        self._written: list[File] = []
+
+    def add(self, chunk: StoredChunk) -> None:
+        """Add the messages of a chunk.
+
+        Raises:
+            HybridlogError: A file cannot be written.
+        """
+        by_kind: dict[_Kind, list[int]] = {}
+        for number in distinct(chunk.batch.channel).tolist():
+            channel = self._channels[number]
+            is_reduced = state_of(channel.message_encoding) is State.REDUCED
+            kind = channel.topic, table_schema_of(channel), is_reduced
+            by_kind.setdefault(kind, []).append(number)
+        for kind, numbers in by_kind.items():
+            if kind not in self._columns:
+                self._columns[kind] = RowColumns(self._channels[numbers[0]])
+            has_publish_time = {n: self._channels[n].has_publish_time for n in numbers}
+            rows = np.flatnonzero(np.isin(chunk.batch.channel, numbers))
+            table = self._columns[kind].table(chunk, rows, has_publish_time)
+            file = self._file(kind, table.schema)
+            file.tables.append(table)
+            file.waiting += table.nbytes
+            file.pending.append((chunk.number, table.num_rows))
+            for number in numbers:
+                own = chunk.batch.channel == number
+                file.parts[number].append(_part(chunk, own))
+            if file.waiting >= _GROUP_BYTES:
+                self._flush(file)
+
+    def close(self) -> tuple[File, ...]:
+        """Finish all files, force them to the disk, and return their lines of the manifest.
+
+        Raises:
+            HybridlogError: One cannot be written.
+        """
+        while self._open:
+            self._finish(self._open.popitem()[1])
+        return tuple(sorted(self._written, key=lambda file: self.names.index(file.name)))
+
+    def discard(self) -> None:
+        """Remove the files that are not finished."""
+        for file in self._open.values():
+            if file.writer is not None:
+                file.writer.discard()
+
+    def _file(self, kind: _Kind, schema: pa.Schema) -> _OpenFile:
+        found = self._open.get((kind, schema))
+        if found is None:
+            if len(self._open) >= _MAX_OPEN:
+                self._finish(self._open.pop(next(iter(self._open))))
+            name = rows_name(self._log.number, self._version + len(self.names))
+            self.names.append(name)
+            found = self._open[kind, schema] = _OpenFile(name, kind[0])
+        return found
+
+    def _flush(self, file: _OpenFile) -> None:
+        table = pa.concat_tables(file.tables).combine_chunks()
+        path = self._folder / file.name
+        try:
+            if file.writer is None:
+                front = self._front if file.name == self.names[0] else b""
+                file.writer = ParquetFileWriter(path, table, level=_LEVEL, front=front)
+            file.writer.write(table)
+        except OSError as error:
+            raise durability.explain(error, path, "writing") from error
+        file.chunks.append(file.pending)
+        file.tables, file.pending, file.waiting = [], [], 0
+
+    def _finish(self, file: _OpenFile) -> None:
+        if file.tables:
+            self._flush(file)
+        assert file.writer is not None
+        parts = {number: _joined(own) for number, own in sorted(file.parts.items())}
+        rows = sum(part.messages for part in parts.values())
+        digests = {str(self._log.number): self._log.digest}
+        section = Section(self._folder.name, 0, digests, {file.topic: TopicCounts(rows)})
+        about = {
+            "chunks": file.chunks,
+            "parts": {n: [p.messages, p.bytes, p.first, p.last] for n, p in parts.items()},
+        }
+        try:
+            size, digest = file.writer.close([section], rows=about, sync=True)
+        except OSError as error:
+            raise durability.explain(error, file.writer.path, "writing") from error
+        self._written.append(rows_line(self._log, file.name, size, digest, parts))
+
+
+def _part(chunk: StoredChunk, own: NDArray[np.bool_]) -> Part:
+    times = chunk.batch.log_time[own]
+    size = int(chunk.batch.places[1][own].sum())
+    return Part(len(times), size, int(times.min()), int(times.max()))
+
+
+def _joined(parts: list[Part]) -> Part:
+    return Part(
+        sum(part.messages for part in parts),
+        sum(part.bytes for part in parts),
+        min(part.first for part in parts if part.first is not None),
+        max(part.last for part in parts if part.last is not None),
+    )

@@ -1,0 +1,130 @@
+"""A log and its rows: what a reader gives of both is the same, but for the payloads."""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import hybridlog as hl
+from hybridlog.columns.recording_logs import RecordingRows
+from hybridlog.columns.rows_file import RowsFile
+from hybridlog.maintenance.expiry import write_rows
+from hybridlog_storage import manifest as truth
+from hybridlog_storage.errors import SegmentError, StoreError
+from hybridlog_storage.manifest import File
+from hybridlog_storage.messages import EXPIRED_IDS, Channel, Schema
+from hybridlog_storage.segments.gone_log import GoneLog, open_log
+from hybridlog_storage.segments.segment_reader import SegmentReader
+from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests import places
+
+POINT = Schema("a/Point", "ros1msg", b"int64 n\nuint8[] data\n")
+CHANNELS = [
+    Channel("/point", "ros1", POINT),
+    Channel("/point", "json", None),
+    Channel("/said", "json", None, has_publish_time=False),
+    Channel("/raw", "odd", None, is_indexed=False),
+]
+PAYLOADS = st.one_of(
+    st.binary(max_size=40),
+    st.integers(0, 99).map(lambda n: b'{"n": %d}' % n),
+    st.binary(max_size=30).map(lambda data: bytes(8) + len(data).to_bytes(4, "little") + data),
+)
+TIMES = st.integers(0, 1 << 62)
+MESSAGES = st.lists(st.tuples(st.integers(0, 3), PAYLOADS, TIMES, TIMES), min_size=1, max_size=60)
+
+
+def log_of(store: Path, messages: list[tuple[int, bytes, int, int]]) -> tuple[Path, list[File]]:
+    """The folder and the logs with messages of a new recording of these messages."""
+    small = SegmentSettings(chunk_size=1024)
+    with hl.open(store, create=True, mongo="none") as opened:
+        with opened.start("log", settings=small) as recording:
+            for channel, payload, log_time, publish_time in messages:
+                own = CHANNELS[channel]
+                publish = publish_time if own.has_publish_time else None
+                recording.write(own, payload, log_time=log_time, publish_time=publish)
+        logs = places.manifest(store, "log").logs.values()
+    return places.folder(store, "log"), [log for log in logs if log.parts]
+
+
+@given(messages=MESSAGES, kind=st.sampled_from(["expired", "elsewhere"]))
+@settings(deadline=None, max_examples=20)
+def test_a_log_and_its_rows_say_the_same(
+    messages: list[tuple[int, bytes, int, int]], kind: str
+) -> None:
+    with tempfile.TemporaryDirectory() as place:
+        folder, logs = log_of(Path(place) / "store", messages)
+        for log in logs:
+            line = truth.replace(log, gone=kind)
+            made = write_rows(folder, line, folder)
+            assert sum(p.messages for one in made for p in one.parts.values()) == sum(
+                part.messages for part in log.parts.values()
+            )
+            compare(folder, line, made, added=EXPIRED_IDS * (1 if kind == "expired" else 2))
+
+
+def compare(folder: Path, line: File, made: tuple[File, ...], added: int) -> None:
+    rows = RecordingRows(folder, made)
+    with (
+        SegmentReader(folder / line.name, line.number) as log,
+        open_log(folder / made[0].name, line.number, rows) as gone,
+    ):
+        here, there = log.summary(), gone.summary()
+        assert isinstance(gone, GoneLog)
+        assert gone.log == line
+        assert (gone.size, gone.digest()) == (log.size, log.digest())
+        for name in ("recording", "end", "losses", "attachments", "metadata", "schema_ids", "size"):
+            assert getattr(there, name) == getattr(here, name)
+        assert there.counts == {number + added: count for number, count in here.counts.items()}
+        assert {*there.channels} == {*here.channels} | {*there.counts}
+        assert np.array_equal(there.table.chunks, here.table.chunks)
+        assert np.array_equal(there.table.as_stored().parts, here.table.parts)
+        assert np.array_equal(gone.table().parts, there.table.parts)
+        assert gone.indexes() == log.indexes()
+        for was, now in zip(here.chunks, there.chunks, strict=True):
+            assert now.is_expired
+            assert replace(now, channels=was.channels) == was
+            assert now.channels == tuple(number + added for number in was.channels)
+            whole, left = log.read_chunk(was), gone.read_chunk(now)
+            for name in ("log_time", "publish_time", "sequence"):
+                assert np.array_equal(getattr(left.batch, name), getattr(whole.batch, name))
+            assert np.array_equal(left.batch.channel, whole.batch.channel + added)
+            assert all(map(np.array_equal, left.batch.places, whole.batch.places))
+            assert np.array_equal(left.seq, whole.seq)
+            times = {number + added: own for number, own in log.read_times(was).items()}
+            found = gone.read_times(now)
+            assert found.keys() == times.keys()
+            assert all(np.array_equal(found[number], times[number]) for number in times)
+            # Who has asked before it went reads what is left, too.
+            assert np.array_equal(gone.read_chunk(was).seq, whole.seq)
+            with pytest.raises(SegmentError, match="is gone"):
+                gone.read(was.offset, was.length)
+
+
+def test_a_damaged_file_of_rows_is_told(tmp_path: Path) -> None:
+    folder, (log, *_) = log_of(tmp_path / "store", [(2, b'{"n": 1}', 1, 1)])
+    line = truth.replace(log, gone="expired")
+    (made,) = write_rows(folder, line, folder)
+    path = folder / made.name
+    whole = path.read_bytes()
+    for at in range(0, len(whole), 7):
+        path.write_bytes(whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :])
+        with pytest.raises(StoreError):
+            check_all(folder, made)
+    for size in range(0, len(whole), 50):
+        path.write_bytes(whole[:size])
+        with pytest.raises(StoreError):
+            check_all(folder, made)
+
+
+def check_all(folder: Path, made: File) -> None:
+    with open_log(folder / made.name, made.number, RecordingRows(folder, [made])) as gone:
+        for place in gone.summary().chunks:
+            gone.read_chunk(place)
+    RowsFile(folder, made).check()
