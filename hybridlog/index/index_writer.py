@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hybridlog.columns.recording_logs import RecordingRows
 from hybridlog.index.indexing import ChunkIndexer
 from hybridlog_storage.catalog import decoded_rows
 from hybridlog_storage.errors import DatabaseError, HybridlogError, SegmentError
@@ -457,7 +456,7 @@ class IndexWriter:
             manifest = manifests_at(self._recording).read(self._recording.name)
             rows = manifest.rows.get(segment, [])
             sealed = path.with_name(rows[0].name if rows else sealed_name(segment))
-            reader = open_log(sealed, segment, RecordingRows(self._recording, rows))
+            reader = open_log(sealed, segment)
         self._readers[segment] = reader
         return reader
 
