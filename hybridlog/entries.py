@@ -207,6 +207,8 @@ def inventory_of(
     listing = listing.choosing(manifest)
     found = Inventory(folder, path, listing, manifest)
     for number, name in listing.sealed.items():
+        if manifest is not None and manifest.has_let_go(number):
+            continue
         try:
             found.summaries[number] = read_summary(path / name, number)
         except SegmentError as error:

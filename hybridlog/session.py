@@ -676,6 +676,7 @@ class Session:
         """The reader of a segment of a recording, by its id. Thread safe.
 
         Raises:
+            ChangedError: It has been let go.
             SegmentError: It cannot be opened.
             TopicError: The recording is gone.
         """
@@ -684,6 +685,8 @@ class Session:
         entry = self.entry(recording)
         if number in entry.flushed:
             return entry.flushed[number].reader
+        if str(number) not in entry.digests:
+            raise _changed(entry)  # a ring has let it go
         try:
             return self.shared.segment(entry, number)
         except SegmentError:

@@ -81,7 +81,8 @@ class Channel(Record, frozen=True):
         type: Name of the message type; empty without a definition.
         encoding: Of the messages, such as `cdr`.
         metadata: As the source states it.
-        messages: All that the recording has had, those of files that are gone included.
+        messages: All that the recording has had, those of files that are gone included, but not
+            those that a ring has let go.
         bytes: The same, of payloads.
         first: Log time of the first one, ns since the epoch; None without messages.
         last: Of the last one.
@@ -213,6 +214,19 @@ class Loss(Record, frozen=True):
     length: Count | None = None
 
 
+class LetGo(Record, frozen=True):
+    """What a ring has let go of a recording.
+
+    Attributes:
+        messages: How many messages.
+        through: The greatest number of a file that went. What has such a number or a smaller one
+            and is not listed is about to be deleted, or left over.
+    """
+
+    messages: Count
+    through: Number
+
+
 class Manifest(Record, frozen=True):
     """A recording: who it is, its channels and files, its losses, and what users said of it.
 
@@ -234,6 +248,7 @@ class Manifest(Record, frozen=True):
         losses: Its loss ledger.
         cut_bytes: Bytes that were cut off after its recorder was killed: records not yet whole.
         damage: What else was wrong then, in words.
+        let_go: What its ring has let go; None for nothing.
     """
 
     id: Id
@@ -252,6 +267,7 @@ class Manifest(Record, frozen=True):
     losses: tuple[Loss, ...] = ()
     cut_bytes: Count = 0
     damage: tuple[Text, ...] = ()
+    let_go: LetGo | None = None
 
     @property
     def logs(self) -> dict[int, File]:
@@ -271,6 +287,11 @@ class Manifest(Record, frozen=True):
     def is_ended(self) -> bool:
         """True once nobody records it any more."""
         return self.status != "open"
+
+    def has_let_go(self, number: int) -> bool:
+        """True if a ring has let files of this number go."""
+        is_old = self.let_go is not None and number <= self.let_go.through
+        return is_old and number not in self.logs
 
     def __post_init__(self) -> None:
         """Refuse what no writer writes.

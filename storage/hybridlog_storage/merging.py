@@ -68,7 +68,9 @@ def merged(here: Manifest, there: Manifest | None, brought: Collection[int]) -> 
 
 
 def _messages(manifest: Manifest) -> int:
-    return sum(channel.messages for channel in manifest.channels.values())
+    """Messages that a recording has had; with a ring, those that went, too."""
+    gone = 0 if manifest.let_go is None else manifest.let_go.messages
+    return gone + sum(channel.messages for channel in manifest.channels.values())
 
 
 def check_origin(here: Manifest, there: Manifest | None) -> None:

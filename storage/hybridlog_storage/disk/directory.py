@@ -132,7 +132,10 @@ class Listing:
         return replace(self, sealed=dict(sorted(sealed.items())), others=tuple(sorted(others)))
 
     def left_over(self, manifest: Manifest) -> list[str]:
-        """Files that an expiry has left: rows of logs that are here, logs whose rows are whole."""
+        """Files that were to be deleted.
+
+        Rows of logs that are here, logs whose rows are whole, what a ring has let go.
+        """
         found, rows = [], manifest.rows
         for number, log in manifest.logs.items():
             names = {file.name: file.bytes for file in rows.get(number, ())}
@@ -140,7 +143,8 @@ class Listing:
             is_whole = all(self.rows.get(name) == size for name, size in names.items())
             if not log.is_here and is_whole and number in self.sealed:
                 found.append(self.sealed[number])
-        return found
+        there = {**self.sealed, **{int(name[:6]): name for name in self.rows}}
+        return found + [n for number, n in there.items() if manifest.has_let_go(number)]
 
 
 class StoreDirectory:
