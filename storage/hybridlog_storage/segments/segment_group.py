@@ -20,7 +20,9 @@ FIRST: Final = 1
 """Key of the first segment of a group."""
 SECOND: Final = 2
 """Key of the segment with larger topics that have none of their own."""
-Key = Literal[1, 2] | str
+LATCHED: Final = 3
+"""Key of the segment with latched messages, where they are to stay alone."""
+Key = Literal[1, 2, 3] | str
 """Which segment of a group: one of the above, or that of a topic."""
 _NAMED: Final = 14  # topics with segments of their own by a rule
 _OTHERS: Final = 16  # and by their size: a group has 32 segments at most

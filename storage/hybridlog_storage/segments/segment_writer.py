@@ -31,7 +31,7 @@ from hybridlog_storage.segments.chunk_builder import ChunkBuilder
 from hybridlog_storage.segments.compression import Compressor
 from hybridlog_storage.segments.segment_file import Sealed, SegmentFile
 from hybridlog_storage.segments.segment_format import entries_of, last_time_of
-from hybridlog_storage.segments.segment_group import FIRST, Division, Key, SegmentGroup
+from hybridlog_storage.segments.segment_group import FIRST, LATCHED, Division, Key, SegmentGroup
 from hybridlog_storage.stopping import safe_point
 
 if TYPE_CHECKING:
@@ -46,6 +46,7 @@ AT_WORK = 8
 """Closed chunks that may be in work before the writer counts as late."""
 _TURN_S = 0.1  # seconds: longest wait of a chunk before it is packed
 _SHARED = -1
+_LATCHED = -2
 _MAX_SPAN = 3600 * 10**9  # ns
 _PHASE = 0.6180339887  # whose multiples, without their whole part, never lie close together
 _SMALL_SPANS = 256  # times the usual span, for a chunk that is still small
@@ -139,6 +140,7 @@ class RecordingWriter:
             for no topic.
         is_latched: Returns whether the messages of a channel stay in the first segments; None
             for no channel.
+        latched_apart: Whether they have a segment of their own in each group instead.
         on_sealing: Called when a group is complete and, unless `sync` is never, on the disk,
             before its segments get their final names. Called on a writer thread or by
             `close_truncated`. An exception stops the writer like a failed write.
@@ -158,6 +160,7 @@ class RecordingWriter:
         no_index: Callable[[str], bool] | None = None,
         is_named: Callable[[str], bool] | None = None,
         is_latched: Callable[[Channel], bool] | None = None,
+        latched_apart: bool = False,
         on_sealing: Callable[[Sequence[Sealed]], None] | None = None,
     ) -> None:
         self.settings = settings or SegmentSettings()
@@ -172,6 +175,7 @@ class RecordingWriter:
         self._known: dict[Channel, _Known] = {}
         self._schema_ids: dict[Schema, int] = {}
         self._clusters: dict[int, ChunkBuilder] = {}
+        self._latched: set[int] = set()  # ids of channels whose messages lie apart
         self._movable: set[int] = set()  # ids of channels that need not be in the first segment
         self._compressor = Compressor(self.settings.compression, self.settings.level)
         self._pool = Threads(PACKERS, "hybridlog-pack")
@@ -182,6 +186,7 @@ class RecordingWriter:
         self._next_chunk_size = next_chunk_size or (lambda: chunk_size)
         self._on_written = on_written
         self._no_index = no_index or (lambda _: False)
+        self._latched_apart = latched_apart
         self._is_latched = is_latched or (lambda _: False)
         self._on_sealing: Callable[[Sequence[Sealed]], None] = on_sealing or (lambda _: None)
         large, own = self.settings.large_payload, self.settings.own_payload
@@ -373,9 +378,13 @@ class RecordingWriter:
         if channel.schema is not None:
             schema_id = self._schema_ids.setdefault(channel.schema, len(self._schema_ids) + 1)
         channel_id = len(self._known) + 1
+        is_latched = self._is_latched(channel)
         is_alone = mean >= self.settings.large_payload or self._division.is_named(channel.topic)
         cluster = channel_id if is_alone else _SHARED
-        if is_alone and not self._is_latched(channel):
+        if is_latched and self._latched_apart:
+            cluster = _LATCHED
+            self._latched.add(channel_id)
+        elif is_alone and not is_latched:
             self._movable.add(channel_id)
         known = self._known[channel] = _Known(channel_id, schema_id, cluster)
         if channel.is_indexed and self._no_index(channel.topic):
@@ -535,6 +544,8 @@ class RecordingWriter:
     def _place_of(self, chunk: PackedChunk) -> tuple[str | None, Key]:
         """The topic of a chunk of one channel, and its segment; no topic in the first one."""
         number = next(iter(chunk.indexes))
+        if number in self._latched:
+            return None, LATCHED
         if number not in self._movable:
             return None, FIRST
         topic = self.channels[number].topic
