@@ -873,16 +873,41 @@ class Store:
             options: Options of the recording.
             choices: Fields of `LiveOptions`, instead of `options`.
         """
+        from hybridlog.index.index_writer import IndexTarget
         from hybridlog.live import LiveOptions, LiveRecording
 
+        chosen = options or LiveOptions(**choices)
+        target = self._to_change().index.index_to_record("Starting a recording")
         return LiveRecording(
             self.directory,
             self.catalog,
-            self._to_change().index.index_to_record("Starting a recording"),
+            IndexTarget() if chosen.is_ring else target,
             name,
-            options or LiveOptions(**choices),
-            on_close=self._after,
+            chosen,
+            on_close=self._after_ring if chosen.is_ring else self._after,
         )
+
+    def _after_ring(self, report: RecordReport) -> None:
+        """Make tables and index documents of what a ring has left."""
+        from hybridlog.maintenance.index import decode_again
+        from hybridlog.maintenance.tables import make
+
+        shared, entry = self._to_change(), report.entry
+        index = shared.index
+        index.disconnect()
+        shared.catch_up(entry.id)
+        try:
+            if index.connection.has_none:
+                with suppress(StoreError), self.directory.writing(entry.id, entry.name):
+                    decode_again(self.directory, self.catalog, entry)
+                make(self.directory, entry, is_new=True)
+            else:
+                self.connect()
+                report.indexed = entry.documents
+                self.repairs.indexed.pop(entry.name, None)  # no repair
+        except HybridlogError as error:
+            report.failure, report.missed = DatabaseError(str(error)), entry.documents
+        report.entry = self.entry(entry.id)
 
     def _after(self, report: RecordReport) -> None:
         """Update the store after the end of a recording."""

@@ -46,7 +46,6 @@ GROUPS: Final = {
     "Record": {
         "record": "record",
         "mark": "edit",
-        "trigger": "top",
         "top": "top",
     },
     "Look": {"ls": "ls", "info": "info", "view": "open", "open": "open", "plot": "plot"},

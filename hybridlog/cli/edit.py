@@ -119,6 +119,9 @@ class _Mark(Running):
         "Mark a recording, also a running one, at this time, written as for --between.", "T"
     )
     until: str | None = option("The mark lasts from --at to this time.", "T2")
+    pin: tuple[str, str] | None = option(
+        "Mark and pin so much before and after the present moment.", "BEFORE AFTER", nargs=2
+    )
     remove: bool = option(
         "Remove the marks with this text; with --at only what begins at this time."
     )
@@ -136,6 +139,10 @@ def mark_command(given: _Mark) -> None:
         raise UsageError("A mark needs a text: say what happened.")
     if given.until is not None and at is None:
         raise UsageError("--until ends a mark that begins at a time: add --at.")
+    if given.pin is not None and (at is not None or given.remove):
+        raise UsageError(
+            "--pin is for the present moment: `hybridlog keep --pin` pins other times."
+        )
     if given.remove:
         if len(given.recording) != 1 or tags or given.until is not None:
             raise UsageError("--remove needs --recording, one, and takes --at besides.")
@@ -143,7 +150,10 @@ def mark_command(given: _Mark) -> None:
             store.unmark(given.recording[0], given.text, at)
         return
     if at is None:
-        marked = _mark_running(given.text, tags, given.recording, given.store)
+        from hybridlog.query.times import parse_duration
+
+        around = None if given.pin is None else [parse_duration(one) / 1e9 for one in given.pin]
+        marked = _mark_running(given.text, tags, around, given.recording, given.store)
     elif len(given.recording) == 1:
         (recording,) = given.recording
         with given.opened() as store:
@@ -156,14 +166,19 @@ def mark_command(given: _Mark) -> None:
 
 
 def _mark_running(
-    text: str, tags: dict[str, str], recordings: tuple[str, ...], store: Path | None
+    text: str,
+    tags: dict[str, str],
+    around: list[float] | None,
+    recordings: tuple[str, ...],
+    store: Path | None,
 ) -> Iterator[str]:
     from hybridlog.live.control_server import choose, request
     from hybridlog.store import store_path
 
     path = store_path(store)
     for name in choose(path, recordings):
-        yield str(request(path, name, "mark", text=text, tags=tags)["recording"])
+        asked = request(path, name, "mark", text=text, tags=tags, around=around)
+        yield str(asked["recording"])
 
 
 _MAX_ROWS = 20

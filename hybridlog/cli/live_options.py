@@ -13,13 +13,11 @@ from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
     from hybridlog.live.recorder import RecorderOptions
-    from hybridlog.live.snapshots import SnapshotOptions
     from hybridlog.live.sources.base import LiveSource
 
 _MIN_SEGMENT: Final = 1 << 20
 _MIN_CHUNK: Final = 1 << 19
 _MAX_FLUSH_S: Final = 3600.0
-_MAX_RING_S: Final = 86_400.0
 
 
 def recorder_options(choices: RecordChoices) -> RecorderOptions:
@@ -33,6 +31,7 @@ def recorder_options(choices: RecordChoices) -> RecorderOptions:
     from hybridlog.live.memory import MIN_USER_BUDGET, default_budget
     from hybridlog.live.policy import priority_rule, throttle_rule
     from hybridlog.live.recorder import RecorderOptions
+    from hybridlog.live.triggers import Trigger
     from hybridlog.query.topics import matcher
 
     budget_bytes = (
@@ -65,29 +64,14 @@ def recorder_options(choices: RecordChoices) -> RecorderOptions:
         budget_bytes=budget_bytes,
         flush_interval_s=flush_interval_s,
         settings=settings,
-        snapshots=_snapshots(choices),
+        ring_s=None if choices.ring is None else _positive("--ring", choices.ring),
+        triggers=[Trigger.of(text) for text in choices.trigger],
+        before_s=None if choices.before is None else _seconds(choices.before),
+        after_s=0.0 if choices.after is None else _seconds(choices.after),
         no_index=matcher(choices.no_index) if choices.no_index else None,
         use_sim_time=choices.use_sim_time,
         contract=None if choices.contract is None else Contract.read(choices.contract),
         on_breach=_words(choices.on_breach),
-    )
-
-
-def _snapshots(choices: RecordChoices) -> SnapshotOptions | None:
-    from hybridlog.live.snapshots import SnapshotOptions, Trigger
-
-    if choices.ring is None:
-        if choices.trigger or choices.before is not None or choices.after is not None:
-            raise UsageError("--trigger, --before and --after are for --ring.")
-        return None
-    ring_s = _positive("--ring", choices.ring)
-    if ring_s > _MAX_RING_S:
-        raise UsageError("--ring must be at most a day.")
-    return SnapshotOptions(
-        ring_s,
-        None if choices.before is None else _seconds(choices.before),
-        0.0 if choices.after is None else _seconds(choices.after),
-        tuple(Trigger.of(text) for text in choices.trigger),
     )
 
 

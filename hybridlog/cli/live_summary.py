@@ -72,17 +72,13 @@ class LiveSummary:
 
     def _print(self) -> None:
         reports, state = self._reports, self._state
-        if state.snapshots is None and reports:
+        if reports:
             rows = closing_rows(reports[0], state, self._unreached)
             if self._recorder.reason:
                 rows.append(("ended", self._recorder.reason))
             output.print_table([("recording", "left"), (reports[0].entry.name, "left")], rows)
-        elif reports:
-            _print_snapshots(reports)
-        elif state.snapshots is None:
-            output.note("Nothing was stored.")
         else:
-            output.note("Nothing was triggered; nothing was stored.")
+            output.note("Nothing was stored.")
 
     def _remarks(self) -> Iterator[str]:
         silent = self._recorder.silent()
@@ -147,21 +143,6 @@ def _idle(option: str, rules: Sequence[Rule], topics: set[str]) -> Iterator[str]
     for rule in rules:
         if not any(map(rule.fits, topics)):
             yield f"no topic fits {output.quoted(rule.pattern)} of {option}"
-
-
-def _print_snapshots(reports: Sequence[RecordReport]) -> None:
-    output.print_table(
-        [("snapshot", "left"), ("because of", "left"), ("messages", "right"), ("stored", "right")],
-        [
-            (
-                report.entry.name,
-                report.entry.tags.get("trigger", ""),
-                str(report.entry.messages),
-                output.size(report.entry.stored_bytes),
-            )
-            for report in reports
-        ],
-    )
 
 
 def _summary(reports: Sequence[RecordReport], state: RecorderState, reason: str) -> dict[str, Any]:

@@ -239,6 +239,8 @@ def closing_rows(
         ("messages indexed", str(report.indexed)),
         ("time", f"{report.elapsed_s:.1f} s ({rate:,.0f} messages/s)"),
     ]
+    if state.let_go:
+        rows.append(("let go", f"{state.let_go}, by the ring"))
     if unreached:
         rows.append(("lost", f"unknown, never reached: {', '.join(unreached)}"))
     elif not state.lost.keys() - {Cause.THROTTLE.value}:

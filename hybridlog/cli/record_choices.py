@@ -136,20 +136,19 @@ class RecordChoices(Between, Latched, InStore, AsJson, Quiet):
         "The most that a killed recorder can lose.", "TIME", default="1s", kind=LiveOption
     )
     ring: str | None = option(
-        "Hold only the last TIME, in memory, and write it to disk at a trigger: --trigger, "
-        "SIGUSR1, or `hybridlog trigger`.",
-        "TIME",
-        kind=LiveOption,
+        "Keep only the last TIME, and what is pinned.", "TIME", kind=LiveOption
     )
     trigger: tuple[str, ...] = option(
-        "With --ring: a message that triggers, such as '/diagnostics: status[*].level >= 2'. ",
+        "Mark and pin what is around such a message: '/diagnostics: status[*].level >= 2'.",
         "TOPIC: PREDICATE",
         kind=LiveOption,
     )
     before: str | None = option(
-        "With --ring: time before the trigger; without, all.", "TIME", kind=LiveOption
+        "Pin so much before a trigger or SIGUSR1; without, all that the ring has.",
+        "TIME",
+        kind=LiveOption,
     )
-    after: str | None = option("With --ring: time after the trigger.", "TIME", kind=LiveOption)
+    after: str | None = option("Pin so much after it.", "TIME", kind=LiveOption)
     contract: Path | None = option(
         "Tell and mark topics that are silent for longer than the rules in this file allow, "
         "and judge the recording at its end.",

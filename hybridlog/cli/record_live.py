@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import shutil
 import signal
 import socket
@@ -28,14 +27,12 @@ if TYPE_CHECKING:
     from contextlib import AbstractContextManager
 
     from hybridlog.cli.record_choices import RecordChoices
-    from hybridlog.live.recorder import Recorder, RecorderOptions, RecorderState
+    from hybridlog.live.recorder import Recorder, RecorderState
     from hybridlog.store import Store
 
 _STATE_S = 1.0
 _RECOVERY_POLL_S = 0.05
 _EXPLAIN_AFTER_S = 2.0  # a longer wait at the end is explained
-_SNAPSHOT = re.compile(r"snapshot .+ because of ")
-"""A message of a recorder that is no problem: `--quiet` leaves it out."""
 
 
 def record_live(choices: RecordChoices) -> None:
@@ -66,7 +63,7 @@ def _record(choices: RecordChoices) -> None:
             recorder = Recorder(store, sources, options, display.say)
             recorder.start()
             recovery = _begin_recovery(choices, store)
-            with display.table(), _snapshot_on_signal(recorder, options):
+            with display.table(), _pinned_by_signal(recorder):
                 last = _watch(recorder, stop, display)
             notify_service("STOPPING=1", "STATUS=writing what is left")
             if quiet:
@@ -158,9 +155,9 @@ def _stop_flag() -> Iterator[Flag]:
 
 
 @contextmanager
-def _snapshot_on_signal(recorder: Recorder, options: RecorderOptions) -> Iterator[None]:
-    """SIGUSR1 writes a snapshot."""
-    if options.snapshots is None or not hasattr(signal, "SIGUSR1"):
+def _pinned_by_signal(recorder: Recorder) -> Iterator[None]:
+    """SIGUSR1 marks and pins what is around it."""
+    if not hasattr(signal, "SIGUSR1"):
         yield
         return
 
@@ -191,7 +188,9 @@ class _Display:
 
     def say(self, text: str) -> None:
         """Print a message of the recorder at once."""
-        if self._quiet and _SNAPSHOT.match(text):
+        from hybridlog.live.incidents import PINNED
+
+        if self._quiet and PINNED in text:  # no problem
             return
         if self._table is not None:
             self._table.note(text)

@@ -1,4 +1,4 @@
-"""`hybridlog top` and `trigger`: what is asked of a running recorder."""
+"""`hybridlog top`: watches a running recorder."""
 
 from __future__ import annotations
 
@@ -9,14 +9,13 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hybridlog.cli import output
 from hybridlog.cli.binder import argument, command, option
 from hybridlog.cli.completion import complete_field, complete_running
 from hybridlog.cli.live_table import LiveTable, drawn
-from hybridlog.cli.options import AsJson, InStore, Running
+from hybridlog.cli.options import AsJson, InStore
 from hybridlog.cli.signals import Stopped
 from hybridlog_storage.errors import UsageError
 from hybridlog_storage.stopping import at_safe_points
@@ -81,9 +80,7 @@ def top_command(given: _Given) -> None:
                 continue  # it has just started
             name = raw["name"]
             values = []
-            if fields and raw.get("snapshots") is not None:
-                values = _values_of_ring(path, recorder, raw, fields, span)
-            elif opened is not None:
+            if opened is not None:
                 values = _values(opened, recorder, raw, fields, span)
             if given.as_json:
                 print(json.dumps({**raw, "fields": values}), flush=True)  # noqa: T201
@@ -134,27 +131,6 @@ def _values(
     return found
 
 
-def _values_of_ring(
-    store: Path,
-    recorder: str,
-    state: Mapping[str, Any],
-    fields: Sequence[_Field],
-    span: int,
-) -> list[dict[str, Any]]:
-    """The same from the memory of a recorder that stores only snapshots."""
-    from hybridlog.live.control_server import request
-
-    since = time.time_ns() - span
-    return [
-        {
-            "topic": topic,
-            "field": field.path,
-            **request(store, recorder, "numbers", topic=topic, path=field.path, begin=since),
-        }
-        for topic, field in _resolved(state, fields)
-    ]
-
-
 def _resolved(state: Mapping[str, Any], fields: Sequence[_Field]) -> Iterator[tuple[str, _Field]]:
     """Each field with the full name of its topic.
 
@@ -193,23 +169,3 @@ def _state(raw: Mapping[str, Any]) -> RecorderState:
     from hybridlog.live.recorder import state_of
 
     return state_of(raw)
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Trigger(Running):
-    name: str = argument("The reason, in a word.", "NAME")
-
-
-@command(_Trigger)
-def trigger_command(given: _Trigger) -> None:
-    """Make a recorder write its ring."""
-    from hybridlog.live.control_server import choose, request
-    from hybridlog.store import store_path
-
-    if not given.name.strip():
-        raise UsageError("A trigger needs a name: give the reason in a word.")
-    path = store_path(given.store)
-    for recorder in choose(path, given.recording):
-        answer = request(path, recorder, "trigger", reason=given.name)
-        if not given.quiet:
-            output.note(f"{answer['recording']} writes a snapshot.")

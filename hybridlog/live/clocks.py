@@ -311,6 +311,14 @@ class MachineClock:
         """The time of the clock at a steady time, ns."""
         return steady + next((j.set_by for j in reversed(self._jumps) if j.at <= steady), 0)
 
+    def log_times(self, begin: int, end: int) -> tuple[int, int]:
+        """The least and the greatest time of the clock between two steady times, ns."""
+        found = [self.log_time(begin), self.log_time(end)]
+        for jump in [*self._jumps]:
+            if begin < jump.at <= end:
+                found += [jump.at + jump.set_by - jump.by, jump.at + jump.set_by]
+        return min(found), max(found)
+
     def jumps(self) -> list[Jump]:
         """The jumps since the last call."""
         self._look()

@@ -1,4 +1,4 @@
-"""Control socket of a running recorder: state, marks, triggers, stop.
+"""Control socket of a running recorder: state, marks, stop.
 
 The server listens on a unix socket that only its owner can open. A client sends one JSON
 object on a line and gets one back. While the recorder runs, a socket file in the store's
@@ -203,7 +203,7 @@ def _read(store: Path, recorder: str) -> tuple[str, str]:
 
 def _name_now(store: Path, recorder: str) -> str:
     """The name of a recorder's recording, which may have another one by now."""
-    with suppress(HybridlogError):  # one with a ring has none, or another one
+    with suppress(HybridlogError):
         return DiskManifests(store).read(recorder).name
     return _read(store, recorder)[1]
 
@@ -256,7 +256,7 @@ def choose(store: Path, named: Sequence[str]) -> list[str]:
     Args:
         store: The store's directory.
         named: Names by the user: id or name of a recording, the beginning of one, or that of
-            the digits of its id. A recorder with a ring has the name of its future snapshots.
+            the digits of its id.
 
     Raises:
         UsageError: No recorder runs, several run and no name is given, or a name matches
@@ -288,10 +288,8 @@ def _resolve(name: str, recorders: Mapping[str, str]) -> str:
     Raises:
         UsageError: No recorder matches, or several do.
     """
-    ring = re.compile(rf"{re.escape(name)}-ring-\d+")
     fitting = (
         [one for one, known in recorders.items() if name in {one, known}]
-        or [one for one, known in recorders.items() if ring.fullmatch(known)]
         or [one for one, known in recorders.items() if name and known.startswith(name)]
         or [
             one

@@ -6,8 +6,6 @@ topic the received messages are the stored ones plus those in the loss ledger.
 
 from __future__ import annotations
 
-import math
-import os
 import shutil
 import threading
 import time
@@ -21,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 from hybridlog.entries import text as as_text
 from hybridlog.live.clocks import CLOCK, MachineClock, SimulatedTime
 from hybridlog.live.control_server import ControlServer
+from hybridlog.live.incidents import Hit, Incidents
 from hybridlog.live.memory import default_budget, resident_bytes
 from hybridlog.live.policy import (
     PAYLOAD_STRIDE,
@@ -35,12 +34,12 @@ from hybridlog.live.policy import (
 from hybridlog.live.recording import (
     LIVE_SETTINGS,
     LiveOptions,
-    LiveRecording,
     indexed_within_s,
 )
+from hybridlog.live.ring import GROUPS, Ring
 from hybridlog.live.silence import RULE, Commands, SilenceWatch
-from hybridlog.live.snapshots import SnapshotOptions, Snapshots
 from hybridlog.live.statistics import Lateness, Tally, TopicRates, TopicState
+from hybridlog.live.triggers import Trigger, Triggers
 from hybridlog.maintenance.edit import remove_if, too_many_marks
 from hybridlog.maintenance.keep import Own, RetentionThread
 from hybridlog.query.times import format_duration, format_time
@@ -67,6 +66,7 @@ _MAX_EXPECTED = 1000  # channels that get a collection before their first messag
 _SEQUENCES = 1 << 32
 _HELD_SHARE = 8  # of the memory budget, for messages that come before `/clock`
 _CLOCK_WAIT_S = 5.0
+_MAX_S = 86_400.0  # of a ring, and of what is pinned
 _SLOW_WRITE_S = 2.0  # to pack and write a chunk, on a disk that is busy
 
 
@@ -87,7 +87,10 @@ class RecorderOptions:
         budget_bytes: Payload bytes that may be in memory.
         flush_interval_s: Seconds of messages that a `kill -9` can cost.
         settings: Settings of segments and chunks.
-        snapshots: Store only messages around triggers; None to store everything.
+        ring_s: Seconds after which messages go that no pin touches; None to keep all.
+        triggers: Conditions on messages, which are marked and pinned.
+        before_s: Seconds before a trigger or signal that are pinned; None for those of the ring.
+        after_s: Seconds after it.
         no_index: Selects topics whose messages get no documents in MongoDB; None for none.
         use_sim_time: Log times are those of `/clock`.
         contract: Topics that are silent for longer than it allows are told and marked.
@@ -106,18 +109,28 @@ class RecorderOptions:
     budget_bytes: int = field(default_factory=default_budget)
     flush_interval_s: float = 1.0
     settings: SegmentSettings = LIVE_SETTINGS
-    snapshots: SnapshotOptions | None = None
+    ring_s: float | None = None
+    triggers: Sequence[Trigger] = ()
+    before_s: float | None = None
+    after_s: float = 0.0
     no_index: TopicMatcher | None = None
     use_sim_time: bool = False
     contract: Contract | None = None
     on_breach: Sequence[str] = ()
 
     def __post_init__(self) -> None:
-        """Refuse limits that would stop the recorder at once, and a ring of two times."""
-        if self.use_sim_time and self.snapshots is not None:
+        """Refuse limits that would stop the recorder at once, and a ring that holds too little."""
+        ring_s = self.ring_s
+        if self.use_sim_time and ring_s is not None:
             raise UsageError("--ring goes by the time of this machine: leave out --use-sim-time.")
-        if self.contract is not None and self.snapshots is not None:
+        if self.contract is not None and ring_s is not None:
             raise UsageError("--contract is for a recording that stores everything: leave --ring.")
+        if ring_s is not None and not 0 < ring_s <= _MAX_S:
+            raise UsageError("--ring must be between 0 and a day")
+        if not (0 <= (self.before_s or 0) <= _MAX_S and 0 <= self.after_s <= _MAX_S):
+            raise UsageError("--before and --after must be between 0 and a day")
+        if ring_s is not None and (self.before_s or 0) > ring_s:
+            raise UsageError("--before cannot be longer than --ring")
         for name in ("duration_s", "max_messages", "max_bytes"):
             bound = getattr(self, name)
             if bound is not None and not bound > 0:
@@ -143,8 +156,8 @@ class RecorderState:
         stored_bytes: Payload bytes stored so far.
         stalled_s: Seconds for which received messages have waited for longer than the flush
             interval, and nothing was written; 0 while writing goes on.
-        snapshots: Snapshots so far; None when everything is stored.
-        ring_s: Seconds that the ring holds; None when everything is stored.
+        incidents: What was marked and pinned so far.
+        let_go: Messages that the ring has let go; None without a ring.
         taken: Messages that are stored or will be, by topic, when the state is requested.
         silent: Topics that are silent for longer than the contract allows.
         breaches: Such silences so far.
@@ -165,8 +178,8 @@ class RecorderState:
     free_bytes: int
     stored_bytes: int
     stalled_s: float = 0.0
-    snapshots: int | None = None
-    ring_s: float | None = None
+    incidents: int = 0
+    let_go: int | None = None
     taken: Mapping[str, int] = field(default_factory=dict)
     silent: Sequence[str] = ()
     breaches: int = 0
@@ -254,33 +267,35 @@ class Recorder:
         if options.use_sim_time:
             self._simulated = SimulatedTime(self, options.budget_bytes // _HELD_SHARE)
         self._sink: Sink = self._simulated or self
-        self._target: LiveRecording | Snapshots
-        if options.snapshots is None:
-            self._target = self._begin(store, {})
-            self.name, recorder = self._target.name, self._target.id
-        else:
-            self.name = recorder = f"{options.name}-ring-{os.getpid()}"
-            self._target = Snapshots(
-                options.snapshots,
-                options.budget_bytes,
-                lambda reason: self._begin(store, {"trigger": reason}),
-                lambda reason: self._note(reason, {"trigger": reason}, self._clock.now()),
-                self._say,
-                clock=self._clock,
-            )
+        self._target = store.start(options.name, self._live_options())
+        self.name = self._target.name
+        self._ring = self._make_ring()
+        self._triggers = Triggers(options.triggers, say)
+        self._incidents = Incidents(
+            partial(self._directory.manifests.change, self._target.id),
+            None if options.use_sim_time else self._clock,
+            lambda: self._target.first_time,
+            self._ring,
+            self.say,
+        )
         try:
             self._retention = RetentionThread(
-                store.directory, partial(remove_if, store.shared), self._own(), self.say
+                store.directory,
+                partial(remove_if, store.shared),
+                Own(
+                    self._target.id,
+                    lambda: self._target.first_unread,
+                    lambda: self._target.sealed,
+                ),
+                self.say,
             )
             self._control = ControlServer(
                 store.directory.path,
-                recorder,
+                self._target.id,
                 self.name,
                 {
                     "state": self._ask_state,
                     "mark": self._ask_mark,
-                    "numbers": self._ask_numbers,
-                    "trigger": self._ask_trigger,
                     "stop": self._ask_stop,
                 },
             )
@@ -288,31 +303,37 @@ class Recorder:
             self._target.abort()
             raise
 
-    def _begin(self, store: Store, tags: Mapping[str, str]) -> LiveRecording:
-        """Start a recording."""
-        options = self._options
-        return store.start(
-            options.name,
-            LiveOptions(
-                tags={**options.tags, **tags},
-                source={
-                    "kind": ", ".join(source.kind for source in self._sources)
-                    + (f", by {CLOCK}" if options.use_sim_time else ""),
-                    "path": ", ".join(source.address for source in self._sources),
-                },
-                budget_bytes=options.budget_bytes,
-                flush_interval_s=options.flush_interval_s,
-                settings=options.settings,
-                no_index=options.no_index,
-            ),
+    def _live_options(self) -> LiveOptions:
+        options, settings = self._options, self._options.settings
+        if options.ring_s is not None:
+            group_s = options.ring_s / GROUPS
+            span_s = min(settings.segment_span_s or group_s, group_s)
+            settings = replace(settings, segment_span_s=span_s)
+        return LiveOptions(
+            tags=options.tags,
+            source={
+                "kind": ", ".join(source.kind for source in self._sources)
+                + (f", by {CLOCK}" if options.use_sim_time else ""),
+                "path": ", ".join(source.address for source in self._sources),
+            },
+            budget_bytes=options.budget_bytes,
+            flush_interval_s=options.flush_interval_s,
+            settings=settings,
+            no_index=options.no_index,
+            is_ring=options.ring_s is not None,
         )
 
-    def _own(self) -> Own | None:
-        """The recording in progress, for retention."""
-        target = self._target
-        if isinstance(target, Snapshots):
+    def _make_ring(self) -> Ring | None:
+        if self._options.ring_s is None:
             return None
-        return Own(target.id, lambda: target.first_unread, lambda: target.sealed)
+        target = self._target
+        return Ring(
+            self._directory,
+            target.id,
+            self._options.ring_s,
+            lambda: target.sealed,
+            target.channels,
+        )
 
     # Methods for the program that runs the recorder.
 
@@ -340,6 +361,7 @@ class Recorder:
             says = f"the clock of this machine says {format_time(now)}"
             self._note_clock(f"{says}, and recording {self._newest.name} was begun later", {}, now)
         self._retention.start()
+        self._incidents.start()
 
     def wait(self, seconds: float) -> bool:
         """Wait for the end for at most so long; returns True once it has come."""
@@ -370,9 +392,9 @@ class Recorder:
             self._simulated.close()
         self._control.close()
         self._retention.stop()
-        if isinstance(self._target, Snapshots):
-            reports = self._target.close()
-        elif self._is_marked(self._target.id) or (
+        self._incidents.stop()
+        self._triggers.close()
+        if self._is_marked(self._target.id) or (
             not (self.stopped_for_disk and self._target.is_empty)
             and (self._recorded_by_content or any(source.was_reached for source in self._sources))
         ):
@@ -399,11 +421,9 @@ class Recorder:
         self._check_clock(now)
         missing: dict[tuple[str, bool], int] = {}
         lost: dict[str, int] = {}
-        ring = self._target if isinstance(self._target, Snapshots) else None
-        if ring is not None:
-            with self._lock:
-                names = [*self._topics]
-            ring.look(names)
+        with self._lock:
+            names = [*self._topics]
+        self._triggers.look(names)
         with self._lock:
             totals = dict(self._lost)
         for (topic, cause), count in totals.items():
@@ -439,8 +459,8 @@ class Recorder:
             shutil.disk_usage(self._directory.path).free,
             stored_bytes,
             self._stalled_s(now),
-            snapshots=None if ring is None else ring.count,
-            ring_s=None if ring is None else ring.held_s,
+            incidents=self._incidents.count,
+            let_go=None if self._ring is None else self._ring.messages,
             silent=() if self._silence is None else self._silence.silent,
             breaches=self._breaches,
             clock_set_s=self._clock.set_by / 1e9,
@@ -457,33 +477,56 @@ class Recorder:
         waited = now - self._written_at - self._options.flush_interval_s
         return waited if waited > _SLOW_WRITE_S else 0.0
 
-    def mark(self, text: str, tags: Mapping[str, str]) -> str:
-        """Set a mark, at this time, in the manifest; with a ring it is a message in it.
+    def mark(
+        self, text: str, tags: Mapping[str, str], around: tuple[float, float] | None = None
+    ) -> str:
+        """Set a mark, at this time, in the manifest.
 
         Args:
             text: What happened.
             tags: Tags of the mark.
+            around: Seconds before and after, which are marked and pinned; None for a moment.
 
         Returns:
-            The name of the recording, or of the recorder with a ring.
+            The name of the recording.
 
         Raises:
             StoreError: The manifest cannot be written, or has as many marks as it can have.
             UsageError: There is no time of `/clock` yet.
         """
-        target = self._target
-        if isinstance(target, Snapshots):
-            self._note(text, tags, self._clock.now())
-            return self.name
         if self._simulated is not None and self._simulated.is_waiting:
             raise UsageError(f"There is no time of {CLOCK} yet: mark again when it has come.")
-        at = self._clock.now() if self._simulated is None else self._now()
         said = {as_text(key): as_text(value) for key, value in tags.items()}
-        made = Mark(new_random(), at, as_text(text), said)
-        now = self._directory.manifests.change(target.id, lambda known: with_mark(known, made))
-        if made not in now.marks:
+        manifests, recording = self._directory.manifests, self._target.id
+        if around is None:
+            at = self._clock.now() if self._simulated is None else self._now()
+            made = Mark(new_random(), at, as_text(text), said)
+            now = manifests.change(recording, lambda known: with_mark(known, made))
+            mark = made.id
+        else:
+            mark = self._hit(as_text(text), said, self._now(), around)
+            self._incidents.write()
+            now = manifests.read(recording)
+        if all(one.id != mark for one in now.marks):
             raise too_many_marks(now.name)
         return now.name
+
+    def fire(self, text: str, steady: int | None = None) -> None:
+        """Mark and pin what is around a trigger or signal; waits for nothing.
+
+        Args:
+            text: Its name.
+            steady: When it was, as a steady time, ns; None for now.
+        """
+        before = self._options.before_s
+        if before is None:
+            before = self._options.ring_s or 0.0
+        around, text = (before, self._options.after_s), as_text(text)
+        self._hit(text, {"trigger": text}, self._now() if steady is None else steady, around)
+
+    def _hit(self, text: str, tags: Mapping[str, str], at: int, around: tuple[float, float]) -> str:
+        before, after = (round(seconds * 1e9) for seconds in around)
+        return self._incidents.hit(Hit(text, tags, at - before, at + after))
 
     def _note(self, text: str, tags: Mapping[str, str], at: int) -> None:
         """Note something as a message on the topic of marks, at a log time, ns."""
@@ -529,16 +572,6 @@ class Recorder:
             except HybridlogError as error:
                 self._lose(recorded, _cause_of(error), str(error), begin)
 
-    def fire(self, reason: str) -> None:
-        """Start a snapshot.
-
-        Raises:
-            UsageError: The recorder stores everything.
-        """
-        if not isinstance(self._target, Snapshots):
-            raise UsageError("this recorder stores everything: triggers need --ring")
-        self._target.fire(reason)
-
     def silent(self) -> list[str]:
         """Topics that had publishers and never sent a message."""
         with self._lock:
@@ -564,6 +597,7 @@ class Recorder:
             too_many = self._expected > _MAX_EXPECTED
         if not too_many:
             self._target.expect(channel)
+            self._triggers.expect(channel)
 
     def take(
         self,
@@ -604,8 +638,7 @@ class Recorder:
             ):
                 if self._silence is not None:
                     self._silence.take(recorded.channel.topic, steady)
-                return
-            if size > SMALL_BYTES:
+            elif size > SMALL_BYTES:
                 # Its fields may fit where its payload does not.
                 self._store_fields(recorded, payload, received, sent, number)
             else:
@@ -614,6 +647,10 @@ class Recorder:
             cause = _cause_of(error)
             self._refuse(cause, str(error))
             self._lose(recorded, cause, str(error), received)
+            return
+        if self._options.triggers:
+            for text in self._triggers.fired(recorded.channel, payload):
+                self.fire(text, steady)
 
     def lost(self, loss: Loss) -> None:
         """See `Sink.lost`."""
@@ -663,8 +700,8 @@ class Recorder:
 
     def _ask_state(self, request: Mapping[str, Any]) -> Mapping[str, Any]:
         state = self._state
-        if state is None or isinstance(self._target, Snapshots):
-            return {} if state is None else summary_of(state)
+        if state is None:
+            return {}
         return summary_of(replace(state, taken=self._target.taken))
 
     def _ask_mark(self, request: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -673,31 +710,16 @@ class Recorder:
             raise UsageError("a mark needs a text and tags")
         if not all(isinstance(word, str) for pair in tags.items() for word in pair):
             raise UsageError("names and values of tags must be texts")
-        return {"recording": self.mark(text, tags)}
-
-    def _ask_trigger(self, request: Mapping[str, Any]) -> Mapping[str, Any]:
-        reason = request.get("reason")
-        if not isinstance(reason, str) or not reason:
-            raise UsageError("a trigger needs a reason")
-        self.fire(reason)
-        return {"recording": self.name}
-
-    def _ask_numbers(self, request: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Minimum, mean and maximum of a field in the ring."""
-        topic, path, begin = request.get("topic"), request.get("path"), request.get("begin")
-        if not isinstance(topic, str) or not isinstance(path, str) or not isinstance(begin, int):
-            raise UsageError("a field needs a topic, a path and a time to begin at")
-        if not isinstance(self._target, Snapshots):
-            raise UsageError("this recorder stores everything: ask its index for fields")
-        found = self._target.numbers(topic, path, begin)
-        if not found:
-            return {"n": 0}
-        return {
-            "n": len(found),
-            "least": min(found),
-            "mean": math.fsum(found) / len(found),
-            "greatest": max(found),
-        }
+        around = request.get("around")
+        if around is None:
+            return {"recording": self.mark(text, tags)}
+        if not (
+            isinstance(around, list)
+            and len(around) == 2
+            and all(isinstance(one, int | float) and 0 <= one <= _MAX_S for one in around)
+        ):
+            raise UsageError("--pin takes two times of a day at most: before and after")
+        return {"recording": self.mark(text, tags, (around[0], around[1]))}
 
     def _ask_stop(self, request: Mapping[str, Any]) -> Mapping[str, Any]:
         self._end("stopped by a request")

@@ -110,6 +110,8 @@ class LiveOptions:
             `kill -9` can cost the messages of this time.
         settings: Settings of segments and chunks; segments of 1 GiB or ten minutes.
         no_index: Selects topics whose messages get no documents in MongoDB; None for none.
+        is_ring: Whether files of it go while it is recorded: tables and index documents are then
+            made at its end, of what is left.
     """
 
     tags: Mapping[str, str] = field(default_factory=dict)
@@ -118,6 +120,7 @@ class LiveOptions:
     flush_interval_s: float = 1.0
     settings: SegmentSettings = LIVE_SETTINGS
     no_index: TopicMatcher | None = None
+    is_ring: bool = False
 
     def __post_init__(self) -> None:
         if self.budget_bytes < MIN_USER_BUDGET:
@@ -225,6 +228,7 @@ class LiveRecording:
                 source={**_SOURCE, **options.source, "flush_interval_s": options.flush_interval_s},
                 settings=options.settings,
                 no_index=options.no_index,
+                is_ring=options.is_ring,
                 pressure=Backpressure(
                     skip_compression=lambda: self._is_under_pressure(self._compression_pressure),
                     pause_indexing=lambda: self._is_under_pressure(self._index_pressure),
@@ -373,7 +377,18 @@ class LiveRecording:
     @property
     def first_unread(self) -> int:
         """Number of the first segment that the index may still read."""
-        return self._capture.index.first_unread
+        return self._capture.first_unread
+
+    @property
+    def channels(self) -> Mapping[int, Channel]:
+        """Channels so far by the numbers that they have in the segments."""
+        return self._capture.writer.channels
+
+    @property
+    def first_time(self) -> int | None:
+        """The least first log time of a channel, ns; None without messages."""
+        with self._lock:
+            return min(self._first, default=None)
 
     @property
     def is_empty(self) -> bool:

@@ -1,149 +1,132 @@
-"""A ring buffer of a robot's latest messages, in bounded memory."""
+"""A ring: of a recording that goes on, groups of files go that ended longer ago than a time.
+
+The time is what has passed, never that of a clock. A group stays while a pin touches it; a file
+stays while it has the latched messages that a late subscriber would receive.
+"""
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Hashable
-from dataclasses import dataclass, field
-from operator import attrgetter
-from typing import NamedTuple
+import time
+from collections import Counter
+from collections.abc import Callable, Collection, Hashable, Mapping
+from contextlib import suppress
+from typing import TYPE_CHECKING, Final
 
-from hybridlog.query.latching import KEEP_ALL, depth_of, is_key_frame, is_video, publisher_of
-from hybridlog_storage.messages import Channel
+from hybridlog.maintenance.retention import pinned_topics
+from hybridlog.query.latching import depth_of, publisher_of
+from hybridlog_storage.disk import durability, files
+from hybridlog_storage.manifest import LetGo, replace, with_totals
 
-_MAX_LATCHED = 32 << 20  # payload bytes of one publisher; its last message always stays
+if TYPE_CHECKING:
+    from hybridlog_storage.disk.directory import StoreDirectory
+    from hybridlog_storage.manifest import File, Manifest
+    from hybridlog_storage.messages import Channel
 
-
-class BufferedMessage(NamedTuple):
-    """A message in the ring.
-
-    Attributes:
-        set_by: Nanoseconds by which the clock of log times was set before it came.
-    """
-
-    channel: Channel
-    payload: bytes
-    log_time: int
-    publish_time: int | None
-    sequence: int
-    set_by: int = 0
-
-    @property
-    def steady(self) -> int:
-        """Its log time, ns, if the clock had never been set."""
-        return self.log_time - self.set_by
-
-
-@dataclass(slots=True)
-class _Latched:
-    """The last messages of a publisher, and the sum of their payload bytes."""
-
-    messages: deque[BufferedMessage] = field(default_factory=deque)
-    size: int = 0
-
-    def clear(self) -> None:
-        self.messages.clear()
-        self.size = 0
-
-    def add(self, message: BufferedMessage, depth: int) -> None:
-        self.messages.append(message)
-        self.size += len(message.payload)
-        while len(self.messages) > depth or (self.size > _MAX_LATCHED and len(self.messages) > 1):
-            self.size -= len(self.messages.popleft().payload)
-
-
-def _latch(latched: dict[Hashable, _Latched], message: BufferedMessage) -> None:
-    """Hold a message if its channel latches; the depth bounds how many stay.
-
-    Of video, the frames from the last key frame on are held, if they are not too many.
-    """
-    channel = message.channel
-    depth = KEEP_ALL if is_video(channel) else depth_of(channel)
-    if not depth:
-        return
-    held = latched.setdefault(publisher_of(channel), _Latched())
-    if is_video(channel):
-        if is_key_frame(channel, message.payload):
-            held.clear()
-        elif not held.messages or held.size + len(message.payload) > _MAX_LATCHED:
-            held.clear()
-            return
-    held.add(message, depth)
+GROUPS: Final = 10
+"""Groups of files in the time of a ring, about."""
+_LATE_S: Final = 1.0  # a trigger may be evaluated so long after its message has come
 
 
 class Ring:
-    """Holds the messages of a time span, or as many as fit.
-
-    Latched messages that leave it are held until newer ones that leave it replace them, and
-    frames of video from a key frame on until the next one: later messages cannot be understood
-    without them.
+    """Lets the oldest groups of a recording go.
 
     Args:
-        span_ns: The span, by the messages' steady times.
-        max_bytes: Limit for the payload bytes in the ring.
+        directory: The store.
+        recording: Id of the recording, which this process makes.
+        span_s: Seconds after its end when a group goes.
+        sealed: Returns the number of files sealed so far.
+        channels: Channels by the numbers that they have in the files.
 
     Attributes:
-        payload_bytes: Payload bytes in the ring.
-        is_short: Whether memory did not suffice for the whole span.
+        messages: Messages that have gone.
     """
 
-    def __init__(self, span_ns: int, max_bytes: int) -> None:
-        self._span = span_ns
-        self._max_bytes = max_bytes
-        self._messages: deque[BufferedMessage] = deque()
-        self._latched: dict[Hashable, _Latched] = {}
-        self.payload_bytes = 0
-        self.is_short = False
+    def __init__(
+        self,
+        directory: StoreDirectory,
+        recording: str,
+        span_s: float,
+        sealed: Callable[[], int],
+        channels: Mapping[int, Channel],
+    ) -> None:
+        self.messages = 0
+        self._directory = directory
+        self._recording = recording
+        self._span_s = span_s + _LATE_S
+        self._count = sealed
+        self._channels = channels
+        self._seen = 0
+        self._ended: dict[int, float] = {}  # when each group was first seen sealed
+        self._kept: set[int] = set()  # must stay, as long as no other group is sealed
 
-    def add(self, message: BufferedMessage) -> None:
-        """Add a message, and drop those that are too old or too many."""
-        self._messages.append(message)
-        self.payload_bytes += len(message.payload)
-        oldest = message.steady - self._span
-        while (is_full := self.payload_bytes > self._max_bytes) or (
-            self._messages and self._messages[0].steady < oldest
-        ):
-            self.is_short |= is_full
-            dropped = self._messages.popleft()
-            self.payload_bytes -= len(dropped.payload)
-            _latch(self._latched, dropped)
+    def due(self, now: float) -> set[int]:
+        """The groups whose time is over.
 
-    def since(self, begin: int) -> list[BufferedMessage]:
-        """The messages from a steady time on, ns, in arrival order.
-
-        The latched messages in force at that time come first, with its log time, so that the
-        slice spans no more than requested. Their publish time still tells when they were sent.
+        Args:
+            now: The time, by `time.monotonic`.
         """
-        latched: dict[Hashable, _Latched] = {}
-        for message in (m for each in self._latched.values() for m in each.messages):
-            _latch(latched, message)
-        recent = [m for m in self._messages if m.steady >= begin]
-        for message in self._messages:
-            if message.steady < begin:
-                _latch(latched, message)
-        front = sorted(
-            (m for each in latched.values() for m in each.messages if m.steady < begin),
-            key=attrgetter("steady"),
-        )
-        at = begin + next((m.set_by for m in (*recent[:1], *front[-1:])), 0)
+        sealed = self._count()
+        if sealed != self._seen:
+            logs = self._directory.manifests.read(self._recording).logs.values()
+            seen = time.monotonic()
+            self._ended = {log.group: self._ended.get(log.group, seen) for log in logs}
+            self._seen, self._kept = sealed, set()
+        old = {group for group, at in self._ended.items() if now - at >= self._span_s}
+        return old - self._kept
+
+    def let_go(self, groups: Collection[int]) -> None:
+        """Delete the files of some groups, except those that must stay.
+
+        Raises:
+            StoreError: The manifest cannot be changed, or a file cannot be deleted.
+        """
+        gone: list[File] = []
+
+        def how(now: Manifest) -> Manifest:
+            gone[:] = self._going(now, groups)
+            if not gone:
+                return now
+            count = sum(part.messages for log in gone for part in log.parts.values())
+            left = tuple(file for file in now.files if file not in gone)
+            before = LetGo(0, 0) if now.let_go is None else now.let_go
+            through = max(before.through, *(file.number for file in gone))
+            let_go = LetGo(before.messages + count, through)
+            return with_totals(replace(now, files=left, let_go=let_go))
+
+        changed = self._directory.manifests.change(self._recording, how)
+        self._kept.update(groups)  # what is left of them stays, until another group is sealed
+        self.messages = 0 if changed.let_go is None else changed.let_go.messages
+        path = self._directory.recording(self._recording)
+        try:
+            for file in gone:
+                with suppress(FileNotFoundError):
+                    files.unlink(path / file.name)
+        except OSError as error:
+            raise durability.explain(error, path, "deleting files of") from error
+
+    def _going(self, now: Manifest, groups: Collection[int]) -> list[File]:
+        logs = [log for log in now.logs.values() if log.group in groups]
+        pinned = {log.group for log in logs if pinned_topics(log, now)}
+        in_force = self._in_force(now)
         return [
-            *(m._replace(log_time=at, publish_time=m.publish_time or m.log_time) for m in front),
-            *recent,
+            file
+            for file in now.files
+            if file.group in groups and file.group not in pinned and file.number not in in_force
         ]
 
-    def latest(self, topic: str, begin: int, limit: int) -> list[BufferedMessage]:
-        """The latest messages of a topic since a steady time, ns, at most `limit`."""
-        found: list[BufferedMessage] = []
-        for message in reversed(self._messages):
-            if message.steady < begin or len(found) == limit:
-                break
-            if message.channel.topic == topic:
-                found.append(message)
+    def _in_force(self, now: Manifest) -> set[int]:
+        """Numbers of the files with latched messages that no later ones have replaced."""
+        found: set[int] = set()
+        newer: Counter[Hashable] = Counter()
+        for number, log in sorted(now.logs.items(), reverse=True):
+            came: Counter[Hashable] = Counter()
+            for one, part in log.parts.items():
+                channel = self._channels.get(one)
+                depth = 0 if channel is None else depth_of(channel)
+                if channel is not None and depth and part.messages:
+                    publisher = publisher_of(channel)
+                    came[publisher] += part.messages
+                    if newer[publisher] < depth:
+                        found.add(number)
+            newer += came
         return found
-
-    @property
-    def held_s(self) -> float:
-        """Seconds between the oldest and the newest message."""
-        if not self._messages:
-            return 0.0
-        return (self._messages[-1].steady - self._messages[0].steady) / 1e9

@@ -7,6 +7,7 @@ recording, provides its writer, and completes or removes the recording.
 from __future__ import annotations
 
 import math
+import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
@@ -89,6 +90,8 @@ class Capture:
         pressure: Settings for a caller that cannot wait for compression, disk and index.
         no_index: Returns whether the messages of a topic get no documents in MongoDB; None for
             no topic.
+        is_ring: Whether files of it go while it is recorded. Then nothing is derived of it, and
+            latched messages have files of their own.
         check: Called with the catalog before anything is written, while no other process can
             start a recording; raises to refuse.
 
@@ -110,10 +113,12 @@ class Capture:
         settings: SegmentSettings,
         pressure: Backpressure | None = None,
         no_index: Callable[[str], bool] | None = None,
+        is_ring: bool = False,
         check: Callable[[Catalog], None] | None = None,
     ) -> None:
         self.catalog = catalog
         self._directory = directory
+        self._is_ring = is_ring
         self._no_index = no_index or (lambda _: False)
         rules = Rules.of(directory.settings.retention)
         largest = min(
@@ -162,11 +167,12 @@ class Capture:
         self.writer = RecordingWriter(
             folder,
             recording_metadata(self.entry),
-            self.index.submit,
+            (lambda *_: None) if is_ring else self.index.submit,
             settings,
             no_index=self._no_index,
             is_named=lambda topic: rules.topic_rule(topic) is not None,
             is_latched=lambda channel: depth_of(channel) > 0,
+            latched_apart=is_ring,
             on_sealing=self._announce,
             skip_compression=pressure.skip_compression if pressure else None,
             next_chunk_size=pressure.next_chunk_size if pressure else None,
@@ -184,6 +190,11 @@ class Capture:
         """Messages that are to be in the index, and are not yet."""
         lag = self.writer.totals.messages - self.index.indexed
         return max(lag, 0) if self._target.is_wanted else 0
+
+    @property
+    def first_unread(self) -> int:
+        """Number of the first segment that is still read to make tables and documents."""
+        return sys.maxsize if self._is_ring else self.index.first_unread
 
     def expect(self, channel: Channel) -> None:
         """Prepare a channel before its first message."""
@@ -234,7 +245,7 @@ class Capture:
             self._change(lambda now: ended(end)(change(now)))
         else:
             self._change(change)
-        for sealed in group:
+        for sealed in () if self._is_ring else group:
             messages = sum(channel.messages for channel in sealed.channels)
             self._tables.seal(sealed.segment, sealed.digest, messages)
             self.index.seal(sealed)

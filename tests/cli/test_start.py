@@ -184,7 +184,7 @@ def test_completion(store: Path) -> None:
     assert complete(f"info --losses --store {store} -t /base/s") == ["/base/scan"]
     assert complete(f"record --store {store} --throttle /base/s") == ["/base/scan"]
     assert complete(f"top --store {store} --field /base/s") == ["/base/scan:"]
-    assert complete(f"trigger x --store {store} -r r") == []  # nothing is recorded now
+    assert complete(f"mark x --store {store} -r r") == []  # nothing is recorded now
     assert "--between" in complete("fetch --be")
     assert complete(f"ls --store {store} --tag p") == ["place"]
     assert complete(f"ls --store {store} --type Laser") == ["LaserScan"]

@@ -23,10 +23,8 @@ from PIL import Image
 import hybridlog as hl
 from hybridlog.arrays.bitstream import FrameOrder, frame_of, is_key_frame
 from hybridlog.arrays.video import VideoDecoder
-from hybridlog.live.ring import BufferedMessage, Ring
 from hybridlog.view.playback.played import PlayedLog
 from hybridlog_storage.errors import MissingDependencyError, PayloadError, TopicError
-from hybridlog_storage.messages import Channel, Schema
 from tests.cli.within import answer
 
 av = pytest.importorskip("av")
@@ -267,20 +265,6 @@ def test_a_recorded_slice_begins_with_the_key_frame(form: str, tmp_path: Path) -
         store=tmp_path / "other",
     )  # fmt: skip
     assert "8 of them latched or frames of video, from before the time range" in answered.out
-
-
-def test_a_snapshot_of_a_ring_begins_with_the_key_frame() -> None:
-    frames = encoded("h264")
-    schema = Schema("foxglove.CompressedVideo", "jsonschema", JSON)
-    channel = Channel("/cam", "json", schema, {})
-    ring = Ring(span_ns=3 * STEP, max_bytes=1 << 30)
-    for n, data in enumerate(frames[2:10], 2):
-        sent = payload("json", "h264", data)
-        ring.add(BufferedMessage(channel, sent, BASE + n * STEP, None, n))
-    assert [m.sequence for m in ring.since(BASE + 8 * STEP)] == [5, 6, 7, 8, 9]
-    assert [m.sequence for m in ring.since(BASE + 6 * STEP)] == [5, 6, 7, 8, 9]
-    ring.add(BufferedMessage(channel, b"no video", BASE + 20 * STEP, None, 20))
-    assert [m.sequence for m in ring.since(BASE + 20 * STEP)] == [5, 6, 7, 8, 9, 20]
 
 
 def test_a_playback_goes_on_from_the_key_frame(videos: hl.Store) -> None:

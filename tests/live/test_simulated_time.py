@@ -13,7 +13,6 @@ import hybridlog as hl
 from hybridlog.live.clocks import clock_time
 from hybridlog.live.policy import throttle_rule
 from hybridlog.live.recorder import RecorderOptions
-from hybridlog.live.snapshots import SnapshotOptions
 from hybridlog.query.topics import matcher
 from hybridlog.record.losses import Cause, Loss
 from hybridlog_storage.errors import UsageError
@@ -228,7 +227,7 @@ def test_messages_that_come_while_the_held_ones_are_passed_on_stay_behind_them(
 
 def test_a_ring_has_another_time(store: hl.Store) -> None:
     with pytest.raises(UsageError, match="--use-sim-time"):
-        RecorderOptions(use_sim_time=True, snapshots=SnapshotOptions(10))
+        RecorderOptions(use_sim_time=True, ring_s=10)
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ from pymongo import MongoClient
 
 import hybridlog as hl
 from hybridlog.contract import Contract
-from hybridlog.live.snapshots import Trigger
+from hybridlog.live.triggers import Trigger
 from hybridlog.query.choice import Choice
 from hybridlog.query.predicate.mongo_filter import MAX_DEPTH
 from hybridlog.query.query import Query

@@ -394,7 +394,6 @@ EXEMPT: dict[str, str] = {
     "top": "it asks the recorder, not the store",
     "copy": "it copies recordings that have ended",
     "view": "it serves until it is stopped; see tests/view",
-    "trigger": "it asks the recorder, not the store",
     "mcp": "it serves until it is stopped; see tests/view/test_tools.py",
     "open": "it opens a program with a slice, which `fetch -o` makes",
     "demo": "it makes a recording",

@@ -90,14 +90,6 @@ def to_truth(
     return _node(root_of(node), reader)
 
 
-def numbers_at(message: Message, path: str) -> list[float]:
-    """The numbers at a path such as `pose.position.x` or `ranges.min`."""
-    parts = tuple(int(part) if part.isdecimal() else part for part in path.split("."))
-    found = _Reader(FieldTypes.of(None), summarised=False).leaves(message, Field(parts))
-    values = (v for leaf in found for v in (_flat(leaf) if isinstance(leaf, list) else [leaf]))
-    return [value for value in values if is_number(value)]
-
-
 @dataclass(frozen=True, slots=True)
 class _Hidden:
     """Elements, or fields of elements, of an array that is present only as a summary.

@@ -1,0 +1,212 @@
+"""A ring: what ended longer ago than a time goes, unless it is pinned or latched."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import hybridlog as hl
+from hybridlog.live import incidents
+from hybridlog.live import ring as ring_module
+from hybridlog.live.recorder import RecorderOptions
+from hybridlog.record.losses import Cause, Loss
+from hybridlog.record.marks import MARKS
+from hybridlog_storage.messages import Channel
+from tests.live.speaker import TEXT, Recorded, scan, scan_channel, text, text_channel
+
+SECOND = 1_000_000_000
+LATCHED = Channel("/map", "ros1", TEXT, {"latching": "1"}, has_publish_time=False)
+RING_S = 0.4
+"""Of the tests; a group is sealed with each message."""
+
+
+@pytest.fixture(autouse=True)
+def is_prompt(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ring_module, "_LATE_S", 0.1)
+    monkeypatch.setattr(incidents, "_EVERY_S", 0.02)
+
+
+class Robot(Recorded):
+    def __init__(self, store: hl.Store, ring_s: float = RING_S, **options: object) -> None:
+        made = RecorderOptions(
+            name="ring",
+            reserve_bytes=0,
+            ring_s=ring_s,
+            flush_interval_s=0.02,
+            **options,  # type: ignore[arg-type]
+        )
+        super().__init__(store, made)
+        self.store = store
+        self.number = itertools.count()
+
+    @property
+    def folder(self) -> Path:
+        target = self.recorder._target
+        return self.store.directory.recording(target.id)
+
+    def run(self, seconds: float) -> None:
+        """Send a number a hundredth of a second."""
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            self.speaker.say(scan_channel(), scan(next(self.number), 2000))
+            time.sleep(0.01)
+
+    def stop(self) -> hl.RecordingEntry:
+        (report,) = self.recorder.stop()
+        self.store.refresh()
+        return report.entry
+
+
+def ids(store: hl.Store) -> list[int]:
+    return [message.fields["id"] for message in store.topic("/scan")]
+
+
+@pytest.fixture
+def plain(tmp_path: Path) -> Iterator[hl.Store]:
+    with hl.open(tmp_path / "store", create=True, mongo="none") as store:
+        yield store
+
+
+def test_the_last_seconds_stay_and_nothing_else(store: hl.Store) -> None:
+    robot = Robot(store)
+    robot.recorder.lost(Loss("/scan", Cause.TRANSPORT, 4, time.time_ns(), time.time_ns()))
+    robot.run(2)
+    seen = ids(store)
+    state = robot.recorder.look()
+    entry = robot.stop()
+    kept = ids(store)
+    sent = next(robot.number)
+    # The end of what came, without gaps.
+    assert kept == [*range(sent - len(kept), sent)]
+    times = [message.log_time_ns for message in store.topic("/scan")]
+    assert RING_S * 0.9 < (times[-1] - times[0]) / SECOND < RING_S + 0.9
+    assert seen == [*range(seen[0], seen[-1] + 1)]
+    assert seen[0] > 0
+    assert state.let_go
+    manifest = store.directory.manifests.read(entry.id)
+    assert manifest.let_go is not None
+    assert manifest.let_go.messages == sent - len(kept)
+    assert sum(one.messages for one in manifest.channels.values()) == entry.messages == len(kept)
+    names = {file.name for file in manifest.files}
+    assert {path.name for path in robot.folder.glob("*.mcap")} == names
+    # All that is derived is of what is left, and what was lost before is not in it.
+    assert store.topic("/scan").where("near >= 0").count() == len(kept)
+    assert store.topic("/scan").to_arrow().num_rows == len(kept)
+    assert store.sql("select count(*) as n from scan").to_pandas()["n"][0] == len(kept)
+    assert entry.end["losses"] == []
+    assert store.verify().findings == []
+
+
+def test_questions_are_answered_while_files_go(plain: hl.Store) -> None:
+    robot = Robot(plain, 5 * RING_S)
+    robot.run(0.5)
+    running = threading.Thread(target=robot.run, args=(6,))
+    running.start()
+    asked = 0
+    with hl.open(plain.directory.path, mongo="none") as other:
+        while running.is_alive():
+            found = ids(other)
+            assert found == [*range(found[0], found[0] + len(found))]
+            assert other.topic("/scan").count() > 0
+            with hl.open(plain.directory.path, mongo="none") as newer:
+                (one,) = newer.recordings()
+                assert one.end.get("losses", []) == []
+                assert [*newer.topic("/scan").between("-0.3s", "end")]
+                assert not newer.verify().findings
+            asked += 1
+    robot.stop()
+    assert asked > 10
+    assert robot.recorder.look().let_go
+
+
+@pytest.mark.mongo
+def test_mongodb_has_what_is_left(store: hl.Store) -> None:
+    robot = Robot(store)
+    robot.run(1.2)
+    robot.stop()
+    found = store.topic("/scan").where({"near": {"$gte": 0}})
+    assert found.count() == store.topic("/scan").count() > 0
+    assert found.remarks() == []
+
+
+def test_what_is_pinned_stays(plain: hl.Store) -> None:
+    robot = Robot(plain, before_s=0.3, after_s=0.1)
+    robot.run(0.8)
+    at = time.time_ns()
+    robot.recorder.fire("bump")
+    robot.run(1.6)
+    entry = robot.stop()
+    kept = [message.log_time_ns for message in plain.topic("/scan")]
+    around = [time for time in kept if at - 0.3 * SECOND <= time <= at + 0.1 * SECOND]
+    gaps = [later - before for before, later in itertools.pairwise(around)]
+    assert around[0] < at - 0.25 * SECOND
+    assert around[-1] > at + 0.05 * SECOND
+    assert max(gaps) < 0.1 * SECOND
+    assert len(kept) < next(robot.number) - 20  # between the pin and the end messages went
+    (mark,) = plain.topic(MARKS)
+    assert mark.fields["tags"] == {"trigger": "bump"}
+    during = plain.topic("/scan").during(plain.topic(MARKS).windows())
+    assert during.count() == len(around)
+    plain.unpin(*(pin["id"] for pin in entry.pins))
+
+
+def test_latched_messages_in_force_stay(plain: hl.Store) -> None:
+    robot = Robot(plain)
+    for word in ("old", "map"):
+        robot.speaker.say(LATCHED, text(word))
+        robot.speaker.say(text_channel(), text("small"))
+        robot.run(0.3)
+    robot.run(1.2)
+    entry = robot.stop()
+    assert plain.topics() == ["/map", "/scan"]  # only what is latched stays
+    assert [m.fields["data"] for m in plain.topic("/map")] == ["map"]
+    last = plain.topic("/scan").between("-0.1s", "end")
+    assert last.count() > 0
+    slice_ = plain.query(["/map", "/scan"], [entry.id]).between("-0.1s", "end")
+    front = [batch.payload(0) for batch, _ in slice_.latched()]
+    assert front == [text("map")]
+
+
+def test_marks_stay_whatever_goes(plain: hl.Store) -> None:
+    robot = Robot(plain)
+    robot.run(0.2)
+    robot.recorder.mark("slipped", {})
+    robot.run(1.2)
+    robot.stop()
+    assert [mark.fields["text"] for mark in plain.topic(MARKS)] == ["slipped"]
+
+
+def test_a_ring_in_which_nothing_comes_any_more(plain: hl.Store) -> None:
+    robot = Robot(plain)
+    robot.speaker.say(text_channel(), text("first"))
+    time.sleep(1)
+    robot.run(0.2)
+    entry = robot.stop()
+    assert entry.status == "complete"
+    assert plain.topic("/scan").count() == next(robot.number)
+
+
+def test_a_file_that_was_let_go_and_not_deleted_is_deleted_later(plain: hl.Store) -> None:
+    robot = Robot(plain)
+    robot.run(0.3)
+    manifest = plain.directory.manifests.read(robot.recorder._target.id)
+    name = manifest.files[0].name
+    kept = (robot.folder / name).read_bytes()
+    robot.run(1.2)
+    entry = robot.stop()
+    (robot.folder / name).write_bytes(kept)
+    assert plain.verify().findings == []
+    before = ids(plain)
+    with hl.open(plain.directory.path, mongo="none") as other:
+        assert ids(other) == before
+    with plain.directory.writing(entry.id):
+        from hybridlog.maintenance.opening import recover
+        from hybridlog.maintenance.report import RepairReport
+
+        assert recover(plain.directory, entry.id, RepairReport())
+    assert not (robot.folder / name).exists()

@@ -1,0 +1,193 @@
+"""Triggers: a message that fits marks and pins what is around it."""
+
+from __future__ import annotations
+
+import json
+import struct
+import time
+from collections.abc import Callable
+
+import pytest
+
+import hybridlog as hl
+from hybridlog.live.recorder import RecorderOptions
+from hybridlog.live.triggers import Trigger, Triggers
+from hybridlog.record.marks import MARKS
+from hybridlog_storage.errors import TopicError, UsageError, WhereError
+from hybridlog_storage.messages import Channel, Schema
+from tests.live.speaker import Recorded, scan, scan_channel, text, text_channel
+from tests.waiting import wait_for
+
+SECOND = 1_000_000_000
+
+
+def robot(store: hl.Store, *texts: str, before: float = 0, after: float = 0) -> Recorded:
+    options = RecorderOptions(
+        reserve_bytes=0,
+        triggers=[*map(Trigger.of, texts)],
+        before_s=before,
+        after_s=after,
+    )
+    return Recorded(store, options)
+
+
+def test_what_is_around_a_trigger_is_marked_and_pinned(store: hl.Store) -> None:
+    trigger = "/scan: near >= 10 and near < 11"
+    recorded = robot(store, trigger, before=5, after=3)
+    start = time.time_ns()
+    for second in range(60):
+        # `near` is half the number: the trigger is at 20 s and 21 s.
+        recorded.speaker.say(scan_channel(), scan(second, 10), start + second * SECOND)
+    (report,) = recorded.recorder.stop()
+    assert report.entry.messages == 60
+    begin, end = start + 15 * SECOND, start + 24 * SECOND
+    (pin,) = report.entry.pins
+    assert (pin["from"], pin["to"], pin["reason"]) == (begin, end + 1, trigger)
+    (mark,) = store.topic(MARKS)
+    assert mark.log_time_ns == begin
+    assert mark.fields == {"text": trigger, "tags": {"trigger": trigger}, "end": end}
+    (said,) = recorded.said
+    assert said.startswith(f"{trigger!r} is marked and pinned from ")
+    inside = store.topic("/scan").during(store.topic(MARKS).windows())
+    assert [m.fields["id"] for m in inside] == [*range(15, 24)]
+
+
+def test_hits_of_one_name_that_touch_are_one(store: hl.Store) -> None:
+    recorded = robot(store, before=2, after=2)
+    now, recorder = time.time_ns(), recorded.recorder
+    recorded.speaker.say(text_channel(), text("first"), now - 10 * SECOND)
+    recorder.fire("bump", now)
+    wait_for(lambda: recorded.said)
+    for second, name in ((3, "bump"), (5, "fall"), (20, "bump"), (40, "bump")):
+        recorder.fire(name, now + second * SECOND)
+    assert recorder.look().incidents == 4
+    (report,) = recorder.stop()
+    spans = [(-2, 5, "bump"), (3, 7, "fall"), (18, 22, "bump"), (38, 42, "bump")]
+    pins = [(pin["from"], pin["to"] - 1, pin["reason"]) for pin in report.entry.pins]
+    marks = [(m.log_time_ns, m.fields["end"], m.fields["text"]) for m in store.topic(MARKS)]
+    for found in (pins, marks):
+        told = sorted(((a - now) // SECOND, (b - now) // SECOND, name) for a, b, name in found)
+        assert told == sorted(spans)
+    assert len(recorded.said) == 4
+
+
+def test_marks_of_a_trigger_begin_no_recording_earlier(store: hl.Store) -> None:
+    recorded = robot(store, before=100)
+    now = time.time_ns()
+    recorded.speaker.say(text_channel(), text("first"), now)
+    recorded.recorder.fire("SIGUSR1")
+    (report,) = recorded.recorder.stop()
+    assert report.entry.marks[0]["time"] == now
+    assert report.entry.pins[0]["from"] < now
+
+
+def test_what_a_person_marks_and_pins_is_stored_at_once(store: hl.Store) -> None:
+    recorded = robot(store)
+    recorded.speaker.say(text_channel(), text("first"))
+    name = recorded.recorder.mark("slipped", {"wheel": "left"}, (30, 10))
+    manifest = store.directory.manifests.read(store.entry(name).id)
+    (mark,), (pin,) = manifest.marks, manifest.pins
+    assert (mark.text, mark.tags) == ("slipped", {"wheel": "left"})
+    assert pin.first is not None
+    assert pin.last is not None
+    assert (pin.last - pin.first, pin.reason) == (40 * SECOND, "slipped")
+    recorded.recorder.stop()
+
+
+@pytest.mark.parametrize(
+    ("text", "error"),
+    [
+        ("", UsageError),
+        (": x > 1", UsageError),
+        ("re:(: x", TopicError),
+        ("/a: x >", WhereError),
+        ("/a: _meta.seq > 1", WhereError),
+    ],
+)
+def test_a_trigger_that_is_none(text: str, error: type[Exception]) -> None:
+    with pytest.raises(error):
+        Trigger.of(text)
+
+
+def test_times_that_make_no_sense() -> None:
+    for options in ({"ring_s": 0}, {"ring_s": 5, "before_s": 6}, {"after_s": -1}):
+        with pytest.raises(UsageError):
+            RecorderOptions(**options)  # type: ignore[arg-type]
+
+
+def test_a_trigger_that_can_never_fire_is_told(store: hl.Store) -> None:
+    recorded = robot(
+        store, "/scan: nope == 1", '/scan: near == "x"', "/nowhere: a == 1", "/scan: near > 1"
+    )
+    for number in range(4):
+        recorded.speaker.say(scan_channel(), scan(number, 10))
+    recorded.recorder.stop()
+    said = "\n".join(recorded.said)
+    assert "'/scan: nope == 1' can never fire on /scan: " in said
+    assert "there is no field nope" in said
+    assert """'/scan: near == "x"' can never fire on /scan: """ in said
+    assert "no topic matched the trigger '/nowhere: a == 1'" in said
+    assert said.count("near > 1") == 1  # that it was marked
+    assert said.count("can never fire") == 2
+
+
+def test_a_trigger_that_can_never_fire_is_told_before_the_first_message() -> None:
+    wrong, nowhere = "/scan: nope == 1", "/nowhere: a == 1"
+    said: list[str] = []
+    triggers = Triggers([Trigger.of(wrong)], said.append)
+    triggers.expect(scan_channel())
+    (line,) = said
+    assert "can never fire on /scan" in line
+    said.clear()
+    triggers = Triggers([Trigger.of(nowhere), Trigger.of("/scan")], said.append, settle_s=0)
+    triggers.look([])
+    assert not said
+    for _ in range(2):
+        triggers.look(["/scan", "/odom"])
+    assert said == [f"no topic matches the trigger {nowhere!r} so far"]
+    triggers.look(["/nowhere"])
+    triggers.close()
+    assert len(said) == 1
+
+
+WIDE = Schema("test_msgs/Wide", "ros1msg", b"uint64 id\nfloat64[] a\n")
+
+
+@pytest.mark.parametrize(
+    ("channel", "spell"),
+    [
+        (
+            Channel("/wide", "json", None),
+            lambda number, a: json.dumps({"id": number, "a": a}).encode(),
+        ),
+        (
+            Channel("/wide", "ros1", WIDE),
+            lambda number, a: struct.pack(f"<QI{len(a)}d", number, len(a), *a),
+        ),
+    ],
+)
+@pytest.mark.parametrize(
+    ("where", "fires"),
+    [
+        ("a == 7", [1, 3]),
+        ("a[35] == 7", [3]),
+        ("a != 7", [0, 2]),
+        ("a < 1", [0, 2, 3]),
+        ("a.max >= 7", [1, 3]),
+        ("a.n >= 2", [2, 3]),
+        ("id == 18364758544493064721", [1]),
+        ("id > 18364758544493064721", [2]),
+    ],
+)
+def test_a_trigger_fires_on_whole_and_exact_messages(
+    channel: Channel,
+    spell: Callable[[int, list[float]], bytes],
+    where: str,
+    fires: list[int],
+) -> None:
+    arrays = [[0.5], [7.0], [0.5] * 40, [*[0.5] * 35, 7.0, 8.0]]
+    numbers = [1, 18364758544493064721, 18364758544493064722, 2]
+    triggers = Triggers([Trigger.of(f"/wide: {where}")], lambda _: None)
+    for index, (number, array) in enumerate(zip(numbers, arrays, strict=True)):
+        fired = [*triggers.fired(channel, spell(number, array))]
+        assert fired == ([f"/wide: {where}"] if index in fires else [])
