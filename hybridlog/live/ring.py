@@ -12,7 +12,7 @@ from collections.abc import Callable, Collection, Hashable, Mapping
 from contextlib import suppress
 from typing import TYPE_CHECKING, Final
 
-from hybridlog.maintenance.retention import pinned_topics
+from hybridlog.maintenance.retention import is_pinned
 from hybridlog.query.latching import depth_of, publisher_of
 from hybridlog_storage.disk import durability, files
 from hybridlog_storage.manifest import LetGo, replace, with_totals
@@ -86,7 +86,9 @@ class Ring:
             gone[:] = self._going(now, groups)
             if not gone:
                 return now
-            count = sum(part.messages for log in gone for part in log.parts.values())
+            count = sum(
+                part.messages for log in gone if log.kind == "log" for part in log.parts.values()
+            )
             left = tuple(file for file in now.files if file not in gone)
             before = LetGo(0, 0) if now.let_go is None else now.let_go
             through = max(before.through, *(file.number for file in gone))
@@ -106,7 +108,7 @@ class Ring:
 
     def _going(self, now: Manifest, groups: Collection[int]) -> list[File]:
         logs = [log for log in now.logs.values() if log.group in groups]
-        pinned = {log.group for log in logs if pinned_topics(log, now)}
+        pinned = {log.group for log in logs if is_pinned(log, now)}
         in_force = self._in_force(now)
         return [
             file

@@ -21,7 +21,7 @@ FIRST: Final = 1
 SECOND: Final = 2
 """Key of the segment with larger topics that have none of their own."""
 LATCHED: Final = 3
-"""Key of the segment with latched messages, where they are to stay alone."""
+"""Key of the segment with latched messages, where they stay alone: a group of its own."""
 Key = Literal[1, 2, 3] | str
 """Which segment of a group: one of the above, or that of a topic."""
 _NAMED: Final = 14  # topics with segments of their own by a rule
@@ -126,7 +126,8 @@ class SegmentGroup:
         """A segment; started if there is none."""
         found = self.segments.get(key)
         if found is None:
-            found = self.segments[key] = self._create(self.first.number)
+            group = None if key == LATCHED else self.first.number
+            found = self.segments[key] = self._create(group)
         return found
 
     def is_full(self, size: int, span_s: float | None) -> bool:
