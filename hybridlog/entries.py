@@ -14,12 +14,14 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Final, Literal, cast
 
 import numpy as np
 from msgspec import UNSET, ValidationError, convert, to_builtins
 
 from hybridlog.record.losses import Cause, extent_of, joined, topics_of
+from hybridlog.record.marks import mark_channel
 from hybridlog.schema.states import State, expired_messages
 from hybridlog_storage import manifest as truth
 from hybridlog_storage.catalog import (
@@ -28,6 +30,7 @@ from hybridlog_storage.catalog import (
     RecordingEntry,
     channel_entry,
     channel_totals,
+    content_hash,
     content_of,
     spans_of,
 )
@@ -45,12 +48,19 @@ from hybridlog_storage.manifest import (
     is_id,
     loss_of,
 )
-from hybridlog_storage.messages import Channel
+from hybridlog_storage.messages import EXPIRED, NOT_COPIED, REDUCED, Channel, schema_hash
 from hybridlog_storage.segments.gone_log import GoneLog, open_log
-from hybridlog_storage.segments.segment_file import Sealed, is_rows, sealed_channels, sealed_name
+from hybridlog_storage.segments.segment_file import (
+    Sealed,
+    SealedChannel,
+    is_rows,
+    sealed_channels,
+    sealed_name,
+)
 from hybridlog_storage.segments.segment_format import group_of
 from hybridlog_storage.segments.segment_reader import SegmentSummary
 from hybridlog_storage.summary import RecordingSummary, TopicType, hash_of, topics_to_json
+from hybridlog_storage.times import span_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -65,6 +75,8 @@ NO_MANIFEST: Final = (
     "segments."
 )
 _TRIES = 10  # to read a recording while its files are replaced
+_ENCODINGS: Final = {"expired": EXPIRED, "elsewhere": NOT_COPIED}
+"""Of the messages of a log that is gone."""
 
 
 def recording_metadata(entry: RecordingEntry) -> dict[str, object]:
@@ -178,9 +190,29 @@ class Inventory:
         }
 
     @property
+    def state(self) -> str:
+        """A value that changes with its files, and with what the manifest says of them."""
+        return state_of(self.listing, self.manifest)
+
+    @property
     def is_proven(self) -> bool:
         """True if the manifest was never lost, and all segments that it lists are valid."""
         return self.manifest is not None and self.manifest.status != "unproven" and not self.lost
+
+
+def state_now(directory: StoreDirectory, recording: str) -> str:
+    """The state of a recording's files, as of `Inventory`.
+
+    Raises:
+        RecordingGoneError: It is being removed.
+        StoreError: Directory or manifest cannot be read.
+    """
+    return state_of(directory.listing(recording), directory.manifests.find(recording))
+
+
+def state_of(listing: Listing, manifest: Manifest | None) -> str:
+    """The same, by the content of its directory and its manifest."""
+    return listing.print if manifest is None else truth.state_of(manifest, listing.print)
 
 
 def take_inventory(directory: StoreDirectory, folder: str) -> Inventory:
@@ -249,7 +281,7 @@ def steady_inventory(directory: StoreDirectory, recording: str) -> Inventory:
         found = take_inventory(directory, recording)
         if not (found.misfits or found.lost or _losses_of_rows(found)):
             return found
-        if directory.listing(recording).print == found.listing.print:
+        if state_now(directory, recording) == found.state:
             return found
     raise StoreError(f"The files of recording {recording!r} change while they are read. Ask again.")
 
@@ -286,8 +318,14 @@ def _difference(
 def _parts_of(summary: SegmentSummary) -> dict[int, truth.Part]:
     """What a segment has of each channel, as a manifest lists it."""
     channels = sealed_channels(summary.table.as_stored(), summary.channels)
+    return _parts(channels)
+
+
+def _parts(channels: Iterable[SealedChannel]) -> dict[int, truth.Part]:
     return {
-        one.id: truth.Part(one.messages, one.payload_bytes, one.first, one.last) for one in channels
+        one.id: truth.Part(one.messages, one.payload_bytes, one.first, one.last)
+        for one in channels
+        if one.messages
     }
 
 
@@ -379,7 +417,7 @@ def describe(catalog: Catalog, inventory: Inventory, *, is_open: bool = False) -
         entry,
         summary_of(shown, inventory.listing.look),
         topic_types(shown),
-        inventory.listing.print,
+        inventory.state,
         channels,
     )
 
@@ -413,32 +451,9 @@ def put_entry(
     return described.entry
 
 
-def put_said(
-    directory: StoreDirectory, catalog: Catalog, recording: str, *, is_open: bool = False
-) -> RecordingEntry:
-    """Update the catalog row of a recording of which people have said something else.
-
-    Raises:
-        SegmentError: The recording cannot be identified.
-    """
-    row, listing = catalog.recording(recording), directory.listing(recording)
-    if row is None or is_open or row[0] != listing.print:
-        return put_entry(directory, catalog, recording, is_open=is_open)
-    said = said_now(directory, row[1], listing)
-    catalog.put(said)
-    return said.entry
-
-
-def said_now(directory: StoreDirectory, entry: RecordingEntry, listing: Listing) -> Described:
-    """A recording whose files are those of its entry, with what people say of it by now.
-
-    Raises:
-        StoreError: Its manifest cannot be read.
-    """
-    manifest = directory.manifests.read(entry.id)
-    now = replace(entry, name=manifest.name, tags=dict(manifest.tags), **_said(manifest))
-    shown = with_marks(now)
-    return Described(now, summary_of(shown, listing.look), topic_types(shown), listing.print, {})
+def with_said(entry: RecordingEntry, manifest: Manifest) -> RecordingEntry:
+    """The entry with what people say of its recording by a manifest."""
+    return replace(entry, name=manifest.name, tags=dict(manifest.tags), **_said(manifest))
 
 
 def read_again(directory: StoreDirectory, catalog: Catalog, entry: RecordingEntry) -> None:
@@ -458,6 +473,77 @@ def read_again(directory: StoreDirectory, catalog: Catalog, entry: RecordingEntr
                 f"The files of recording {entry.name!r} have changed since the store was "
                 "opened. Open it again."
             ) from error
+
+
+def summary_by(
+    manifest: Manifest, look: str
+) -> tuple[RecordingSummary, frozenset[TopicType]] | None:
+    """The summary and the topics of a whole recording by its manifest.
+
+    Args:
+        manifest: Its manifest; all files are there.
+        look: State of its directory, read before.
+
+    Returns:
+        As of `summary_of` and `topic_types`; None if only its files say what is left.
+    """
+    if not manifest.is_ended:
+        return None
+    logs = [file for file in manifest.files if file.kind == "log"]
+    channels = manifest.channels.values()
+    times = [time for c in channels for time in (c.first, c.last) if time is not None]
+    times += [mark.time for mark in manifest.marks]
+    lost = [row for row in manifest.losses if row.cause == Cause.SEGMENT]
+    spans = [time for row in lost for time in (row.first, row.last) if time is not None]
+    topics = {TopicType(c.topic, c.encoding, c.schema) for c in channels}
+    topics |= {_marks_type()} if manifest.marks else set()
+    gone = Counter[str]()
+    for file in logs:
+        for number, part in file.parts.items() if isinstance(file.gone, str) else ():
+            of, encoding = manifest.channels[number], _ENCODINGS[file.gone]
+            if of.encoding != REDUCED:  # it had no payloads before
+                topics.add(TopicType(of.topic, encoding, of.schema))
+                gone[encoding] += part.messages
+    has_losses = bool(manifest.losses) or any(file.has_losses for file in logs)
+    names = {topic.topic for topic in topics}
+    topics |= {TopicType(row.topic, "", "") for row in lost if row.topic not in {*names, ""}}
+    types = frozenset(topics)
+    summary = RecordingSummary(
+        id=manifest.id,
+        name=manifest.name,
+        tags=manifest.tags,
+        source=_source_of(manifest.source),
+        created=manifest.created,
+        status="damaged" if lost else manifest.status,
+        span=(min(times), max(times)) if times else None,
+        extent=span_of(min(times + spans), max(times + spans)) if times or spans else (0, 0),
+        topics=_hash_of(types),
+        topic_count=len(names),
+        messages=sum(c.messages for c in channels) + len(manifest.marks),
+        stored_bytes=sum(file.bytes for file in manifest.files if file.is_here),
+        segments=len(logs),
+        has_losses=has_losses,
+        has_lost_segments=bool(lost),
+        expired=gone[EXPIRED],
+        not_copied=gone[NOT_COPIED],
+        notes=_said(manifest)["notes"],
+        content=content_hash({str(file.number): file.digest for file in logs}),
+        look=look,
+    )
+    return summary, types
+
+
+@lru_cache(maxsize=1024)
+def _hash_of(topics: frozenset[TopicType]) -> str:
+    return hash_of(topics_to_json(topics))
+
+
+@lru_cache(maxsize=1)
+def _marks_type() -> TopicType:
+    """The topic of marks that somebody set."""
+    channel = mark_channel()
+    assert channel.schema is not None
+    return TopicType(channel.topic, channel.message_encoding, schema_hash(channel.schema))
 
 
 def summary_of(entry: RecordingEntry, look: str = "") -> RecordingSummary:
@@ -731,7 +817,7 @@ def listed(*segments: Sealed) -> Callable[[Manifest], Manifest]:
     files = tuple(map(_file_of, segments))
     numbers = {file.number for file in files}
     channels = {
-        one.id: truth.Channel(one.topic, one.encoding, one.type)
+        one.id: truth.Channel(one.topic, one.encoding, one.type, schema=one.schema)
         for sealed in segments
         for one in sealed.channels
     }
@@ -745,7 +831,7 @@ def listed(*segments: Sealed) -> Callable[[Manifest], Manifest]:
 
 
 def _file_of(sealed: Sealed) -> File:
-    times = [time for one in sealed.channels for time in (one.first, one.last)]
+    times = [time for one in sealed.channels for time in (one.first, one.last) if time is not None]
     return File(
         sealed.segment,
         sealed.group,
@@ -756,10 +842,8 @@ def _file_of(sealed: Sealed) -> File:
         time.time_ns(),
         min(times, default=None),
         max(times, default=None),
-        {
-            one.id: truth.Part(one.messages, one.payload_bytes, one.first, one.last)
-            for one in sealed.channels
-        },
+        _parts(sealed.channels),
+        has_losses=sealed.has_losses,
     )
 
 
@@ -846,7 +930,8 @@ def sealed_of(inventory: Inventory, number: int) -> Sealed:
     summary = inventory.summaries[number]
     channels = sealed_channels(summary.table.as_stored(), summary.channels)
     group, digest = group_of(summary.recording, number), inventory.digest(number)
-    return Sealed(number, sealed_name(number), summary.size, digest, channels, group)
+    has_losses, name = bool(summary.losses), sealed_name(number)
+    return Sealed(number, name, summary.size, digest, channels, group, has_losses)
 
 
 def free_name_in(catalog: Catalog, name: str, but: str = "") -> str:

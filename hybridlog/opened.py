@@ -135,15 +135,19 @@ class OpenStore(Shared):
         with self.following:
             if self._latest is None:
                 return
+            self.catalog.has_changed |= bool(recordings)
             before = self._latest.snapshot()
             ids = {one for one in recordings if one in before.by_id}
             changed, names = self.directory.changed(), self._names
             has_changed = changed != self._changed
             if has_changed:
                 names = self.directory.ids()
-                ids.update({*names}.symmetric_difference(before.by_id))
+                come = [one for one in names if one not in before.by_id]
+                if len(before) + len(come) > len(names):
+                    ids |= before.by_id.keys() - {*names}
+                ids.update(come)
             now = self._files.catch_up(before, ids)
-            if now is None or (has_changed and self.directory.ids() != names):
+            if now is None or (has_changed and self.directory.changed()[0] != changed[0]):
                 self.invalidate()
                 return
             self._changed, self._names = changed, names

@@ -24,7 +24,7 @@ from hybridlog.query.topics import resolve
 from hybridlog.record.marks import MARKS, MARKS_SEGMENT
 from hybridlog.snapshot import UNFINISHED
 from hybridlog.wording import counted, listed
-from hybridlog_storage.catalog import ChannelStats, file_of, schema_hash
+from hybridlog_storage.catalog import ChannelStats, file_of
 from hybridlog_storage.disk.directory import gone
 from hybridlog_storage.errors import (
     CatalogError,
@@ -33,7 +33,7 @@ from hybridlog_storage.errors import (
     StoreError,
     TopicError,
 )
-from hybridlog_storage.messages import Channel
+from hybridlog_storage.messages import Channel, schema_hash
 from hybridlog_storage.segments.segment_reader import place_of
 from hybridlog_storage.times import BEGIN, END, placed
 

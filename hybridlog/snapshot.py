@@ -134,12 +134,17 @@ class Snapshot:
             held = [*known.items()]
             known = dict(held[number] for number in used.tolist())
             columns["set"] = np.searchsorted(used, columns["set"])
-        vars(found).update(_columns=columns, _topics=known, _having={})
-        stale = {"tags", "by_id", "by_name", "unfinished"}
+        unfinished = np.flatnonzero(columns["is_open"]).tolist()
+        vars(found).update(_columns=columns, _topics=known, _having={}, unfinished=unfinished)
+        stale = {"tags", "by_id", "by_name"}
         if before == places[::-1] and [one.id for one in changed] == [
             self.summaries[place].id for place in before
         ]:
-            stale = {"tags", "by_name", "unfinished"}  # each is where it was
+            stale = {"tags", "by_name"}  # each is where it was
+        elif not places and before[:1] == [len(self.summaries)]:  # all others are where they were
+            stale.discard("by_id")
+            last = enumerate((one.id for one in changed), len(self.summaries))
+            vars(found)["by_id"] = {**self.by_id, **{recording: n for n, recording in last}}
         if known.keys() != self._topics.keys():
             stale |= {"topics", "schemas"}
         for name in stale:

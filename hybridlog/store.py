@@ -1202,12 +1202,13 @@ class Store:
         """A recording whose manifest was changed, after its mirror in the index is."""
         from hybridlog.maintenance import index
 
+        self._to_change().catch_up(recording)
+        entry = self.entry(recording)
         connected = self.shared.index.connected
         if connected is not None and self.shared.index.connection.may_write:
             with suppress(ConnectionLostError):  # the next connection mirrors it
                 index.mirror(self.catalog, connected, recording)
-        self._to_change().catch_up(recording)
-        return self.entry(recording)
+        return entry
 
     def mark(
         self,

@@ -159,6 +159,9 @@ class Manifest:
         self.notes = [(note["at"], note["text"]) for note in said.get("notes", ())]
         self.marks: list[dict[str, Any]] = said.get("marks", [])
         self.topics = {int(n): about["topic"] for n, about in said.get("channels", {}).items()}
+        self.schemas = {
+            int(n): one.get("schema", "") for n, one in said.get("channels", {}).items()
+        }
         self.logs = {one["number"]: one for one in said.get("files", ()) if one["kind"] == "log"}
         self.rows = [one for one in said.get("files", ()) if one["kind"] == "rows"]
         empty = {
@@ -503,6 +506,12 @@ class Recording:
             if segment is not None and self._is_believed(number, segment, listed.get(number))
         }
         self.unlisted = {number for number in self.segments if number not in listed}
+        for number in self.segments.keys() & listed.keys():
+            segment, has_losses = self.segments[number], listed[number].get("has_losses", False)
+            demand(has_losses == bool(segment.losses), "whether a segment has losses")
+            for channel, (schema, *_) in segment.channels.items():
+                digest = schema_hash(*segment.schemas[schema]) if schema else ""
+                demand(self.manifest.schemas[channel] == digest, "the definition of a channel")
         self.end = self._end()
         self.damage = dict(self._damage())
         self.lost = [*self._lost_segments(listed), *self._lost_chunks()]

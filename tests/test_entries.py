@@ -27,6 +27,7 @@ from hybridlog.entries import (
     read_summary,
     recording_metadata,
     sealed_of,
+    summary_by,
     take_inventory,
     text,
     unlisted,
@@ -139,7 +140,13 @@ class Made:
 
     def entry(self, *, is_open: bool = False) -> RecordingEntry:
         with closing(Catalog(Path("/nowhere"), "x", in_memory=True)) as catalog:
-            return describe_now(self.directory, catalog, self.id, is_open=is_open).entry
+            described = describe_now(self.directory, catalog, self.id, is_open=is_open)
+        for manifest in self.directory.whole([self.id]):
+            made = summary_by(manifest, described.summary.look)
+            is_seen = not described.summary.has_lost_segments or manifest.losses
+            if made is not None and is_seen:  # a footer is read when it is asked about
+                assert made == (described.summary, described.topics)
+        return described.entry
 
 
 @pytest.fixture

@@ -50,7 +50,7 @@ def print_table(columns: Sequence[Column], rows: Iterable[Sequence[str]]) -> Non
         columns: Headings, and the side on which the cells stand.
         rows: Cells; control characters in them are shown, not obeyed.
     """
-    shown = ([printable(cell) for cell in row] for row in rows)
+    shown = (_printable_row(row) for row in rows)
     named: Sequence[Column] = [(printable(heading), side) for heading, side in columns]
     widths = [len(heading) for heading, _ in named]
     block, is_first = list(islice(shown, ROWS_AT_ONCE)), True
@@ -71,7 +71,7 @@ def print_pages(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> Non
         return
     import click
 
-    shown = [[printable(cell) for cell in row] for row in rows]
+    shown = [_printable_row(row) for row in rows]
     widths = [len(heading) for heading, _ in columns]
     _widen(widths, shown)
     click.echo_via_pager(f"{line}\n" for line in _lines_of(columns, shown, widths))
@@ -144,12 +144,10 @@ def _lines_of(
     headings: bool = True,
 ) -> Iterator[str]:
     """Headings and rows at full width: nothing is folded or left out."""
+    sides = (">" if side == "right" else "<" for _, side in columns)
+    line = "  ".join(f"{{:{side}{width}}}" for side, width in zip(sides, widths, strict=True))
     for row in [[heading for heading, _ in columns], *rows] if headings else rows:
-        line = "  ".join(
-            cell.rjust(width) if side == "right" else cell.ljust(width)
-            for cell, width, (_, side) in zip(row, widths, columns, strict=True)
-        )
-        yield line.rstrip()
+        yield line.format(*row).rstrip()
 
 
 def is_narrow() -> bool:
@@ -229,6 +227,10 @@ def print_record(title: str, fields: Sequence[tuple[str, str]]) -> None:
         for heading, line in zip_longest([name], lines, fillvalue=""):
             say(f"  {heading:<{width}}  {line}".rstrip())
     say()
+
+
+def _printable_row(row: Sequence[str]) -> Sequence[str]:
+    return row if all(map(str.isprintable, row)) else [*map(printable, row)]
 
 
 def printable(text: str) -> str:

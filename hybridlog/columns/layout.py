@@ -23,8 +23,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from hybridlog.schema.states import encoding_of
-from hybridlog_storage.catalog import schema_hash
 from hybridlog_storage.errors import StoreError
+from hybridlog_storage.messages import schema_hash
 
 if TYPE_CHECKING:
     from hybridlog_storage.catalog import RecordingEntry

@@ -7,10 +7,7 @@ from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
 from typing import TYPE_CHECKING
 
-from hybridlog.entries import (
-    free_name_in,
-    put_said,
-)
+from hybridlog.entries import free_name_in
 from hybridlog.maintenance import tables
 from hybridlog.maintenance.index import remove_documents
 from hybridlog.query.times import TimeLike, format_time, parse_time
@@ -39,7 +36,7 @@ def change(
     entry: RecordingEntry,
     how: Callable[[Manifest], Manifest],
     name: str | None = None,
-) -> RecordingEntry:
+) -> Manifest:
     """Change the manifest of a recording, also of a running one, and give it another name.
 
     Args:
@@ -50,7 +47,7 @@ def change(
         name: The name; it gets a number if another recording has it. None to leave it.
 
     Returns:
-        The entry of its files as they are now.
+        The manifest with the change.
 
     Raises:
         StoreError: The manifest cannot be written.
@@ -66,10 +63,12 @@ def change(
                 return replace(others(now), name=free)
 
         try:
-            directory.manifests.change(entry.id, how)
+            made = directory.manifests.change(entry.id, how)
         except RecordingGoneError as error:
             raise gone(entry.name) from error
-        return put_said(directory, catalog, entry.id, is_open=directory.is_recorded(entry.id))
+        if name is not None:
+            catalog.put_name(entry.id, made.name)  # before another recording gets it
+        return made
 
 
 def time_of_mark(entry: RecordingEntry, moment: TimeLike) -> int:
@@ -128,7 +127,7 @@ def mark(
         raise TimeError("A mark cannot end before it begins.")
     made = Mark(new_random(), moment, text, dict(tags), end)
     now = change(directory, catalog, entry, lambda known: with_mark(known, made))
-    if all(one["id"] != made.id for one in now.marks):
+    if all(one.id != made.id for one in now.marks):
         raise too_many_marks(entry.name)
 
 

@@ -13,7 +13,7 @@ from collections.abc import Collection, Mapping
 from collections.abc import Set as AbstractSet
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from msgspec import to_builtins
 
@@ -24,12 +24,17 @@ from hybridlog.entries import (
     inventory_of,
     listed,
     lost_in_crash,
-    said_now,
+    state_of,
+    summary_by,
+    summary_of,
     take_inventory,
+    topic_types,
     unlisted,
+    with_marks,
+    with_said,
 )
 from hybridlog.snapshot import UNFINISHED, Snapshot
-from hybridlog_storage.catalog import Catalog
+from hybridlog_storage.catalog import Catalog, Described
 from hybridlog_storage.disk import durability, files
 from hybridlog_storage.errors import (
     DiskFullError,
@@ -43,11 +48,11 @@ from hybridlog_storage.manifest import Manifest, replace
 if TYPE_CHECKING:
     from hybridlog.entries import Inventory
     from hybridlog.maintenance.report import RepairReport
-    from hybridlog_storage.catalog import Described, RecordingEntry
+    from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.disk.directory import Listing, StoreDirectory
     from hybridlog_storage.segments.recovery import Recovered
     from hybridlog_storage.segments.segment_file import Sealed
-    from hybridlog_storage.summary import RecordingSummary
+    from hybridlog_storage.summary import RecordingSummary, TopicType
 
 _LEFT_OVER = re.compile(r"\.[0-9.]+\.mcap\.([0-9a-f]{16}|rebuilt)")
 """Names of files that were being written, and were to get another name when they were whole."""
@@ -163,40 +168,75 @@ class StoreFiles:
             mends: Repair what a crash has left; otherwise it is noted.
         """
         found: dict[str, RecordingSummary] = {}
+        due = set[str]()
         for recording, look in looks.items():
             summary = known.get(recording)
             if summary is None or summary.look != look or summary.status in UNFINISHED:
-                try:
-                    summary = self._look_again(recording, summary, mends=mends)
-                except DiskFullError:
-                    raise
-                except StoreError as error:
-                    if self.directory.has(recording):  # another process may have removed it
-                        self.report.unreadable[recording] = str(error)
-                    continue
+                due.add(recording)
+            else:
+                found[recording] = summary
+        whole = self._by_manifests({one: looks[one] for one in due})
+        for recording in sorted(due - whole.keys()):
+            try:
+                summary = self._look_again(recording, mends=mends)
+            except DiskFullError:
+                raise
+            except StoreError as error:
+                if self.directory.has(recording):  # another process may have removed it
+                    self.report.unreadable[recording] = str(error)
+                continue
             if summary is not None:
                 found[recording] = summary
+        return found | whole
+
+    def _by_manifests(self, looks: Mapping[str, str]) -> dict[str, RecordingSummary]:
+        """Summaries of those of some recordings that are whole, by id; no log is opened."""
+        found: dict[str, RecordingSummary] = {}
+        topics: dict[str, Collection[TopicType]] = {}
+        damaged = self.catalog.damaged(looks)
+        for manifest in self.directory.whole(one for one in looks if one not in damaged):
+            made = summary_by(manifest, looks[manifest.id])
+            if made is not None:
+                summary, topics[summary.topics] = made
+                found[summary.id] = summary
+        if found:
+            self.catalog.put_summaries(found.values(), topics)
         return found
 
-    def _look_again(
-        self, recording: str, summary: RecordingSummary | None, *, mends: bool
-    ) -> RecordingSummary | None:
+    def _look_again(self, recording: str, *, mends: bool) -> RecordingSummary | None:
         """The summary of a recording as its files are now; None if it is gone."""
-        if summary is not None:
-            listing = self.directory.listing(recording)
-            row = self.catalog.recording(recording)
-            if row is not None and _is_current(self.directory, row[1], row[0], listing):
-                if listing.look != summary.look:
-                    said = said_now(self.directory, row[1], listing)
-                    if said.entry == row[1]:
-                        self.catalog.put_look(said.summary)
-                    else:
-                        self.catalog.put(said, waits=False)
-                    return said.summary
-                return summary
+        known = self._known(recording)
+        if known is not None:
+            found = known.described
+            if known.has_changed or found.entry.status not in UNFINISHED:
+                self.catalog.put(found, waits=False)
+            return found.summary
         mends = mends and self._may_mend(recording)
         described = (self._mended if mends else self._refresh)(recording)
         return described.summary if described is not None else None
+
+    def _known(self, recording: str) -> _Known | None:
+        """A recording by its catalog row, if that still matches its files."""
+        directory, row = self.directory, self.catalog.recording(recording)
+        if row is None:
+            return None
+        files, entry = row
+        listing = directory.listing(recording)
+        try:
+            manifest = directory.manifests.read(recording)
+        except RecordingGoneError:
+            return None
+        if files != state_of(listing, manifest) or not self._is_settled(entry, listing):
+            return None
+        now = with_said(entry, manifest)
+        return _Known(now, files, listing.look, now != entry)
+
+    def _is_settled(self, entry: RecordingEntry, listing: Listing) -> bool:
+        """False if a process that is gone has left something to mend."""
+        if listing.open or entry.status == "open" or _has_left_over(entry, listing):
+            holder = self.directory.holder(entry.id)
+            return holder is not None and (holder.is_recording or entry.status != "open")
+        return True
 
     def current_entry(self, summary: RecordingSummary) -> tuple[RecordingEntry | None, bool]:
         """The entry of a recording, compared with its files.
@@ -207,13 +247,12 @@ class StoreFiles:
         Raises:
             StoreError: Its files cannot be read.
         """
-        directory = self.directory
-        row = self.catalog.recording(summary.id)
-        if row is not None:
-            listing = directory.listing(summary.id)
-            if _is_current(directory, row[1], row[0], listing):
-                return row[1], False
-        if not directory.has(summary.id):
+        known = self._known(summary.id)
+        if known is not None:
+            if known.has_changed:
+                self.catalog.put(known.described, waits=False)
+            return known.entry, False
+        if not self.directory.has(summary.id):
             return None, True
         described = self._refresh(summary.id)
         return (described.entry if described is not None else None), True
@@ -290,6 +329,29 @@ class StoreFiles:
         return mended
 
 
+class _Known(NamedTuple):
+    """A recording by its catalog row, with what people say of it by now.
+
+    Attributes:
+        entry: Its entry.
+        files: State of its files.
+        look: State of its directory.
+        has_changed: Whether people say something else than the row.
+    """
+
+    entry: RecordingEntry
+    files: str
+    look: str
+    has_changed: bool
+
+    @property
+    def described(self) -> Described:
+        """For the catalog."""
+        shown = with_marks(self.entry)
+        summary, topics = summary_of(shown, self.look), topic_types(shown)
+        return Described(self.entry, summary, topics, self.files, {})
+
+
 def snapshot_of(catalog: Catalog, summaries: Collection[RecordingSummary]) -> Snapshot:
     """Some recordings with their topics.
 
@@ -298,18 +360,6 @@ def snapshot_of(catalog: Catalog, summaries: Collection[RecordingSummary]) -> Sn
     """
     hashes = {summary.topics for summary in summaries}
     return Snapshot(summaries, {digest: catalog.topics(digest) for digest in hashes})
-
-
-def _is_current(
-    directory: StoreDirectory, entry: RecordingEntry, looks: str, listing: Listing
-) -> bool:
-    """True if a catalog row still matches the files."""
-    if looks != listing.print:
-        return False
-    if listing.open or entry.status == "open" or _has_left_over(entry, listing):
-        holder = directory.holder(entry.id)
-        return holder is not None and (holder.is_recording or entry.status != "open")
-    return True
 
 
 def _has_left_over(entry: RecordingEntry, listing: Listing) -> bool:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from hybridlog.columns import rows_file
 from hybridlog.columns.recording_logs import RecordingRows, walk
-from hybridlog.entries import describe, steady_inventory
+from hybridlog.entries import describe, steady_inventory, with_said
 from hybridlog.maintenance import tables
 from hybridlog.maintenance.index import documents_in
 from hybridlog_storage.disk.directory import LOCK
@@ -225,10 +225,9 @@ class _Check:
         is_open = holder is not None and holder.is_recording
         entry = describe(self._catalog, inventory, is_open=is_open).entry
         row = self._catalog.recording(entry.id)
-        looks = {inventory.listing.print, self._directory.listing(self._recording).print}
-        # What is decoded of a recording in progress is noted behind its entry, and somebody may
-        # edit it meanwhile.
-        if row is not None and not is_open and looks == {row[0]} and row[1] != entry:
+        # What is decoded of a recording in progress is noted behind its entry.
+        known = None if row is None or row[0] != inventory.state else row[1]
+        if not is_open and known and with_said(known, inventory.manifest) != entry:
             self.found("catalog", "its entry differs from the files", _REPAIR)
         self._result.without_documents += entry.messages - entry.documents
         if entry.status == "open":

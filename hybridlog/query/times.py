@@ -237,8 +237,8 @@ def format_time(ns: int) -> str:
     it back exactly.
     """
     seconds, rest = divmod(int(ns), _SECOND)
-    base = datetime(1970, 1, 1, tzinfo=UTC) + timedelta(seconds=seconds)
-    return f"{base:%Y-%m-%dT%H:%M:%S}{_fraction(rest, 9)}Z"
+    base = datetime(1970, 1, 1) + timedelta(seconds=seconds)
+    return f"{base.isoformat()}{_fraction(rest, 9)}Z"
 
 
 def format_duration(ns: int) -> str:

@@ -9,7 +9,6 @@ are read from the footers of segments.
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 from collections import Counter, defaultdict
@@ -25,14 +24,14 @@ from zlib import error as ZlibError  # noqa: N812
 
 import numpy as np
 from msgspec import convert, to_builtins
-from msgspec.json import Decoder
+from msgspec.json import Decoder, encode
 
 from hybridlog_storage.cache import Cache
 from hybridlog_storage.cells import Cells, Statement, drop, put
 from hybridlog_storage.disk import durability, files
 from hybridlog_storage.errors import CatalogError, SegmentError
 from hybridlog_storage.lazy import RowType
-from hybridlog_storage.messages import MARKS_CHANNEL, Channel, Schema
+from hybridlog_storage.messages import MARKS_CHANNEL, Channel, Schema, schema_hash
 from hybridlog_storage.ordering import run_starts
 from hybridlog_storage.segments.chunk_table import ChunkTable
 from hybridlog_storage.segments.gone_log import GoneLog, open_log
@@ -72,6 +71,7 @@ _NOTING_S: Final = 0.1
 _MAX_TABLES: Final = 64 << 20  # bytes of chunk tables in memory
 _MAX_NOTED: Final = 1 << 17  # recordings with bounds of one kind, and bounds that wait for the end
 _MAX_KINDS: Final = 256  # of bounds
+_FEW: Final = 100  # cells that are read one by one
 _T = TypeVar("_T")
 Ends = tuple[float | None, float | None]
 """The least and the greatest of some numbers; None twice without any."""
@@ -481,7 +481,7 @@ class Catalog:
             writes=not in_memory,
             before_late=self._remove_recordings_file,
         )
-        self._listed: tuple[tuple[int, ...], list[RecordingSummary]] = (), []
+        self._listed: tuple[tuple[int, ...], dict[str, RecordingSummary]] = (), {}
         self._topics: dict[str, tuple[TopicType, ...]] = {}
         # Bounds by kind and content: as they were read, and those to be written.
         self._bounds: dict[str, tuple[bytes, dict[str, Ends]]] = {}
@@ -519,8 +519,16 @@ class Catalog:
         wait_s: float = _BUSY_S,
         make: Callable[[], Iterable[Statement]] = tuple,
         is_change: bool = False,
+        recordings: Collection[str] = (),
     ) -> None:
         """Write to the file.
+
+        Args:
+            statements: What is written.
+            wait_s: Seconds to wait for another process.
+            make: Returns more of it, while no other process changes cells.
+            is_change: Whether the list of ended recordings does not hold any more.
+            recordings: Ids of those whose summaries change.
 
         Raises:
             StoreError: The list of ended recordings, which is wrong now, cannot be removed.
@@ -531,10 +539,23 @@ class Catalog:
                 self._remove_recordings_file()
             return [*statements, *make()]
 
-        try:
-            self._cells.write(changed, wait_s)
-        except OSError as error:
-            raise durability.explain(error, self.recordings_file, "removing") from error
+        with self._cells.lock:
+            before = self._cells.state()
+            try:
+                self._cells.write(changed, wait_s)
+            except OSError as error:
+                raise durability.explain(error, self.recordings_file, "removing") from error
+            self._relist(before, recordings)
+
+    def _relist(self, before: tuple[int, ...], recordings: Collection[str]) -> None:
+        """Note in the list of summaries what this process alone has changed."""
+        state, listed = self._cells.state(), self._listed[1]
+        if self._listed[0] != before or state[:-1] != before[:-1] or len(recordings) > _FEW:
+            return
+        for recording in recordings:
+            listed.pop(recording, None)
+        listed.update((one.id, one) for one in self.summaries(recordings))
+        self._listed = state, listed
 
     def _remove_recordings_file(self) -> None:
         self.has_changed = True
@@ -563,15 +584,50 @@ class Catalog:
             ),
             put(_TOPICS, summary.topics, topics.encode()),
             put(_ENTRY, entry.id, _body([described.files, entry.to_document()])),
-            put(_SUMMARY, entry.id, _body(summary[:-1])),
+            put(_SUMMARY, entry.id, _summary_body(summary)),
             make=lambda: self._indexed_by([entry.id], ""),  # until it is compared with the index
             wait_s=_BUSY_S if waits else _NOTING_S,
             is_change=entry.status != "open",
+            recordings=[entry.id],
         )
 
-    def put_look(self, summary: RecordingSummary) -> None:
-        """Note that a recording is unchanged although its directory looks different."""
-        self._write(put(_SUMMARY, summary.id, _body(summary[:-1])), wait_s=_NOTING_S)
+    def put_summaries(
+        self,
+        summaries: Collection[RecordingSummary],
+        topics: Mapping[str, Collection[TopicType]],
+    ) -> None:
+        """Note summaries that manifests have made, at once; no question waits for it.
+
+        Args:
+            summaries: Of whole recordings.
+            topics: Their topics and types, by hash.
+        """
+        self._topics.update({digest: tuple(types) for digest, types in topics.items()})
+
+        recordings = [one.id for one in summaries]
+        known = {one.id: one._replace(look="", indexed_by="") for one in self.summaries(recordings)}
+        changed = [one.id for one in summaries if known.get(one.id) != one._replace(look="")]
+
+        def statements() -> Iterator[Statement]:
+            for digest, types in topics.items():
+                yield put(_TOPICS, digest, topics_to_json(types).encode())
+            for one in summaries:
+                yield put(_SUMMARY, one.id, _summary_body(one))
+            yield from self._indexed_by(changed, "")
+
+        has_changed = self.has_changed  # the list is made again by who changes recordings
+        is_change = bool(changed)
+        self._write(make=statements, wait_s=_NOTING_S, is_change=is_change, recordings=recordings)
+        self.has_changed = has_changed
+
+    def put_name(self, recording: str, name: str) -> None:
+        """Note the name of a recording; the rest is read again when it is looked at."""
+
+        def renamed() -> Iterator[Statement]:
+            for one in self.summaries([recording]):
+                yield put(_SUMMARY, recording, _summary_body(one._replace(name=name, look="")))
+
+        self._write(make=renamed, is_change=True, recordings=[recording])
 
     def put_indexed(self, recordings: Collection[str], index: str) -> None:
         """Note which index is complete for recordings.
@@ -580,20 +636,23 @@ class Catalog:
             recordings: Their ids.
             index: The id of the index; empty if none is.
         """
-        self._write(make=lambda: self._indexed_by(recordings, index), wait_s=_NOTING_S)
+        self._write(
+            make=lambda: self._indexed_by(recordings, index),
+            wait_s=_NOTING_S,
+            recordings=recordings,
+        )
 
-    def _indexed_by(self, recordings: Iterable[str], index: str) -> Iterator[Statement]:
-        for recording in recordings:
-            before, damage = self._indexed(recording)
+    def _indexed_by(self, recordings: Collection[str], index: str) -> Iterator[Statement]:
+        known = self._bodies(_INDEX, recordings)
+        for recording in recordings if index else known:
+            before, damage = _indexed(known.get(recording))
             if before != index:
                 yield put(_INDEX, recording, _body([index, damage]))
 
     def put_damage(self, recording: str, damage: Mapping[tuple[int, int], str]) -> None:
         """Store the unreadable chunks of a recording: reason by segment and number."""
         rows = [(*place, reason) for place, reason in sorted(damage.items())]
-        self._write(
-            make=lambda: [put(_INDEX, recording, _body([self._indexed(recording)[0], rows]))]
-        )
+        self._write(make=lambda: [put(_INDEX, recording, _body([self._index(recording)[0], rows]))])
 
     def put_stamps(
         self, recording: str, stamps: Iterable[tuple[int, str, NDArray[np.void]]]
@@ -622,24 +681,30 @@ class Catalog:
         """Remove a recording."""
         self._invalidate(recording)
         kinds = (_SUMMARY, _ENTRY, _INDEX, _STAMPS)
-        self._write(*(drop(kind, recording) for kind in kinds), is_change=True)
+        statements = (drop(kind, recording) for kind in kinds)
+        self._write(*statements, is_change=True, recordings=[recording])
 
     # Answers.
 
     def summaries(self, recordings: Collection[str] | None = None) -> list[RecordingSummary]:
         """Summaries of recordings by id, None for all; unordered, without damaged ones."""
         if recordings is None:
-            state, (known, listed) = self._cells.state(), self._listed
-            if known != state:
-                indexed = self._cells.beside(_INDEX, _SUMMARY)
-                listed = self._summaries(self._cells.each(_SUMMARY), indexed)
-                self._listed = state, listed
-            return [*listed]
-        bodies, indexed = (
-            {one: body for one in recordings if (body := self._cells.read(kind, one))}
-            for kind in (_SUMMARY, _INDEX)
-        )
-        return self._summaries(bodies, indexed)
+            with self._cells.lock:
+                state, (known, listed) = self._cells.state(), self._listed
+                if known != state:
+                    indexed = self._cells.beside(_INDEX, _SUMMARY)
+                    every = self._summaries(self._cells.each(_SUMMARY), indexed)
+                    listed = {one.id: one for one in every}
+                    self._listed = state, listed
+                return [*listed.values()]
+        return self._summaries(*(self._bodies(kind, recordings) for kind in (_SUMMARY, _INDEX)))
+
+    def _bodies(self, kind: str, recordings: Collection[str]) -> dict[str, bytes]:
+        """The cells of some recordings by id."""
+        if len(recordings) > _FEW:
+            every = self._cells.each(kind)
+            return {one: every[one] for one in recordings if one in every}
+        return {one: body for one in recordings if (body := self._cells.read(kind, one))}
 
     def _summaries(
         self, bodies: Mapping[str, bytes], indexed: Mapping[str, bytes]
@@ -680,26 +745,25 @@ class Catalog:
         found = _read(_ENTRY_OF, self._cells.read(_ENTRY, recording))
         return found if found is not None and found[1].id == recording else None
 
-    def with_fingerprint(self, fingerprint: str) -> RecordingEntry | None:
+    def with_fingerprint(self, fingerprint: str) -> RecordingSummary | None:
         """A recording of a log with this content, or of one of which it is a part."""
-        for recording, body in self._cells.each(_SUMMARY, _body(fingerprint)).items():
+        for body in self._cells.each(_SUMMARY, _body(fingerprint)).values():
             summary = _read(_SUMMARY_OF, body)
             if summary is not None and fingerprint in _fingerprints(summary.source):
-                row = self.recording(recording)
-                if row is not None:
-                    return row[1]
+                return summary
         return None
 
-    def _indexed(self, recording: str) -> tuple[str, list[tuple[int, int, str]]]:
-        """The index that is complete for a recording, and its unreadable chunks.
+    def _index(self, recording: str) -> tuple[str, list[tuple[int, int, str]]]:
+        return _indexed(self._cells.read(_INDEX, recording))
 
-        They are one cell: of a list that is lost, no index is known to have all chunks.
-        """
-        return _read(_INDEX_OF, self._cells.read(_INDEX, recording)) or ("", [])
+    def damaged(self, recordings: Collection[str]) -> set[str]:
+        """Those of some recordings, by id, that are known to have unreadable chunks."""
+        known = self._bodies(_INDEX, recordings)
+        return {recording for recording, body in known.items() if _indexed(body)[1]}
 
     def damage(self, recording: str) -> dict[tuple[int, int], str]:
         """The unreadable chunks of a recording: reason by segment and number."""
-        return {(segment, chunk): reason for segment, chunk, reason in self._indexed(recording)[1]}
+        return {(segment, chunk): reason for segment, chunk, reason in self._index(recording)[1]}
 
     def stamps(
         self, entry: RecordingEntry, number: int, table: ChunkTable
@@ -828,6 +892,12 @@ class Catalog:
         self._tables.drop("table", recording)
 
 
+def _summary_body(summary: RecordingSummary) -> bytes:
+    with suppress(UnicodeEncodeError):
+        return encode(summary[:-1])
+    return _body(summary[:-1])
+
+
 def _body(values: object) -> bytes:
     # In ASCII: the name of a file may not be UTF-8.
     return json.dumps(values, separators=(",", ":")).encode("ascii")
@@ -853,6 +923,14 @@ def _read(decoder: Decoder[_T], body: bytes | None) -> _T | None:
     return None
 
 
+def _indexed(body: bytes | None) -> tuple[str, list[tuple[int, int, str]]]:
+    """The index that is complete for a recording, and its unreadable chunks.
+
+    They are one cell: of a list that is lost, no index is known to have all chunks.
+    """
+    return _read(_INDEX_OF, body) or ("", [])
+
+
 def _ends(body: bytes) -> dict[str, Ends]:
     """Bounds by content, without those that are none."""
     with suppress(TypeError, ValueError, RecursionError, AttributeError):
@@ -871,15 +949,12 @@ def _schema_body(schema: Schema) -> bytes:
 
 def content_of(entry: RecordingEntry) -> str:
     """A hash of the content of a recording's segments, by their digests."""
-    return hash_of(json.dumps(sorted(entry.digests.items())))
+    return content_hash(entry.digests)
 
 
-def schema_hash(schema: Schema) -> str:
-    """SHA-256 of name, encoding and definition, as hex digits."""
-    digest = hashlib.sha256()
-    for part in (schema.name.encode(), schema.encoding.encode(), bytes(schema.data)):
-        digest.update(len(part).to_bytes(8, "little") + part)
-    return digest.hexdigest()
+def content_hash(digests: Mapping[str, str]) -> str:
+    """The same, by the digests alone: of each segment, by its number as text."""
+    return hash_of(json.dumps(sorted(digests.items())))
 
 
 def file_of(entry: RecordingEntry, number: int) -> str:

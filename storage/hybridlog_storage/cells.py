@@ -87,6 +87,9 @@ class Cells:
         writes: False to leave the file as it is, and use a copy in memory.
         before_late: Called before what was kept is written at last.
 
+    Attributes:
+        lock: Held while cells are read or changed.
+
     Raises:
         StoreError: A symlink lies in the place of the file; so do all methods.
     """
@@ -103,7 +106,7 @@ class Cells:
         self._owner = crc32(f"{_VERSION} {owner}".encode()) >> 1
         self._writes = writes and path is not None
         self._before_late = before_late
-        self._lock = RLock()
+        self.lock = RLock()
         self._db: sqlite3.Connection | None = None
         self._file: tuple[int, int] | None = None  # that is open; None in memory
         self._again_at = 0.0
@@ -113,7 +116,7 @@ class Cells:
 
     def close(self, wait_s: float) -> None:
         """Write what was kept, if that is possible now, and close the file."""
-        with self._lock:
+        with self.lock:
             if self._late:
                 self._open(wait_s)
                 self._late.clear()
@@ -240,7 +243,7 @@ class Cells:
 
     def _run(self, work: Callable[[sqlite3.Connection], _T]) -> _T:
         """Do something with the file, or else in memory."""
-        with self._lock:
+        with self.lock:
             for _ in range(_TRIES):
                 try:
                     return work(self._use())
@@ -301,7 +304,7 @@ class Cells:
     @contextmanager
     def alone(self, wait_s: float) -> Iterator[bool]:
         """Keep other processes from changing cells. False if the file cannot be used."""
-        with self._lock:
+        with self.lock:
             opened = self._use()
             try:
                 _begin(opened, wait_s)

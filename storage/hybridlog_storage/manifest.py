@@ -40,6 +40,8 @@ PinId = Annotated[str, Meta(pattern=r"\A[^\s/\0]{1,64}\Z")]
 Id = Annotated[str, Meta(pattern=r"\A[a-z0-9](-?[a-z0-9]){0,63}-[0-9a-f]{16}\Z")]
 Digest = Annotated[str, Meta(pattern=r"\A[0-9a-f]{64}\Z")]
 """BLAKE3 of all bytes of a file."""
+Hash = Annotated[str, Meta(min_length=64, max_length=64)]
+"""Of a definition; names no file. A pattern would cost as much as the rest of a channel."""
 FileName = Annotated[str, Meta(pattern=r"\A[0-9]{6}(\.[a-z0-9_-]{1,64}){0,2}\.(mcap|parquet)\Z")]
 Tags = dict[Key, Text]
 
@@ -86,6 +88,7 @@ class Channel(Record, frozen=True):
         bytes: The same, of payloads.
         first: Log time of the first one, ns since the epoch; None without messages.
         last: Of the last one.
+        schema: SHA-256 of name, encoding and text of the definition; empty without one.
     """
 
     topic: Topic
@@ -96,6 +99,7 @@ class Channel(Record, frozen=True):
     bytes: Count = 0
     first: Nanoseconds | None = None
     last: Nanoseconds | None = None
+    schema: Hash | Literal[""] = ""
 
 
 class Part(Record, frozen=True, array_like=True):
@@ -122,6 +126,7 @@ class File(Record, frozen=True):
         first: Log time of its first message, ns; None without messages.
         last: Of its last message.
         parts: What it has of each channel.
+        has_losses: Whether it has rows of the loss ledger.
         gone: Why the file is no longer here; absent while it is.
         copy: Address of a store with a copy of a file that is gone.
     """
@@ -136,6 +141,7 @@ class File(Record, frozen=True):
     first: Nanoseconds | None = None
     last: Nanoseconds | None = None
     parts: dict[ChannelNumber, Part] = {}
+    has_losses: bool = False
     gone: Literal["expired", "elsewhere"] | UnsetType = UNSET
     copy: Text = ""
 
@@ -311,20 +317,15 @@ class Manifest(Record, frozen=True):
         for ids in ([mark.id for mark in self.marks], [pin.id for pin in self.pins]):
             if len({*ids}) < len(ids):
                 raise ValueError("two marks or pins have one id")
-        spans: Iterable[Channel | File | Pin | Loss] = (
+        timed: Iterable[Channel | File | Pin | Loss] = (
             *self.channels.values(), *self.files, *self.pins, *self.losses
         )  # fmt: skip
-        for one in spans:
-            _check_order(one.first, one.last)
-        for mark in self.marks:
-            _check_order(mark.time, mark.end)
-        if any(file.parts.keys() - self.channels.keys() for file in self.files):
+        spans = [(one.first, one.last) for one in timed]
+        spans += [(mark.time, mark.end) for mark in self.marks]
+        if any(first is not None and last is not None and last < first for first, last in spans):
+            raise ValueError("something ends before it begins")
+        if not all(file.parts.keys() <= self.channels.keys() for file in self.files):
             raise ValueError("a file has messages of an unknown channel")
-
-
-def _check_order(first: int | None, last: int | None) -> None:
-    if first is not None and last is not None and last < first:
-        raise ValueError("something ends before it begins")
 
 
 def new_id(kind: str) -> str:
@@ -372,6 +373,18 @@ def replace(part: _Part, **values: object) -> _Part:
         ValueError: They do not fit.
     """
     return structs.replace(part, **values)
+
+
+def state_of(manifest: Manifest, files: str) -> str:
+    """A hash of a manifest but for what people say of the recording, and of what files there are.
+
+    Args:
+        manifest: The manifest.
+        files: State of the files.
+    """
+    said = {"tags": {}, "notes": (), "marks": (), "uncounted_marks": 0, "pins": ()}
+    plain = replace(manifest, name="-", changes=0, **said)
+    return blake3(json.encode(plain) + files.encode()).hexdigest()
 
 
 def hasher(data: bytes = b"") -> blake3:

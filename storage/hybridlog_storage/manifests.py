@@ -125,6 +125,16 @@ class Manifests(ABC):
             return None
         return _present(found)
 
+    def each(self, recordings: Iterable[str]) -> Iterator[Manifest]:
+        """The newest manifests of some recordings, without those that cannot be read.
+
+        Raises:
+            HybridlogError: The store does not answer.
+        """
+        for one in recordings:
+            with suppress(StoreError):
+                yield self.read(one)
+
     def change(self, recording: str, how: Callable[[Manifest], Manifest]) -> Manifest:
         """Replace a manifest.
 
@@ -237,14 +247,11 @@ class Manifests(ABC):
         except FileNotFoundError:
             raise RecordingGoneError(f"There is no recording {recording!r}.") from None
         try:
-            found = decode(data)
-            if found.id != recording:
-                raise ValueError(f"it is the one of {found.id}")
+            return _decoded(recording, data), version
         except ValueError as error:
             raise ManifestError(
                 f"The manifest of {recording} is damaged: {error}. {self.cure}"
             ) from error
-        return found, version
 
     @abstractmethod
     def _get(self, recording: str) -> tuple[bytes, str]:
@@ -289,11 +296,13 @@ class DiskManifests(Manifests):
 
     def ids(self) -> list[str]:
         """Ids of all recordings that have a manifest, sorted; also of those being removed."""
-        names = {*self._names(self._folder)}
-        before, ids = self._listed
-        if names != before:
-            ids = _ids(names)
-            self._listed = names, ids
+        names, (before, ids) = self._names(self._folder), self._listed
+        come = [name for name in names if name not in before]
+        gone = before.difference(names) if len(before) + len(come) > len(names) else set()
+        if come or gone:
+            left = {*_ids(gone)}
+            ids = sorted([*(one for one in ids if one not in left), *_ids(come)])
+            self._listed = (before - gone).union(come), ids
         return [*ids]
 
     def without(self) -> list[str]:
@@ -306,8 +315,9 @@ class DiskManifests(Manifests):
 
     def _others(self) -> set[str]:
         """Names in `recordings` of what has no manifest."""
-        found = {*self._names(self._recordings)}  # before the manifests, which come later
-        return found - {name.removesuffix(_SUFFIX) for name in self._names(self._folder)}
+        found = self._names(self._recordings)  # before the manifests, which come later
+        manifests = {*self._names(self._folder)}
+        return {name for name in found if f"{name}{_SUFFIX}" not in manifests}
 
     def _holds(self, recording: str) -> bool:
         """True for a folder with more than locks."""
@@ -327,6 +337,13 @@ class DiskManifests(Manifests):
             if odd := _odd(folder / _ALL):
                 raise StoreError(odd) from error
             raise unreadable(error, folder) from error
+
+    def each(self, recordings: Iterable[str]) -> Iterator[Manifest]:
+        """As of `Manifests`, faster than one by one."""
+        with suppress(FileNotFoundError), files.folder(self._folder) as fd:
+            for one in recordings:
+                with suppress(OSError, ValueError, RecordingGoneError):
+                    yield _present(_decoded(one, files.read_in(fd, f"{one}{_SUFFIX}", MAX_BYTES)))
 
     def path(self, recording: str) -> Path:
         """Where the manifest of a recording lies."""
@@ -603,6 +620,14 @@ def _keep_old(path: Path, folder: Path) -> None:
 def _ids(names: Iterable[str]) -> list[str]:
     ids = (name.removesuffix(_SUFFIX) for name in names if name.endswith(_SUFFIX))
     return sorted(filter(is_id, ids))
+
+
+def _decoded(recording: str, data: bytes) -> Manifest:
+    """The manifest of a recording. Raises ValueError."""
+    found = decode(data)
+    if found.id != recording:
+        raise ValueError(f"it is the one of {found.id}")
+    return found
 
 
 def _present(manifest: Manifest) -> Manifest:

@@ -8,6 +8,7 @@ into a chunk.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
@@ -65,6 +66,14 @@ class Schema:
     name: str
     encoding: str
     data: bytes
+
+
+def schema_hash(schema: Schema) -> str:
+    """SHA-256 of name, encoding and definition, as hex digits."""
+    digest = hashlib.sha256()
+    for part in (schema.name.encode(), schema.encoding.encode(), bytes(schema.data)):
+        digest.update(len(part).to_bytes(8, "little") + part)
+    return digest.hexdigest()
 
 
 @dataclass(frozen=True, eq=False, slots=True)

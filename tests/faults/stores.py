@@ -19,7 +19,7 @@ from pymongo import MongoClient
 import hybridlog as hl
 from hybridlog.columns.folders import recordings_of
 from hybridlog.columns.layout import PARTS
-from hybridlog.entries import describe_now, take_inventory
+from hybridlog.entries import describe_now, state_now, take_inventory
 from hybridlog.maintenance.lease import place_of
 from hybridlog.record.losses import losses_of
 from hybridlog.record.marks import MARKS, MARKS_SEGMENT
@@ -108,8 +108,8 @@ class Prepared:
             rows = catalog.execute("SELECT key, body FROM cells WHERE kind = 'entry'").fetchall()
             for recording, body in rows:
                 looks, entry = json.loads(body)
-                if looks == old.listing(recording).print:
-                    now = json.dumps([new.listing(recording).print, entry])
+                if looks == state_now(old, recording):
+                    now = json.dumps([state_now(new, recording), entry])
                     catalog.execute(*put("entry", recording, now.encode()))
 
     @contextmanager

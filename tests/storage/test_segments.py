@@ -28,7 +28,7 @@ from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk.append_file import BLOCK, AppendFile
 from hybridlog_storage.disk.copying import COPIED_AT_ONCE
 from hybridlog_storage.errors import DiskFullError, SegmentError, StoreError, UsageError
-from hybridlog_storage.messages import Batch, Buffer, Channel, LooseBatch, Schema
+from hybridlog_storage.messages import Batch, Buffer, Channel, LooseBatch, Schema, schema_hash
 from hybridlog_storage.segments import chunk_builder, segment_writer
 from hybridlog_storage.segments.attachments import Attachment
 from hybridlog_storage.segments.chunk import StoredChunk
@@ -1025,8 +1025,9 @@ def test_a_segment_is_told_of_as_it_is(tmp_path: Path) -> None:
             assert {c.id: c.messages for c in sealed.channels} == summary.counts
     every = [channel for sealed in told for channel in sealed.channels]
     assert sum(c.payload_bytes for c in every) == 3 * 4009
+    digest = schema_hash(Schema("a/msg/B", "ros2msg", b"uint8[] data"))
     assert [c for c in every if c.topic == "/large"] == [
-        SealedChannel(2, "/large", 1, 4000, 5, 5, "cdr", "a/msg/B")
+        SealedChannel(2, "/large", 1, 4000, 5, 5, "cdr", "a/msg/B", digest)
     ] * 3
     small = [c for c in every if c.topic == "/small"]
     assert [(c.first, c.last, c.messages, c.payload_bytes) for c in small] == [

@@ -19,9 +19,10 @@ import hashlib
 import os
 import re
 import secrets
+import stat
 import sys
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from itertools import takewhile
@@ -57,6 +58,8 @@ LOCK_WAIT_S: Final = 10.0
 """Seconds that a command waits for another one that holds its recording."""
 _RECORDINGS: Final = "recordings"
 _OF_MANIFEST: Final = frozenset({MANIFEST_LOCK, MANIFEST_OLD, f".{MANIFEST_OLD}"})
+_FOLDER: Final = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW
+_BESIDE: Final = _OF_MANIFEST | {WRITER_LOCK}
 _TICK_NS: Final = 50_000_000
 _POLL_S = 0.02
 _RECORDER_WAIT_S = 0.5  # a reader's look at a lock must not pass for a recorder
@@ -101,7 +104,8 @@ class Listing:
         others: All other names.
         rows: Sizes of files of rows, by name.
         look: As of `StoreDirectory.looks`, before the names were read.
-        print: A value that changes whenever a relevant file changes.
+        print: A value that changes whenever a relevant file changes; of the manifest, see
+            `manifest.state_of`.
     """
 
     sealed: Mapping[int, str]
@@ -389,7 +393,6 @@ class StoreDirectory:
         """
         path = self.recording(recording)
         look = self._look_of(recording)
-        manifest = look.split(" ", 3)[-1]
         found = {}
         try:
             found = files.names(path)
@@ -402,7 +405,6 @@ class StoreDirectory:
         sealed: dict[int, str] = {}
         rows: dict[str, int] = {}
         looks = hashlib.blake2b(digest_size=16)
-        looks.update(f"{manifest}\n".encode())
         for name, about in sorted(found.items()):
             number, kind = _numbered(name)
             if kind == OPEN_SUFFIX:
@@ -424,6 +426,24 @@ class StoreDirectory:
             look,
             looks.hexdigest(),
         )
+
+    def whole(self, ids: Iterable[str]) -> Iterator[Manifest]:
+        """Manifests of those recordings, by id, all of whose files are there.
+
+        Nothing else is there to be read or mended. No log is opened.
+
+        Raises:
+            StoreError: They cannot be read.
+        """
+        try:
+            with files.folder(self.recordings) as inside:
+                for manifest in self.manifests.each(ids):
+                    if _is_whole(manifest, inside):
+                        yield manifest
+        except FileNotFoundError:  # a copy by hand may lack it
+            return
+        except OSError as error:
+            raise unreadable(error, self.path, f"The store {self.path}") from error
 
     def segments(self, recording: str) -> list[tuple[int, Path]]:
         """Number and path of each sealed segment of a recording, in order."""
@@ -578,6 +598,28 @@ def _folder_look(recording: str, folders: int) -> str:
     except FileNotFoundError:
         return "0 0 0"
     return f"{about.st_ino} {about.st_mtime_ns} {about.st_ctime_ns}"
+
+
+def _is_whole(manifest: Manifest, folders: int) -> bool:
+    """True if a recording's folder holds what its manifest lists, and nothing unknown."""
+    listed = listed_files(manifest)
+    try:
+        fd = os.open(manifest.id, _FOLDER, dir_fd=folders)
+    except OSError:  # copies of a store leave out what is empty
+        return False
+    try:
+        if {*os.listdir(fd)} - _BESIDE != {one.path for one in listed}:  # noqa: PTH208
+            return False
+        return all(_has_size(fd, one.path, one.bytes) for one in listed)
+    except OSError:  # one goes at this moment
+        return False
+    finally:
+        os.close(fd)
+
+
+def _has_size(folder: int, name: str, size: int) -> bool:
+    about = os.stat(name, dir_fd=folder, follow_symlinks=False)
+    return about.st_size == size and stat.S_ISREG(about.st_mode)
 
 
 def _file_look(about: os.stat_result) -> str:

@@ -167,7 +167,16 @@ def read_file(path: Path, most: int) -> bytes:
     Raises:
         OSError: It cannot be read, or is not an ordinary file.
     """
-    fd = open_file(path, os.O_RDONLY)
+    return _content(open_file(path, os.O_RDONLY), most, path)
+
+
+def read_in(folder: int, name: str, most: int) -> bytes:
+    """Read a small ordinary file of an open folder; as `read_file`."""
+    flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK
+    return _content(system.open(name, flags, folder=folder), most, name)
+
+
+def _content(fd: int, most: int, path: Path | str) -> bytes:
     try:
         if not stat.S_ISREG(os.fstat(fd).st_mode):
             raise OSError(0, "it is not an ordinary file", str(path))

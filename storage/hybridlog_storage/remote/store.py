@@ -21,7 +21,7 @@ import tempfile
 import threading
 import time
 import zlib
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
@@ -47,7 +47,7 @@ from hybridlog_storage.errors import (
     RecordingGoneError,
     StoreError,
 )
-from hybridlog_storage.manifest import Manifest, decode, encode, with_rows
+from hybridlog_storage.manifest import Manifest, decode, with_rows
 from hybridlog_storage.manifests import BucketManifests
 from hybridlog_storage.remote.blocks import LOST, BlockCache, inode_of
 from hybridlog_storage.remote.bucket import Bucket, Object
@@ -100,7 +100,7 @@ class CatalogCells(Cells):
                 finally:
                     os.close(handle)
                 content = zlib.decompressobj().decompress(packed, _MAX_CATALOG)
-        with self._lock:
+        with self.lock:
             self._close()
             self._db = self._in_memory(None, content)
             self.about, self.is_behind = about, False
@@ -523,7 +523,7 @@ class RemoteDirectory(StoreDirectory):
 
     def listing(self, recording: str) -> Listing:
         """As of a directory: what the manifest lists, without what was lost."""
-        look, lost = self._look_of(recording), {*self._lost(recording)}
+        look, lost = self._look_of(recording), sorted(self._lost(recording))
         manifest = self.manifests.find(recording)
         if manifest is None:
             raise ManifestError(f"{recording} has no manifest. {BucketManifests.cure}")
@@ -531,10 +531,11 @@ class RemoteDirectory(StoreDirectory):
         sealed = {number: name for number, name in sealed.items() if name not in lost}
         files = (one for own in manifest.rows.values() for one in own)
         rows = {one.name: one.bytes for one in files if one.name not in lost}
-        # What people say of a recording makes no other files of it.
-        plain = truth.replace(manifest, name="-", tags={}, notes=(), marks=(), pins=(), changes=0)
-        state = truth.hasher(encode(plain) + repr(sorted(lost)).encode()).hexdigest()
-        return Listing(sealed, {}, (), rows, look, state)
+        return Listing(sealed, {}, (), rows, look, truth.state_of(manifest, repr(lost)))
+
+    def whole(self, ids: Iterable[str]) -> Iterator[Manifest]:
+        """As of a directory: all but those of which files were found to be missing."""
+        return (one for one in self.manifests.each(ids) if not self._lost(one.id))
 
     def listed_bytes(self) -> int:
         """Bytes of all files that manifests list, and of tables."""

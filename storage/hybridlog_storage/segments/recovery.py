@@ -494,8 +494,9 @@ def _complete(path: Path, number: int) -> Sealed | None:
     finally:
         file.close()
     channels = sealed_channels(summary.table, summary.channels)
-    group = group_of(summary.recording, number)
-    return Sealed(number, sealed_name(number), summary.size, digest, channels, group)
+    group, has_losses = group_of(summary.recording, number), bool(summary.losses)
+    name = sealed_name(number)
+    return Sealed(number, name, summary.size, digest, channels, group, has_losses)
 
 
 def _proven_summary(path: Path, number: int) -> SegmentSummary | None:

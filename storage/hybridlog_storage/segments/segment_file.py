@@ -27,6 +27,7 @@ from hybridlog_storage.disk import durability, files
 from hybridlog_storage.disk.append_file import AppendFile
 from hybridlog_storage.errors import StoreError
 from hybridlog_storage.mcap.mcap_content import RECORD_HEAD
+from hybridlog_storage.messages import EXPIRED_IDS, schema_hash
 from hybridlog_storage.segments.attachments import Attachment
 from hybridlog_storage.segments.chunk import PackedChunk, StoredChunk
 from hybridlog_storage.segments.chunk_table import ChunkTable, TableBuilder
@@ -35,6 +36,7 @@ from hybridlog_storage.segments.segment_format import (
     CHUNK_TABLE_OPCODE,
     FORMAT_VERSION,
     LIBRARY,
+    LOSSES_METADATA,
     MAGIC,
     PROFILE,
     RECORDING_METADATA,
@@ -71,22 +73,24 @@ class SealedChannel:
     Attributes:
         id: The channel's id in the recording.
         topic: Its topic.
-        messages: Number of its messages, at least 1.
+        messages: Number of its messages.
         payload_bytes: Bytes of their payloads.
-        first: Smallest log time, ns.
+        first: Smallest log time, ns; None without messages.
         last: Largest log time, ns.
         encoding: Of the messages, such as `cdr`.
         type: Name of the message type; empty without a definition.
+        schema: Hash of the definition; empty without one.
     """
 
     id: int
     topic: str
     messages: int
     payload_bytes: int
-    first: int
-    last: int
+    first: int | None
+    last: int | None
     encoding: str
     type: str
+    schema: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,8 +102,9 @@ class Sealed:
         file: Its name once it is sealed.
         bytes: Its size.
         digest: BLAKE3 of all its bytes.
-        channels: Channels with messages, by channel id.
+        channels: Its channels, also those without messages, in the order of their ids.
         group: Number of the first segment of its group.
+        has_losses: Whether the loss ledger has rows in it.
     """
 
     segment: int
@@ -108,6 +113,7 @@ class Sealed:
     digest: str
     channels: tuple[SealedChannel, ...]
     group: int
+    has_losses: bool
 
 
 OnSealing = Callable[[Sealed], None]
@@ -138,18 +144,21 @@ def rows_name(number: int, version: int = 0) -> str:
 def sealed_channels(
     table: ChunkTable, channels: Mapping[int, Channel]
 ) -> tuple[SealedChannel, ...]:
-    """Statistics of each channel with messages in a segment."""
+    """Statistics of each channel of a segment, without those of expired messages."""
     rows = table.by_channel()
-    names = ("channel", "messages", "payload_bytes", "first", "last")
+    names = ("messages", "payload_bytes", "first", "last")
     columns = (rows[name].tolist() for name in names)
+    stored: dict[int, tuple[int, int, int | None, int | None]] = dict(
+        zip(rows["channel"].tolist(), zip(*columns, strict=True), strict=True)
+    )
     found = []
-    for number, messages, payload_bytes, first, last in zip(*columns, strict=True):
-        channel = channels[number]
-        kind = "" if channel.schema is None else channel.schema.name
-        of = channel.message_encoding, kind
-        found.append(
-            SealedChannel(number, channel.topic, messages, payload_bytes, first, last, *of)
-        )
+    for number, channel in sorted(channels.items()):
+        if number in stored or number < EXPIRED_IDS:
+            schema = channel.schema
+            totals = stored.get(number, (0, 0, None, None))
+            kind, digest = ("", "") if schema is None else (schema.name, schema_hash(schema))
+            encoding = channel.message_encoding
+            found.append(SealedChannel(number, channel.topic, *totals, encoding, kind, digest))
     return tuple(found)
 
 
@@ -513,6 +522,7 @@ class SegmentFile:
             self._digest(),
             sealed_channels(table, channels),
             self.group,
+            any(index.name == LOSSES_METADATA for index in self._metadata_indexes),
         )
         return self._sealed
 
