@@ -499,8 +499,11 @@ def summary_by(
     topics |= {_marks_type()} if manifest.marks else set()
     gone = Counter[str]()
     for file in logs:
-        for number, part in file.parts.items() if isinstance(file.gone, str) else ():
-            of, encoding = manifest.channels[number], _ENCODINGS[file.gone]
+        if file.gone is UNSET:
+            continue
+        encoding = _ENCODINGS[file.gone]
+        for number, part in file.parts.items():
+            of = manifest.channels[number]
             if of.encoding != REDUCED:  # it had no payloads before
                 topics.add(TopicType(of.topic, encoding, of.schema))
                 gone[encoding] += part.messages

@@ -16,9 +16,10 @@ import pytest
 from blake3 import blake3
 
 import hybridlog as hl
-from hybridlog.entries import put_entry, topic_of
+from hybridlog.entries import put_entry, summary_of, topic_of
 from hybridlog.maintenance import expiry
 from hybridlog.maintenance.expiry import Expired
+from hybridlog_storage.catalog import CATALOG
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import IncompleteError, PayloadError, StoreError
 from hybridlog_storage.manifest import replace, with_rows
@@ -87,6 +88,14 @@ def payloads(path: Path, topic: str) -> list[bytes | str]:
     return found
 
 
+def check_list(path: Path) -> None:
+    """A list says by manifests alone what it says by the files."""
+    (path / CATALOG).unlink()
+    with hl.open(path, mongo="none") as store:
+        (known,) = store.summaries()
+        assert known == summary_of(store.entry(known.id), known.look)
+
+
 STEPS = {"a group": [[0]], "one after the other": [[0], [1]], "all": [[0, 1]]}
 
 
@@ -98,6 +107,7 @@ def test_answers_stay_when_payloads_go(copy: Path, steps: list[list[int]]) -> No
         done = expire(copy, segments)
         for topic, count in done.messages.items():
             gone[topic] += count
+        check_list(copy)
         assert expire(copy, segments).segments == []
     assert answers(copy) == before
     shutil.rmtree(copy / "tables")
