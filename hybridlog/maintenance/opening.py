@@ -330,19 +330,12 @@ class StoreFiles:
 
 
 class _Known(NamedTuple):
-    """A recording by its catalog row, with what people say of it by now.
-
-    Attributes:
-        entry: Its entry.
-        files: State of its files.
-        look: State of its directory.
-        has_changed: Whether people say something else than the row.
-    """
+    """A recording by its catalog row, with what people say of it by now."""
 
     entry: RecordingEntry
     files: str
     look: str
-    has_changed: bool
+    has_changed: bool  # they say something else than the row
 
     @property
     def described(self) -> Described:

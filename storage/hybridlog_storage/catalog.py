@@ -521,14 +521,7 @@ class Catalog:
         is_change: bool = False,
         recordings: Collection[str] = (),
     ) -> None:
-        """Write to the file.
-
-        Args:
-            statements: What is written.
-            wait_s: Seconds to wait for another process.
-            make: Returns more of it, while no other process changes cells.
-            is_change: Whether the list of ended recordings does not hold any more.
-            recordings: Ids of those whose summaries change.
+        """Write to the file; summaries of some recordings, by id, change.
 
         Raises:
             StoreError: The list of ended recordings, which is wrong now, cannot be removed.
@@ -603,7 +596,6 @@ class Catalog:
             topics: Their topics and types, by hash.
         """
         self._topics.update({digest: tuple(types) for digest, types in topics.items()})
-
         recordings = [one.id for one in summaries]
         known = {one.id: one._replace(look="", indexed_by="") for one in self.summaries(recordings)}
         changed = [one.id for one in summaries if known.get(one.id) != one._replace(look="")]
