@@ -1,6 +1,7 @@
 """Makes catalog entries of recordings from their manifests and segments, and puts them there.
 
-Recording, recovery and opening use the same functions, so their entries are equal. Files that
+Recording, recovery and opening use the same functions, so their entries are equal. Summaries of
+whole recordings are made of manifests alone. Files that
 differ from the manifest in size or content are not used; whole files are compared with its
 digests by `verify` only. Content that the manifest lists and that is missing or
 changed becomes rows of the loss ledger.
