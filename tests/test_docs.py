@@ -1186,7 +1186,7 @@ def test_the_specification_names_what_there_is() -> None:
         assert all(f"`{name}`" in text for name in kind.names or ())
     rows = sections(DOCS / "format.md", 2)["Manifest"]
     m = manifest
-    for part in (m.Manifest, m.File, m.Mark, m.Pin, m.Loss):
+    for part in (m.Manifest, m.File, m.Mark, m.Pin, m.Loss, m.LetGo):
         for name in part.__struct_fields__:
             assert f"`{name}`" in rows or name == "uncounted_marks", name
     for state in typing.get_args(index_state.State):

@@ -170,6 +170,8 @@ def test_latched_messages_in_force_stay(plain: hl.Store) -> None:
     slice_ = plain.query(["/map", "/scan"], [entry.id]).between("-0.1s", "end")
     front = [batch.payload(0) for batch, _ in slice_.latched()]
     assert front == [text("map")]
+    plain.keep({"max-age": "0s"})
+    assert [m.raw for m in plain.topic("/map")] == [text("map")]
 
 
 def test_marks_stay_whatever_goes(plain: hl.Store) -> None:
