@@ -681,7 +681,7 @@ class Session:
             TopicError: The recording is gone.
         """
         if recording in self._newer and number != MARKS_SEGMENT:
-            return self._newer[recording].segment(recording, number)
+            return self._newer_segment(recording, number)
         entry = self.entry(recording)
         if number in entry.flushed:
             return entry.flushed[number].reader
@@ -690,10 +690,18 @@ class Session:
         try:
             return self.shared.segment(entry, number)
         except SegmentError:
-            newer = self._newer_of(entry)
-            if newer is None:
+            if self._newer_of(entry) is None:
                 raise
+            return self._newer_segment(recording, number)
+
+    def _newer_segment(self, recording: str, number: int) -> SegmentReader:
+        """As of `segment`, in a newer state of the store."""
+        newer = self._newer[recording]
+        try:
             return newer.segment(recording, number)
+        except ChangedError:
+            self._entries[recording] = newer.entry(recording)
+            raise
 
     def read_chunk(self, recording: str, number: int, place: ChunkPlace) -> StoredChunk:
         """Read a chunk of a segment of a recording, by its id.
@@ -709,10 +717,9 @@ class Session:
         try:
             return read(self.segment(recording, number))
         except SegmentError:
-            newer = None if recording in self._newer else self._newer_of(self.entry(recording))
-            if newer is None:
+            if recording in self._newer or self._newer_of(self.entry(recording)) is None:
                 raise
-            return read(newer.segment(recording, number))
+            return read(self._newer_segment(recording, number))
 
     def _newer_of(self, entry: RecordingEntry) -> Session | None:
         """A newer state of the store, if a recording has other files there.

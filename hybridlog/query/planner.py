@@ -53,6 +53,7 @@ if TYPE_CHECKING:
 
 _GROUP_GROWTH = 64  # so many times more recordings are planned after each group
 _MAX_GROUP = 4096  # recordings planned at once, if they do not overlap
+_RENEWALS = 5  # of a question, while a ring lets files go
 _READ_AHEAD_FROM = 50  # messages; nothing is read ahead for fewer
 _T = TypeVar("_T")
 _Rows = TypeVar("_Rows", "MatchColumns", "Values")
@@ -339,11 +340,13 @@ class Planner:
             begin, most = end, min(most * _GROUP_GROWTH, _MAX_GROUP)
 
     def _again(self, ask: Callable[[Sequence[Part]], _T], parts: Sequence[Part]) -> _T:
-        """Ask about parts; once more about those of recordings whose files were replaced."""
-        try:
-            return ask(parts)
-        except ChangedError:
-            return ask(self._renewed(parts))
+        """Ask about parts; again about those of recordings whose files were replaced."""
+        for _ in range(_RENEWALS):
+            try:
+                return ask(parts)
+            except ChangedError:
+                parts = self._renewed(parts)
+        return ask(parts)
 
     def _renewed(self, parts: Sequence[Part]) -> list[Part]:
         """The same parts, of recordings whose files were replaced as they are now."""
@@ -520,7 +523,7 @@ class Planner:
         """Items of the cheapest engine; the next one goes on where it fails."""
         failure: Exception | None = None
         last: _Key | None = None
-        left, is_renewed = [*engines], False
+        left, renewals = [*engines], 0
         while left:
             engine = left.pop(0)
             try:
@@ -532,8 +535,8 @@ class Planner:
                 return
             except ChangedError as error:
                 failure = error
-                if not is_renewed:
-                    is_renewed = True
+                if renewals < _RENEWALS:
+                    renewals += 1
                     (part,) = self._decided(self._renewed([part]))
                     left.insert(0, engine)
             except _FALLBACK_ERRORS as error:
