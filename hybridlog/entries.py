@@ -491,7 +491,8 @@ def summary_by(
     if not manifest.is_ended:
         return None
     logs = [file for file in manifest.files if file.kind == "log"]
-    channels = manifest.channels.values()
+    # Of those whose messages a ring has let go, no file says anything.
+    channels = [c for c in manifest.channels.values() if c.messages or manifest.let_go is None]
     times = [time for c in channels for time in (c.first, c.last) if time is not None]
     times += [mark.time for mark in manifest.marks]
     lost = [row for row in manifest.losses if row.cause == Cause.SEGMENT]

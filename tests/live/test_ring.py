@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 import hybridlog as hl
+from hybridlog.entries import summary_by, summary_of, topic_types
 from hybridlog.live import incidents
 from hybridlog.live import ring as ring_module
 from hybridlog.live.recorder import RecorderOptions
@@ -59,6 +60,9 @@ class Robot(Recorded):
     def stop(self) -> hl.RecordingEntry:
         (report,) = self.recorder.stop()
         self.store.refresh()
+        entry = self.store.entry(report.entry.id)
+        for manifest in self.store.directory.whole([entry.id]):
+            assert summary_by(manifest, "") == (summary_of(entry), topic_types(entry))
         return report.entry
 
 
