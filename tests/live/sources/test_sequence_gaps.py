@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import socket
 import struct
 from collections.abc import Callable, Sequence
@@ -9,6 +10,7 @@ from collections.abc import Callable, Sequence
 import pytest
 
 from hybridlog.live.sources.base import Cause
+from hybridlog.live.sources.foxglove.protocol import MESSAGE_DATA
 from hybridlog.live.sources.foxglove.session import Notifier, Session
 from hybridlog.live.sources.ros1.stream import Stream
 from hybridlog.live.sources.sequence_gaps import SequenceGap, SequenceGapDetector, joined_gap
@@ -73,15 +75,26 @@ def by_ros1_at_once(numbers: Sequence[int]) -> int:
     return by_ros1(numbers, at_once=True)
 
 
+class Unanswered(Session):
+    """A session of a server that hears nothing."""
+
+    def _send(self, operation: str, **values: object) -> None:
+        pass
+
+
 def heard_by_foxglove(*payloads: bytes) -> Heard:
     heard = Heard()
-    session = Session(heard, Notifier(heard, "server"), lambda _: None, {})
-    session._advertise(
-        [{"id": 1, "topic": "/a", "encoding": "ros1", "schemaName": "T", "schema": DEFINITION}]
-    )
-    for one in payloads:
-        session.data(0, 1, one)
-    session.end(is_stopped=True)
+
+    async def hear() -> None:
+        session = Unanswered(heard, Notifier(heard, "server"), {})
+        session._advertise(
+            [{"id": 1, "topic": "/a", "encoding": "ros1", "schemaName": "T", "schema": DEFINITION}]
+        )
+        for one in payloads:
+            session._binary(struct.pack("<BIQ", MESSAGE_DATA, 0, 1) + one)
+        session.end(is_stopped=True)
+
+    asyncio.run(hear())
     assert len(heard.taken) == len(payloads)
     return heard
 
