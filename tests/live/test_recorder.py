@@ -201,7 +201,10 @@ def test_a_disk_that_has_room_for_little_more(
     pwritev = os.pwritev
 
     def full(fd: int, pieces: list[memoryview], position: int) -> int:
-        # As a disk does that has some blocks left: it takes a part first.
+        # As a disk does that has some blocks left: it takes a part first. What the file of the
+        # scans gives back then is enough for the end of the first one.
+        if Path(f"/proc/self/fd/{fd}").readlink().name == "000000.mcap.open":
+            return pwritev(fd, pieces, position)
         if len(pieces[0]) > 4096:
             return pwritev(fd, [pieces[0][:4096]], position)
         raise OSError(errno.ENOSPC, "full")
