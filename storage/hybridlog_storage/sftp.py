@@ -366,7 +366,7 @@ class Server(Place):
         return _running([*self._ssh, *self._options, self._host, command], None)
 
     def _check_reached(self, process: subprocess.Popen[bytes], errors: IO[bytes]) -> None:
-        if process.returncode == _NOT_REACHED:
+        if process.returncode not in range(_NOT_REACHED):  # or the connection's end has ended it
             raise StoreError(
                 f"{self.address} is not reached: {_reason(errors)}. What arrived stays there: run "
                 "the command again."
