@@ -685,14 +685,19 @@ class Session:
         entry = self.entry(recording)
         if number in entry.flushed:
             return entry.flushed[number].reader
-        if str(number) not in entry.digests:
-            raise _changed(entry)  # a ring has let it go
+        if str(number) not in entry.digests and self._has_let_go(recording, number):
+            raise _changed(entry)
         try:
             return self.shared.segment(entry, number)
         except SegmentError:
             if self._newer_of(entry) is None:
                 raise
             return self._newer_segment(recording, number)
+
+    def _has_let_go(self, recording: str, number: int) -> bool:
+        """True if a ring has let a segment go."""
+        now = self.directory.manifests.find(recording)
+        return now is not None and number not in now.logs and now.has_let_go(number)
 
     def _newer_segment(self, recording: str, number: int) -> SegmentReader:
         """As of `segment`, in a newer state of the store."""

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hybridlog.columns.payload_files import WalkedSegment
 
 import hybridlog as hl
 from benchmarks.simulator.write import write_bag
+from hybridlog.columns.recording_logs import WalkedSegment
 from hybridlog.index.of_store import contents
 from hybridlog_storage.errors import (
     ConnectionLostError,
