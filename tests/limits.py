@@ -81,6 +81,7 @@ PLACES = {
     "server_copy_wait_s": "hybridlog_storage.sftp.LOCK_WAIT_S",
     "manifest_bytes": "hybridlog_storage.manifest.MAX_BYTES",
     "manifest_wait_s": "hybridlog_storage.manifests.WAIT_S",
+    "inserted_documents": "hybridlog_storage.mongo.database.BATCH_DOCUMENTS",
     "inserted_bytes_together": "hybridlog_storage.mongo.database._MAX_COMMAND_BYTES",
     "mongod_silence_s": "hybridlog_storage.mongo.mongod.SILENCE_LIMIT_S",
     "mongod_room_bytes": "hybridlog_storage.mongo.mongod._ROOM",
