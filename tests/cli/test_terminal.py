@@ -142,12 +142,16 @@ def test_no_word_is_broken_at_eighty_columns(store: Path) -> None:
 
 def test_eighty_columns_hold_a_robot_without_a_fold(store: Path) -> None:
     topics = {one["topic"] for one in run("check", "-r", "robot", "--json", store=store).json}
-    segment = places.segment(store, "robot")
-    for command in (("info", "robot"), ("info", segment), ("check", "-r", "robot")):
-        code, shown = on_terminal(*command, "--store", store, width=80)
-        assert code == 0
-        assert {*re.findall(r"(?m)^(/\S+)  ", plain(shown))} == topics
-        assert max(map(len, plain(shown).splitlines())) <= 80
+    segments = [("info", path) for path in sorted(places.folder(store, "robot").glob("*.mcap"))]
+    assert segments
+    for commands in ([("info", "robot")], segments, [("check", "-r", "robot")]):
+        found: set[str] = set()
+        for command in commands:
+            code, shown = on_terminal(*command, "--store", store, width=80)
+            assert code == 0
+            found.update(re.findall(r"(?m)^(/\S+)  ", plain(shown)))
+            assert max(map(len, plain(shown).splitlines())) <= 80
+        assert found == topics
     code, shown = on_terminal("ls", "--store", store, width=80)
     labels = [line.split()[0] for line in plain(shown).splitlines()[1:]]
     assert {*labels} == {"robot", "odd", "torn"}

@@ -219,8 +219,8 @@ def test_frames_that_cannot_be_decoded_are_left_out(store: hl.Store, tmp_path: P
 def test_frames_whose_payloads_have_expired(tmp_path: Path) -> None:
     write(tmp_path / "log.mcap", {"/cam": ("json", [*encoded("h264")])}, "h264")
     with hl.open(tmp_path / "store", create=True, mongo="none") as store:
-        recording = store.record(tmp_path / "log.mcap", name="cam").entry.id
-        expire(store.directory, recording, [0])
+        entry = store.record(tmp_path / "log.mcap", name="cam").entry
+        expire(store.directory, entry.id, [*map(int, entry.digests)])
     with (
         hl.open(tmp_path / "store", mongo="none") as store,
         pytest.raises(PayloadError, match=r"12 messages have no payload.*there is no picture"),

@@ -18,6 +18,7 @@ from hybridlog.query.answers.match_times import next_time
 from hybridlog_storage.errors import TopicError
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests import places
 from tests.every_image import (
     BROKEN,
     COMPRESSED,
@@ -218,15 +219,17 @@ def test_the_next_time_is_found_in_any_chunk(tmp_path: Path) -> None:
 def test_a_damaged_chunk_is_told(tmp_path: Path, asking: Asking) -> None:
     with hl.open(tmp_path / "store", create=True) as store:
         write_odd(store)
-    (segment,) = (tmp_path / "store").rglob("*.mcap")
-    data = bytearray(segment.read_bytes())
-    with segment.open("rb") as file:
-        summary = make_reader(file).get_summary()
-    assert summary is not None
-    for chunk in summary.chunk_indexes:
-        data[chunk.chunk_start_offset + chunk.chunk_length - 1] ^= 1
-    segment.chmod(0o644)
-    segment.write_bytes(data)
+    segments = places.files(tmp_path / "store")
+    assert segments
+    for segment in segments:
+        data = bytearray(segment.read_bytes())
+        with segment.open("rb") as file:
+            summary = make_reader(file).get_summary()
+        assert summary is not None
+        for chunk in summary.chunk_indexes:
+            data[chunk.chunk_start_offset + chunk.chunk_length - 1] ^= 1
+        segment.chmod(0o644)
+        segment.write_bytes(data)
     with hl.open(tmp_path / "store") as store:
         client = asking(store)
         for page, topic, asked in (
