@@ -8,7 +8,7 @@ import shutil
 import sqlite3
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,7 @@ from hybridlog.record.marks import MARKS, MARKS_SEGMENT
 from hybridlog_storage.catalog import CATALOG, RecordingEntry
 from hybridlog_storage.cells import put
 from hybridlog_storage.disk.directory import LOCK, StoreDirectory
+from hybridlog_storage.errors import ManifestError
 from hybridlog_storage.manifests import MANIFEST_LOCK, MANIFEST_OLD
 from hybridlog_storage.messages import MARKS_CHANNEL
 from hybridlog_storage.mongo.collection_names import CATALOG_PREFIX, collection_of
@@ -108,9 +109,10 @@ class Prepared:
             rows = catalog.execute("SELECT key, body FROM cells WHERE kind = 'entry'").fetchall()
             for recording, body in rows:
                 looks, entry = json.loads(body)
-                if looks == state_now(old, recording):
-                    now = json.dumps([state_now(new, recording), entry])
-                    catalog.execute(*put("entry", recording, now.encode()))
+                with suppress(ManifestError):  # one whose manifest is damaged fits no row
+                    if looks == state_now(old, recording):
+                        now = json.dumps([state_now(new, recording), entry])
+                        catalog.execute(*put("entry", recording, now.encode()))
 
     @contextmanager
     def copy(self, server: Server, path: Path) -> Iterator[Case]:
