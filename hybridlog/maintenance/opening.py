@@ -263,7 +263,7 @@ class StoreFiles:
         None if the recording is gone.
         """
         is_open = self.directory.is_recorded(recording)
-        if not is_open and self._may_mend(recording):
+        if not is_open and self._may_mend(recording) and is_unfinished(self.directory, recording):
             self.report.noted.add(recording)
         return self._describe(recording, is_open=is_open)
 
@@ -425,6 +425,22 @@ def recover(directory: StoreDirectory, recording: str, report: RepairReport) -> 
 
     directory.manifests.change(recording, change)
     return True
+
+
+def is_unfinished(directory: StoreDirectory, recording: str) -> bool:
+    """True if `recover` has something to do: new files alone may be as the manifest says."""
+    try:
+        manifest = directory.manifests.read(recording)
+        listing = directory.listing(recording)
+    except StoreError:
+        return True
+    return bool(
+        not manifest.is_ended
+        or listing.open
+        or listing.left_over(manifest)
+        or listing.sealed.keys() - manifest.logs.keys()  # it may be whole, and not listed
+        or any(map(is_left_over, listing.others))
+    )
 
 
 def is_left_over(name: str) -> bool:
