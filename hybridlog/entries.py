@@ -59,6 +59,7 @@ from hybridlog_storage.segments.segment_file import (
     sealed_name,
 )
 from hybridlog_storage.segments.segment_format import group_of
+from hybridlog_storage.segments.segment_group import MOST_SEALED
 from hybridlog_storage.segments.segment_reader import SegmentSummary
 from hybridlog_storage.summary import RecordingSummary, TopicType, hash_of, topics_to_json
 from hybridlog_storage.times import span_of
@@ -174,21 +175,33 @@ class Inventory:
     def end(self) -> Mapping[str, Any] | None:
         """The end of the recording: by its manifest, else by the segments that state it.
 
-        Of a group whose recorder was killed, each recovered segment says what it has lost.
+        Of a group whose recorder was killed, each recovered segment says what it has lost. What
+        a power cut has taken whole, the end itself tells: it says how many segments there were.
         """
         if self.manifest is not None and self.manifest.is_ended:
             return end_values(self.manifest)
-        said = (summary.end for _, summary in sorted(self.summaries.items()))
-        ends: list[Mapping[str, Any]] = [end for end in said if end]
+        ends: list[Mapping[str, Any]] = []
+        missing: list[int] = []
+        for number, summary in sorted(self.summaries.items()):
+            if summary.end:
+                end: dict[str, Any] = dict(summary.end)
+                segments = min(end.pop("segments", 0), number + MOST_SEALED)
+                ends.append(end)
+                missing += [n for n in range(number, segments) if not self._has(n)]
         cut = [end for end in ends if end.get("status") == "recovered"]
-        if len(ends) < 2 or not cut:
+        if not missing and (len(ends) < 2 or not cut):
             return ends[-1] if ends else None
+        damage = [text for end in cut for text in end.get("damage", ())]
         return {
             "status": "recovered",
             "losses": [row for end in ends for row in end.get("losses", ())],
             "cut_bytes": sum(end.get("cut_bytes", 0) for end in cut),
-            "damage": [text for end in cut for text in end.get("damage", ())],
+            "damage": damage + [f"segment {number} is lost" for number in missing],
         }
+
+    def _has(self, number: int) -> bool:
+        """True if a segment is there, or the manifest lists it, and so what it had."""
+        return number in self.summaries or number in self.logs or number in self.listing.open
 
     @property
     def state(self) -> str:

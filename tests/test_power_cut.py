@@ -13,10 +13,12 @@ import pytest
 import hybridlog as hl
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import HybridlogError, SegmentError
+from hybridlog_storage.manifest import Manifest, replace
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.mongo.database import Database
 from hybridlog_storage.mongo.mongod import EmbeddedMongod
 from hybridlog_storage.segments.segment_writer import RecordingWriter, SegmentSettings
+from tests import places
 from tests.power import PowerCut
 
 pytestmark = pytest.mark.mongo("embedded")
@@ -147,6 +149,26 @@ def test_a_power_cut_while_recording(
     tmp_path: Path, mongod: str, sync: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     try_cuts(tmp_path, mongod, sync, monkeypatch, cuts=12, fates=3)
+
+
+def test_the_end_says_how_many_segments_there_were(
+    tmp_path: Path, mongod: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of the last group a power cut may leave that which has the end, and no other."""
+    run = Run(tmp_path / "whole", mongod, "seal", None)
+    run.go(monkeypatch)
+    (folder,) = places.folders(run.store)
+    last = places.manifest(run.store, "run").files[-1]
+    assert last.number > last.group
+
+    def how(now: Manifest) -> Manifest:
+        before = tuple(file for file in now.files if file.group != last.group)
+        return replace(now, status="open", files=before)
+
+    places.change_in(folder, how)
+    (folder / last.name).unlink()
+    assert check(run.store, run, "never") == "recovered"
+    assert places.manifest(run.store, "run").damage == (f"segment {last.number} is lost",)
 
 
 @pytest.mark.exhaustive

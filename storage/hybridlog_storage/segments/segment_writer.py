@@ -30,7 +30,13 @@ from hybridlog_storage.segments.chunk import PackedChunk, StoredChunk, pack
 from hybridlog_storage.segments.chunk_builder import ChunkBuilder
 from hybridlog_storage.segments.compression import Compressor
 from hybridlog_storage.segments.segment_file import Sealed, SegmentFile
-from hybridlog_storage.segments.segment_format import entries_of, last_time_of
+from hybridlog_storage.segments.segment_format import (
+    END_METADATA,
+    entries_of,
+    json_metadata,
+    json_of,
+    last_time_of,
+)
 from hybridlog_storage.segments.segment_group import FIRST, LATCHED, Division, Key, SegmentGroup
 from hybridlog_storage.stopping import safe_point
 
@@ -345,7 +351,7 @@ class RecordingWriter:
             self._seal()
         first = self._open_group().first
         for extra in extras:
-            first.add_metadata(extra)
+            first.add_metadata(self._stated(extra))
         self._seal()
 
     def written_of(self, channel: Channel) -> int:
@@ -554,11 +560,20 @@ class RecordingWriter:
     def _add(self, record: Metadata | Attachment) -> None:
         group = self._open_group()
         if isinstance(record, Metadata):
-            group.first.add_metadata(record)
+            group.first.add_metadata(self._stated(record))
             return
         group.first.add_attachment(record)
         if group.position >= self.settings.segment_size:
             self._seal()
+
+    def _stated(self, record: Metadata) -> Metadata:
+        """A record as it is written: the end of the recording says how many segments there are.
+
+        Others of its group may be lost in a crash that keeps it.
+        """
+        if record.name != END_METADATA:
+            return record
+        return json_metadata(END_METADATA, {**json_of(record), "segments": self._number})
 
     def _define_rest(self) -> None:
         """Define the channels without messages in the last group."""

@@ -29,12 +29,13 @@ LossRow = TypedDict(
 
 
 class End(TypedDict, total=False):
-    """The end of a recording."""
+    """The end of a recording; `segments`: how many it has, by the one that a recorder wrote."""
 
     status: Literal["complete", "damaged", "recovered"]
     losses: list[LossRow]
     cut_bytes: Count
     damage: list[Text]
+    segments: Count
 
 
 def end_of(value: object) -> dict[str, Any]:
