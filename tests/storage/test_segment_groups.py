@@ -278,7 +278,7 @@ def test_the_end_lies_in_the_first_segment_after_a_full_disk(
     made.writer.close_truncated([json_metadata(END_METADATA, {"status": "damaged"})])
     assert [[sealed.segment for sealed in group] for group in made.groups] == [[0, 1, 2]]
     with SegmentReader(made.folder / "000000.mcap", 0) as reader:
-        assert reader.summary().end == {"status": "damaged"}
+        assert reader.summary().end == {"status": "damaged", "segments": 3}
 
 
 def test_what_came_into_other_segments_counts_on_a_full_disk(

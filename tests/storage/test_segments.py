@@ -584,7 +584,7 @@ def test_reader_gives_the_chunks_that_were_written(
     with SegmentReader(path, 0) as reader:
         summary = reader.summary()
         assert summary.recording["id"] == RECORDING["id"]
-        assert summary.end == {"status": "complete"}
+        assert summary.end == {"status": "complete", "segments": 1}
         assert [p.offset for p in summary.chunks] == [c.offset for c in chunks]
         for place, chunk in zip(summary.chunks, chunks, strict=True):
             assert content_of(reader.read_chunk(place)) == content_of(chunk)
@@ -662,7 +662,7 @@ def test_a_segment_cut_in_its_summary_is_what_it_was(tmp_path: Path, missing: in
     recovered = recovered_of(tmp_path, whole[: len(whole) - missing])
     assert recovered.path is not None
     assert recovered.path.read_bytes() == whole
-    assert summary_of(recovered.path, 0).end == {"status": "complete"}
+    assert summary_of(recovered.path, 0).end == {"status": "complete", "segments": 1}
     assert problems(recovered.path) == []
 
 
@@ -1112,7 +1112,7 @@ def test_when_the_manifest_fails_the_segment_is_sealed_later(tmp_path: Path) -> 
     writer.close_truncated([json_metadata(END_METADATA, {"status": "damaged"})])
     assert [sealed.file for sealed in told] == ["000000.mcap", "000001.mcap"]
     assert (directory / "000000.mcap").read_bytes() == before
-    assert summary_of(directory / "000001.mcap", 1).end == {"status": "damaged"}
+    assert summary_of(directory / "000001.mcap", 1).end == {"status": "damaged", "segments": 2}
 
 
 def test_a_sealed_segment_is_not_replaced(tmp_path: Path) -> None:
