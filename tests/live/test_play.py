@@ -38,6 +38,8 @@ from tests.waiting import wait_for
 
 SECOND = 10**9
 FLUSH_S = 0.4
+ROOM = 16_384
+"""Bytes that a write may still have on the full disk: enough to seal a file."""
 SLACK_S = 1.5  # for a machine that has other things to do
 BLOB = Schema("a/Blob", "ros1msg", b"uint32 n\nfloat64 x\nbool pressed\nuint8[] data\n")
 SIZES = {"/camera": 50_000, "/points": 20_000, "/arm": 0, "/bumper": 0}
@@ -112,7 +114,7 @@ class Robot:
         self.note("pin", *span)
 
     def write(self, do: Any, fd: int, parts: list[memoryview], *where: int) -> int:
-        if self.is_full and sum(map(len, parts)) > 4096:
+        if self.is_full and sum(map(len, parts)) > ROOM:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         return int(do(fd, parts, *where))
 

