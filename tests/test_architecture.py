@@ -62,6 +62,7 @@ ALLOWED = {
     "mcap_protobuf": ("hybridlog.schema.protobuf_codec",),
     "msgspec": (
         "hybridlog.entries",
+        "hybridlog.live.state",
         "hybridlog.maintenance",
         "hybridlog.record.capture",
         "hybridlog_storage.catalog",

@@ -13,7 +13,6 @@ import re
 import shutil
 import time
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -187,11 +186,15 @@ def use(path: Path, mongo: str | None, bag: Path) -> list[HybridlogError]:
         store.topic("/imu/data").fields("header.seq").to_pandas()
 
     def record_live(store: hl.Store) -> None:
-        from hybridlog.live.control_server import ControlServer, running
+        from hybridlog.live.recorder import Recorder, RecorderOptions
+        from hybridlog.live.state import running
 
-        running(path)
-        with suppress(StoreError):
-            ControlServer(path, "live", "live", {}).close()
+        running(store.directory)
+        options = RecorderOptions(reserve_bytes=0)
+        recorder = Recorder(store, [], options, lambda _: None)
+        recorder.start()
+        recorder.look()
+        recorder.stop()
         store.start("live").close()
 
     def record(store: hl.Store) -> None:

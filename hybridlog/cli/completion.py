@@ -72,12 +72,10 @@ def complete_type(context: click.Context, _: click.Parameter, incomplete: str) -
 
 def complete_running(context: click.Context, _: click.Parameter, incomplete: str) -> list[str]:
     """Names of running recorders that begin with what was typed."""
-    from hybridlog.live.control_server import running
+    from hybridlog.live.state import running
 
     with _nothing_on_error():
-        return [
-            name for name in running(_store(context).path).values() if name.startswith(incomplete)
-        ]
+        return [name for name in running(_store(context)).values() if name.startswith(incomplete)]
     return []
 
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -27,7 +29,7 @@ from hybridlog.cli.options import (
 from hybridlog.cli.signals import if_stopped
 from hybridlog.query.choice import Choice
 from hybridlog.wording import listed
-from hybridlog_storage.errors import UsageError
+from hybridlog_storage.errors import StoreError, UsageError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -152,7 +154,8 @@ def mark_command(given: _Mark) -> None:
     if at is None:
         from hybridlog.query.times import parse_duration
 
-        around = None if given.pin is None else [parse_duration(one) / 1e9 for one in given.pin]
+        before, after = map(parse_duration, given.pin or ("0s", "0s"))
+        around = None if given.pin is None else (before, after)
         marked = _mark_running(given.text, tags, around, given.recording, given.store)
     elif len(given.recording) == 1:
         (recording,) = given.recording
@@ -168,17 +171,25 @@ def mark_command(given: _Mark) -> None:
 def _mark_running(
     text: str,
     tags: dict[str, str],
-    around: list[float] | None,
+    around: tuple[int, int] | None,
     recordings: tuple[str, ...],
     store: Path | None,
 ) -> Iterator[str]:
-    from hybridlog.live.control_server import choose, request
+    """Mark what recorders write at this moment, and pin the time around it; yields their names."""
+    from hybridlog.live.clocks import CLOCK
+    from hybridlog.live.state import choose, read
+    from hybridlog.maintenance.edit import mark_now
     from hybridlog.store import store_path
+    from hybridlog_storage.remote import directory_of
 
-    path = store_path(store)
-    for name in choose(path, recordings):
-        asked = request(path, name, "mark", text=text, tags=tags, around=around)
-        yield str(asked["recording"])
+    now, directory = time.time_ns(), directory_of(store_path(store))
+    for recording in choose(directory, recordings):
+        simulated: int | None = None
+        with suppress(StoreError):  # it has just begun
+            simulated = read(directory.path, recording).sim_time
+        if simulated == 0:
+            raise UsageError(f"There is no time of {CLOCK} yet: mark again when it has come.")
+        yield mark_now(directory, recording, simulated or now, text, tags, around=around)
 
 
 _MAX_ROWS = 20

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
@@ -71,19 +70,7 @@ def recorder_options(choices: RecordChoices) -> RecorderOptions:
         no_index=matcher(choices.no_index) if choices.no_index else None,
         use_sim_time=choices.use_sim_time,
         contract=None if choices.contract is None else Contract.read(choices.contract),
-        on_breach=_words(choices.on_breach),
     )
-
-
-def _words(command: str | None) -> list[str]:
-    """The words of a command, as a shell splits them."""
-    try:
-        words = [] if command is None else shlex.split(command)
-    except ValueError as error:
-        raise UsageError(f"--on-breach: {error}.") from error
-    if command is not None and not words:
-        raise UsageError("--on-breach needs a command.")
-    return words
 
 
 def _pair(option: str, value_name: str, text: str) -> tuple[str, str]:

@@ -24,8 +24,9 @@ from hybridlog_storage.errors import (
 if TYPE_CHECKING:
     from hybridlog.contract.judge import Result
     from hybridlog.live.policy import Rule
-    from hybridlog.live.recorder import Recorder, RecorderOptions, RecorderState
+    from hybridlog.live.recorder import Recorder, RecorderOptions
     from hybridlog.live.sources.base import LiveSource
+    from hybridlog.live.state import RecorderState
     from hybridlog.record.recorder import RecordReport
 
 _MAX_ROWS = 10  # of the ledger; `losses` prints all

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from rich.console import Group
     from rich.text import Text
 
-    from hybridlog.live.recorder import RecorderState
+    from hybridlog.live.state import RecorderState
     from hybridlog.live.statistics import TopicState
     from hybridlog.record.recorder import RecordReport
 

@@ -155,11 +155,6 @@ class RecordChoices(Between, Latched, InStore, AsJson, Quiet):
         "FILE",
         kind=LiveOption,
     )
-    on_breach: str | None = option(
-        "With --contract: run this when a topic is silent; topic, rule and seconds follow.",
-        "COMMAND",
-        kind=LiveOption,
-    )
     set_tag: tuple[str, ...] = option("Store KEY=VALUE with it.", "K=V")
     cache_size: int | None = cache_size()
     live_options: tuple[str, ...] = ()
@@ -196,8 +191,6 @@ def check_choices(choices: RecordChoices) -> None:
         raise UsageError("--no-latched and --original-times are for --between, and logs.")
     if choices.master is not None and not choices.master.strip():
         raise UsageError("A ROS master's URI looks like http://host:11311; this one is empty.")
-    if choices.on_breach is not None and choices.contract is None:
-        raise UsageError("--on-breach is for --contract.")
     if choices.qos is not None and not choices.ros2:
         raise UsageError("--qos is for --ros2.")
     if "--speed" in choices.live_options and choices.replay is None:

@@ -27,7 +27,8 @@ if TYPE_CHECKING:
     from contextlib import AbstractContextManager
 
     from hybridlog.cli.record_choices import RecordChoices
-    from hybridlog.live.recorder import Recorder, RecorderState
+    from hybridlog.live.recorder import Recorder
+    from hybridlog.live.state import RecorderState
     from hybridlog.store import Store
 
 _STATE_S = 1.0
@@ -207,7 +208,7 @@ class _Display:
         if self._table is not None:
             self._table.show(state)
         elif self._as_json:
-            from hybridlog.live.recorder import summary_of
+            from hybridlog.live.state import summary_of
 
             output.print_json_line({"state": summary_of(state)})
 

@@ -21,7 +21,7 @@ from hybridlog_storage.errors import UsageError
 from hybridlog_storage.stopping import at_safe_points
 
 if TYPE_CHECKING:
-    from hybridlog.live.recorder import RecorderState
+    from hybridlog.live.state import RecorderState
     from hybridlog.store import Store
 
 _EVERY_S = 1.0
@@ -60,14 +60,15 @@ def top_command(given: _Given) -> None:
 
     Without a terminal, and without --json, the state is shown once.
     """
-    from hybridlog.live.control_server import choose, states
+    from hybridlog.live.state import choose, states, summary_of
     from hybridlog.query.times import parse_duration
     from hybridlog.store import store_path
+    from hybridlog_storage.remote import directory_of
 
     fields = [_field(text) for text in given.field]
     span = parse_duration(given.window)
-    path = store_path(given.store)
-    (recorder,) = choose(path, [] if given.recording is None else [given.recording])
+    directory = directory_of(store_path(given.store))
+    (recorder,) = choose(directory, [] if given.recording is None else [given.recording])
     name = recorder
     on_screen = not given.as_json and sys.stdout.isatty() and not given.once
     with _ended_by_ctrl_c(), at_safe_points(), ExitStack() as held:
@@ -75,20 +76,20 @@ def top_command(given: _Given) -> None:
         if fields:
             opened = held.enter_context(given.opened(is_lasting=True, quiet=False))
         table = held.enter_context(LiveTable(error=False)) if on_screen else None
-        for raw in states(path, recorder, _EVERY_S):
-            if not raw:
+        for state in states(directory, recorder, _EVERY_S):
+            if state is None:
                 continue  # it has just started
-            name = raw["name"]
+            name = state.name
             values = []
             if opened is not None:
-                values = _values(opened, recorder, raw, fields, span)
+                values = _values(opened, recorder, state, fields, span)
             if given.as_json:
-                print(json.dumps({**raw, "fields": values}), flush=True)  # noqa: T201
+                print(json.dumps({**summary_of(state), "fields": values}), flush=True)  # noqa: T201
             elif table is not None:
-                table.show(_state(raw), _lines(values))
+                table.show(state, _lines(values))
             else:
                 console = output.console()
-                console.print(drawn(_state(raw), width=console.width, below=_lines(values)))
+                console.print(drawn(state, width=console.width, below=_lines(values)))
             if given.once or not (given.as_json or on_screen):
                 return
         if not given.as_json:
@@ -115,7 +116,7 @@ def _field(text: str) -> _Field:
 def _values(
     store: Store,
     recording: str,
-    state: Mapping[str, Any],
+    state: RecorderState,
     fields: Sequence[_Field],
     span: int,
 ) -> list[dict[str, Any]]:
@@ -131,7 +132,7 @@ def _values(
     return found
 
 
-def _resolved(state: Mapping[str, Any], fields: Sequence[_Field]) -> Iterator[tuple[str, _Field]]:
+def _resolved(state: RecorderState, fields: Sequence[_Field]) -> Iterator[tuple[str, _Field]]:
     """Each field with the full name of its topic.
 
     Raises:
@@ -140,7 +141,7 @@ def _resolved(state: Mapping[str, Any], fields: Sequence[_Field]) -> Iterator[tu
     """
     from hybridlog.query.topics import resolve
 
-    topics = [topic["topic"] for topic in state["topics"]]
+    topics = [topic.topic for topic in state.topics]
     for field in fields:
         (topic, *others) = resolve([field.topic], topics)
         if others:
@@ -163,9 +164,3 @@ def _number(value: object) -> str:
     if value is None:
         return "-"  # such as the mean of texts
     return f"{value:.6g}" if isinstance(value, int | float) else str(value)
-
-
-def _state(raw: Mapping[str, Any]) -> RecorderState:
-    from hybridlog.live.recorder import state_of
-
-    return state_of(raw)

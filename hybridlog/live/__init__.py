@@ -1,4 +1,4 @@
-"""The recorder of a running robot: policies, snapshots, statistics, control socket, sources."""
+"""The recorder of a running robot: policies, statistics, triggers, state file, sources."""
 
 from hybridlog.live.recording import LiveOptions, LiveRecording
 

@@ -86,6 +86,11 @@ class SimulatedTime(Sink):
         """True until the first time has come."""
         return not self._ticks
 
+    @property
+    def latest(self) -> int:
+        """The latest time of the clock, ns; 0 before the first."""
+        return self._latest[1]
+
     def clock(self, now: int, *, received: int) -> None:
         """See `Sink.clock`."""
         if not 0 <= now < _MAX_NS:

@@ -11,14 +11,13 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from hybridlog.entries import text as as_text
 from hybridlog.live.clocks import CLOCK, MachineClock, SimulatedTime
-from hybridlog.live.control_server import ControlServer
 from hybridlog.live.incidents import Hit, Incidents
 from hybridlog.live.memory import default_budget, resident_bytes
 from hybridlog.live.policy import (
@@ -37,19 +36,21 @@ from hybridlog.live.recording import (
     indexed_within_s,
 )
 from hybridlog.live.ring import GROUPS, Ring
-from hybridlog.live.silence import RULE, Commands, SilenceWatch
-from hybridlog.live.statistics import Lateness, Tally, TopicRates, TopicState
+from hybridlog.live.silence import RULE, Silence, SilenceWatch
+from hybridlog.live.state import RecorderState, StateFile
+from hybridlog.live.statistics import Lateness, Tally, TopicRates
 from hybridlog.live.triggers import Trigger, Triggers
-from hybridlog.maintenance.edit import remove_if, too_many_marks
+from hybridlog.maintenance.edit import remove_if
 from hybridlog.maintenance.keep import Own, RetentionThread
 from hybridlog.query.times import format_duration, format_time
 from hybridlog.record.losses import Cause, Loss
-from hybridlog.record.marks import CLOCK_SET, CONTRACT, mark_channel, mark_payload
+from hybridlog.record.marks import CLOCK_SET, CONTRACT
 from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.completion import completed
 from hybridlog.schema.reduced_codec import reduce, reduced_channel
 from hybridlog_storage.errors import DiskFullError, HybridlogError, StoreError, UsageError
 from hybridlog_storage.manifest import Mark, new_random, with_mark
+from hybridlog_storage.manifest import replace as replaced
 from hybridlog_storage.messages import Channel
 
 if TYPE_CHECKING:
@@ -58,6 +59,7 @@ if TYPE_CHECKING:
     from hybridlog.query.topics import TopicMatcher
     from hybridlog.record.recorder import RecordReport
     from hybridlog.store import Store
+    from hybridlog_storage.manifest import Manifest
     from hybridlog_storage.segments.segment_writer import SegmentSettings
 
 _MAX_REPORTS = 1000
@@ -94,7 +96,6 @@ class RecorderOptions:
         no_index: Selects topics whose messages get no documents in MongoDB; None for none.
         use_sim_time: Log times are those of `/clock`.
         contract: Topics that are silent for longer than it allows are told and marked.
-        on_breach: Command that runs when a topic becomes silent.
     """
 
     name: str = "live"
@@ -116,7 +117,6 @@ class RecorderOptions:
     no_index: TopicMatcher | None = None
     use_sim_time: bool = False
     contract: Contract | None = None
-    on_breach: Sequence[str] = ()
 
     def __post_init__(self) -> None:
         """Refuse limits that would stop the recorder at once, and a ring that holds too little."""
@@ -135,66 +135,6 @@ class RecorderOptions:
             bound = getattr(self, name)
             if bound is not None and not bound > 0:
                 raise UsageError(f"{name.removesuffix('_s').replace('_', ' ')} must be above 0")
-
-
-@dataclass(frozen=True, slots=True)
-class RecorderState:
-    """State of a recorder at one time.
-
-    Attributes:
-        name: Name of the recorder: that of its recording.
-        elapsed_s: Seconds since its start.
-        topics: Topics with publishers or messages, by name.
-        messages: Messages received so far.
-        stored: Messages in chunks, or on their way to the disk.
-        lost: Messages lost so far, by cause, as far as they can be counted.
-        filled: Used share of the memory budget, 0 to 1.
-        lag: Messages that are not indexed yet.
-        late: Of these, the overdue ones: they wait longer than messages of slow topics do.
-        index_failure: The error that stopped the index; empty while it works.
-        free_bytes: Free space of the disk.
-        stored_bytes: Payload bytes stored so far.
-        stalled_s: Seconds for which received messages have waited for longer than the flush
-            interval, and nothing was written; 0 while writing goes on.
-        incidents: What was marked and pinned so far.
-        let_go: Messages that the ring has let go; None without a ring.
-        taken: Messages that are stored or will be, by topic, when the state is requested.
-        silent: Topics that are silent for longer than the contract allows.
-        breaches: Such silences so far.
-        clock_set_s: Seconds by which the clock of this machine was set since the start.
-        memory_bytes: Memory of the recorder's process; 0 where that is unknown.
-    """
-
-    name: str
-    elapsed_s: float
-    topics: Sequence[TopicState]
-    messages: int
-    stored: int
-    lost: Mapping[str, int]
-    filled: float
-    lag: int
-    late: int
-    index_failure: str
-    free_bytes: int
-    stored_bytes: int
-    stalled_s: float = 0.0
-    incidents: int = 0
-    let_go: int | None = None
-    taken: Mapping[str, int] = field(default_factory=dict)
-    silent: Sequence[str] = ()
-    breaches: int = 0
-    clock_set_s: float = 0.0
-    memory_bytes: int = 0
-
-    @property
-    def hz(self) -> float:
-        """Messages a second since the previous look."""
-        return sum(topic.hz for topic in self.topics)
-
-    @property
-    def bytes_per_s(self) -> float:
-        """Payload bytes a second since the previous look."""
-        return sum(topic.bytes_per_s for topic in self.topics)
 
 
 @dataclass(slots=True)
@@ -248,19 +188,17 @@ class Recorder:
         self._left, self._room = options.max_messages, options.max_bytes
         self._closed = False
         self._refused: tuple[Cause, str] | None = None
-        self._marks = mark_channel()
         self._started = time.monotonic()
         self._looked = self._written_at = self._started
         self._written = 0
         self._lateness = Lateness(indexed_within_s(options.flush_interval_s))
         self._stored_bytes = 0
         self._lost: dict[tuple[str, Cause], int] = {}
-        self._state: RecorderState | None = None
         self._breaches = 0
         self._clock_marks: list[tuple[str, Mapping[str, str], int]] = []
         self._newest = max(store.summaries(), key=attrgetter("created"), default=None)
         self._silence = None if options.contract is None else SilenceWatch(options.contract)
-        self._commands = Commands(options.on_breach)
+        self._silences: dict[tuple[str, int], str] = {}  # ids of marks, by topic and beginning
         self._watching = threading.Thread(target=self._watch, daemon=True)
         self._ended_at: int | None = None
         self._simulated: SimulatedTime | None = None
@@ -269,6 +207,7 @@ class Recorder:
         self._sink: Sink = self._simulated or self
         self._target = store.start(options.name, self._live_options())
         self.name = self._target.name
+        self._says = StateFile(store.directory.path, self._target.id)
         self._ring = self._make_ring()
         self._triggers = Triggers(options.triggers, say)
         self._incidents = Incidents(
@@ -288,16 +227,6 @@ class Recorder:
                     lambda: self._target.sealed,
                 ),
                 self.say,
-            )
-            self._control = ControlServer(
-                store.directory.path,
-                self._target.id,
-                self.name,
-                {
-                    "state": self._ask_state,
-                    "mark": self._ask_mark,
-                    "stop": self._ask_stop,
-                },
             )
         except BaseException:
             self._target.abort()
@@ -351,13 +280,13 @@ class Recorder:
         except BaseException:
             for source in self._sources:
                 source.stop()
-            self._control.close()
+            self._says.remove()
             self._target.abort()
             raise
         if self._silence is not None:
             self._watching.start()
         now = self._clock.now()
-        if self._newest is not None and self._newest.created > now:
+        if self._simulated is None and self._newest is not None and self._newest.created > now:
             says = f"the clock of this machine says {format_time(now)}"
             self._note_clock(f"{says}, and recording {self._newest.name} was begun later", {}, now)
         self._retention.start()
@@ -390,7 +319,7 @@ class Recorder:
             self._report_silences(self._silence, ended_at, is_end=True)
         if self._simulated is not None:
             self._simulated.close()
-        self._control.close()
+        self._says.remove()
         self._retention.stop()
         self._incidents.stop()
         self._triggers.close()
@@ -461,13 +390,15 @@ class Recorder:
             self._stalled_s(now),
             incidents=self._incidents.count,
             let_go=None if self._ring is None else self._ring.messages,
+            taken=dict(self._target.taken),
             silent=() if self._silence is None else self._silence.silent,
             breaches=self._breaches,
             clock_set_s=self._clock.set_by / 1e9,
             memory_bytes=resident_bytes(),
+            sim_time=None if self._simulated is None else self._simulated.latest,
         )
         self._check_limits(state)
-        self._state = state
+        self._says.write(state)
         return state
 
     def _stalled_s(self, now: float) -> float:
@@ -476,40 +407,6 @@ class Recorder:
             self._written, self._written_at = written, now
         waited = now - self._written_at - self._options.flush_interval_s
         return waited if waited > _SLOW_WRITE_S else 0.0
-
-    def mark(
-        self, text: str, tags: Mapping[str, str], around: tuple[float, float] | None = None
-    ) -> str:
-        """Set a mark, at this time, in the manifest.
-
-        Args:
-            text: What happened.
-            tags: Tags of the mark.
-            around: Seconds before and after, which are marked and pinned; None for a moment.
-
-        Returns:
-            The name of the recording.
-
-        Raises:
-            StoreError: The manifest cannot be written, or has as many marks as it can have.
-            UsageError: There is no time of `/clock` yet.
-        """
-        if self._simulated is not None and self._simulated.is_waiting:
-            raise UsageError(f"There is no time of {CLOCK} yet: mark again when it has come.")
-        said = {as_text(key): as_text(value) for key, value in tags.items()}
-        manifests, recording = self._directory.manifests, self._target.id
-        if around is None:
-            at = self._clock.now() if self._simulated is None else self._now()
-            made = Mark(new_random(), at, as_text(text), said)
-            now = manifests.change(recording, lambda known: with_mark(known, made))
-            mark = made.id
-        else:
-            mark = self._hit(as_text(text), said, self._now(), around)
-            self._incidents.write()
-            now = manifests.read(recording)
-        if all(one.id != mark for one in now.marks):
-            raise too_many_marks(now.name)
-        return now.name
 
     def fire(self, text: str, steady: int | None = None) -> None:
         """Mark and pin what is around a trigger or signal; waits for nothing.
@@ -522,15 +419,23 @@ class Recorder:
         if before is None:
             before = self._options.ring_s or 0.0
         around, text = (before, self._options.after_s), as_text(text)
-        self._hit(text, {"trigger": text}, self._now() if steady is None else steady, around)
-
-    def _hit(self, text: str, tags: Mapping[str, str], at: int, around: tuple[float, float]) -> str:
         before, after = (round(seconds * 1e9) for seconds in around)
-        return self._incidents.hit(Hit(text, tags, at - before, at + after))
+        at = self._now() if steady is None else steady
+        self._incidents.hit(Hit(text, {"trigger": text}, at - before, at + after))
 
-    def _note(self, text: str, tags: Mapping[str, str], at: int) -> None:
-        """Note something as a message on the topic of marks, at a log time, ns."""
-        self._sink.take(self._marks, mark_payload(text, tags), received=at)
+    def _mark(self, mark: Mark) -> None:
+        """Set a mark, or give one of its id another end."""
+
+        def how(now: Manifest) -> Manifest:
+            if any(one.id == mark.id for one in now.marks):
+                marks = tuple(mark if one.id == mark.id else one for one in now.marks)
+                return replaced(now, marks=marks)
+            return with_mark(now, mark)
+
+        try:
+            self._directory.manifests.change(self._target.id, how)
+        except HybridlogError as error:
+            self.say(f"{mark.text!r} cannot be marked: {error}")
 
     def _is_marked(self, recording: str) -> bool:
         with suppress(StoreError):
@@ -557,20 +462,19 @@ class Recorder:
         for one in begun:
             self._breaches += 1
             self._say(f"{one.text} ({RULE} of the contract)")
-            if problem := self._commands.run(one):
-                self.say(problem)
+            self._silences[one.topic, one.begin] = new_random()
+            self._mark_silence(one, None)
         for one in ended:
-            recorded = self._recorded.get(self._marks) or self._meet(self._marks, b"{}")
-            tags = {"cause": CONTRACT, "rule": RULE, "topic": one.topic}
-            begin, end = self._clock.log_time(one.begin), self._clock.log_time(one.end)
-            payload = mark_payload(one.text, tags, max(begin, end))
-            recorded.tally.add(len(payload), one.begin)
-            try:
-                stored = self._target.write(recorded.channel, payload, log_time=begin, wait=False)
-                if not stored:
-                    self._lose_for_room(recorded, begin)
-            except HybridlogError as error:
-                self._lose(recorded, _cause_of(error), str(error), begin)
+            self._mark_silence(one, self._clock.log_time(one.end))
+
+    def _mark_silence(self, one: Silence, end: int | None) -> None:
+        """Mark a silence from its beginning on, with its end once that has come."""
+        place = one.topic, one.begin
+        mark = self._silences[place] if end is None else self._silences.pop(place, new_random())
+        tags = {"cause": CONTRACT, "rule": RULE, "topic": one.topic}
+        begin = self._clock.log_time(one.begin)
+        last = None if end is None else max(begin, end)
+        self._mark(Mark(mark, begin, one.text, tags, last))
 
     def silent(self) -> list[str]:
         """Topics that had publishers and never sent a message."""
@@ -695,35 +599,6 @@ class Recorder:
             last = self._unended <= 0
         if last:
             self._end(reason or "all sources have ended")
-
-    # Requests of other processes.
-
-    def _ask_state(self, request: Mapping[str, Any]) -> Mapping[str, Any]:
-        state = self._state
-        if state is None:
-            return {}
-        return summary_of(replace(state, taken=self._target.taken))
-
-    def _ask_mark(self, request: Mapping[str, Any]) -> Mapping[str, Any]:
-        text, tags = request.get("text"), request.get("tags")
-        if not isinstance(text, str) or not isinstance(tags, dict):
-            raise UsageError("a mark needs a text and tags")
-        if not all(isinstance(word, str) for pair in tags.items() for word in pair):
-            raise UsageError("names and values of tags must be texts")
-        around = request.get("around")
-        if around is None:
-            return {"recording": self.mark(text, tags)}
-        if not (
-            isinstance(around, list)
-            and len(around) == 2
-            and all(isinstance(one, int | float) and 0 <= one <= _MAX_S for one in around)
-        ):
-            raise UsageError("--pin takes two times of a day at most: before and after")
-        return {"recording": self.mark(text, tags, (around[0], around[1]))}
-
-    def _ask_stop(self, request: Mapping[str, Any]) -> Mapping[str, Any]:
-        self._end("stopped by a request")
-        return {"recording": self.name}
 
     # Parts of `take`.
 
@@ -895,7 +770,7 @@ class Recorder:
         """Mark what is noted of the clock; alone it makes no recording."""
         while self._clock_marks and self._recorded_by_content and not self._over.is_set():
             text, tags, at = self._clock_marks.pop(0)
-            self._note(text, tags, at)
+            self._mark(Mark(new_random(), at, text, dict(tags)))
 
 
 def _cause_of(error: HybridlogError) -> Cause:
@@ -917,26 +792,3 @@ def check_room(free_bytes: int, reserve_bytes: int, coming_bytes: float = 0) -> 
 
 def _megabytes(count: float) -> str:
     return f"{count / 1e9:.1f} GB" if count >= 1e9 else f"{count / 1e6:.0f} MB"
-
-
-def summary_of(state: RecorderState) -> dict[str, Any]:
-    """A state as JSON, for scripts and other processes."""
-    return {
-        **{k: v for k, v in asdict(state).items() if k != "topics"},
-        "hz": state.hz,
-        "bytes_per_s": state.bytes_per_s,
-        "lost": dict(state.lost),
-        "taken": dict(state.taken),
-        "topics": [asdict(topic) for topic in state.topics],
-    }
-
-
-def state_of(summary: Mapping[str, Any]) -> RecorderState:
-    """The state of a summary; the inverse of `summary_of`.
-
-    Raises:
-        TypeError: The summary has other fields.
-    """
-    topics = [TopicState(**topic) for topic in summary["topics"]]
-    own = {key: value for key, value in summary.items() if key not in {"hz", "bytes_per_s"}}
-    return RecorderState(**{**own, "topics": topics})

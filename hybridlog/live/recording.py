@@ -192,6 +192,7 @@ class LiveRecording:
         self._taken: list[int] = []  # messages, by index of the channel
         self._first: list[int] = []  # log time of the first one
         self._last: list[int] = []  # log time of the last one
+        self._least = _MAX_NS  # log time of all
         self._inbox: deque[_Message] = deque()
         self._inbox_bytes = 0
         self._worth_waking = min(_WAKE_BYTES, options.budget_bytes // 4)
@@ -341,6 +342,7 @@ class LiveRecording:
             message = _Message(index, now, sent, sequence, payload)
             self._taken[index] += 1
             self._last[index] = now
+            self._least = min(self._least, now)
             self._taken_bytes += size
             if not at_once:
                 self._inbox.append(message)
@@ -386,9 +388,8 @@ class LiveRecording:
 
     @property
     def first_time(self) -> int | None:
-        """The least first log time of a channel, ns; None without messages."""
-        with self._lock:
-            return min(self._first, default=None)
+        """The least log time, ns; None without messages."""
+        return self._least if self._channels else None
 
     @property
     def is_empty(self) -> bool:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import threading
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -15,7 +13,6 @@ if TYPE_CHECKING:
 
 RULE: Final = "longest_gap"
 _MAX_INTERVAL_S: Final = 0.5
-_MAX_COMMANDS: Final = 8  # that run at the same time
 
 
 class Silence(NamedTuple):
@@ -106,32 +103,3 @@ class SilenceWatch:
     def silent(self) -> Sequence[str]:
         """Topics that are silent, as of the last look."""
         return sorted(self._reported)
-
-
-class Commands:
-    """Runs a command for each breach, beside the recorder.
-
-    Args:
-        words: The command; topic, rule and limit in seconds follow.
-    """
-
-    def __init__(self, words: Sequence[str]) -> None:
-        self._words = words
-        self._running: list[subprocess.Popen[bytes]] = []
-
-    def run(self, one: Silence) -> str:
-        """Start it; returns why that failed, or nothing."""
-        self._running = [process for process in self._running if process.poll() is None]
-        if not self._words:
-            return ""
-        if len(self._running) >= _MAX_COMMANDS:
-            return f"{self._words[0]} is not started: {_MAX_COMMANDS} of it run still"
-        words = [*self._words, one.topic, RULE, f"{one.limit / 1e9:g}"]
-        try:
-            process = subprocess.Popen(  # noqa: S603 - the user's own command
-                words, stdin=subprocess.DEVNULL, stdout=sys.stderr.fileno(), start_new_session=True
-            )
-        except (OSError, ValueError) as error:
-            return f"{self._words[0]} cannot be started: {error}"
-        self._running.append(process)
-        return ""

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
 from typing import TYPE_CHECKING
 
-from hybridlog.entries import free_name_in
+from hybridlog.entries import free_name_in, text
 from hybridlog.maintenance import tables
 from hybridlog.maintenance.index import remove_documents
 from hybridlog.query.times import TimeLike, format_time, parse_time
@@ -20,7 +20,15 @@ from hybridlog_storage.errors import (
     TimeError,
     UsageError,
 )
-from hybridlog_storage.manifest import MAX_MARKS, Manifest, Mark, new_random, replace, with_mark
+from hybridlog_storage.manifest import (
+    MAX_MARKS,
+    Manifest,
+    Mark,
+    Pin,
+    new_random,
+    replace,
+    with_mark,
+)
 from hybridlog_storage.mongo.index_state import IndexState
 
 if TYPE_CHECKING:
@@ -129,6 +137,48 @@ def mark(
     now = change(directory, catalog, entry, lambda known: with_mark(known, made))
     if all(one.id != made.id for one in now.marks):
         raise too_many_marks(entry.name)
+
+
+def mark_now(
+    directory: StoreDirectory,
+    recording: str,
+    now: int,
+    note: str,
+    tags: Mapping[str, str],
+    *,
+    around: tuple[int, int] | None = None,
+) -> str:
+    """Set a mark at the present moment of a recording that goes on.
+
+    Args:
+        directory: The store.
+        recording: Id of the recording.
+        now: Log time of the moment, ns.
+        note: Text of the mark.
+        tags: Tags of the mark.
+        around: Time before and after the moment that is marked and pinned, ns; None for none.
+
+    Returns:
+        The name of the recording.
+
+    Raises:
+        StoreError: The manifest cannot be written, or has as many marks as it can have.
+    """
+    key, said = new_random(), {text(one): text(value) for one, value in tags.items()}
+
+    def how(known: Manifest) -> Manifest:
+        if around is None:
+            return with_mark(known, Mark(key, now, text(note), said))
+        begin, end = max(now - around[0], 0), now + around[1]
+        pins = (*known.pins, Pin(key, begin, end, reason=text(note)))
+        # A mark from before the first message would become the beginning of the recording.
+        begin = max(begin, min(known.created, now))
+        return with_mark(replace(known, pins=pins), Mark(key, begin, text(note), said, end))
+
+    found = directory.manifests.change(recording, how)
+    if all(one.id != key for one in found.marks):
+        raise too_many_marks(found.name)
+    return found.name
 
 
 def too_many_marks(name: str) -> StoreError:

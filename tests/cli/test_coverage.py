@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 import hybridlog as hl
-from hybridlog.live.control_server import ControlServer
+from hybridlog.live.state import RecorderState, StateFile
 from hybridlog_storage.manifests import MANIFEST_OLD
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings
@@ -148,12 +149,8 @@ def test_messages_that_are_not_written_yet_are_counted(tmp_path: Path) -> None:
         for second in range(3):
             recording.write(KEPT, PAYLOAD, log_time=BEGIN_NS + second * SECOND_NS)
         wait_for(is_known)
-        state = {"taken": {"/kept": 15, "/other": 100}}
-        recorder = ControlServer(
-            tmp_path / "store", recording.id, "now", {"state": lambda _: state}
-        )
-        try:
-            done = run("fetch", "-t", "/kept", "--count", store=tmp_path / "store")
-        finally:
-            recorder.close()
+        nothing = RecorderState("now", 0, [], 0, 0, {}, 0, 0, 0, "", 0, 0)
+        says = StateFile(tmp_path / "store", recording.id)
+        says.write(replace(nothing, taken={"/kept": 15, "/other": 100}))
+        done = run("fetch", "-t", "/kept", "--count", store=tmp_path / "store")
     assert "now is being recorded: 12 messages not written yet" in done.err

@@ -29,7 +29,7 @@ from rich.console import Console
 
 from hybridlog.cli.app import app
 from hybridlog.cli.live_table import changes, closing_rows, drawn, summary
-from hybridlog.live.recorder import RecorderState
+from hybridlog.live.state import RecorderState
 from hybridlog.live.statistics import TopicState
 from hybridlog.record.recorder import RecordReport
 from hybridlog_storage.catalog import RecordingEntry
@@ -339,7 +339,7 @@ def test_a_recorder_is_visited(logs: Path, tmp_path: Path) -> None:
     assert json.loads(found.out.splitlines()[0])["text"] == "gripper slipped"
     for command in (["top"], ["mark", "x"]):
         assert "No recorder runs on this store" in run(*command, store=store, code=2).err
-        assert "nope is no store" in run(*command, store=store / "nope", code=5).err
+        assert "nope is not a hybridlog store" in run(*command, store=store / "nope", code=5).err
 
 
 def assert_it_is_told_as_it_is(store: Path) -> None:

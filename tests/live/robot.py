@@ -97,6 +97,7 @@ def main(store: str, name: str, segment_s: float, flush_s: float) -> None:
             topic, content, time = told
             channel = channels.setdefault(topic, text_channel(topic))
             speaker.say(channel, text(content), time)
+            recorder.look()
             print("done", flush=True)
 
 

@@ -9,6 +9,7 @@ import hybridlog as hl
 from hybridlog.live.clocks import MachineClock
 from hybridlog.live.recorder import Recorder, RecorderOptions
 from hybridlog.live.sources.base import LiveSource, Sink
+from hybridlog.maintenance.edit import mark_now
 from hybridlog_storage.messages import Channel, Schema
 
 TEXT = Schema("std_msgs/String", "ros1msg", b"string data\n")
@@ -72,3 +73,10 @@ class Recorded:
         self.said: list[str] = []
         self.recorder = Recorder(store, [self.speaker], options, self.said.append, *clock)
         self.recorder.start()
+        self.store = store
+
+    def mark(self, note: str, tags: dict[str, str], *around: int) -> str:
+        """Mark the present moment, as another process does."""
+        pair = (around[0], around[1]) if around else None
+        target, now = self.recorder._target, time.time_ns()
+        return mark_now(self.store.directory, target.id, now, note, tags, around=pair)

@@ -26,6 +26,7 @@ from hybridlog.contract import Contract, TopicRules
 from hybridlog.live import ring
 from hybridlog.live.recorder import Recorder, RecorderOptions
 from hybridlog.live.triggers import Trigger
+from hybridlog.maintenance.edit import mark_now
 from hybridlog.maintenance.retention import MIN_SEGMENT
 from hybridlog.maintenance.sizes import disk_bytes
 from hybridlog.record.marks import MARKS
@@ -113,6 +114,10 @@ class Robot:
             other.pin(self.recorder.name, *span, ["/camera"])
         self.note("pin", *span)
 
+    def mark(self) -> None:
+        recording = self.recorder._target.id
+        mark_now(self.store.directory, recording, self.clock.time, "slipped", {})
+
     def write(self, do: Any, fd: int, parts: list[memoryview], *where: int) -> int:
         if self.is_full and sum(map(len, parts)) > ROOM:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -126,7 +131,7 @@ class Robot:
         self.recorder.start()
         events: list[tuple[float, Any]] = [
             (0.3, self.pin),
-            (0.4, lambda: self.recorder.mark("slipped", {})),
+            (0.4, self.mark),
             (0.5, lambda: self.send("/bumper", 10**6, pressed=True)),
             (1.0, lambda: print("done", flush=True)),
         ]
@@ -252,7 +257,10 @@ def account(
                 end = max(sent_at for _, sent_at in messages.values())
                 span = ring_s(seconds, speed) * SECOND
                 assert all(end - sent_at > span for _, sent_at in missing.values())
-                assert [mark["text"] for mark in entry.marks][1:] == ["/bumper: pressed = true"]
+                assert [m["text"] for m in entry.marks if m["tags"].get("cause") != "clock"] == [
+                    "slipped",
+                    "/bumper: pressed = true",
+                ]
             else:
                 rows = entry.end["losses"]
                 for topic in SIZES:

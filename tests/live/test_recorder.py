@@ -8,7 +8,6 @@ import json
 import os
 import random
 import shutil
-import socket
 import threading
 import time
 from collections import Counter
@@ -22,10 +21,10 @@ from hybridlog.cli.live_options import recorder_options
 from hybridlog.cli.record import record_command
 from hybridlog.cli.record_choices import RecordChoices
 from hybridlog.live import recorder as recorder_module
-from hybridlog.live.control_server import choose, request, running
 from hybridlog.live.policy import priority_rule, throttle_rule
 from hybridlog.live.recorder import Recorder, RecorderOptions
 from hybridlog.live.recording import LiveOptions, LiveRecording
+from hybridlog.live.state import choose, read, running, summary_of
 from hybridlog.query.topics import matcher
 from hybridlog.record.losses import Cause, Loss
 from hybridlog.record.marks import MARKS
@@ -369,7 +368,7 @@ def test_a_source_that_cannot_work_leaves_nothing(store: hl.Store) -> None:
     assert speaker.stopped == 1
     store.refresh()
     assert store.recordings() == []
-    assert running(store.directory.path) == {}
+    assert running(store.directory) == {}
 
 
 @pytest.mark.parametrize(
@@ -382,7 +381,7 @@ def test_a_try_that_reached_nobody_leaves_nothing(
     running = Running(store)
     running.speaker.was_reached = is_reached
     if is_marked:
-        running.recorder.mark("here", {})
+        running.mark("here", {})
     assert len(running.recorder.stop()) == recordings
     store.refresh()
     assert len(store.recordings()) == recordings
@@ -395,7 +394,7 @@ def test_marks_are_messages_that_questions_use(store: hl.Store) -> None:
     now = time.time_ns()
     for number in range(10):
         robot.speaker.say(chatter, text(str(number)), now + (number - 5) * SECOND)
-    robot.recorder.mark("gripper slipped", {"trial": "7"})
+    robot.mark("gripper slipped", {"trial": "7"})
     robot.recorder.stop()
     marks = store.topic(MARKS).where("tags.trial = '7'")
     assert [m.fields["text"] for m in marks] == ["gripper slipped"]
@@ -407,42 +406,32 @@ def test_marks_are_messages_that_questions_use(store: hl.Store) -> None:
 def test_visitors(store: hl.Store) -> None:
     one, other = Running(store), Running(store)
     here = store.directory.path
-    ids = {name: recorder for recorder, name in running(here).items()}
+    for each in (one, other):
+        each.recorder.look()
+    ids = {name: recorder for recorder, name in running(store.directory).items()}
     assert ids.keys() == {one.recorder.name, other.recorder.name}
     name = ids[one.recorder.name]
-    assert choose(here, [one.recorder.name]) == choose(here, [name]) == [name]
+    assert choose(store.directory, [one.recorder.name]) == choose(store.directory, [name]) == [name]
     with pytest.raises(UsageError, match="Several recorders"):
-        choose(here, [])
+        choose(store.directory, [])
     with pytest.raises(UsageError, match="No running recorder matches"):
-        choose(here, ["nothing"])
+        choose(store.directory, ["nothing"])
     one.speaker.say(text_channel(), text("a"))
     one.recorder.look()
-    state = request(here, name, "state")
-    assert state["topics"][0]["messages"] == 1
-    assert recorder_module.summary_of(recorder_module.state_of(state)) == state
-    request(here, name, "mark", text="here", tags={})
-    for bad in ({"text": 1, "tags": {}}, {"text": "a", "tags": {"a": 1}}, {"text": "a"}):
-        with pytest.raises(UsageError, match="tags"):
-            request(here, name, "mark", **bad)
-    with pytest.raises(UsageError, match="choose one of: mark, state, stop"):
-        request(here, name, "dance")
-    # Who says nothing, or nonsense, or does not stop, is let go, and keeps nobody out.
-    path = json.loads((here / "recorders" / f"{name}.json").read_text())["socket"]
-    assert Path(path).stat().st_uid == os.geteuid()
-    assert not Path(path).parent.stat().st_mode & 0o077
-    with socket.socket(socket.AF_UNIX) as silent, socket.socket(socket.AF_UNIX) as wild:
-        silent.connect(path)
-        wild.connect(path)
-        wild.sendall(b"[" * 100_000 + b"\n")
-        assert b"unknown request" in wild.recv(1000)
-        assert request(here, name, "state")
-    request(here, name, "stop")
-    assert one.recorder.wait(1)
+    state = read(here, name)
+    assert state.topics[0].messages == 1
+    assert state.taken == {"/chatter": 1}
+    assert summary_of(state).keys() > {"hz", "taken"}
+    # A recorder that was killed leaves what it said; what is no recorder's is none.
+    (here / "recorders" / "20200101-killed-0123456789abcdef.json").write_text("{}")
+    (here / "recorders" / f"{other.recorder._target.id}.json").write_text("[" * 100_000)
+    with pytest.raises(StoreError, match="has not said"):
+        read(here, other.recorder._target.id)
     one.recorder.stop()
-    with pytest.raises(StoreError, match="does not answer"):
-        request(here, name, "state")
-    assert not Path(path).parent.exists()
-    assert [*running(here).values()] == [other.recorder.name]
+    with pytest.raises(StoreError, match="has not said"):
+        read(here, name)
+    assert [*running(store.directory).values()] == [other.recorder.name]
+    other.recorder.look()
     other.recorder.stop()
 
 
@@ -485,7 +474,7 @@ def test_fields_land_when_no_payload_finds_room(store: hl.Store, calls: Calls) -
 
 def test_a_mark_that_is_no_text(store: hl.Store) -> None:
     robot = Running(store)
-    robot.recorder.mark("bad\udcff\udcfebytes", {"a": "\udc80"})
+    robot.mark("bad\udcff\udcfebytes", {"a": "\udc80"})
     robot.rows()
     (message,) = store.topic(MARKS)
     assert json.loads(bytes(message.raw)) == {"text": r"bad\xff\xfebytes", "tags": {"a": r"\x80"}}

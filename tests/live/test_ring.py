@@ -180,7 +180,7 @@ def test_latched_messages_in_force_stay(plain: hl.Store) -> None:
 def test_marks_stay_whatever_goes(plain: hl.Store) -> None:
     robot = Robot(plain)
     robot.run(0.2)
-    robot.recorder.mark("slipped", {})
+    robot.mark("slipped", {})
     robot.run(1.2)
     robot.stop()
     assert [mark.fields["text"] for mark in plain.topic(MARKS)] == ["slipped"]

@@ -84,7 +84,7 @@ def test_marks_of_a_trigger_begin_no_recording_earlier(store: hl.Store) -> None:
 def test_what_a_person_marks_and_pins_is_stored_at_once(store: hl.Store) -> None:
     recorded = robot(store)
     recorded.speaker.say(text_channel(), text("first"))
-    name = recorded.recorder.mark("slipped", {"wheel": "left"}, (30, 10))
+    name = recorded.mark("slipped", {"wheel": "left"}, 30 * SECOND, 10 * SECOND)
     manifest = store.directory.manifests.read(store.entry(name).id)
     (mark,), (pin,) = manifest.marks, manifest.pins
     assert (mark.text, mark.tags) == ("slipped", {"wheel": "left"})

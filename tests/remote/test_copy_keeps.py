@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 
 import hybridlog as hl
-from hybridlog.live.control_server import choose
+from hybridlog.live.state import choose
 from hybridlog.maintenance.copying import CopyOptions
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import UsageError
+from hybridlog_storage.remote import directory_of
 from hybridlog_storage.remote.bucket import Bucket
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.cli.within import answer
@@ -47,9 +48,10 @@ def states(address: str | Path) -> dict[str, int]:
         return dict(Counter(str(one.state) for one in store.topic("scan")))
 
 
-def test_messages_have_addresses(address: str) -> None:
+def test_messages_have_addresses(robot: hl.Store, address: str) -> None:
+    robot.copy(address)
     with pytest.raises(UsageError, match=f"bucket of {address};"):
-        choose(Path(address), [])
+        choose(directory_of(Path(address)), [])
 
 
 def lose(address: str, *names: str) -> None:

@@ -242,11 +242,11 @@ def _unwritten(session: Session, questions: Sequence[Question]) -> tuple[int | N
 
 
 def _taken(session: Session, recording: RecordingSummary) -> dict[str, int] | None:
-    """Messages that a recorder has taken and not written, by topic; None if it does not answer."""
-    from hybridlog.live.control_server import request
+    """Messages that a recorder has taken and not written, by topic; None if it does not say it."""
+    from hybridlog.live.state import read
 
-    with suppress(HybridlogError, KeyError):  # no socket, or it has just begun or ended
-        taken = request(session.directory.path, recording.id, "state")["taken"]
+    with suppress(HybridlogError):  # it has just begun or ended, or is no recorder's
+        taken = read(session.directory.path, recording.id).taken
         written = session.entry_of(recording).messages_by_topic()
         return {topic: max(count - written[topic], 0) for topic, count in taken.items()}
     return None

@@ -1,0 +1,214 @@
+"""What a running recorder says of itself: a file of the store, which it replaces once a second.
+
+Other processes read it. Whether the recorder runs, the lock on its recording tells.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field
+from operator import attrgetter
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import msgspec
+
+from hybridlog.live.statistics import TopicState
+from hybridlog_storage.disk import files
+from hybridlog_storage.errors import HybridlogError, StoreError, UsageError
+from hybridlog_storage.stopping import pause
+
+if TYPE_CHECKING:
+    from hybridlog_storage.disk.directory import StoreDirectory
+    from hybridlog_storage.manifest import Manifest
+
+_FOLDER: Final = "recorders"
+_SUFFIX: Final = ".json"
+_MAX_BYTES: Final = 1 << 26
+
+
+@dataclass(frozen=True, slots=True)
+class RecorderState:
+    """State of a recorder at one time.
+
+    Attributes:
+        name: Name of the recorder: that of its recording.
+        elapsed_s: Seconds since its start.
+        topics: Topics with publishers or messages, by name.
+        messages: Messages received so far.
+        stored: Messages in chunks, or on their way to the disk.
+        lost: Messages lost so far, by cause, as far as they can be counted.
+        filled: Used share of the memory budget, 0 to 1.
+        lag: Messages that are not indexed yet.
+        late: Of these, the overdue ones: they wait longer than messages of slow topics do.
+        index_failure: The error that stopped the index; empty while it works.
+        free_bytes: Free space of the disk.
+        stored_bytes: Payload bytes stored so far.
+        stalled_s: Seconds for which received messages have waited for longer than the flush
+            interval, and nothing was written; 0 while writing goes on.
+        incidents: What was marked and pinned so far.
+        let_go: Messages that the ring has let go; None without a ring.
+        taken: Messages that are stored or will be, by topic.
+        silent: Topics that are silent for longer than the contract allows.
+        breaches: Such silences so far.
+        clock_set_s: Seconds by which the clock of this machine was set since the start.
+        memory_bytes: Memory of the recorder's process; 0 where that is unknown.
+        sim_time: Time of `/clock`, ns, 0 before it comes; None for the clock of the machine.
+    """
+
+    name: str
+    elapsed_s: float
+    topics: Sequence[TopicState]
+    messages: int
+    stored: int
+    lost: Mapping[str, int]
+    filled: float
+    lag: int
+    late: int
+    index_failure: str
+    free_bytes: int
+    stored_bytes: int
+    stalled_s: float = 0.0
+    incidents: int = 0
+    let_go: int | None = None
+    taken: Mapping[str, int] = field(default_factory=dict)
+    silent: Sequence[str] = ()
+    breaches: int = 0
+    clock_set_s: float = 0.0
+    memory_bytes: int = 0
+    sim_time: int | None = None
+
+    @property
+    def hz(self) -> float:
+        """Messages a second since the previous look."""
+        return sum(topic.hz for topic in self.topics)
+
+    @property
+    def bytes_per_s(self) -> float:
+        """Payload bytes a second since the previous look."""
+        return sum(topic.bytes_per_s for topic in self.topics)
+
+
+def summary_of(state: RecorderState) -> dict[str, Any]:
+    """A state as JSON, for scripts."""
+    return {**asdict(state), "hz": state.hz, "bytes_per_s": state.bytes_per_s}
+
+
+class StateFile:
+    """The file with the state of a recorder.
+
+    Args:
+        store: The store's directory.
+        recording: Id of its recording.
+    """
+
+    def __init__(self, store: Path, recording: str) -> None:
+        self._path = _path(store, recording)
+
+    def write(self, state: RecorderState) -> None:
+        """Replace it; on a full disk the last one stays."""
+        with suppress(OSError):
+            with suppress(FileExistsError):
+                files.make_folder(self._path.parent)
+            files.write_file(self._path, msgspec.json.encode(state), sync=False)
+
+    def remove(self) -> None:
+        """Remove it: the recorder ends."""
+        with suppress(OSError):
+            files.unlink(self._path)
+
+
+def read(store: Path, recording: str) -> RecorderState:
+    """The last state of a recorder, by the id of its recording.
+
+    Raises:
+        StoreError: It has just begun or ended, or the file is damaged.
+    """
+    try:
+        content = files.read_file(_path(store, recording), _MAX_BYTES)
+        return msgspec.json.decode(content, type=RecorderState)
+    except (OSError, ValueError, RecursionError) as error:
+        raise StoreError(f"The recorder of {recording} has not said how it is.") from error
+
+
+def running(directory: StoreDirectory) -> dict[str, str]:
+    """Names of the recordings that recorders write, by their ids, in the order of their start."""
+    found: list[Manifest] = []
+    with suppress(OSError):
+        for file in files.names(directory.path / _FOLDER):
+            recording = file.removesuffix(_SUFFIX)
+            # A recorder that was killed leaves its file behind.
+            with suppress(HybridlogError):
+                if directory.is_recorded(recording):
+                    found.append(directory.manifests.read(recording))
+    return {one.id: one.name for one in sorted(found, key=attrgetter("created"))}
+
+
+def states(
+    directory: StoreDirectory, recording: str, every_s: float
+) -> Iterator[RecorderState | None]:
+    """Poll the state of a recorder until it ends; None before it has said one."""
+    while directory.is_recorded(recording):
+        started = time.monotonic()
+        state: RecorderState | None = None
+        with suppress(StoreError):
+            state = read(directory.path, recording)
+        yield state
+        pause(max(every_s - (time.monotonic() - started), 0))
+
+
+def choose(directory: StoreDirectory, named: Sequence[str]) -> list[str]:
+    """The ids of recordings that recorders write; without names, the only one.
+
+    Args:
+        directory: The store.
+        named: Names by the user: id or name of a recording, the beginning of one, or that of
+            the digits of its id.
+
+    Raises:
+        UsageError: No recorder runs, several run and no name is given, or a name matches
+            none or several.
+    """
+    if directory.is_remote:
+        raise UsageError(
+            f"No recorder runs in the bucket of {directory.path}; `hybridlog mark --at` marks "
+            "recordings there."
+        )
+    names = running(directory)
+    if named:
+        return list(dict.fromkeys(_resolve(name, names) for name in named))
+    if not names:
+        raise UsageError("No recorder runs on this store; start one with `hybridlog record`.")
+    if len(names) > 1:
+        raise UsageError(f"Several recorders run; name one of {', '.join(names.values())}.")
+    return [*names]
+
+
+def _resolve(name: str, recorders: Mapping[str, str]) -> str:
+    """The id of the running recorder that a user's name means.
+
+    Raises:
+        UsageError: No recorder matches, or several do.
+    """
+    fitting = (
+        [one for one, known in recorders.items() if name in {one, known}]
+        or [one for one, known in recorders.items() if name and known.startswith(name)]
+        or [
+            one
+            for one in recorders
+            if name and (one.startswith(name) or one[-16:].startswith(name))
+        ]
+    )
+    if len(fitting) > 1:
+        found = ", ".join(recorders[one] for one in fitting)
+        raise UsageError(f"{name!r} is ambiguous: it may be {found}.")
+    if not fitting:
+        known = ", ".join(recorders.values()) or "none"
+        raise UsageError(f"No running recorder matches {name!r}; running: {known}.")
+    return fitting[0]
+
+
+def _path(store: Path, recording: str) -> Path:
+    return store / _FOLDER / f"{recording}{_SUFFIX}"
