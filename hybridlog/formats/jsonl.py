@@ -13,12 +13,12 @@ import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from datetime import date, timedelta
-from itertools import chain
+from itertools import chain, repeat
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hybridlog.formats.writing import FileWriter, Line, Sink, Target
+from hybridlog.formats.writing import Answer, Line, Sink, Target
 from hybridlog.schema.text import without_nan
 from hybridlog_storage.errors import UsageError
 
@@ -30,72 +30,43 @@ _BLOCK = 1 << 20
 _ROWS = 4096
 
 
-class JsonlWriter(FileWriter):
-    """Writes JSON lines."""
-
-    end = "\n"
-    """What follows a line."""
-
-    def __init__(self, target: Target) -> None:
-        super().__init__()
-        self._sink = Sink(target)
-
-    def write(self, lines: Iterable[Line]) -> None:
-        """Append lines, without their ends.
-
-        Raises:
-            DiskFullError: No space left.
-        """
-        block: list[str] = []
-        size, end = 0, self.end
-        for piece in chain.from_iterable(
-            (f"{line}{end}",) if isinstance(line, str) else chain(line, end) for line in lines
-        ):
-            block.append(piece)
-            size += len(piece)
-            if size >= _BLOCK:
-                self._sink.write("".join(block).encode("utf-8", "backslashreplace"))
-                block, size = [], 0
-        # A lone surrogate becomes the escape that JSON has for it.
-        self._sink.write("".join(block).encode("utf-8", "backslashreplace"))
-
-    def flush(self) -> None:
-        """Pass on the lines so far."""
-        self._sink.flush()
-
-    def _finish(self) -> None:
-        self._sink.commit()
-
-    def _discard(self) -> None:
-        self._sink.abort()
+def write_jsonl(answer: Answer, target: Target) -> None:
+    """Write JSON lines."""
+    with Sink(target) as sink:
+        for lines in answer.lines:
+            _write(
+                sink, (chain((line,) if isinstance(line, str) else line, "\n") for line in lines)
+            )
+            if answer.is_live:
+                sink.flush()
 
 
-class JsonWriter(JsonlWriter):
-    """Writes the same objects as one list, a line each."""
+def write_json(answer: Answer, target: Target) -> None:
+    """Write the same objects as one list, a line each."""
+    with Sink(target) as sink:
+        between = chain(("[\n  ",), repeat(",\n  "))
+        for lines in answer.lines:
+            _write(
+                sink,
+                (
+                    chain((next(between),), (line,) if isinstance(line, str) else line)
+                    for line in lines
+                ),
+            )
+        sink.write(b"\n]\n" if sink.tell() else b"[]\n")
 
-    end = ""
 
-    def __init__(self, target: Target) -> None:
-        super().__init__(target)
-        self._between = "[\n  "
-
-    def write(self, lines: Iterable[Line]) -> None:
-        """Append elements of the list.
-
-        Raises:
-            DiskFullError: No space left.
-        """
-        super().write(self._elements(lines))
-
-    def _elements(self, lines: Iterable[Line]) -> Iterator[Line]:
-        for line in lines:
-            yield self._between
-            yield line
-            self._between = ",\n  "
-
-    def _finish(self) -> None:
-        self._sink.write(b"[]\n" if self._between.startswith("[") else b"\n]\n")
-        super()._finish()
+def _write(sink: Sink, pieces: Iterable[Iterable[str]]) -> None:
+    block: list[str] = []
+    size = 0
+    for piece in chain.from_iterable(pieces):
+        block.append(piece)
+        size += len(piece)
+        if size >= _BLOCK:
+            sink.write("".join(block).encode("utf-8", "backslashreplace"))
+            block, size = [], 0
+    # A lone surrogate becomes the escape that JSON has for it.
+    sink.write("".join(block).encode("utf-8", "backslashreplace"))
 
 
 def rows_within(size: int, rows: int) -> int:
