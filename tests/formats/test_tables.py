@@ -6,7 +6,6 @@ import json
 import math
 import random
 import zipfile
-from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import numpy as np
@@ -269,30 +268,19 @@ def test_json_text_is_what_json_reads(rows: list[dict[str, object]], cut: int) -
 def test_jsonl() -> None:
     stream = io.BytesIO()
     rows = [
-        {"nan": math.nan, "deep": [{"inf": -math.inf, "ok": 1}], "tuple": (math.nan,)},
-        {"big": 2**64 - 1, "i": np.int64(2**63 - 1), "f": np.float32(0.5), "n": np.float64("nan")},
-        {"a": np.array([1, 2]), "m": np.array([[1.0, math.nan]]), "b": np.bool_(True)},
-        {"bytes": b"abc", "view": memoryview(b"abcd"), "s": "é\ud800\n", "none": None},
-        {"t": datetime(2015, 3, 3, tzinfo=UTC), "d": timedelta(seconds=1.5)},
-        {"t64": np.datetime64(T, "ns"), "set": frozenset([1])},
+        {"nan": math.nan, "deep": [{"inf": -math.inf, "ok": 1}], "b": True},
+        {"big": 2**64 - 1, "bytes": b"abc", "s": "é\ud800\n", "none": None},
     ]
     write_jsonl(Answer(lines=[map(json_line, rows)]), stream)
     lines = stream.getvalue().decode().splitlines()
     assert [json.loads(line, parse_constant=pytest.fail) for line in lines] == [
-        {"nan": "NaN", "deep": [{"inf": "-Infinity", "ok": 1}], "tuple": ["NaN"]},
-        {"big": 2**64 - 1, "i": 2**63 - 1, "f": 0.5, "n": "NaN"},
-        {"a": [1, 2], "m": [[1.0, "NaN"]], "b": True},
-        {"bytes": "YWJj", "view": "YWJjZA==", "s": "é\ud800\n", "none": None},
-        {"t": "2015-03-03T00:00:00+00:00", "d": 1.5},
-        {"t64": T, "set": [1]},
+        {"nan": "NaN", "deep": [{"inf": "-Infinity", "ok": 1}], "b": True},
+        {"big": 2**64 - 1, "bytes": "YWJj", "s": "é\ud800\n", "none": None},
     ]
-
-
-def test_jsonl_refuses() -> None:
     deep: object = 1
     for _ in range(100_000):
         deep = [deep]
-    for value in (object(), 1j, deep, [math.nan, deep]):
+    for value in (deep, [math.nan, deep]):
         with pytest.raises(UsageError):
             json_line({"a": value})
 
