@@ -6,13 +6,13 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import chain, groupby, islice
 from operator import itemgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Final
+from typing import TYPE_CHECKING, Any, BinaryIO, ClassVar, Final, TypeVar, cast
 
 import click
 
@@ -22,30 +22,17 @@ from hybridlog.cli.options import VERBOSE, AsJson, Forced, Topics
 from hybridlog.cli.progress import Bar, progress_bar
 from hybridlog.cli.signals import if_stopped
 from hybridlog.formats import OUTPUTS, formats_of, is_directory, suffixes_of
-from hybridlog.formats.slices import (
-    IN_FORCE,
-    Front,
-    add_extras,
-    batches_of,
-    payload_bytes,
-    profile_of,
-)
+from hybridlog.formats.slices import IN_FORCE, Front, log_of, payload_bytes
+from hybridlog.formats.writing import Answer
 from hybridlog_storage.disk.unfinished import is_published, undone
-from hybridlog_storage.errors import DefinitionError, HybridlogError, PayloadError, UsageError
+from hybridlog_storage.errors import PayloadError, UsageError
 from hybridlog_storage.stopping import anywhere
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
     from hybridlog.attachments import Extras
-    from hybridlog.formats.writing import (
-        Line,
-        LineWriter,
-        LogWriter,
-        PictureWriter,
-        TableWriter,
-        Target,
-    )
+    from hybridlog.formats.writing import Line, Target
     from hybridlog.message import Message
     from hybridlog.query.answers.completeness import Completeness
     from hybridlog.query.answers.follow import Following
@@ -53,6 +40,7 @@ if TYPE_CHECKING:
     from hybridlog.query.query import Query
     from hybridlog.sql.engine import SqlAnswer
     from hybridlog.store import Store
+    from hybridlog_storage.messages import Buffer
 
 
 SCREEN: Final = "table"
@@ -65,22 +53,7 @@ TABLE_FORMATS: Final = formats_of("lines", "table")
 _LISTING_FORMATS: Final = [name for name in TABLE_FORMATS if not OUTPUTS[name].is_of_places]
 """Those of rows that have no place."""
 
-Progress = Callable[[], None]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Rows:
-    """The rows of an answer in the forms that formats take.
-
-    Attributes:
-        lines: Gives a JSON object a row, some at a time.
-        tables: Gives the rows as tables.
-        schema: Gives the columns; None where only the rows tell them.
-    """
-
-    lines: Callable[[], Iterable[Sequence[Line]]]
-    tables: Callable[[], Iterable[pa.Table]]
-    schema: Callable[[], pa.Schema | None]
+_T = TypeVar("_T")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -364,12 +337,8 @@ def answer_tables(
     quiet = to.quiet or to.path is None
     with to.opened() as target, progress_bar(to.form, None, quiet=quiet) as bar:
         counted = _with_progress(limited, bar)
-        rows = Rows(
-            lines=lambda: chain.from_iterable(map(_lines_of, counted)),
-            tables=lambda: counted,
-            schema=schema,
-        )
-        _write_rows(rows, to.form, target, lambda: None)
+        columns = schema() if OUTPUTS[to.form].content == "table" else None
+        OUTPUTS[to.form].write(_rows(counted, columns), target)
 
 
 def answer_sql(answer: SqlAnswer, to: Destination) -> None:
@@ -407,39 +376,46 @@ def write_answer(
     Returns:
         Messages that are missing, because they do not fit their definition.
     """
-
-    def objects() -> Iterator[list[Line]]:
-        from hybridlog.frames.lines import lines
-        from hybridlog.query.planner import Planner
-
-        query.counters.reset()
-        yield from lines(Planner(query.session, query.question, query.counters))
-
     if query.question.frame is not None:
         _write_in_frame(query, form, target, strict=strict)
         return 0
-    content = OUTPUTS[form].content
+    to, counters = OUTPUTS[form], query.counters
     total = 0 if quiet else payload_bytes(query)
     with progress_bar(form, total, quiet=quiet) as bar:
-        counters = query.counters
 
-        def progress() -> None:
-            bar(counters.payload_bytes, output.counted(counters.messages, "message"))
+        def told(pieces: Iterable[_T]) -> Iterator[_T]:
+            for piece in pieces:
+                yield piece
+                bar(counters.payload_bytes, output.counted(counters.messages, "message"))
 
-        if content in {"pictures", "video"}:
-            _write_pictures(query, form, target, progress, front)
+        if to.content in {"pictures", "video"}:
+            _write_pictures(query, form, target, told, front)
             return 0
-        if content in {"log", "payloads"}:
-            before = front if content == "log" else Front(latched=False)
-            _write_messages(
-                query, form, target, progress, front=before, extras=extras, settings=settings or {}
-            )
+        if to.content in {"log", "payloads"}:
+            log = log_of(query, front if to.content == "log" else Front(latched=False), extras)
+            log.batches = told(log.batches)
+            to.write(log, target, **settings or {})
+            output.notes(log.notes)
             return 0
-        columns = _schema_of(query) if content == "table" else None
-        rows = Rows(lines=objects, tables=query.to_tables, schema=lambda: columns)
-        written = _write_rows(rows, form, target, progress)
-    from hybridlog.frames.answer import json_columns
+        from hybridlog.frames.answer import json_columns
+        from hybridlog.frames.lines import lines
+        from hybridlog.query.planner import Planner
 
+        columns, written = None, 0
+
+        def counting(pieces: Iterable[Any]) -> Iterator[Any]:
+            nonlocal written
+            for piece in told(pieces):
+                yield piece
+                written += len(piece)
+
+        if to.content == "table":
+            columns = _schema_of(query)
+            to.write(Answer(tables=counting(query.to_tables()), schema=columns), target)
+        else:
+            counters.reset()
+            planner = Planner(query.session, query.question, counters)
+            to.write(Answer(lines=counting(lines(planner))), target)
     for name in json_columns(columns):
         output.note(f"{name} has values of several types: it is written as JSON text.")
     return counters.messages - counters.reduced - written
@@ -447,35 +423,27 @@ def write_answer(
 
 def _write_in_frame(query: Query, form: str, target: Target, *, strict: bool) -> None:
     """Write points and poses in the frame of the question."""
+    completeness = query.completeness if strict else None
     if OUTPUTS[form].content != "payloads":
-        tables = _checked(query.to_tables(), query.completeness if strict else None)
-        rows = Rows(
-            lines=lambda: chain.from_iterable(map(_lines_of, tables)),
-            tables=lambda: tables,
-            schema=lambda: None,
-        )
-        _write_rows(rows, form, target, lambda: None)
+        OUTPUTS[form].write(_rows(_checked(query.to_tables(), completeness)), target)
         return
     from hybridlog.tf.in_frame import points_of
 
     query.counters.reset()
-    with OUTPUTS[form].open(target) as writer:
-        for one in points_of(query.session, query.question, query.counters):
-            message = one.message
-            writer.add_points(one.points, message.topic, message.type, message.log_time_ns)
-        if strict:
-            query.completeness().check()
+    points = (
+        (one.points, one.message.topic, one.message.type, one.message.log_time_ns)
+        for one in points_of(query.session, query.question, query.counters)
+    )
+    OUTPUTS[form].write(Answer(points=_checked(points, completeness)), target)
 
 
-def _checked(
-    tables: Iterable[pa.Table], completeness: Callable[[], Completeness] | None
-) -> Iterator[pa.Table]:
-    """The tables of an answer, which is checked behind the last one: before a file is complete.
+def _checked(pieces: Iterable[_T], completeness: Callable[[], Completeness] | None) -> Iterator[_T]:
+    """An answer that is checked behind its last piece: before a file is complete.
 
     Raises:
         IncompleteError: Poses have no transform, or messages are lost.
     """
-    yield from tables
+    yield from pieces
     if completeness is not None:
         completeness().check()
 
@@ -485,55 +453,27 @@ def write_following(following: Following, form: str) -> None:
     from hybridlog.frames.answer import stream
     from hybridlog.frames.lines import lines
 
-    rows = Rows(
-        lines=lambda: lines(following),
-        tables=lambda: stream(following, at_once=True),
-        schema=lambda: None,
-    )
-    _write_rows(rows, form, sys.stdout.buffer, lambda: None, is_live=True)
+    answer = Answer(lines=lines(following), tables=stream(following, at_once=True), is_live=True)
+    OUTPUTS[form].write(answer, cast("BinaryIO", _Anywhere()))
 
 
-def _write_rows(
-    rows: Rows, form: str, target: Target, progress: Progress, *, is_live: bool = False
-) -> int:
-    """Write rows as lines or tables; returns how many."""
-    found, written = OUTPUTS[form], 0
-    writer: LineWriter | TableWriter
-    pieces: Iterable[Any]
-    if found.content == "lines":
-        writer, pieces = found.open(target), rows.lines()
-    else:
-        writer, pieces = found.open(target, schema=rows.schema()), rows.tables()
-    with writer:
-        for piece in pieces:
-            with anywhere() if is_live else nullcontext():
-                writer.write(piece)
-                if is_live:
-                    writer.flush()
-            written += len(piece)
-            progress()
-    return written
+class _Anywhere:
+    """Standard output; signals may stop the process while it waits for the reader."""
+
+    name = "standard output"
+
+    def write(self, data: Buffer) -> int:
+        with anywhere():
+            return sys.stdout.buffer.write(data)
+
+    def flush(self) -> None:
+        with anywhere():
+            sys.stdout.buffer.flush()
 
 
-def _write_messages(
-    query: Query,
-    form: str,
-    target: Target,
-    progress: Progress,
-    *,
-    front: Front,
-    extras: Extras | None,
-    settings: Mapping[str, Any],
-) -> None:
-    found = OUTPUTS[form]
-    profile = {"profile": profile_of(query)} if found.has_profile else {}
-    log: LogWriter
-    with found.open(target, **profile, **settings) as log:
-        if extras is not None:
-            output.notes(add_extras(log, extras))
-        for batch, channels in batches_of(query, front):
-            log.write(batch, channels)
-            progress()
+def _rows(tables: Iterable[pa.Table], schema: pa.Schema | None = None) -> Answer:
+    """Tables as they are, or as lines."""
+    return Answer(lines=chain.from_iterable(map(_lines_of, tables)), tables=tables, schema=schema)
 
 
 def _schema_of(query: Query) -> pa.Schema | None:
@@ -546,7 +486,11 @@ def _schema_of(query: Query) -> pa.Schema | None:
 
 
 def _write_pictures(
-    query: Query, form: str, target: Target, progress: Progress, front: Front
+    query: Query,
+    form: str,
+    target: Target,
+    told: Callable[[Iterable[Message]], Iterator[Message]],
+    front: Front,
 ) -> None:
     """Write the images; messages that are unreadable are left out and told.
 
@@ -556,18 +500,17 @@ def _write_pictures(
         DefinitionError: the same.
     """
     from hybridlog.arrays.message_arrays import IMAGES
-    from hybridlog.formats.raw import DirectoryWriter
     from hybridlog.query.answers.video import frames_in_front
     from hybridlog.schema.states import without_payload
 
     before: list[Message] = []
     if OUTPUTS[form].content == "video" and front.latched:
         before = frames_in_front(query.session, query.question)
-    written = left_out = 0
-    missing = ""
-    refused: HybridlogError | None = None
-    images: PictureWriter
-    with OUTPUTS[form].open(target) as images:
+    answer = Answer()
+    is_folder = isinstance(target, str | os.PathLike) and is_directory(form, Path(target))
+
+    def images() -> Iterator[Message]:
+        given, missing = 0, ""
         for message in chain(before, query):
             if message.type.replace("/msg/", "/") not in IMAGES:
                 raise UsageError(
@@ -578,22 +521,23 @@ def _write_pictures(
                 query.counters.leave_out(1, message.state)
                 missing = without_payload(query.counters.reduced, message.state)
                 continue
-            try:
-                images.write(message)
-            except (PayloadError, DefinitionError) as error:
-                refused = refused or error
-                left_out += 1
-                continue
-            written += 1
-            progress()
-        if refused is not None and not written:
-            raise refused
-        if missing and not written and not isinstance(images, DirectoryWriter):
-            raise PayloadError(f"{missing}: there is no picture")
+            yield message
+            given += 1
+        if given == len(answer.unreadable):
+            if answer.unreadable:
+                raise answer.unreadable[0]
+            if missing and not is_folder:
+                raise PayloadError(f"{missing}: there is no picture")
+
+    answer.messages = told(images())
+    OUTPUTS[form].write(answer, target)
     query.counters.frames += len(before)
-    if refused is not None:
+    if left_out := len(answer.unreadable):
         are = "is" if left_out == 1 else "are"
-        output.note(f"{output.counted(left_out, 'message')} {are} left out; the first: {refused}.")
+        output.note(
+            f"{output.counted(left_out, 'message')} {are} left out; the first: "
+            f"{answer.unreadable[0]}."
+        )
 
 
 def _with_progress(tables: Iterable[pa.Table], bar: Bar) -> Iterator[pa.Table]:

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from hybridlog.formats.reading import Source
-    from hybridlog.formats.writing import Target
+    from hybridlog.formats.writing import Answer, Target
 
 Content: TypeAlias = Literal["lines", "table", "log", "payloads", "pictures", "video"]
 
@@ -93,14 +93,13 @@ class OutputFormat:
     """An output format.
 
     Attributes:
-        content: What its writer takes: `lines` of JSON, one a message; Arrow tables (`table`);
-            batches of messages for a `log`, or for a file a payload (`payloads`); messages that
-            are images, for `pictures` or a `video`.
-        writer: The writer, as `module:name`. Called with a path or a binary stream, and with
-            the `schema` of tables.
+        content: What it takes of an `Answer`: `lines` of JSON; tables (`table`); batches of
+            messages for a `log`, or for a file a payload (`payloads`); messages that are
+            images, for `pictures` or a `video`.
+        writer: Writes an answer, as `module:name`. Called with an `Answer` and a path or a
+            binary stream.
         suffixes: Suffixes of file names, the usual one first; none if it writes a directory.
         is_text: It can be read on a terminal, and written a message at a time.
-        has_profile: The writer takes the MCAP `profile` of the messages, too.
         is_of_places: It is for poses and places alone.
     """
 
@@ -108,49 +107,45 @@ class OutputFormat:
     writer: str
     suffixes: tuple[str, ...]
     is_text: bool = False
-    has_profile: bool = False
     is_of_places: bool = False
 
-    def open(self, target: Target, **options: Any) -> Any:
-        """Open a writer of `hybridlog.formats.writing`, according to `content`.
+    def write(self, answer: Answer, target: Target, **settings: Any) -> None:
+        """Write an answer, all of it or nothing.
 
         Raises:
-            UsageError: The target cannot be written.
+            DiskFullError: No space left.
+            UsageError: The target cannot be written, or the format cannot hold the answer.
         """
-        return resolve_name(self.writer)(target, **options)
+        resolve_name(self.writer)(answer, target, **settings)
 
 
 OUTPUTS: Final[dict[str, OutputFormat]] = {
     "jsonl": OutputFormat(
-        "lines", "hybridlog.formats.jsonl:JsonlWriter", (".jsonl", ".ndjson"), is_text=True
+        "lines", "hybridlog.formats.jsonl:write_jsonl", (".jsonl", ".ndjson"), is_text=True
     ),
-    "json": OutputFormat("lines", "hybridlog.formats.jsonl:JsonWriter", (".json",), is_text=True),
-    "csv": OutputFormat("table", "hybridlog.formats.tables:CsvWriter", (".csv",), is_text=True),
-    "parquet": OutputFormat("table", "hybridlog.formats.tables:ParquetWriter", (".parquet",)),
-    "arrow": OutputFormat("table", "hybridlog.formats.tables:ArrowWriter", (".arrow", ".feather")),
-    "npz": OutputFormat("table", "hybridlog.formats.npz:NpzWriter", (".npz",)),
-    "mcap": OutputFormat(
-        "log", "hybridlog.formats.mcap.writer:McapWriter", (".mcap",), has_profile=True
-    ),
-    "bag": OutputFormat("log", "hybridlog.formats.rosbag1.writer:BagWriter", (".bag",)),
-    "rosbag2": OutputFormat("log", "hybridlog.formats.rosbag2.writer:Rosbag2Writer", ()),
+    "json": OutputFormat("lines", "hybridlog.formats.jsonl:write_json", (".json",), is_text=True),
+    "csv": OutputFormat("table", "hybridlog.formats.tables:write_csv", (".csv",), is_text=True),
+    "parquet": OutputFormat("table", "hybridlog.formats.tables:write_parquet", (".parquet",)),
+    "arrow": OutputFormat("table", "hybridlog.formats.tables:write_arrow", (".arrow", ".feather")),
+    "npz": OutputFormat("table", "hybridlog.formats.npz:write_npz", (".npz",)),
+    "mcap": OutputFormat("log", "hybridlog.formats.mcap.writer:write_mcap", (".mcap",)),
+    "bag": OutputFormat("log", "hybridlog.formats.rosbag1.writer:write_bag", (".bag",)),
+    "rosbag2": OutputFormat("log", "hybridlog.formats.rosbag2.writer:write_rosbag2", ()),
     "tum": OutputFormat(
-        "table", "hybridlog.formats.places:TumWriter", (".tum",), is_text=True, is_of_places=True
+        "table", "hybridlog.formats.places:write_tum", (".tum",), is_text=True, is_of_places=True
     ),
     "geojson": OutputFormat(
         "table",
-        "hybridlog.formats.places:GeoJsonWriter",
+        "hybridlog.formats.places:write_geojson",
         (".geojson",),
         is_text=True,
         is_of_places=True,
     ),
-    "ply": OutputFormat("payloads", "hybridlog.formats.ply:PlyWriter", ()),
-    "raw": OutputFormat("payloads", "hybridlog.formats.raw:open_raw_writer", ()),
-    "png": OutputFormat("pictures", "hybridlog.formats.pictures:open_png_writer", (".png",)),
-    "jpg": OutputFormat(
-        "pictures", "hybridlog.formats.pictures:open_jpg_writer", (".jpg", ".jpeg")
-    ),
-    "mp4": OutputFormat("video", "hybridlog.formats.mp4:Mp4Writer", (".mp4",)),
+    "ply": OutputFormat("payloads", "hybridlog.formats.ply:write_ply", ()),
+    "raw": OutputFormat("payloads", "hybridlog.formats.raw:write_raw", ()),
+    "png": OutputFormat("pictures", "hybridlog.formats.pictures:write_png", (".png",)),
+    "jpg": OutputFormat("pictures", "hybridlog.formats.pictures:write_jpg", (".jpg", ".jpeg")),
+    "mp4": OutputFormat("video", "hybridlog.formats.mp4:write_mp4", (".mp4",)),
 }
 """Every output format by its name for `--format`."""
 

@@ -10,92 +10,58 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from collections.abc import Set as AbstractSet
-from datetime import date, timedelta
-from itertools import chain
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable, Iterator, Mapping
+from itertools import chain, repeat
+from typing import TYPE_CHECKING
 
-import numpy as np
-
-from hybridlog.formats.writing import FileWriter, Line, Sink, Target
+from hybridlog.formats.writing import Answer, Line, Sink, Target
 from hybridlog.schema.text import without_nan
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-_MAX_DEPTH = 200
 _BLOCK = 1 << 20
 _ROWS = 4096
 
 
-class JsonlWriter(FileWriter):
-    """Writes JSON lines."""
-
-    end = "\n"
-    """What follows a line."""
-
-    def __init__(self, target: Target) -> None:
-        super().__init__()
-        self._sink = Sink(target)
-
-    def write(self, lines: Iterable[Line]) -> None:
-        """Append lines, without their ends.
-
-        Raises:
-            DiskFullError: No space left.
-        """
-        block: list[str] = []
-        size, end = 0, self.end
-        for piece in chain.from_iterable(
-            (f"{line}{end}",) if isinstance(line, str) else chain(line, end) for line in lines
-        ):
-            block.append(piece)
-            size += len(piece)
-            if size >= _BLOCK:
-                self._sink.write("".join(block).encode("utf-8", "backslashreplace"))
-                block, size = [], 0
-        # A lone surrogate becomes the escape that JSON has for it.
-        self._sink.write("".join(block).encode("utf-8", "backslashreplace"))
-
-    def flush(self) -> None:
-        """Pass on the lines so far."""
-        self._sink.flush()
-
-    def _finish(self) -> None:
-        self._sink.commit()
-
-    def _discard(self) -> None:
-        self._sink.abort()
+def write_jsonl(answer: Answer, target: Target) -> None:
+    """Write JSON lines."""
+    with Sink(target) as sink:
+        for lines in answer.lines:
+            _write(
+                sink, (chain((line,) if isinstance(line, str) else line, "\n") for line in lines)
+            )
+            if answer.is_live:
+                sink.flush()
 
 
-class JsonWriter(JsonlWriter):
-    """Writes the same objects as one list, a line each."""
+def write_json(answer: Answer, target: Target) -> None:
+    """Write the same objects as one list, a line each."""
+    with Sink(target) as sink:
+        between = chain(("[\n  ",), repeat(",\n  "))
+        for lines in answer.lines:
+            _write(
+                sink,
+                (
+                    chain((next(between),), (line,) if isinstance(line, str) else line)
+                    for line in lines
+                ),
+            )
+        sink.write(b"\n]\n" if sink.tell() else b"[]\n")
 
-    end = ""
 
-    def __init__(self, target: Target) -> None:
-        super().__init__(target)
-        self._between = "[\n  "
-
-    def write(self, lines: Iterable[Line]) -> None:
-        """Append elements of the list.
-
-        Raises:
-            DiskFullError: No space left.
-        """
-        super().write(self._elements(lines))
-
-    def _elements(self, lines: Iterable[Line]) -> Iterator[Line]:
-        for line in lines:
-            yield self._between
-            yield line
-            self._between = ",\n  "
-
-    def _finish(self) -> None:
-        self._sink.write(b"[]\n" if self._between.startswith("[") else b"\n]\n")
-        super()._finish()
+def _write(sink: Sink, pieces: Iterable[Iterable[str]]) -> None:
+    block: list[str] = []
+    size = 0
+    for piece in chain.from_iterable(pieces):
+        block.append(piece)
+        size += len(piece)
+        if size >= _BLOCK:
+            sink.write("".join(block).encode("utf-8", "backslashreplace"))
+            block, size = [], 0
+    # A lone surrogate becomes the escape that JSON has for it.
+    sink.write("".join(block).encode("utf-8", "backslashreplace"))
 
 
 def rows_within(size: int, rows: int) -> int:
@@ -142,59 +108,19 @@ def _pieces(row: Mapping[str, object]) -> Iterator[str]:
 
 
 def json_line(row: object) -> str:
-    """A value as one line of JSON, without its end.
+    """A plain value, as of `Decoded.plain`, as one line of JSON, without its end.
 
     Raises:
-        UsageError: A value that has no JSON form.
+        UsageError: It is nested too deep.
     """
     try:
-        return json.dumps(row, ensure_ascii=False, allow_nan=False, default=_plain)
-    except ValueError:  # NaN or an infinity; rare, so it is looked for only then
-        return json.dumps(_clean(row, 0), ensure_ascii=False, default=_plain)
+        try:
+            return json.dumps(row, ensure_ascii=False, allow_nan=False, default=_base64)
+        except ValueError:  # NaN or an infinity; rare, so it is looked for only then
+            return json.dumps(without_nan(row), ensure_ascii=False, default=_base64)
     except RecursionError:
         raise UsageError("a message is nested too deep for JSON") from None
 
 
-def _plain(value: object) -> object:
-    """Convert a value of a type unknown to `json`."""
-    for kind, make in _KINDS:
-        if isinstance(value, kind):
-            return make(value)
-    raise UsageError(f"a value of type {type(value).__name__} has no JSON form")
-
-
-def _numbers(value: np.ndarray[tuple[int, ...], np.dtype[np.generic]] | np.generic) -> object:
-    if value.dtype.kind in "mM":
-        unit = "datetime64[ns]" if value.dtype.kind == "M" else "timedelta64[ns]"
-        value = value.astype(unit).astype(np.int64)
-    plain: object = value.tolist()
-    return plain
-
-
-_KINDS: tuple[tuple[type, Callable[[Any], object]], ...] = (
-    (np.ndarray, _numbers),
-    (np.generic, _numbers),
-    (bytes, lambda value: base64.b64encode(value).decode()),
-    (bytearray, lambda value: base64.b64encode(value).decode()),
-    (memoryview, lambda value: base64.b64encode(value).decode()),
-    (date, lambda value: value.isoformat()),
-    (timedelta, timedelta.total_seconds),
-    (Mapping, dict),
-    (Sequence, list),
-    (AbstractSet, list),
-)
-
-
-def _clean(value: object, depth: int) -> object:
-    """A copy with a string for each number that JSON does not have."""
-    if depth > _MAX_DEPTH:
-        raise UsageError("a message is nested too deep for JSON")
-    if isinstance(value, float):
-        return without_nan(value)
-    if value is None or isinstance(value, str | int):
-        return value
-    if isinstance(value, Mapping):
-        return {key: _clean(item, depth + 1) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_clean(item, depth + 1) for item in value]
-    return _clean(_plain(value), depth + 1)
+def _base64(value: bytes) -> str:
+    return base64.b64encode(value).decode()

@@ -20,9 +20,14 @@ from hybridlog.arrays import is_video_type
 from hybridlog.arrays.bitstream import frame_of, is_key_frame
 from hybridlog.arrays.video import VideoDecoder, pyav
 from hybridlog.drawing.images import shown_pixels
-from hybridlog.formats.writing import FileWriter, Sink, Target, failures, path_of
+from hybridlog.formats.writing import Answer, Sink, Target, Whole, failures, path_of
 from hybridlog.query.times import format_time
-from hybridlog_storage.errors import MissingDependencyError, PayloadError, UsageError
+from hybridlog_storage.errors import (
+    DefinitionError,
+    MissingDependencyError,
+    PayloadError,
+    UsageError,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -44,18 +49,29 @@ _ENCODER: Final = {"preset": "veryfast", "crf": "18"}
 _BT601: Final = 6
 
 
-class Mp4Writer(FileWriter):
-    """Writes a video.
+def write_mp4(answer: Answer, target: Target) -> None:
+    """Write a video; messages that are unreadable are left out.
 
     Raises:
-        UsageError: The target is a stream, or cannot be written.
+        UsageError: The target is a stream, or cannot be written; or a picture is of another
+            topic, recording, or size than those before, or earlier.
         MissingDependencyError: PyAV is not installed.
+        DiskFullError: No space left.
     """
+    with _Video(path_of(target, "mp4", "a file")) as video:
+        for message in answer.messages:
+            try:
+                video.write(message)
+            except (PayloadError, DefinitionError) as error:
+                answer.unreadable.append(error)
 
-    def __init__(self, target: Target) -> None:
-        super().__init__()
+
+class _Video(Whole):
+    """Writes a video."""
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
         self._av = pyav()
-        self._sink = _SeekableSink(path_of(target, "mp4", "a file"))
+        self._sink = _SeekableSink(path)
         self._file: Any = self._av.open(
             self._sink,
             "w",
@@ -73,14 +89,7 @@ class Mp4Writer(FileWriter):
         self._step = _ONLY_STEP
 
     def write(self, message: Message) -> None:
-        """Append the picture of a message.
-
-        Raises:
-            UsageError: It is of another topic, recording, or size than those before, or earlier.
-            PayloadError: It has none, or does not follow the frames before.
-            DefinitionError: No usable definition exists.
-            DiskFullError: No space left.
-        """
+        """Append the picture of a message."""
         source = (message.recording, message.topic)
         if self._track is not None and source != self._source:
             raise UsageError(
@@ -206,7 +215,8 @@ class Mp4Writer(FileWriter):
             "time before or after with --between, or write --format png."
         )
 
-    def _finish(self) -> None:
+    def commit(self) -> None:
+        """Complete the file."""
         with self._sink.checked():
             self._end_of_frames()
             if self._track is None:
@@ -217,7 +227,8 @@ class Mp4Writer(FileWriter):
             self._file.close()
         self._sink.commit()
 
-    def _discard(self) -> None:
+    def abort(self) -> None:
+        """Remove the file."""
         self._sink.abort()
         with contextlib.suppress(Exception):  # it cannot be completed
             self._file.close()

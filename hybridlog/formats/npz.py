@@ -19,13 +19,13 @@ from __future__ import annotations
 import zipfile
 from collections.abc import Callable, Iterator
 from functools import partial
-from typing import IO, TYPE_CHECKING, Any, TypeAlias, cast
+from typing import IO, TYPE_CHECKING, Any, Self, TypeAlias, cast
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from hybridlog.formats.writing import FileWriter, Sink, Target, failures
+from hybridlog.formats.writing import Answer, Sink, Target, failures
 from hybridlog.schema.arrow_types import (
     bounds_of,
     converted,
@@ -51,38 +51,69 @@ Arrays: TypeAlias = "Iterator[tuple[str, np.dtype[Any], tuple[int, ...], Iterato
 """Name, type, shape and content, piece by piece, of arrays."""
 
 
-class NpzWriter(FileWriter):
-    """Writes one .npz file."""
+def write_npz(answer: Answer, target: Target) -> None:
+    """Write one .npz file.
 
-    def __init__(self, target: Target, *, schema: pa.Schema | None = None) -> None:
-        super().__init__()
+    Raises:
+        UsageError: A column changes its type, or has a type without a numpy form.
+        DiskFullError: No space left.
+    """
+    with Sink(target) as sink, failures(sink.name), _Spool(answer.schema) as spool:
+        for table in answer.tables:
+            spool.add(table)
+        with zipfile.ZipFile(cast("IO[bytes]", sink), "w", zipfile.ZIP_STORED) as archive:
+            try:
+                for name, kind, pieces in spool.columns():
+                    for array in _arrays(_array_name(name), kind, pieces):
+                        _add(archive, *array)
+            except BaseException:
+                # Otherwise the archive would be finished, and a stream would look complete.
+                sink.abort()
+                raise
+
+
+class _Spool:
+    """Rows in temporary Arrow files; columns are matched by name, a missing one is null.
+
+    Args:
+        schema: The columns, if they are known before.
+    """
+
+    def __init__(self, schema: pa.Schema | None) -> None:
         self._schema = schema
         self._types: dict[str, pa.DataType] = {}
         self._file: pa.ipc.RecordBatchFileWriter | None = None
         self._file_schema: pa.Schema | None = None
         self._paths: list[str] = []
-        self._sink = Sink(target)
-        try:
-            with failures(self._sink.name):
-                self._directory = scratch_directory()
-        except BaseException:
-            self._sink.abort()
-            raise
+        self._directory = scratch_directory()
 
-    def write(self, table: pa.Table) -> None:
-        """Append rows; columns are matched by name. A missing column is null.
+    def __enter__(self) -> Self:
+        return self
 
-        Raises:
-            UsageError: A column changes its type, or has a type without a numpy form.
-            DiskFullError: No space left.
-        """
+    def __exit__(self, *_: object) -> None:
+        self._end_file()
+        self._directory.remove()
+
+    def add(self, table: pa.Table) -> None:
+        """Append rows."""
         names = table.column_names
         if len(set(names)) != len(names):
             raise UsageError("two columns have the same name; leave one out with --fields")
-        with failures(self._sink.name):
-            for batch in table.combine_chunks().to_batches():
-                arrays = [self._plain(*one) for one in zip(names, batch.columns, strict=True)]
-                self._spool(pa.record_batch(arrays, names))
+        for batch in table.combine_chunks().to_batches():
+            arrays = [self._plain(*one) for one in zip(names, batch.columns, strict=True)]
+            made = pa.record_batch(arrays, names)
+            if self._file is None or made.schema != self._file_schema:
+                self._end_file()
+                self._paths.append(str(self._directory.path / f"{len(self._paths)}.arrow"))
+                self._file = pa.ipc.new_file(self._paths[-1], made.schema)
+                self._file_schema = made.schema
+            self._file.write_batch(made)
+
+    def columns(self) -> Iterator[tuple[str, pa.DataType, Pieces]]:
+        """Name, type and values of each column that has any."""
+        self._end_file()
+        for name, kind in self._types.items():
+            yield name, kind, partial(self._pieces, name, kind)
 
     def _plain(self, name: str, array: pa.Array) -> pa.Array:
         """The array in the type that its column had before, JSON as text."""
@@ -107,20 +138,12 @@ class NpzWriter(FileWriter):
                 f"({error}); leave it out with --fields"
             ) from error
 
-    def _spool(self, batch: pa.RecordBatch) -> None:
-        if self._file is None or batch.schema != self._file_schema:
-            self._end_file()
-            self._paths.append(str(self._directory.path / f"{len(self._paths)}.arrow"))
-            self._file = pa.ipc.new_file(self._paths[-1], batch.schema)
-            self._file_schema = batch.schema
-        self._file.write_batch(batch)
-
     def _end_file(self) -> None:
         file, self._file = self._file, None
         if file is not None:
             file.close()
 
-    def _pieces(self, name: str) -> Iterator[pa.Array]:
+    def _pieces(self, name: str, kind: pa.DataType) -> Iterator[pa.Array]:
         for path in self._paths:
             with pa.memory_map(path) as mapped:
                 file = pa.ipc.open_file(mapped)
@@ -128,31 +151,7 @@ class NpzWriter(FileWriter):
                 is_there = at >= 0 and not pa.types.is_null(file.schema.types[at])
                 for number in range(file.num_record_batches):
                     batch = file.get_batch(number)
-                    nulls = pa.nulls(len(batch), self._types[name])
-                    yield batch.column(at) if is_there else nulls
-
-    def _finish(self) -> None:
-        with (
-            failures(self._sink.name),
-            zipfile.ZipFile(cast("IO[bytes]", self._sink), "w", zipfile.ZIP_STORED) as archive,
-        ):
-            try:
-                self._end_file()
-                for name, kind in self._types.items():
-                    pieces = partial(self._pieces, name)
-                    for array in _arrays(_array_name(name), kind, pieces):
-                        _add(archive, *array)
-            except BaseException:
-                # Otherwise the archive would be finished, and a stream would look complete.
-                self._sink.abort()
-                raise
-        self._sink.commit()
-        self._directory.remove()
-
-    def _discard(self) -> None:
-        self._sink.abort()
-        self._end_file()
-        self._directory.remove()
+                    yield batch.column(at) if is_there else pa.nulls(len(batch), kind)
 
 
 def _add(

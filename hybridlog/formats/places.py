@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pyarrow as pa
 
-from hybridlog.formats.writing import FileWriter, Sink, Target
+from hybridlog.formats.writing import Answer, Sink, Target
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
 
 _TIMES = ("header.stamp", "timestamp", "time", "log_time")
 """Columns with the time of a row, the best first."""
@@ -22,105 +22,81 @@ _ROTATIONS = ("orientation", "rotation")
 _FIX = ("latitude", "longitude", "altitude")
 
 
-class _RowWriter(FileWriter):
-    """Writes a line of text for each row."""
-
-    def __init__(self, target: Target, *, schema: pa.Schema | None = None) -> None:
-        super().__init__()
-        if schema is not None:
-            self._columns(schema.names)
-        self._topics: set[str] = set()
-        self._sink = Sink(target)
-
-    def write(self, table: pa.Table) -> None:
-        """Append rows; those without a place are left out.
-
-        Raises:
-            UsageError: The columns hold no such places, or those of several topics.
-            DiskFullError: No space left.
-        """
-        if table.num_rows:
-            if "topic" in table.column_names:
-                self._topics.update(table["topic"].unique().to_pylist())
-                if len(self._topics) > 1:
-                    raise UsageError("A file has the places of one topic: name one.")
-            self._write_rows(table, self._columns(table.column_names))
-
-    def flush(self) -> None:
-        """Write the rows so far."""
-        self._sink.flush()
-
-    def _columns(self, names: Sequence[str]) -> list[str]:
-        raise NotImplementedError
-
-    def _write_rows(self, table: pa.Table, columns: list[str]) -> None:
-        raise NotImplementedError
-
-    def _finish(self) -> None:
-        self._sink.commit()
-
-    def _discard(self) -> None:
-        self._sink.abort()
+def write_tum(answer: Answer, target: Target) -> None:
+    """Write poses as lines of `time x y z qx qy qz qw`, s and m, which evo reads."""
+    with Sink(target) as sink:
+        for table, columns in _places(answer, _pose_among):
+            rows = table.select(columns).drop_null()
+            times = rows[columns[0]].cast(pa.int64()).to_pylist()
+            numbers = np.stack([rows[name].to_numpy() for name in columns[1:]], axis=1)
+            lines = (
+                f"{time // 10**9}.{time % 10**9:09d} {' '.join(map(repr, pose))}\n"
+                for time, pose in zip(times, numbers.astype(np.float64).tolist(), strict=True)
+            )
+            sink.write("".join(lines).encode())
+            if answer.is_live:
+                sink.flush()
 
 
-class TumWriter(_RowWriter):
-    """Writes poses as lines of `time x y z qx qy qz qw`, s and m, which evo reads."""
+def write_geojson(answer: Answer, target: Target) -> None:
+    """Write fixes as a collection of points (RFC 7946): longitude, latitude, altitude."""
+    with Sink(target) as sink:
+        before = b'{"type": "FeatureCollection", "features": ['
+        for table, columns in _places(answer, _fix_among):
+            others = ("status.status", "recording")
+            chosen = table.select([*columns, *(n for n in others if n in table.column_names)])
+            for row in chosen.cast(_with_text_times(chosen.schema)).to_pylist():
+                longitude, latitude = row.pop("longitude"), row.pop("latitude")
+                place = [longitude, latitude, row.pop("altitude", None)]
+                if not all(_is_number(one) for one in place[:2]):
+                    continue
+                feature = {
+                    "type": "Feature",
+                    "geometry": {"type": "Point", "coordinates": [*filter(_is_number, place)]},
+                    "properties": row,
+                }
+                sink.write(before + b"\n" + json.dumps(feature).encode())
+                before = b","
+            if answer.is_live:
+                sink.flush()
+        sink.write((b"" if sink.tell() else before) + b"\n]}\n")
 
-    def _columns(self, names: Sequence[str]) -> list[str]:
-        time, pose = _time_among(names), next(_pose_columns(names), None)
-        if time is not None and pose is not None:
-            return [time, *pose]
-        raise UsageError(
-            "tum takes poses: fields such as pose.position and pose.orientation, or transforms."
-        )
 
-    def _write_rows(self, table: pa.Table, columns: list[str]) -> None:
-        rows = table.select(columns).drop_null()
-        times = rows[columns[0]].cast(pa.int64()).to_pylist()
-        numbers = np.stack([rows[name].to_numpy() for name in columns[1:]], axis=1)
-        lines = (
-            f"{time // 10**9}.{time % 10**9:09d} {' '.join(map(repr, pose))}\n"
-            for time, pose in zip(times, numbers.astype(np.float64).tolist(), strict=True)
-        )
-        self._sink.write("".join(lines).encode())
+def _places(
+    answer: Answer, choose: Callable[[Sequence[str]], list[str]]
+) -> Iterator[tuple[pa.Table, list[str]]]:
+    """The tables that have rows, and the columns that are written.
+
+    Raises:
+        UsageError: The columns hold no such places, or those of several topics.
+    """
+    if answer.schema is not None:
+        choose(answer.schema.names)
+    topics: set[str] = set()
+    for table in answer.tables:
+        if not table.num_rows:
+            continue
+        if "topic" in table.column_names:
+            topics.update(table["topic"].unique().to_pylist())
+            if len(topics) > 1:
+                raise UsageError("A file has the places of one topic: name one.")
+        yield table, choose(table.column_names)
 
 
-class GeoJsonWriter(_RowWriter):
-    """Writes fixes as a collection of points (RFC 7946): longitude, latitude, altitude."""
+def _pose_among(names: Sequence[str]) -> list[str]:
+    time, pose = _time_among(names), next(_pose_columns(names), None)
+    if time is not None and pose is not None:
+        return [time, *pose]
+    raise UsageError(
+        "tum takes poses: fields such as pose.position and pose.orientation, or transforms."
+    )
 
-    def __init__(self, target: Target, *, schema: pa.Schema | None = None) -> None:
-        super().__init__(target, schema=schema)
-        self._before = b'{"type": "FeatureCollection", "features": ['
 
-    def _columns(self, names: Sequence[str]) -> list[str]:
-        time = _time_among(names)
-        if time is None or not set(_FIX[:2]) <= set(names):
-            raise UsageError("geojson takes fixes: fields latitude and longitude.")
-        return [time, *(name for name in _FIX if name in names)]
-
-    def _write_rows(self, table: pa.Table, columns: list[str]) -> None:
-        wanted = [
-            name for name in (*columns, "status.status", "recording") if name in table.column_names
-        ]
-        chosen = table.select(wanted)
-        for row in chosen.cast(_with_text_times(chosen.schema)).to_pylist():
-            longitude, latitude = row.pop("longitude"), row.pop("latitude")
-            place = [longitude, latitude, row.pop("altitude", None)]
-            if not all(_is_number(one) for one in place[:2]):
-                continue
-            feature = {
-                "type": "Feature",
-                "geometry": {"type": "Point", "coordinates": [*filter(_is_number, place)]},
-                "properties": row,
-            }
-            self._sink.write(self._before + b"\n" + json.dumps(feature).encode())
-            self._before = b","
-
-    def _finish(self) -> None:
-        if not self._before.startswith(b","):
-            self._sink.write(self._before)
-        self._sink.write(b"\n]}\n")
-        super()._finish()
+def _fix_among(names: Sequence[str]) -> list[str]:
+    time = _time_among(names)
+    if time is None or not set(_FIX[:2]) <= set(names):
+        raise UsageError("geojson takes fixes: fields latitude and longitude.")
+    return [time, *(name for name in _FIX if name in names)]
 
 
 def _time_among(names: Sequence[str]) -> str | None:

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator
+from itertools import chain
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from hybridlog.arrays.message_arrays import to_numpy
 from hybridlog.arrays.point_arrays import point_columns, positions
-from hybridlog.formats.raw import DirectoryWriter
+from hybridlog.formats.raw import Directory
 from hybridlog.formats.writing import path_of
 from hybridlog.schema.codecs import codec_for
 from hybridlog_storage.errors import UsageError
@@ -18,9 +19,9 @@ from hybridlog_storage.errors import UsageError
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog.formats.writing import Target
+    from hybridlog.formats.writing import Answer, Target
     from hybridlog.schema.codec import Codec
-    from hybridlog_storage.messages import Batch, Channel
+    from hybridlog_storage.messages import Channel
 
 _TYPES: Final = {
     "i1": "char",
@@ -36,42 +37,31 @@ _TYPES: Final = {
 _NO_WORD: Final = re.compile(r"\W", re.ASCII)
 
 
-class PlyWriter(DirectoryWriter):
-    """Writes a directory with a PLY file a message.
+def write_ply(answer: Answer, target: Target) -> None:
+    """Write a directory with a PLY file a message.
 
     Raises:
-        UsageError: The target is a stream, not empty, or cannot be written.
+        UsageError: The target is a stream, not empty, or cannot be written; or a message has no
+            points.
+        PayloadError: A message is damaged.
+        DiskFullError: No space left.
     """
+    with Directory(path_of(target, "ply", "a directory")) as folder:
+        for points, topic, kind, time in chain(answer.points, _points(answer)):
+            about = {"topic": topic, "type": kind, "log_time_ns": time, "points": points.size}
+            folder.add(ply_of(points), ".ply", about)
 
-    def __init__(self, target: Target) -> None:
-        super().__init__(path_of(target, "ply", "a directory"))
-        self._codecs: dict[Channel, Codec] = {}
 
-    def write(self, batch: Batch, channels: Sequence[Channel]) -> None:
-        """Append the points of messages.
-
-        Raises:
-            UsageError: A message has no points.
-            PayloadError: A message is damaged.
-            DiskFullError: No space left.
-        """
+def _points(answer: Answer) -> Iterator[tuple[NDArray[Any], str, str, int]]:
+    codecs: dict[Channel, Codec] = {}
+    for batch, channels in answer.batches:
         for row in range(len(batch)):
             channel = channels[int(batch.channel[row])]
-            if channel not in self._codecs:
-                self._codecs[channel] = codec_for(channel)
+            if channel not in codecs:
+                codecs[channel] = codec_for(channel)
             name = channel.schema.name if channel.schema else ""
-            points = to_numpy(name, self._codecs[channel].decode(batch.payload(row)))
-            self.add_points(points, channel.topic, name, int(batch.log_time[row]))
-
-    def add_points(self, points: NDArray[Any], topic: str, kind: str, log_time: int) -> None:
-        """Append the points of a message.
-
-        Raises:
-            UsageError: They are no points.
-            DiskFullError: No space left.
-        """
-        about = {"topic": topic, "type": kind, "log_time_ns": log_time, "points": points.size}
-        self.add(ply_of(points), ".ply", about)
+            points = to_numpy(name, codecs[channel].decode(batch.payload(row)))
+            yield points, channel.topic, name, int(batch.log_time[row])
 
 
 def ply_of(points: NDArray[Any]) -> bytes:

@@ -12,16 +12,16 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hybridlog.formats.writing import BatchWriter, FileWriter, Sink, Target, failures, new_directory
+from hybridlog.formats.writing import Answer, Sink, Target, Whole, failures, new_directory
 from hybridlog_storage.mongo.collection_names import collection_of
 
 if TYPE_CHECKING:
-    from hybridlog_storage.messages import Batch, Buffer, Channel
+    from hybridlog_storage.messages import Buffer
 
 INDEX = "index.jsonl"
 """The file that describes each file. No topic's directory has a dot."""
@@ -62,15 +62,32 @@ def _is_index(path: Path) -> bool:
     return isinstance(line, dict) and (not first or {"file", "log_time_ns"} <= line.keys())
 
 
-def open_raw_writer(target: Target) -> BatchWriter:
-    """Open a writer: of a directory for a path, of consecutive payloads for a stream."""
-    if isinstance(target, str | os.PathLike):
-        return RawWriter(target)
-    return RawStreamWriter(target)
+def write_raw(answer: Answer, target: Target) -> None:
+    """Write a directory of payloads for a path, consecutive payloads for a stream."""
+    if not isinstance(target, str | os.PathLike):
+        with Sink(target) as sink:
+            for batch, _ in answer.batches:
+                for row in range(len(batch)):
+                    sink.write(batch.payload(row))
+        return
+    with Directory(target) as folder:
+        for batch, channels in answer.batches:
+            for row in range(len(batch)):
+                channel = channels[int(batch.channel[row])]
+                about = {
+                    "topic": channel.topic,
+                    "type": channel.schema.name if channel.schema else "",
+                    "encoding": channel.message_encoding,
+                    "log_time_ns": int(batch.log_time[row]),
+                    "publish_time_ns": int(batch.publish_time[row]),
+                    "sequence": int(batch.sequence[row]),
+                    "length": int(batch.length[row]),
+                }
+                folder.add(batch.payload(row), ".bin", about)
 
 
-class DirectoryWriter(FileWriter):
-    """Writes a directory with a file a message.
+class Directory(Whole):
+    """A directory with a file a message.
 
     Args:
         target: The directory; it must be missing or empty.
@@ -80,7 +97,6 @@ class DirectoryWriter(FileWriter):
     """
 
     def __init__(self, target: str | os.PathLike[str]) -> None:
-        super().__init__()
         self._name = os.fspath(target)
         with failures(self._name):
             self._final, self._unfinished = new_directory(target, "messages go into a directory")
@@ -121,64 +137,16 @@ class DirectoryWriter(FileWriter):
             self._last[folder] = (log_time, number)
             return name
 
-    def _finish(self) -> None:
+    def commit(self) -> None:
+        """Sync, and give the directory its name."""
         with failures(self._name):
             self._index.close()
             # One sync for all: thousands of separate ones take minutes on a slow disk.
             os.sync()
             self._unfinished.publish(self._final)
 
-    def _discard(self) -> None:
+    def abort(self) -> None:
+        """Remove the directory."""
         with suppress(OSError):
             self._index.close()
         self._unfinished.remove()
-
-
-class RawWriter(DirectoryWriter):
-    """Writes a directory of payload files."""
-
-    def write(self, batch: Batch, channels: Sequence[Channel]) -> None:
-        """Append messages.
-
-        Raises:
-            DiskFullError: No space left.
-        """
-        for row in range(len(batch)):
-            channel = channels[int(batch.channel[row])]
-            about = {
-                "topic": channel.topic,
-                "type": channel.schema.name if channel.schema else "",
-                "encoding": channel.message_encoding,
-                "log_time_ns": int(batch.log_time[row]),
-                "publish_time_ns": int(batch.publish_time[row]),
-                "sequence": int(batch.sequence[row]),
-                "length": int(batch.length[row]),
-            }
-            self.add(batch.payload(row), ".bin", about)
-
-
-class RawStreamWriter(FileWriter):
-    """Writes payloads one after the other, for a pipe.
-
-    Args:
-        target: Binary stream, or the path of a file.
-    """
-
-    def __init__(self, target: Target) -> None:
-        super().__init__()
-        self._sink = Sink(target)
-
-    def write(self, batch: Batch, channels: Sequence[Channel]) -> None:
-        """Append payloads.
-
-        Raises:
-            DiskFullError: No space left.
-        """
-        for row in range(len(batch)):
-            self._sink.write(batch.payload(row))
-
-    def _finish(self) -> None:
-        self._sink.commit()
-
-    def _discard(self) -> None:
-        self._sink.abort()

@@ -13,11 +13,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from hybridlog_storage.errors import SegmentError, UsageError
+from hybridlog.formats import OUTPUTS
+from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
     from hybridlog.attachments import Extras
-    from hybridlog.formats.writing import LogWriter
+    from hybridlog.formats.writing import Answer
     from hybridlog.query.query import Query
     from hybridlog_storage.messages import Batch, Channel
 
@@ -87,36 +88,24 @@ def profile_of(query: Query) -> str:
     return {"ros1": "ros1", "cdr": "ros2"}.get(encodings.pop(), "") if len(encodings) == 1 else ""
 
 
-def add_extras(log: LogWriter, extras: Extras) -> Iterator[str]:
-    """Write what a log has beside its messages.
+def log_of(query: Query, front: Front = IN_FORCE, extras: Extras | None = None) -> Answer:
+    """A slice as a log.
 
-    Yields:
-        A sentence about each record or attachment that is left out because it is damaged.
+    Args:
+        query: The slice.
+        front: The latched messages in front of the answer.
+        extras: What it has beside messages.
     """
-    log.declare(extras.channels)
-    for metadata in extras.metadata:
-        log.add_metadata(metadata.name, metadata.values)
-    for problem in extras.problems:
-        yield f"A metadata record is left out: {problem}"
-    for attachment in extras.attachments:
-        try:
-            checked = attachment.open()
-        except SegmentError as error:
-            yield f"The attachment {attachment.name!r} is left out: {error}"
-            continue
-        log.add_attachment(checked)
+    from hybridlog.formats.writing import Answer
+
+    return Answer(batches=batches_of(query, front), extras=extras, profile=profile_of(query))
 
 
 def write_mcap(query: Query, path: Path) -> None:
     """Write a slice as an MCAP file, as `hybridlog export` does; all of it or nothing."""
     from hybridlog.attachments import extras_of
-    from hybridlog.formats.mcap.writer import McapWriter
 
-    with McapWriter(path, profile=profile_of(query)) as log:
-        for _ in add_extras(log, extras_of(query)):
-            pass  # the ledger has what is damaged
-        for batch, channels in batches_of(query, IN_FORCE):
-            log.write(batch, channels)
+    OUTPUTS["mcap"].write(log_of(query, extras=extras_of(query)), path)
 
 
 MAX_BYTES: Final = 16 << 30

@@ -7,9 +7,8 @@ null, and a new one is an error, because these formats fix their columns.
 
 from __future__ import annotations
 
-import contextlib
 import io
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Protocol
 
 import pyarrow as pa
@@ -25,7 +24,7 @@ from hybridlog.formats.json_text import (
     json_pieces,
 )
 from hybridlog.formats.jsonl import rows_within
-from hybridlog.formats.writing import FileWriter, Sink, Target
+from hybridlog.formats.writing import Answer, Sink, Target
 from hybridlog.schema.arrow_types import common_schema, converted, is_bytes
 from hybridlog_storage.errors import UsageError
 
@@ -42,185 +41,28 @@ class _ArrowFile(Protocol):
     def close(self) -> None: ...
 
 
-class TableFileWriter(FileWriter):
-    """Base of the table formats: learns the columns and collects rows into groups.
-
-    Args:
-        target: Path or binary stream.
-        schema: The columns, if known beforehand; else they are learnt.
-        held_bytes: Limit of the pieces held back to learn them.
-    """
-
-    format_name = "table"
-
-    def __init__(
-        self, target: Target, *, schema: pa.Schema | None = None, held_bytes: int = HELD_BYTES
-    ) -> None:
-        super().__init__()
-        self._schema = schema
-        self._held_bytes = held_bytes
-        self._pieces: list[pa.Table] = []
-        self._bytes = 0
-        self._rows = 0
-        self._written = 0
-        self._file: _ArrowFile | None = None
-        self._sink = Sink(target)
-
-    def write(self, table: pa.Table) -> None:
-        """Append rows; columns are matched by name.
-
-        Raises:
-            UsageError: A column that appears too late, twice, or with values that do not
-                fit the type it had.
-            DiskFullError: No space left.
-        """
-        with self._failures():
-            _check_names(table.schema)
-            if self._schema is not None:
-                table = self._fitted(table)
-            self._pieces.append(table)
-            self._bytes += table.nbytes
-            self._rows += table.num_rows
-            if self._schema is None:
-                if self._bytes >= self._held_bytes:
-                    self._write_group()
-            elif self._bytes >= GROUP_BYTES or self._rows >= GROUP_ROWS:
-                self._write_group()
-
-    def flush(self) -> None:
-        """Write the rows so far."""
-        with self._failures():
-            self._write_group()
-        self._sink.flush()
-
-    def _open(self, sink: Sink, schema: pa.Schema) -> _ArrowFile:
-        raise NotImplementedError
-
-    def _prepared(self, table: pa.Table) -> pa.Table:
-        """Convert a table to columns that the format supports."""
-        return table
-
-    def _write_group(self) -> None:
-        if self._schema is None:
-            self._schema = common_schema(self._pieces)
-            self._pieces = [self._fitted(piece) for piece in self._pieces]
-        if self._file is None:
-            # `empty_table` knows no lists of extension types.
-            nothing = [pa.nulls(0, field.type) for field in self._schema]
-            empty = self._prepared(pa.Table.from_arrays(nothing, schema=self._schema))
-            self._file = self._open(self._sink, empty.schema)
-        if self._pieces:
-            # More than the bound is here only if one piece was.
-            self._file.write_table(self._prepared(pa.concat_tables(self._pieces)))
-        self._written += self._rows
-        self._pieces, self._bytes, self._rows = [], 0, 0
-
-    def _fitted(self, table: pa.Table) -> pa.Table:
-        """The table with exactly the columns of the file."""
-        assert self._schema is not None
-        if table.schema.equals(self._schema):
-            return table
-        known = set(self._schema.names)
-        for name in table.column_names:
-            if name not in known:
-                raise UsageError(
-                    f"column {name!r} first appears after {self._written + self._rows} rows, and "
-                    f"a {self.format_name} file fixes its columns before; leave it out with "
-                    "--fields, or write --format jsonl"
-                )
-        columns = []
-        for field in self._schema:
-            index = table.schema.get_field_index(field.name)
-            if index < 0:
-                columns.append(pa.nulls(table.num_rows, field.type))
-                continue
-            column = table.column(index)
-            try:
-                arrays = [converted(chunk, field.type) for chunk in column.chunks]
-            except pa.ArrowException as error:
-                raise UsageError(
-                    f"column {field.name!r} is {field.type} at first and {column.type} later, "
-                    f"which does not fit ({error}); leave it out with --fields, or write each "
-                    "part into a file of its own with --between"
-                ) from error
-            columns.append(pa.chunked_array(arrays, type=field.type))
-        return pa.Table.from_arrays(columns, schema=self._schema)
-
-    @contextlib.contextmanager
-    def _failures(self) -> Iterator[None]:
-        """Map Arrow errors to hybridlog errors."""
-        try:
-            yield
-        except pa.ArrowException as error:
-            raise UsageError(
-                f"the table cannot be written to {self._sink.name} as {self.format_name}: {error}"
-            ) from error
-
-    def _finish(self) -> None:
-        with self._failures():
-            self._write_group()
-            assert self._file is not None
-            self._file.close()
-        self._sink.commit()
-
-    def _discard(self) -> None:
-        self._sink.abort()
-        self._pieces = []
-        file, self._file = self._file, None
-        if file is not None:
-            # Its output is dropped; otherwise Arrow's writers would close when collected.
-            with contextlib.suppress(Exception):
-                file.close()
-
-
-class ParquetWriter(TableFileWriter):
-    """Writes Parquet, row groups of zstd.
+def write_parquet(answer: Answer, target: Target) -> None:
+    """Write Parquet, row groups of zstd.
 
     Columns of floats have no statistics: readers skip row groups by them, and some then
     lose rows where there are NaN among the values.
     """
-
-    format_name = "parquet"
-
-    def _open(self, sink: Sink, schema: pa.Schema) -> _ArrowFile:
-        kinds = {leaf.path: leaf.kind for leaf in leaves(schema)}
-        # Arrow holds the dictionary of a long array, and many copies of a long text.
-        has_long_rows = self._bytes > _LONG_ROW * max(self._rows, 1)
-        writer: _ArrowFile = pa.parquet.ParquetWriter(
-            sink,
-            schema,
-            compression="zstd",
-            use_dictionary=[] if has_long_rows else list(kinds),
-            write_statistics=[
-                path
-                for path, kind in kinds.items()
-                if not pa.types.is_floating(kind)
-                and not (has_long_rows and not pa.types.is_primitive(kind))
-            ],
-        )
-        return writer
-
-    def _prepared(self, table: pa.Table) -> pa.Table:
-        # Parquet has no empty group, so messages without fields are omitted.
-        for index, field in enumerate(table.schema):
-            if pa.types.is_struct(field.type) and field.type.num_fields == 0:
-                table = table.set_column(index, field.name, pa.nulls(table.num_rows))
-        return table
+    _write(answer, target, "parquet", _open_parquet, _without_empty_structs)
 
 
-class ArrowWriter(TableFileWriter):
-    """Writes an Arrow IPC file, also known as Feather version 2, with zstd buffers."""
+def write_arrow(answer: Answer, target: Target) -> None:
+    """Write an Arrow IPC file, also known as Feather version 2, with zstd buffers."""
+    options = pa.ipc.IpcWriteOptions(compression="zstd")
+    _write(
+        answer,
+        target,
+        "arrow",
+        lambda sink, table: pa.ipc.new_file(sink, table.schema, options=options),
+    )
 
-    format_name = "arrow"
 
-    def _open(self, sink: Sink, schema: pa.Schema) -> _ArrowFile:
-        options = pa.ipc.IpcWriteOptions(compression="zstd")
-        writer: _ArrowFile = pa.ipc.new_file(sink, schema, options=options)
-        return writer
-
-
-class CsvWriter(TableFileWriter):
-    """Writes CSV with a header.
+def write_csv(answer: Answer, target: Target) -> None:
+    """Write CSV with a header.
 
     | value | cell |
     |---|---|
@@ -233,24 +75,145 @@ class CsvWriter(TableFileWriter):
     Durations are integer nanoseconds, binary values base64. Lists and structures are JSON
     text, as in JSON lines.
     """
+    _write(answer, target, "csv", _CsvFile)
 
-    format_name = "csv"
 
-    def _open(self, sink: Sink, schema: pa.Schema) -> _ArrowFile:
-        return _CsvFile(sink, schema) if schema.names else _Nothing()
+def _write(
+    answer: Answer,
+    target: Target,
+    form: str,
+    open_file: Callable[[Sink, pa.Table], _ArrowFile],
+    prepared: Callable[[pa.Table], pa.Table] = lambda table: table,
+) -> None:
+    """Write tables.
+
+    Args:
+        answer: The tables.
+        target: Path or binary stream.
+        form: The format.
+        open_file: Opens a file for a table and those after it.
+        prepared: Converts a table to columns that the format supports.
+    """
+    with Sink(target) as sink:
+        try:
+            file: _ArrowFile | None = None
+            for group in _groups(answer, form):
+                table = prepared(group)
+                file = file or open_file(sink, table)
+                file.write_table(table)
+                if answer.is_live:
+                    sink.flush()
+            assert file is not None
+            file.close()
+        except pa.ArrowException as error:
+            raise UsageError(
+                f"the table cannot be written to {sink.name} as {form}: {error}"
+            ) from error
+
+
+def _groups(answer: Answer, form: str) -> Iterator[pa.Table]:
+    """The rows in tables of the same columns, each of many rows; at least one, possibly empty.
+
+    Raises:
+        UsageError: A column appears too late, twice, or with values that do not fit the type
+            it had.
+    """
+    schema, written, rows, size = answer.schema, 0, 0, 0
+    pieces: list[pa.Table] = []
+
+    def group() -> pa.Table:
+        assert schema is not None
+        if not pieces:  # `empty_table` knows no lists of extension types
+            return pa.Table.from_arrays([pa.nulls(0, one.type) for one in schema], schema=schema)
+        return pa.concat_tables([_fitted(one, schema, form, 0) for one in pieces])
+
+    for table in answer.tables:
+        _check_names(table.schema)
+        pieces.append(table if schema is None else _fitted(table, schema, form, written + rows))
+        size += table.nbytes
+        rows += table.num_rows
+        is_full = size >= GROUP_BYTES or rows >= GROUP_ROWS
+        if answer.is_live or (size >= HELD_BYTES if schema is None else is_full):
+            schema = schema or common_schema(pieces)
+            yield group()
+            written += rows
+            rows = size = 0
+            pieces.clear()
+    if pieces or not written:
+        schema = schema or common_schema(pieces)
+        yield group()
+
+
+def _fitted(table: pa.Table, schema: pa.Schema, form: str, before: int) -> pa.Table:
+    """The table with exactly the columns of the file, behind some rows."""
+    if table.schema.equals(schema):
+        return table
+    known = set(schema.names)
+    for name in table.column_names:
+        if name not in known:
+            raise UsageError(
+                f"column {name!r} first appears after {before} rows, and a {form} file fixes its "
+                "columns before; leave it out with --fields, or write --format jsonl"
+            )
+    columns = []
+    for field in schema:
+        index = table.schema.get_field_index(field.name)
+        if index < 0:
+            columns.append(pa.nulls(table.num_rows, field.type))
+            continue
+        column = table.column(index)
+        try:
+            arrays = [converted(chunk, field.type) for chunk in column.chunks]
+        except pa.ArrowException as error:
+            raise UsageError(
+                f"column {field.name!r} is {field.type} at first and {column.type} later, "
+                f"which does not fit ({error}); leave it out with --fields, or write each "
+                "part into a file of its own with --between"
+            ) from error
+        columns.append(pa.chunked_array(arrays, type=field.type))
+    return pa.Table.from_arrays(columns, schema=schema)
+
+
+def _open_parquet(sink: Sink, table: pa.Table) -> _ArrowFile:
+    kinds = {leaf.path: leaf.kind for leaf in leaves(table.schema)}
+    # Arrow holds the dictionary of a long array, and many copies of a long text.
+    has_long_rows = table.nbytes > _LONG_ROW * max(table.num_rows, 1)
+    file: _ArrowFile = pa.parquet.ParquetWriter(
+        sink,
+        table.schema,
+        compression="zstd",
+        use_dictionary=[] if has_long_rows else list(kinds),
+        write_statistics=[
+            path
+            for path, kind in kinds.items()
+            if not pa.types.is_floating(kind)
+            and not (has_long_rows and not pa.types.is_primitive(kind))
+        ],
+    )
+    return file
+
+
+def _without_empty_structs(table: pa.Table) -> pa.Table:
+    # Parquet has no empty group, so messages without fields are omitted.
+    for index, field in enumerate(table.schema):
+        if pa.types.is_struct(field.type) and field.type.num_fields == 0:
+            table = table.set_column(index, field.name, pa.nulls(table.num_rows))
+    return table
 
 
 class _CsvFile:
     """Rows as text, long ones cell by cell and in pieces."""
 
-    def __init__(self, sink: Sink, schema: pa.Schema) -> None:
+    def __init__(self, sink: Sink, table: pa.Table) -> None:
         self._sink = sink
-        nothing = [pa.nulls(0, field.type) for field in schema]
-        empty = _as_text(pa.Table.from_arrays(nothing, schema=schema))
-        self._writer = pa.csv.CSVWriter(sink, empty.schema)
+        has_columns = bool(table.column_names)
+        schema = _as_text(table.slice(0, 0)).schema
+        self._writer = pa.csv.CSVWriter(sink, schema) if has_columns else None
 
     def write_table(self, table: pa.Table) -> None:
         """Write rows."""
+        if self._writer is None:
+            return
         rows = rows_within(table.nbytes, table.num_rows)
         for begin in range(0, table.num_rows, rows):
             part = table.slice(begin, rows)
@@ -263,7 +226,8 @@ class _CsvFile:
 
     def close(self) -> None:
         """End the file."""
-        self._writer.close()
+        if self._writer is not None:
+            self._writer.close()
 
 
 def _row_pieces(row: pa.Table) -> Iterator[bytes]:
@@ -317,16 +281,6 @@ def _as_text(table: pa.Table) -> pa.Table:
             continue
         table = table.set_column(index, field.name, column)
     return table
-
-
-class _Nothing:
-    """A file without columns."""
-
-    def write_table(self, table: pa.Table) -> None:
-        """Nothing to write."""
-
-    def close(self) -> None:
-        """Nothing to close."""
 
 
 def _check_names(schema: pa.Schema) -> None:

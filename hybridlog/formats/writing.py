@@ -1,7 +1,7 @@
 """Base of all writers: atomic output files.
 
 A file appears under its name only when it is complete: it is written beside the target,
-synced, and renamed on `close`. `abort` removes it, and so does an interruption at any
+synced, and renamed on `commit`. `abort` removes it, and so does an interruption at any
 moment: see `unfinished`. Devices, pipes and streams are written directly.
 """
 
@@ -11,18 +11,25 @@ import contextlib
 import errno
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO, Protocol, Self, TypeAlias
+from typing import TYPE_CHECKING, Any, BinaryIO, Self, TypeAlias
 
 from hybridlog_storage.disk.unfinished import Unfinished, beside
-from hybridlog_storage.errors import NO_SPACE, DiskFullError, HybridlogError, UsageError
+from hybridlog_storage.errors import (
+    NO_SPACE,
+    DiskFullError,
+    HybridlogError,
+    SegmentError,
+    UsageError,
+)
 from hybridlog_storage.settings import NAME as SETTINGS
 
 if TYPE_CHECKING:
-    from types import TracebackType
-
     import pyarrow as pa
+    from numpy.typing import NDArray
 
+    from hybridlog.attachments import Extras
     from hybridlog.message import Message
     from hybridlog_storage.messages import Batch, Buffer, Channel
     from hybridlog_storage.segments.attachments import Attachment
@@ -48,139 +55,105 @@ _WRONG_PLACE = {
 _BUFFER = 1 << 20
 
 
-class Writer(Protocol):
-    """A writer whose output is complete or absent.
+@dataclass(kw_only=True)
+class Answer:
+    """An answer in the forms that formats take; a format pulls one of them, once.
 
-    As a context manager it closes at the end of the block, and aborts if the block raises.
+    Attributes:
+        lines: Objects as lines of JSON without their ends, some at a time.
+        tables: Rows, at least one table; columns are matched by name.
+        schema: Columns of the tables, if they are known before.
+        batches: Messages as they came, and the channels that `batch.channel` indexes.
+        points: Points, their topic, type and log time (ns), a message at a time.
+        messages: Messages that are images.
+        extras: What a log has beside its messages.
+        profile: MCAP profile of the messages.
+        is_live: Rows are written as they come.
+        notes: Gets a sentence about each extra that is left out because it is damaged.
+        unreadable: Gets the error of each message that is left out.
     """
 
-    def close(self) -> None:
-        """Complete the output; it then stands under its name."""
-
-    def abort(self) -> None:
-        """Leave nothing behind. Does nothing after `close`."""
-
-    def __enter__(self) -> Self: ...
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None: ...
+    lines: Iterable[Iterable[Line]] = ()
+    tables: Iterable[pa.Table] = ()
+    schema: pa.Schema | None = None
+    batches: Iterable[tuple[Batch, Sequence[Channel]]] = ()
+    points: Iterable[tuple[NDArray[Any], str, str, int]] = ()
+    messages: Iterable[Message] = ()
+    extras: Extras | None = None
+    profile: str = ""
+    is_live: bool = False
+    notes: list[str] = field(default_factory=list)
+    unreadable: list[HybridlogError] = field(default_factory=list)
 
 
-class BatchWriter(Writer, Protocol):
-    """A writer of unchanged payloads."""
+class Whole:
+    """An output that is complete at the end of the block, or absent if the block raises."""
 
-    def write(self, batch: Batch, channels: Sequence[Channel]) -> None:
-        """Append messages.
+    def __enter__(self) -> Self:
+        """Return this output."""
+        return self
 
-        Args:
-            batch: Rows in the order of the output.
-            channels: `batch.channel` indexes these. Channels of equal content, in one
-                call or several, become one.
-        """
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        """Commit, or abort when the block has raised."""
+        try:
+            if kind is None:
+                self.commit()
+        finally:
+            self.abort()
 
-
-class LogWriter(BatchWriter, Protocol):
-    """A writer of logs, which have more than payloads."""
-
-    def declare(self, channels: Sequence[Channel]) -> None:
-        """Add channels, which need have no messages."""
-
-    def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
-        """Add a metadata record."""
-
-    def add_attachment(self, attachment: Attachment) -> None:
-        """Add an attachment, piece by piece."""
-
-
-class TableWriter(Writer, Protocol):
-    """A writer of columns."""
-
-    def write(self, table: pa.Table) -> None:
-        """Append rows."""
-
-    def flush(self) -> None:
-        """Write the rows so far, if the format can."""
-
-
-class LineWriter(Writer, Protocol):
-    """A writer of one JSON object for each message."""
-
-    def write(self, lines: Iterable[Line]) -> None:
-        """Append objects as lines without their ends."""
-
-    def flush(self) -> None:
-        """Write the lines so far."""
-
-
-class PictureWriter(Writer, Protocol):
-    """A writer of images, one file a message or all in a video."""
-
-    def write(self, message: Message) -> None:
-        """Append the image of a message."""
-
-
-class FileWriter:
-    """A writer with `close` and `abort`; subclasses implement both ends.
-
-    `close` and `abort` may be called again; the first call counts.
-    """
-
-    def __init__(self) -> None:
-        self._over = False
-
-    def close(self) -> None:
+    def commit(self) -> None:
         """Complete the output; it then stands under its name.
 
         Raises:
             DiskFullError: No space; no file remains.
             UsageError: The target cannot be written.
         """
-        if self._over:
-            return
-        try:
-            self._finish()
-        except BaseException:
-            self.abort()
-            raise
-        self._over = True
+        raise NotImplementedError
 
     def abort(self) -> None:
-        """Leave nothing behind. Does nothing after `close`."""
-        if not self._over:
-            self._over = True
-            self._discard()
-
-    def flush(self) -> None:
-        """Do nothing: most formats are written at their end."""
-
-    def __enter__(self) -> Self:
-        """Return this writer."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Close, or abort when the block has raised."""
-        if kind is None:
-            self.close()
-        else:
-            self.abort()
-
-    def _finish(self) -> None:
-        raise NotImplementedError
-
-    def _discard(self) -> None:
+        """Leave nothing behind. Does nothing after `commit`."""
         raise NotImplementedError
 
 
-class Sink:
+class LogWriter(Whole):
+    """A writer of logs.
+
+    Channels of equal content become one.
+    """
+
+    def write(self, batch: Batch, channels: Sequence[Channel]) -> None:
+        """Append messages in the order of the rows; `batch.channel` indexes the channels."""
+        raise NotImplementedError
+
+    def declare(self, channels: Sequence[Channel]) -> None:
+        """Add channels, which need have no messages; those that do not fit are left out."""
+
+    def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
+        """Add a metadata record, if the format has such."""
+
+    def add_attachment(self, attachment: Attachment) -> None:
+        """Add an attachment, piece by piece, if the format has such."""
+
+    def write_answer(self, answer: Answer) -> None:
+        """Write an answer; what a log has beside its messages comes first."""
+        extras = answer.extras
+        if extras is not None:
+            self.declare(extras.channels)
+            for metadata in extras.metadata:
+                self.add_metadata(metadata.name, metadata.values)
+            answer.notes += (f"A metadata record is left out: {one}" for one in extras.problems)
+            for attachment in extras.attachments:
+                try:
+                    checked = attachment.open()
+                except SegmentError as error:
+                    answer.notes.append(f"The attachment {attachment.name!r} is left out: {error}")
+                    continue
+                self.add_attachment(checked)
+        for batch, channels in answer.batches:
+            self.write(batch, channels)
+
+
+class Sink(Whole):
     """A binary output that appears on `commit`.
 
     It has the methods that pyarrow, zipfile and the mcap writer need of a file without seek.

@@ -11,7 +11,8 @@ from typing import Any
 import pytest
 
 from hybridlog.cli import output
-from hybridlog.formats.jsonl import JsonWriter
+from hybridlog.formats.jsonl import write_json
+from hybridlog.formats.writing import Answer
 from tests.independent import Seen, read_bag
 from tests.limits import Limit
 
@@ -77,10 +78,8 @@ def test_long_answers_are_printed_some_rows_at_a_time(
     assert capsys.readouterr().out == "none\n"
     for values in ([], [{"a": "1\n2", "b": [1, {"c": None}]}, {}], [3]):
         target = io.BytesIO()
-        with JsonWriter(target) as writer:
-            for value in values:
-                writer.write([json.dumps(value)])
-                writer.write([iter(json.dumps(value))])
+        texts = [json.dumps(value) for value in values]
+        write_json(Answer(lines=[[line] for one in texts for line in (one, iter(one))]), target)
         assert json.loads(target.getvalue()) == [one for one in values for _ in range(2)]
 
 

@@ -248,14 +248,14 @@ def test_a_stopped_record_says_what_is_stored(
     [
         ("mcap", "return beside"),
         ("mcap", "return Sink.__init__"),
-        ("mcap", "return FileWriter.__enter__"),
-        ("mcap", "call FileWriter.__exit__"),
-        ("mcap", "call FileWriter.close"),
+        ("mcap", "return Whole.__enter__"),
+        ("mcap", "call Whole.__exit__"),
+        ("mcap", "call McapWriter.commit"),
         ("mcap", "call Unfinished.publish"),
         ("bag", "return BagWriter.__init__"),
-        ("bag", "call FileWriter.__exit__"),
-        ("raw", "return DirectoryWriter.__init__"),
-        ("raw", "call FileWriter.__exit__"),
+        ("bag", "call Whole.__exit__"),
+        ("raw", "return Directory.__init__"),
+        ("raw", "call Whole.__exit__"),
     ],
 )
 def test_no_instant_leaves_a_part(form: str, moment: str, store: Path, tmp_path: Path) -> None:
@@ -276,12 +276,12 @@ def test_a_directory_that_was_to_be_replaced_comes_back(store: Path, tmp_path: P
     command = ["fetch", "-t", "/base/scan", "-F", "raw", "-o", str(target), "-r", "robot"]
     run(*command, store=store)
     before = sorted(path.name for path in target.iterdir())
-    ended = stop_at("return DirectoryWriter.__init__", *command, "--force", store=store)
+    ended = stop_at("return Directory.__init__", *command, "--force", store=store)
     assert ended.returncode == 130, ended.stderr
     assert [path.name for path in tmp_path.iterdir()] == ["payloads"]
     assert sorted(path.name for path in target.iterdir()) == before
     command = ["export", str(tmp_path / "new"), "-F", "csv", "-r", "robot"]
-    ended = stop_at("return FileWriter.__enter__", *command, store=store)
+    ended = stop_at("return Whole.__enter__", *command, store=store)
     assert ended.returncode == 130, ended.stderr
     assert [path.name for path in tmp_path.iterdir()] == ["payloads"]
 

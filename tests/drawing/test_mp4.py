@@ -17,8 +17,9 @@ from PIL import Image
 import hybridlog as hl
 from hybridlog.cli.answers import write_answer
 from hybridlog.formats import OUTPUTS
-from hybridlog.formats.writing import Sink
+from hybridlog.formats.writing import Answer, Sink
 from hybridlog.maintenance.expiry import expire
+from hybridlog.message import Message
 from hybridlog.query.query import Query
 from hybridlog_storage.errors import DiskFullError, PayloadError, TimeError, UsageError
 from hybridlog_storage.messages import Channel, Schema
@@ -255,7 +256,7 @@ def test_what_is_no_video(store: hl.Store, tmp_path: Path) -> None:
             to_mp4(query, tmp_path / "out.mp4")
         assert not list(tmp_path.iterdir())
     with pytest.raises(UsageError, match="name a file with -o"):
-        OUTPUTS["mp4"].open(io.BytesIO())
+        OUTPUTS["mp4"].write(Answer(), io.BytesIO())
     to_mp4(images.every(2), tmp_path / "out.mp4")
     assert len(read(tmp_path / "out.mp4")[1]) == 3
 
@@ -276,11 +277,13 @@ def test_files_that_are_not_completed(
     store: hl.Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, calls: Calls
 ) -> None:
     """Aborted, stopped, or on a full disk: nothing stays, and nothing is said twice."""
-    messages = [*store.query(["/odd"], ["images"])]
-    writer = OUTPUTS["mp4"].open(tmp_path / "out.mp4")
-    for message in messages:
-        writer.write(message)
-    writer.abort()
+
+    def messages() -> Iterator[Message]:
+        yield from store.query(["/odd"], ["images"])
+        raise KeyError
+
+    with pytest.raises(KeyError):
+        OUTPUTS["mp4"].write(Answer(messages=messages()), tmp_path / "out.mp4")
     assert not list(tmp_path.iterdir())
 
     query = store.query(["/cam"], ["h264"])

@@ -11,8 +11,9 @@ from mcap.reader import NonSeekingReader, make_reader
 from rosbags.rosbag1 import Reader
 
 from hybridlog.formats.mcap.writer import McapWriter
-from hybridlog.formats.raw import RawStreamWriter, RawWriter
+from hybridlog.formats.raw import write_raw
 from hybridlog.formats.rosbag1.writer import BagWriter
+from hybridlog.formats.writing import Answer
 from hybridlog_storage.errors import UsageError
 from hybridlog_storage.messages import Channel, Schema
 from tests.formats.batches import STRING, STRING_MD5, batch, many, ros1_channels
@@ -159,9 +160,8 @@ def test_raw(tmp_path: Path) -> None:
         [5, 5, 5, 5, 5, 5, 5, 5, 5, *([7] * 9), *([5] * 9), *([9] * 9), *([5] * 9)],
     )
     target = tmp_path / "out"
-    with RawWriter(target) as writer:
-        writer.write(source.take(slice(0, 20)), channels)
-        writer.write(source.take(slice(20, 45)), channels)
+    parts = [source.take(slice(0, 20)), source.take(slice(20, 45))]
+    write_raw(Answer(batches=[(one, channels) for one in parts]), target)
     assert list(tmp_path.iterdir()) == [target]
     lines = [json.loads(line) for line in (target / "index.jsonl").read_text().splitlines()]
     assert len(lines) == 45
@@ -181,18 +181,17 @@ def test_raw(tmp_path: Path) -> None:
 
 def test_raw_target(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
-    with RawWriter(tmp_path / "empty") as writer:
-        writer.write(many(3), ros1_channels())
+    answer = Answer(batches=[(many(3), ros1_channels())])
+    write_raw(answer, tmp_path / "empty")
     assert (tmp_path / "empty" / "index.jsonl").exists()
     with pytest.raises(UsageError, match="not empty"):
-        RawWriter(tmp_path / "empty")
+        write_raw(answer, tmp_path / "empty")
     (tmp_path / "file").touch()
     with pytest.raises(UsageError, match="is a file"):
-        RawWriter(tmp_path / "file")
+        write_raw(answer, tmp_path / "file")
 
 
 def test_raw_stream() -> None:
     stream = io.BytesIO()
-    with RawStreamWriter(stream) as writer:
-        writer.write(many(20), ros1_channels())
+    write_raw(Answer(batches=[(many(20), ros1_channels())]), stream)
     assert stream.getvalue() == b"".join(bytes(many(20).payload(row)) for row in range(20))

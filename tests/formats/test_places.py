@@ -16,6 +16,7 @@ import pytest
 import hybridlog as hl
 from hybridlog.formats import OUTPUTS
 from hybridlog.formats.ply import ply_of
+from hybridlog.formats.writing import Answer
 from hybridlog_storage.errors import UsageError
 from tests.data import DATA, needs_data
 from tests.independent import read_bag
@@ -41,9 +42,7 @@ def read_ply(data: bytes) -> np.ndarray[Any, Any]:
 
 def written(form: str, *tables: pa.Table) -> str:
     stream = io.BytesIO()
-    with OUTPUTS[form].open(stream) as writer:
-        for table in tables:
-            writer.write(table)
+    OUTPUTS[form].write(Answer(tables=tables), stream)
     return stream.getvalue().decode()
 
 
@@ -60,9 +59,8 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
 @needs_data
 def test_clouds_have_all_fields(store: hl.Store, tmp_path: Path) -> None:
     query = store.topic("/cloud_radar_rawtarget")
-    with OUTPUTS["ply"].open(tmp_path / "out") as writer:
-        for batch, channels in query.batches():
-            writer.write(batch, [one.channel for one in channels])
+    batches = ((batch, [one.channel for one in channels]) for batch, channels in query.batches())
+    OUTPUTS["ply"].write(Answer(batches=batches), tmp_path / "out")
     index = [json.loads(line) for line in (tmp_path / "out/index.jsonl").read_text().splitlines()]
     messages = [*query]
     assert len(index) == len(messages)
@@ -103,7 +101,7 @@ def test_odd_points() -> None:
     with pytest.raises(UsageError, match="clouds and scans"):
         ply_of(np.zeros(3, [("a", "f4")]))
     with pytest.raises(UsageError, match="name a directory"):
-        OUTPUTS["ply"].open(io.BytesIO())
+        OUTPUTS["ply"].write(Answer(), io.BytesIO())
 
 
 @needs_data

@@ -19,8 +19,7 @@ from rosbags.rosbag1 import Writer
 
 from hybridlog.formats import reading
 from hybridlog.formats.reading import BATCH_MESSAGES, Damage, Source
-from hybridlog.formats.rosbag1.reader import Rosbag1Source
-from hybridlog.formats.rosbag1.records import read_run
+from hybridlog.formats.rosbag1.reader import Rosbag1Source, walk
 from hybridlog_storage.errors import SourceError
 from hybridlog_storage.messages import Channel, Schema
 from tests.data import DATA, needs_data
@@ -527,7 +526,7 @@ def test_zeros_are_no_records() -> None:
     data = sound + bytes(16 << 20)
     tracemalloc.start()
     try:
-        run = read_run(data)
+        run = walk(data)
         assert tracemalloc.get_traced_memory()[1] < 1 << 20
     finally:
         tracemalloc.stop()

@@ -7,7 +7,7 @@ from typing import IO, TYPE_CHECKING, Any, cast
 
 from mcap.writer import CompressionType, Writer
 
-from hybridlog.formats.writing import FileWriter, Sink, Target
+from hybridlog.formats.writing import Answer, LogWriter, Sink, Target
 from hybridlog.schema.completion import with_nested
 from hybridlog_storage.segments.segment_format import OUR_NAMES
 
@@ -40,7 +40,13 @@ class _Writer(Writer):
         self.__statistics.attachment_count += 1
 
 
-class McapWriter(FileWriter):
+def write_mcap(answer: Answer, target: Target) -> None:
+    """Write one MCAP file."""
+    with McapWriter(target, profile=answer.profile) as log:
+        log.write_answer(answer)
+
+
+class McapWriter(LogWriter):
     """Writes one MCAP file with a complete summary.
 
     Args:
@@ -56,7 +62,6 @@ class McapWriter(FileWriter):
         profile: str = "",
         chunk_size: int = 4 << 20,
     ) -> None:
-        super().__init__()
         self._sink = Sink(target)
         self._schemas: dict[Schema, int] = {}
         self._ids: dict[_ChannelKey, int] = {}
@@ -140,9 +145,11 @@ class McapWriter(FileWriter):
             self._schemas[schema] = int(number)
         return self._schemas[schema]
 
-    def _finish(self) -> None:
+    def commit(self) -> None:
+        """Complete the file."""
         self._writer.finish()  # type: ignore[no-untyped-call]
         self._sink.commit()
 
-    def _discard(self) -> None:
+    def abort(self) -> None:
+        """Remove the file."""
         self._sink.abort()

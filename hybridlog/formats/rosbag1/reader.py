@@ -1,23 +1,23 @@
-"""Reads ROS 1 bags (format 2.0) from the start.
+"""Reads ROS 1 bags (format 2.0) from the start: also unindexed, cut and damaged ones.
 
-Messages are found by walking the records, without the index. Unindexed bags
-(`.bag.active`), truncated bags and damaged bags yield everything that is readable.
-
-After damage the reader searches for the next valid record. What was lost is counted by
-chunk: with the chunk list at the end of the bag, or with the index records behind the chunk.
+Records are walked in the order of the file, without the index. Damage in a compressed chunk costs
+the rest of the chunk; elsewhere reading goes on at the next record. What was lost is counted by
+the chunk list at the end of the bag, or by the index records behind a chunk.
 """
 
 from __future__ import annotations
 
 import bz2
+import struct
 from bisect import bisect_left
 from collections import Counter
 from dataclasses import dataclass, field
 from tempfile import SpooledTemporaryFile
-from typing import IO, TYPE_CHECKING, Any, BinaryIO, NamedTuple
+from typing import IO, TYPE_CHECKING, Any, BinaryIO, Final, NamedTuple
 
 import lz4.frame
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from hybridlog.formats.reading import (
     TOO_MANY_CHANNELS,
@@ -26,18 +26,6 @@ from hybridlog.formats.reading import (
     Source,
     cannot_open,
     regroup,
-)
-from hybridlog.formats.rosbag1.records import (
-    OP_BAG_HEADER,
-    OP_CHUNK,
-    OP_CHUNK_INFO,
-    OP_CONNECTION,
-    OP_INDEX_DATA,
-    Record,
-    Run,
-    Space,
-    parse_fields,
-    read_run,
 )
 from hybridlog.wording import listed
 from hybridlog_storage.errors import SourceError
@@ -51,24 +39,181 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-MAGIC = b"#ROSBAG V2.0\n"
+MAGIC: Final = b"#ROSBAG V2.0\n"
 
-_UNDEFINED = -1
-_TOO_MANY = -2  # one more channel than a recording can have
-
-_ENTRY_BYTES = {OP_INDEX_DATA: 12, OP_CHUNK_INFO: 8}  # of the lists in index records
-_UNPACKERS: dict[bytes, tuple[Any, bytes]] = {
-    b"bz2": (bz2.BZ2Decompressor, b"BZh"),
-    b"lz4": (lz4.frame.LZ4FrameDecompressor, b"\x04\x22\x4d\x18"),
+_MESSAGE, _BAG_HEADER, _INDEX_DATA, _CHUNK, _CHUNK_INFO, _CONNECTION = 2, 3, 4, 5, 6, 7
+_NEEDED: Final[dict[int, dict[bytes, int | None]]] = {
+    _MESSAGE: {b"conn": 4, b"time": 8},
+    _BAG_HEADER: {b"index_pos": 8},
+    _INDEX_DATA: {b"conn": 4, b"count": 4},
+    _CHUNK: {b"compression": None, b"size": 4},
+    _CHUNK_INFO: {b"chunk_pos": 8, b"count": 4},
+    _CONNECTION: {b"conn": 4, b"topic": None},
 }
+"""Fields that a kind of record has, and the length of their values; None for any."""
+_ENTRY_BYTES: Final = {_INDEX_DATA: 12, _CHUNK_INFO: 8}  # of the lists in index records
+_UNPACKERS: Final[dict[bytes, Any]] = {
+    b"bz2": bz2.BZ2Decompressor,
+    b"lz4": lz4.frame.LZ4FrameDecompressor,
+}
+_UNDEFINED, _TOO_MANY = -1, -2  # in the place of a channel
 
-_WINDOW = 4 << 20
-_MAX_DEFINITION = 64 << 20
-_AT_ONCE = 64 << 20  # bytes of an unpacked chunk in memory; larger ones go to a file
+_MAX_HEADER: Final = 1 << 20
+_LEAST_HEADER: Final = 8  # bytes of one with the field `op` only; zeros are no header
+_MAX_DEFINITION: Final = 64 << 20
+_OP: Final = b"\x04\0\0\0op="
+_LOOK_BACK: Final = 320  # most bytes in front of this field in a header that is searched for
+_MAX_FOUND: Final = 4096  # longest header that is searched for
+_WINDOW = 4 << 20  # bytes that are read at once
+_AT_ONCE: Final = 64 << 20  # bytes of an unpacked chunk in memory; larger ones go to a file
 _UNSTATED = 16 << 20  # bytes that a chunk may unpack to whatever its header says
-_MAX_CHUNK_BYTES = 2 << 30  # and whatever it says
-_STEP = 256 << 10  # bytes that are unpacked at once
-_STREAMS = 1000  # compressed streams in a chunk, and as many bytes for each further one
+_MAX_CHUNK_BYTES: Final = 2 << 30  # and whatever it says
+_STEP: Final = 256 << 10  # bytes that are unpacked at once
+
+_u32 = struct.Struct("<I").unpack_from
+
+
+class _Record(NamedTuple):
+    """A record: its kind, the values of its header, and `[start, end)` of its data."""
+
+    op: int
+    fields: dict[bytes, bytes]
+    start: int
+    end: int
+
+    def number(self, name: bytes) -> int:
+        return int.from_bytes(self.fields.get(name, b""), "little")
+
+    def time(self, name: bytes) -> int:
+        packed = self.number(name)
+        return (packed & 0xFFFFFFFF) * 10**9 + (packed >> 32 & 0xFFFFFFFF)
+
+
+def _fields(data: bytes) -> dict[bytes, bytes]:
+    """The values of `name=value` fields, the last of each name; empty if they are damaged."""
+    found: dict[bytes, bytes] = {}
+    pos, end = 0, len(data)
+    while pos < end:
+        start = pos + 4
+        if start > end or (pos := start + _u32(data, pos)[0]) > end:
+            return {}
+        name, equals, value = data[start:pos].partition(b"=")
+        if not equals:
+            return {}
+        found[name] = value
+    return found
+
+
+def _parsed(header: bytes, start: int, end: int) -> _Record | None:
+    """The record with this header; None if it lacks a field that its kind needs."""
+    fields = _fields(header)
+    op = fields.get(b"op", b"")
+    needed = _NEEDED.get(op[0], {}) if len(op) == 1 else {b"op": 1}
+    if all(n in fields and size in {None, len(fields[n])} for n, size in needed.items()):
+        return _Record(op[0], fields, start, end)
+    return None
+
+
+def _record_at(file: IO[bytes], pos: int, size: int) -> _Record | None:
+    """The record at a position of a file, None without one; its data may end past the file."""
+    file.seek(pos)
+    length = int.from_bytes(file.read(4), "little")
+    if not 0 < length <= min(_MAX_HEADER, size - pos - 8):
+        return None
+    raw = file.read(length + 4)
+    start = pos + 8 + length
+    return _parsed(raw[:length], start, start + _u32(raw, length)[0])
+
+
+def _search(file: IO[bytes], pos: int, size: int) -> int | None:
+    """First position at or behind `pos` of a file that looks like a record."""
+    while pos < size:
+        file.seek(pos)
+        data = file.read(_STEP + _LOOK_BACK + len(_OP))
+        hit = data.find(_OP)
+        while hit >= 0:
+            # The header's length precedes its first field and must reach past the op.
+            for place in range(min(hit - 4, _STEP - 1), max(0, hit - _LOOK_BACK) - 1, -1):
+                length = _u32(data, place)[0]
+                if hit + 4 - place <= length <= _MAX_FOUND and _is_believable(
+                    file, pos + place, size
+                ):
+                    return pos + place
+            hit = data.find(_OP, hit + 1)
+        pos += _STEP
+    return None
+
+
+def _is_believable(file: IO[bytes], pos: int, size: int) -> bool:
+    """True if what looks like a record is one.
+
+    A message counts only if another record follows it. Compressed chunks contain pieces of
+    messages, too, but no valid record follows those. Only a chunk may be cut.
+    """
+    record = _record_at(file, pos, size)
+    if record is None or record.op not in _NEEDED or (record.op != _CHUNK and record.end > size):
+        return False
+    return record.op != _MESSAGE or _is_sound(file, record.end, size)
+
+
+def _is_sound(file: IO[bytes], pos: int, size: int) -> bool:
+    """True if a record starts at a position, or the file ends there."""
+    return pos == size or _record_at(file, pos, size) is not None
+
+
+class _Walk(NamedTuple):
+    """The messages at the beginning of some bytes.
+
+    Attributes:
+        rows: Of each, begin and length of its payload, and the places of its connection and time.
+        connections: Connection records, and the number of messages before each.
+        end: The end of the last whole record.
+    """
+
+    rows: list[tuple[int, int, int, int]]
+    connections: list[tuple[int, _Record]]
+    end: int
+
+
+def walk(data: bytes) -> _Walk:
+    """Read the whole message and connection records at the beginning of some bytes."""
+    rows: list[tuple[int, int, int, int]] = []
+    connections: list[tuple[int, _Record]] = []
+    # Headers of one length are mostly alike, except for these two values.
+    shapes: dict[int, tuple[int, int, bytes, bytes, bytes]] = {}
+    pos, size, u32 = 0, len(data), _u32
+    while pos + 8 <= size:
+        head = pos + 4
+        body = head + u32(data, pos)[0]
+        if body - head < _LEAST_HEADER or body + 4 > size:
+            break
+        start = body + 4
+        count = u32(data, body)[0]
+        if start + count > size:
+            break
+        if body - head in shapes:
+            conn, time, first, second, third = shapes[body - head]
+            if (
+                data.startswith(first, head)
+                and data.startswith(second, head + len(first) + (4 if conn < time else 8))
+                and data.endswith(third, head, body)
+            ):
+                rows.append((start, count, head + conn, head + time))
+                pos = start + count
+                continue
+        record = _parsed(data[head:body], start, start + count)
+        if record is None or record.op not in {_MESSAGE, _CONNECTION}:
+            break
+        pos = record.end
+        if record.op == _CONNECTION:
+            connections.append((len(rows), record))
+            continue
+        header = data[head:body]
+        conn, time = header.rindex(b"\x09\0\0\0conn=") + 9, header.rindex(b"\x0d\0\0\0time=") + 9
+        rows.append((start, count, head + conn, head + time))
+        (low, low_end), (high, high_end) = sorted(((conn, conn + 4), (time, time + 8)))
+        shapes[body - head] = conn, time, header[:low], header[low_end:high], header[high_end:]
+    return _Walk(rows, connections, pos)
 
 
 @dataclass(slots=True)
@@ -80,9 +225,9 @@ class _Place:
     got: int = 0  # messages read in it
     indexed: int | None = None  # messages in its index records, None before the first one
     reasons: list[str] = field(default_factory=list)
-    broken: bool = False  # messages may be missing
-    torn_index: bool = False  # some of its index records could not be read
-    cut: bool = False  # the file ends in it
+    is_broken: bool = False  # messages may be missing
+    is_torn: bool = False  # some of its index records could not be read
+    is_cut: bool = False  # the file ends in it
 
 
 class _Connection(NamedTuple):
@@ -92,13 +237,9 @@ class _Connection(NamedTuple):
     topic: bytes
     data: bytes
 
-    @classmethod
-    def of(cls, record: Record, data: bytes) -> _Connection:
-        return cls(record.number(b"conn"), record.fields[b"topic"], data)
-
     def channel(self) -> Channel:
         """The channel of its messages."""
-        fields = {k.decode(errors="replace"): v for k, v in parse_fields(self.data).items()}
+        fields = {k.decode(errors="replace"): v for k, v in _fields(self.data).items()}
         definition = fields.pop("message_definition", None)
         name = fields.pop("type", b"").decode(errors="replace")
         fields.pop("topic", None)
@@ -121,21 +262,19 @@ class Rosbag1Source(Source):
     def __init__(self, path: Path) -> None:
         super().__init__(path, kind="ROS 1 bag", profile="ros1", files=[path])
         self._meaning: dict[int, _Connection] = {}  # of connection ids, at present
-        self._fallback: dict[int, _Connection] = {}
+        self._fallback: dict[int, _Connection] = {}  # by the index of the bag
         self._numbers: dict[_Connection, int] = {}
-        self._undefined: Counter[int] = Counter()  # messages by connection id
-        self._too_many: Counter[int] = Counter()
+        self._left_out: dict[int, Counter[int]] = {_UNDEFINED: Counter(), _TOO_MANY: Counter()}
         self._chunks: list[tuple[int, int]] = []  # by the index: place and number of messages
         self._index_pos = 0
         self._index_is_short = False
         self._zeros: list[range] = []  # between records
-        self._skipped = 0
+        self._passed = 0  # behind the header of the last record, whose length may be wrong
         self._place: _Place | None = None
         try:
             self._file: BinaryIO = path.open("rb", buffering=1 << 16)
         except OSError as error:
             raise cannot_open(path, error) from error
-        self._space = Space(self._file, self.size_bytes, _WINDOW)
         try:
             self._open()
         except BaseException as error:
@@ -155,16 +294,16 @@ class Rosbag1Source(Source):
     # Opening: the bag header, and the index if it exists.
 
     def _open(self) -> None:
-        magic = self._space.read(0, len(MAGIC))
+        magic = self._file.read(len(MAGIC))
         if magic != MAGIC:
             raise SourceError(_not_version_2(self.path, magic))
-        record = self._space.record(len(MAGIC))
+        record = self._record(len(MAGIC))
         if record is None and self.size_bytes < len(MAGIC) + 4096:
             raise SourceError(
                 f"{self.path}: the file ends in the bag header, before any message; "
                 "copy it again from where it was recorded"
             )
-        if record is None or record.op != OP_BAG_HEADER:
+        if record is None or record.op != _BAG_HEADER:
             return
         if encryptor := record.fields.get(b"encryptor"):
             raise SourceError(
@@ -175,7 +314,7 @@ class Rosbag1Source(Source):
         if 0 < self._index_pos <= self.size_bytes:
             self._read_index(record)
 
-    def _read_index(self, head: Record) -> None:
+    def _read_index(self, head: _Record) -> None:
         """Read connections and chunk list; the list counts only if it is complete."""
         chunks: list[tuple[int, int]] = []
         times: list[int] = []
@@ -187,12 +326,15 @@ class Rosbag1Source(Source):
                 continue
             if record is None or record.end > self.size_bytes:
                 return
-            data = self._space.read(record.start, min(record.end - record.start, _MAX_DEFINITION))
-            if record.op == OP_CONNECTION:
+            length = record.end - record.start
+            self._file.seek(record.start)
+            data = self._file.read(min(length, _MAX_DEFINITION))
+            if record.op == _CONNECTION:
                 connections += 1
-                if len(data) == record.end - record.start:  # that in a chunk may be lost
-                    self._fallback[record.number(b"conn")] = _Connection.of(record, data)
-            elif record.op == OP_CHUNK_INFO:
+                if len(data) == length:  # that in a chunk may be lost
+                    conn = record.number(b"conn")
+                    self._fallback[conn] = _Connection(conn, record.fields[b"topic"], data)
+            elif record.op == _CHUNK_INFO:
                 pairs = np.frombuffer(data, "<u4", len(data) // 8 * 2).reshape(-1, 2)
                 chunks.append((record.number(b"chunk_pos"), int(pairs[:, 1].sum(dtype=np.int64))))
                 times += record.time(b"start_time"), record.time(b"end_time")
@@ -211,36 +353,42 @@ class Rosbag1Source(Source):
         if self.message_count:
             self.time_range = (min(times), max(times) + 1)
 
-    # Reading the file.
+    # Records of the file.
 
-    def _record(self, pos: int) -> Record | None:
-        """The record at a position of the file.
+    def _record(self, pos: int) -> _Record | None:
+        """The record at a position, None without one; its data may end past the file.
 
         Some recorders state a wrong length for the list in an index record. Its number of
         entries then says where the next record starts.
         """
-        record = self._space.record(pos)
+        record = _record_at(self._file, pos, self.size_bytes)
         if record is None or record.op not in _ENTRY_BYTES:
             return record
         end = record.start + _ENTRY_BYTES[record.op] * record.number(b"count")
-        if record.end != end and self._space.record(record.end) is None:
-            return record._replace(end=end) if self._space.is_sound(end) else record
+        if record.end != end and _record_at(self._file, record.end, self.size_bytes) is None:
+            return (
+                record._replace(end=end) if _is_sound(self._file, end, self.size_bytes) else record
+            )
         return record
 
     def _behind_zeros(self, pos: int) -> int | None:
         """Position of the record, or end of the file, behind zeros; None without one."""
         end = pos
-        while data := self._space.read(end, _STEP):
+        self._file.seek(pos)
+        while data := self._file.read(_STEP):
             rest = data.lstrip(b"\0")
             end += len(data) - len(rest)
             if rest:
                 break
         # The first bytes of a record may be zeros, too.
         starts = range(max(pos + 1, end - 3), end + 1)
-        return next((start for start in starts if self._space.is_sound(start)), None)
+        return next(
+            (start for start in starts if _is_sound(self._file, start, self.size_bytes)), None
+        )
+
+    # Reading the file.
 
     def _pieces(self) -> Iterator[Batch]:
-        """Walk the file record by record and chunk by chunk."""
         pos = len(MAGIC)
         try:
             while pos < self.size_bytes:
@@ -249,9 +397,9 @@ class Rosbag1Source(Source):
         except OSError as error:
             place = self._place_at(pos)
             place.reasons.append(f"the system cannot read on: {error.strerror or error}")
-            place.end, place.broken = self.size_bytes, True
+            place.end, place.is_broken = self.size_bytes, True
         self.bytes_read = self.size_bytes
-        was_cut = self._place is not None and self._place.cut
+        was_cut = self._place is not None and self._place.is_cut
         self._finish_place()
         if (self._index_pos > self.size_bytes or self._index_is_short) and not was_cut:
             reason = f"the file ends before the end of its index, which starts at {self._index_pos}"
@@ -260,30 +408,30 @@ class Rosbag1Source(Source):
         self._report_rest()
 
     def _step(self, pos: int) -> Generator[Batch, None, int]:
-        """Read one record, chunk or run of loose messages; returns the position behind it."""
+        """Read one record, chunk or run of messages; returns the position behind it."""
         record = self._record(pos)
-        # The length of a record that was only skipped may be wrong.
-        skipped, self._skipped = self._skipped, 0
+        passed, self._passed = self._passed, 0
         if record is None:
-            return self._skip_damage(pos, skipped or pos + 1)
-        if record.op == OP_CHUNK:
+            return self._skip(pos, passed or pos + 1)
+        if record.op == _CHUNK:
             return (yield from self._chunk(pos, record))
-        if record.in_chunk:
-            # Also messages behind an uncompressed chunk whose length field is too small.
-            return (yield from self._run(self._space, pos))
-        if record.end > self.size_bytes:
-            return self._skip_damage(pos, record.start)
-        if record.op == OP_INDEX_DATA:
+        if record.end > min(self.size_bytes, record.start + MAX_PAYLOAD):
+            return self._skip(pos, record.start)
+        if record.op in {_MESSAGE, _CONNECTION}:
+            # The end of an uncompressed chunk too, whose length is too small or is damaged.
+            place = self._place_at(pos)
+            return (yield from self._run(self._file, pos, self.size_bytes, place))
+        if record.op == _INDEX_DATA:
             place = self._place or self._place_at(pos)
             place.indexed = (place.indexed or 0) + record.number(b"count")
             place.end = record.end
-        elif record.op == OP_CHUNK_INFO:
+        elif record.op == _CHUNK_INFO:
             self._finish_place()
-        self._skipped = record.start
+        self._passed = record.start
         return record.end
 
-    def _skip_damage(self, pos: int, start: int) -> int:
-        """Skip from damage at `pos` to the first valid record at or behind `start`."""
+    def _skip(self, pos: int, start: int) -> int:
+        """Go from damage at `pos` to the first record at or behind `start`."""
         behind = self._behind_zeros(pos)
         if self._chunks and behind is not None and not self._listed(pos, behind):
             self._zeros.append(range(pos, behind))
@@ -291,201 +439,166 @@ class Rosbag1Source(Source):
         if self._place is not None:  # the record before, with a wrong length, is not its end
             self._place.end = min(self._place.end, start)
         place = self._place_at(pos)
-        place.torn_index = place.start < pos
-        return self._search(place, pos, start)
+        place.is_torn = place.start < pos
+        return self._behind(place, self._file, pos, start, self.size_bytes)
 
-    def _search(self, place: _Place, pos: int, start: int) -> int:
-        """Find the first record of the file at or behind `start`, after damage at `pos`."""
-        found = self._space.search(start)
-        place.cut = found is None
-        place.broken |= place.indexed is None
-        what = "the file ends in a record that starts" if place.cut else "bytes that are no record"
-        place.reasons.append(f"{what} at byte {pos}")
-        place.end = self.size_bytes if found is None else found
-        return place.end
+    def _behind(self, place: _Place, file: IO[bytes], pos: int, start: int, size: int) -> int:
+        """The first record of a file at or behind `start`, after damage at `pos`."""
+        found = _search(file, start, size)
+        what = "bytes that are no record" if found else "the file ends in a record that starts"
+        if file is self._file:
+            place.end = found or size
+            place.is_cut = found is None
+        place.is_broken |= file is not self._file or place.indexed is None
+        where = "" if file is self._file else " of the chunk"
+        place.reasons.append(f"{what} at byte {pos}{where}")
+        return found or size
 
-    # Chunks.
+    # Chunks and runs of messages.
 
-    def _chunk(self, pos: int, record: Record) -> Generator[Batch, None, int]:
+    def _chunk(self, pos: int, record: _Record) -> Generator[Batch, None, int]:
         """Read a chunk; returns the position behind it."""
         self._finish_place()
-        place = self._place = _Place(pos, min(record.end, self.size_bytes))
-        form, size = record.fields[b"compression"], record.number(b"size")
-        if form in _UNPACKERS:
-            with SpooledTemporaryFile(max_size=_AT_ONCE) as file:
-                return (yield from self._packed_chunk(place, record, file))
-        if form != b"none":
-            unknown = f"the chunk's compression {form.decode(errors='replace')!r} is not known"
-            first = self._space.record(record.start)
-            if first is None or not first.in_chunk:
-                return self._pass_chunk(place, record, unknown)
-            place.reasons.append(f"{unknown}; it has none")
-        if size != record.end - record.start:
-            place.reasons.append(
-                f"the chunk's header says {size} bytes, its record {record.end - record.start}"
-            )
-        pos = yield from self._run(self._space, record.start, record.end)
-        if pos == self.size_bytes < record.end and not place.cut:
-            place.reasons.append("the file ends in a chunk")
-            place.cut = True
-        return pos
-
-    def _packed_chunk(
-        self, place: _Place, record: Record, file: IO[bytes]
-    ) -> Generator[Batch, None, int]:
-        """Read a compressed chunk; returns the position behind it."""
-        try:
-            used, place.cut = self._unpack(record, file)
-        except (OSError, EOFError, RuntimeError, ValueError) as error:
-            if isinstance(error, OSError) and error.errno:  # of the system, not of the format
-                raise
-            return self._pass_chunk(place, record, f"the chunk cannot be unpacked: {error}")
-        length, size = record.end - record.start, record.number(b"size")
-        if place.cut:
-            place.reasons.append("the file ends in a chunk")
-        elif used != length:
-            place.reasons.append(
-                f"the chunk's record says {length} compressed bytes, there are {used}"
-            )
-        if size != file.tell() and not place.cut:
-            place.reasons.append(f"the chunk's header says {size} bytes, there are {file.tell()}")
-        place.end = self.size_bytes if place.cut else record.start + used
-        for batch in self._run(Space(file, file.tell(), _AT_ONCE, is_chunk=True), 0):
-            if place.got > MIN_RECORDS + used:
-                place.got -= len(batch)
-                place.reasons.append("the chunk holds too many messages for its size")
-                place.broken = True
-                break
-            yield batch
+        end = min(record.end, self.size_bytes)
+        place = self._place = _Place(pos, end)
+        form, length = record.fields[b"compression"], record.end - record.start
+        if form not in _UNPACKERS:
+            if form != b"none":
+                name = form.decode(errors="replace")
+                place.reasons.append(f"the chunk's compression {name!r} is not known")
+            if (size := record.number(b"size")) != length:
+                place.reasons.append(f"the chunk's header says {size} bytes, its record {length}")
+            pos = yield from self._run(self._file, record.start, end, place)
+            if pos == self.size_bytes < record.end and not place.is_cut:
+                place.reasons.append("the file ends in a chunk")
+                place.is_cut = True
+            return pos
+        with SpooledTemporaryFile(max_size=_AT_ONCE) as file:
+            try:
+                used = self._unpack(record, file, place)
+            except (OSError, EOFError, RuntimeError, ValueError) as error:
+                if isinstance(error, OSError) and error.errno:  # of the system, not of the format
+                    raise
+                place.reasons.append(f"the chunk cannot be unpacked: {error}")
+                size, start = self.size_bytes, record.start
+                if record.end <= size and _is_sound(self._file, record.end, size):
+                    return record.end
+                return self._behind(place, self._file, start, start, size)
+            size = file.tell()
+            place.end = self.size_bytes if place.is_cut else record.start + used
+            for batch in self._run(file, 0, size, place):
+                if place.got > MIN_RECORDS + used:
+                    place.got -= len(batch)
+                    place.reasons.append("the chunk holds too many messages for its size")
+                    place.is_broken = True
+                    break
+                yield batch
         return place.end
 
-    def _unpack(self, record: Record, file: IO[bytes]) -> tuple[int, bool]:
+    def _unpack(self, record: _Record, file: IO[bytes], place: _Place) -> int:
         """Unpack a chunk into a file, also one whose record states too few bytes.
 
         Returns:
-            Number of its compressed bytes, and whether the bag ends in them.
+            Number of its compressed bytes.
 
         Raises:
             ValueError: The chunk is damaged or too large; or another error of its format.
         """
-        make, magic = _UNPACKERS[record.fields[b"compression"]]
-        size = record.number(b"size")
+        size, length = record.number(b"size"), record.end - record.start
         most = min(max(size, _UNSTATED), _MAX_CHUNK_BYTES)
-        length = min(record.end, self.size_bytes) - record.start
         # In a valid bag index records follow, so a little more is enough.
-        end = min(record.start + length + max(length, 1 << 20), self.size_bytes)
-        pos, streams = record.start, 0
-        while not streams or self._space.read(pos, len(magic)) == magic:
-            streams += 1
-            if streams > _STREAMS + length // _STREAMS:
-                raise ValueError("it consists of too many streams")
-            stream = make()
-            while not stream.eof:
-                data = self._space.read(pos, min(_STEP, end - pos)) if stream.needs_input else b""
-                if stream.needs_input and not data:
-                    if record.end < self.size_bytes:
-                        raise ValueError("its compressed bytes end too early")
-                    return pos - record.start, True
-                pos += len(data)
-                file.write(stream.decompress(data, _STEP))
-                if file.tell() > most:
-                    raise ValueError(f"its header says {size} bytes, it has more than {most}")
-                if is_implausible(file.tell(), length):
-                    raise ValueError(f"its {length} bytes become more than {file.tell()}")
-            pos -= len(stream.unused_data or b"")
-        return pos - record.start, False
+        there = min(record.end, self.size_bytes) - record.start
+        end = min(record.start + there + max(there, 1 << 20), self.size_bytes)
+        self._file.seek(record.start)
+        pos, stream = record.start, _UNPACKERS[record.fields[b"compression"]]()
+        while not stream.eof:
+            data = self._file.read(min(_STEP, end - pos)) if stream.needs_input else b""
+            if stream.needs_input and not data:
+                if record.end < self.size_bytes:
+                    raise ValueError("its compressed bytes end too early")
+                place.is_cut = True
+                place.reasons.append("the file ends in a chunk")
+                return pos - record.start
+            pos += len(data)
+            file.write(stream.decompress(data, _STEP))
+            if file.tell() > most:
+                raise ValueError(f"its header says {size} bytes, it has more than {most}")
+            if is_implausible(file.tell(), there):
+                raise ValueError(f"its {there} bytes become more than {file.tell()}")
+        used = pos - len(stream.unused_data or b"") - record.start
+        if used != length:
+            place.reasons.append(
+                f"the chunk's record says {length} compressed bytes, there are {used}"
+            )
+        if size != file.tell():
+            place.reasons.append(f"the chunk's header says {size} bytes, there are {file.tell()}")
+        return used
 
-    def _pass_chunk(self, place: _Place, record: Record, reason: str) -> int:
-        """Go on behind an unreadable chunk; trust its length only if a record follows."""
-        place.reasons.append(reason)
-        is_right = record.end <= self.size_bytes and self._space.is_sound(record.end)
-        return record.end if is_right else self._search(place, record.start, record.start)
-
-    # Runs of messages.
-
-    def _run(self, space: Space, pos: int, stop: int | None = None) -> Generator[Batch, None, int]:
-        """Read message and connection records, up to another kind.
+    def _run(
+        self, file: IO[bytes], pos: int, end: int, place: _Place
+    ) -> Generator[Batch, None, int]:
+        """Read message and connection records; returns the position of what is neither.
 
         Args:
-            space: The bytes.
+            file: The bag, or an unpacked chunk.
             pos: First byte.
-            stop: Expected end of the run, which limits reading ahead.
-
-        Returns:
-            The position of the next record.
+            end: End of the bytes.
+            place: Counts the messages, and is told of damage in an unpacked chunk.
         """
-        limit = space.size if stop is None else min(stop, space.size)
-        need = 0
-        while pos < limit:
-            data = space.read(pos, max(min(space.window, limit - pos), need))
-            if not data:
-                break
-            run, asked, need = read_run(data), need, 0
-            place, end = self._place_at(pos), pos + run.end
-            record = None if run.end == len(data) else space.record(end)
-            is_over = record is not None and not record.in_chunk and not space.is_chunk
-            go_on = end
-            if is_over and stop is not None:
-                place.reasons.append(f"a record that does not belong into a chunk at byte {end}")
-            elif not is_over and run.end < len(data):
-                if run.end or not asked:
-                    need = self._need(space, record, end, stop)
-                if not need:
-                    run, go_on = self._resume(space, place, run, pos)
-            batch = self._batch(data, run, place)
-            if not space.is_chunk:
-                place.end = max(place.end, go_on) if len(batch) else place.end
-                self.bytes_read = go_on
-            yield batch
-            pos = go_on
-            if is_over:
-                break
+        size, window = (self.size_bytes, _WINDOW) if file is self._file else (end, _AT_ONCE)
+        need, is_over = 0, False
+        while pos < end and not is_over:
+            file.seek(pos)
+            data = file.read(min(max(window, need), end - pos))
+            found = walk(data)
+            behind = pos + found.end
+            record = None if behind == end else _record_at(file, behind, size)
+            need = record.end - behind if record and record.op in {_MESSAGE, _CONNECTION} else 0
+            is_over = not 0 < need <= min(end - behind, MAX_PAYLOAD)
+            if behind < end and (record is None or (is_over and file is not self._file)):
+                start, rows = behind + 1, found.rows
+                if rows and sum(rows[-1][:2]) == found.end:
+                    start = pos + rows[-1][0]
+                behind = self._behind(place, file, behind, start, size)
+                if behind < pos + found.end:  # the length of the last message was wrong
+                    found = found._replace(rows=rows[:-1])
+                is_over = file is self._file
+            yield self._batch(data, found, place)
+            if file is self._file:
+                place.end = max(place.end, behind)
+                self.bytes_read = behind
+            pos = behind
         return pos
 
-    def _need(self, space: Space, record: Record | None, pos: int, stop: int | None) -> int:
-        """Bytes to read for an incomplete record of a run, 0 if it cannot be complete."""
-        if record is None or not record.in_chunk or record.end > space.size:
-            return 0
-        # One that crosses the end of its chunk is right if another record follows.
-        is_right = stop is None or record.end <= stop or space.is_sound(record.end)
-        return record.end - pos if is_right and record.end - pos <= MAX_PAYLOAD else 0
-
-    def _resume(self, space: Space, place: _Place, run: Run, pos: int) -> tuple[Run, int]:
-        """The run without a last message of a wrong length, and the next record behind damage."""
-        end = pos + run.end
-        start = end + 1
-        if run.columns.size and run.columns[:2, -1].sum() == run.end:
-            start = pos + int(run.columns[0, -1])
-        if not space.is_chunk:
-            found = self._search(place, end, start)
-        else:
-            found, place.broken = space.search(start) or space.size, True
-            if not place.cut:
-                place.reasons.append(
-                    f"bytes that are no record at byte {end} of the unpacked chunk"
-                )
-        return (run._replace(columns=run.columns[:, :-1]) if found < end else run), found
-
-    def _batch(self, data: bytes, run: Run, place: _Place) -> Batch:
-        """Assign channels to the messages of a run; count those without one."""
-        offset, length, connection, times = run.columns
-        channel = np.empty(len(offset), np.int32)
+    def _batch(self, data: bytes, found: _Walk, place: _Place) -> Batch:
+        """The messages of a run with a known channel."""
+        table = np.array(found.rows, np.int64).reshape(-1, 4)
+        count = len(table)
+        ids, stamps = np.empty(0, np.int64), np.empty((0, 2), np.int64)
+        if count:
+            words = sliding_window_view(np.frombuffer(data, np.uint8), 4)
+            ids = words[table[:, 2]].view("<u4")[:, 0].astype(np.int64)
+            stamps = np.stack([words[table[:, 3] + n].view("<u4")[:, 0] for n in (0, 4)], axis=1)
+        times = stamps[:, 0].astype(np.int64) * 10**9 + stamps[:, 1]
+        channel = np.empty(count, np.int32)
         done = 0
-        for before, record in run.connections:
-            meaning = _Connection.of(record, data[record.start : record.end])
-            if self._meaning.get(meaning.conn, meaning) != meaning:
+        for before, record in found.connections:
+            conn = record.number(b"conn")
+            meaning = _Connection(conn, record.fields[b"topic"], data[record.start : record.end])
+            if self._meaning.get(conn, meaning) != meaning:
                 # The id now has another meaning; earlier messages keep the old one.
-                channel[done:before] = self._channels(connection[done:before])
+                channel[done:before] = self._channels(ids[done:before])
                 done = before
-            self._meaning[meaning.conn] = meaning
-        channel[done:] = self._channels(connection[done:])
-        place.got += len(offset)
-        zeros = np.zeros(len(offset), np.uint32)
-        batch = Batch(data, offset, length, channel, times, times, zeros)
-        if not len(batch) or channel.min() >= 0:
+            self._meaning[conn] = meaning
+        channel[done:] = self._channels(ids[done:])
+        place.got += count
+        batch = Batch(
+            data, table[:, 0], table[:, 1], channel, times, times, np.zeros(count, np.uint32)
+        )
+        if not count or channel.min() >= 0:
             return batch
-        for number, counts in ((_UNDEFINED, self._undefined), (_TOO_MANY, self._too_many)):
-            counts.update(connection[channel == number].tolist())
+        for number, counts in self._left_out.items():
+            counts.update(ids[channel == number].tolist())
         return batch.take(channel >= 0)
 
     def _channels(self, connection: NDArray[np.int64]) -> NDArray[np.int32]:
@@ -521,7 +634,7 @@ class Rosbag1Source(Source):
         place, self._place = self._place, None
         if place is None:
             return
-        expected = None if place.torn_index else place.indexed
+        expected = None if place.is_torn else place.indexed
         if self._chunks:
             expected = self._listed(place.start, max(place.end, place.start + 1))
         lost = None if expected is None else max(0, expected - place.got)
@@ -529,9 +642,9 @@ class Rosbag1Source(Source):
             if not lost:
                 return
             place.reasons.append(f"its index lists {expected} messages, {place.got} are there")
-        if lost is None and not place.broken:
+        if lost is None and not place.is_broken:
             lost = 0
-        if place.cut and not 0 < self._index_pos <= self.size_bytes:
+        if place.is_cut and not 0 < self._index_pos <= self.size_bytes:
             lost = None  # the content behind the end is unknown
         self._report(place.start, max(place.end - place.start, 0), "; ".join(place.reasons), lost)
 
@@ -547,16 +660,18 @@ class Rosbag1Source(Source):
 
     def _report_rest(self) -> None:
         """Report messages without a channel and zeros, and add channels without messages."""
-        if self._too_many:
-            self._report(None, None, TOO_MANY_CHANNELS, self._too_many.total())
-        if self._undefined:
-            shown = listed(map(str, sorted(self._undefined)))
+        undefined, too_many = self._left_out.values()
+        if too_many:
+            self._report(None, None, TOO_MANY_CHANNELS, too_many.total())
+        if undefined:
+            shown = listed(map(str, sorted(undefined)))
             reason = f"messages of connections that the bag does not define (id {shown})"
-            self._report(None, None, reason, self._undefined.total())
-        used = {connection.conn for connection in self._numbers} | set(self._too_many)
-        known = {**self._fallback, **self._meaning}
-        numbers = [self._number(conn) for conn in known if conn not in used]
-        if left_out := numbers.count(_TOO_MANY):
+            self._report(None, None, reason, undefined.total())
+        used = {connection.conn for connection in self._numbers} | set(too_many)
+        silent = [
+            self._number(conn) for conn in {**self._fallback, **self._meaning} if conn not in used
+        ]
+        if left_out := silent.count(_TOO_MANY):
             self._report(None, None, f"{left_out} {TOO_MANY_SILENT}", 0)
         if self._zeros:
             self.remarks.append(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, Literal, cast
@@ -15,7 +15,7 @@ from rosbags.rosbag1.writer import Writer as RosbagsWriter
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from hybridlog.formats.mcap.writer import source_metadata
-from hybridlog.formats.writing import FileWriter, Target, destination, failures
+from hybridlog.formats.writing import Answer, LogWriter, Target, destination, failures
 from hybridlog.schema.completion import with_nested
 from hybridlog_storage.disk.unfinished import beside, scratch_directory
 from hybridlog_storage.errors import UsageError
@@ -24,14 +24,19 @@ if TYPE_CHECKING:
     from rosbags.interfaces import Connection
 
     from hybridlog_storage.messages import Batch, Channel, Schema
-    from hybridlog_storage.segments.attachments import Attachment
 
 _TIME_LIMIT = 2**32 * 10**9
 _LARGEST_DEFINITION = 256 << 10
 _ConnectionKey = tuple[str, str, bytes, str, str | None, str | None]
 
 
-class BagWriter(FileWriter):
+def write_bag(answer: Answer, target: Target) -> None:
+    """Write one ROS 1 bag."""
+    with BagWriter(target) as bag:
+        bag.write_answer(answer)
+
+
+class BagWriter(LogWriter):
     """Writes one ROS 1 bag, version 2.0, with its index.
 
     Only channels of ROS 1 messages (`message_encoding` is `ros1`) fit into a bag.
@@ -45,7 +50,6 @@ class BagWriter(FileWriter):
     def __init__(
         self, target: Target, *, compression: Literal["none", "bz2", "lz4"] = "none"
     ) -> None:
-        super().__init__()
         self._stream: BinaryIO | None = None
         self._final: Path | None = None
         self._connections: dict[_ConnectionKey, Connection] = {}
@@ -70,7 +74,7 @@ class BagWriter(FileWriter):
             try:
                 self._writer.open()
             except BaseException:
-                self._discard()
+                self.abort()
                 raise
 
     def write(self, batch: Batch, channels: Sequence[Channel]) -> None:
@@ -110,12 +114,6 @@ class BagWriter(FileWriter):
                 if channel.message_encoding == "ros1" and channel.schema is not None:
                     self._connection(channel)
 
-    def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
-        """Do nothing: a bag has no metadata records."""
-
-    def add_attachment(self, attachment: Attachment) -> None:
-        """Do nothing: a bag has no attachments."""
-
     def _connection(self, channel: Channel) -> Connection:
         connection = self._known.get(channel)
         if connection is None:
@@ -139,7 +137,8 @@ class BagWriter(FileWriter):
             self._connections[key] = self._writer.add(channel.topic, schema, md5sum, metadata)
         return self._connections[key]
 
-    def _finish(self) -> None:
+    def commit(self) -> None:
+        """Complete the bag."""
         with failures(self._name):
             self._writer.close()
             if self._atomic and self._final is not None:
@@ -154,9 +153,10 @@ class BagWriter(FileWriter):
                 elif self._final is not None:
                     with self._final.open("wb") as device:
                         shutil.copyfileobj(file, device, 1 << 20)
-        self._discard()
+        self.abort()
 
-    def _discard(self) -> None:
+    def abort(self) -> None:
+        """Remove the file, and its temporary copy."""
         with suppress(OSError):
             self._writer.abort()
         self._unfinished.remove()

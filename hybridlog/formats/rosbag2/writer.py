@@ -15,7 +15,7 @@ from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
 
 from hybridlog.formats.mcap.writer import McapWriter
 from hybridlog.formats.rosbag2.directory import NAME
-from hybridlog.formats.writing import FileWriter, Target, failures, new_directory, path_of
+from hybridlog.formats.writing import Answer, LogWriter, Target, failures, new_directory, path_of
 from hybridlog.formats.yaml_values import YamlError, parse_yaml
 from hybridlog.schema.completion import with_nested
 from hybridlog_storage.errors import DiskFullError, HybridlogError, UsageError
@@ -98,7 +98,13 @@ class _Topic:
         return found
 
 
-class Rosbag2Writer(FileWriter):
+def write_rosbag2(answer: Answer, target: Target, **settings: Any) -> None:
+    """Write a bag of ROS 2, with the settings of a `Rosbag2Writer`."""
+    with Rosbag2Writer(target, **settings) as bag:
+        bag.write_answer(answer)
+
+
+class Rosbag2Writer(LogWriter):
     """Writes a bag.
 
     Args:
@@ -111,7 +117,6 @@ class Rosbag2Writer(FileWriter):
     """
 
     def __init__(self, target: Target, *, storage: str = "mcap", max_file: int = MAX_FILE) -> None:
-        super().__init__()
         self._storage = storage
         path = path_of(target, "rosbag2", "a directory")
         self._name = os.fspath(path)
@@ -167,7 +172,7 @@ class Rosbag2Writer(FileWriter):
 
     def _next_file(self) -> None:
         if self._log is not None:
-            self._log.close()
+            self._log.commit()
         name = f"{self._final.name}_{len(self._files)}{STORAGES[self._storage]}"
         self._files[name] = _Span()
         self._size = 0
@@ -196,8 +201,9 @@ class Rosbag2Writer(FileWriter):
             self._known[channel] = found
         return self._known[channel]
 
-    def _finish(self) -> None:
-        self._current().close()
+    def commit(self) -> None:
+        """Complete the bag."""
+        self._current().commit()
         described = {"rosbag2_bagfile_information": self.described()}
         with failures(self._name):
             with (self._unfinished.path / NAME).open("x", encoding="utf-8") as file:
@@ -242,13 +248,14 @@ class Rosbag2Writer(FileWriter):
         """The number of a channel's topic."""
         return self._topic(channel).number
 
-    def _discard(self) -> None:
+    def abort(self) -> None:
+        """Remove the bag."""
         if self._log is not None:
             self._log.abort()
         self._unfinished.remove()
 
 
-class _SqliteFile:
+class _SqliteFile(LogWriter):
     """A file of a bag in SQLite; times of publication and attachments have no place in it."""
 
     def __init__(self, path: Path, bag: Rosbag2Writer) -> None:
@@ -273,13 +280,7 @@ class _SqliteFile:
                 "INSERT INTO messages(topic_id, timestamp, data) VALUES (?, ?, ?)", rows
             )
 
-    def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
-        """Do nothing: there are no metadata records."""
-
-    def add_attachment(self, attachment: Attachment) -> None:
-        """Do nothing: there are no attachments."""
-
-    def close(self) -> None:
+    def commit(self) -> None:
         """Complete the file."""
         types: dict[str, tuple[str, str, str, str]] = {}
         with self._failures():

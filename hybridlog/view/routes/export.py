@@ -132,11 +132,11 @@ class _Pieces:
 def pieces_of(query: Query) -> Pieces:
     """An MCAP file in pieces; a piece is made when it is asked for."""
     from hybridlog.formats.mcap.writer import McapWriter
-    from hybridlog.formats.slices import IN_FORCE, batches_of, profile_of
+    from hybridlog.formats.slices import log_of
 
-    written = _Pieces()
-    with McapWriter(cast("BinaryIO", written), profile=profile_of(query)) as writer:
-        for batch, channels in batches_of(query, IN_FORCE):
+    written, log = _Pieces(), log_of(query)
+    with McapWriter(cast("BinaryIO", written), profile=log.profile) as writer:
+        for batch, channels in log.batches:
             writer.write(batch, channels)
             if written.size >= PIECE:
                 yield written.take()
