@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from mcap.records import AttachmentIndex, MetadataIndex
 
-    from hybridlog.query.query import Query
+    from hybridlog.query.question import Question
     from hybridlog.session import Session
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.messages import Channel
@@ -151,14 +151,13 @@ def metadata_of(session: Session, entry: RecordingEntry) -> list[StoredMetadata]
     return [read() for read in _metadata_records(session, entry)]
 
 
-def extras_of(query: Query) -> Extras:
-    """Attachments and metadata records that belong to the answer of a query as a slice.
+def extras_of(session: Session, question: Question) -> Extras:
+    """Attachments and metadata records that belong to the answer of a question as a slice.
 
     Raises:
         SegmentError: A segment is damaged.
         TimeError: The range is empty, or outside all recordings.
     """
-    session, question = query.session, query.question
     found = Extras([], [], [], 0, [])
     left_out = 0
     topics = set(question.topics)

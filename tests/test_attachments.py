@@ -18,7 +18,7 @@ from rosbags.rosbag1 import Reader as BagReader
 from rosbags.rosbag1 import Writer as BagWriter
 
 import hybridlog as hl
-from hybridlog.attachments import StoredAttachment, extras_of, file_names
+from hybridlog.attachments import Extras, StoredAttachment, extras_of, file_names
 from hybridlog.cli.answers import write_answer
 from hybridlog_storage.catalog import CATALOG
 from hybridlog_storage.errors import SegmentError
@@ -129,16 +129,20 @@ def test_a_channel_without_messages_changes_no_answer(store: hl.Store) -> None:
     assert list(store.topic("/silent").where({"data": {"$gt": "a"}})) == []
 
 
+def extras_in(query: hl.Query) -> Extras:
+    return extras_of(query.session, query.question)
+
+
 def test_a_whole_recording_comes_back(log: Path, store: hl.Store, tmp_path: Path) -> None:
     write_answer(
-        store.all_topics(), "mcap", tmp_path / "out.mcap", extras=extras_of(store.all_topics())
+        store.all_topics(), "mcap", tmp_path / "out.mcap", extras=extras_in(store.all_topics())
     )
     assert contents(tmp_path / "out.mcap") == contents(log)
 
 
 def test_a_slice_has_the_attachments_from_before_its_end(store: hl.Store, tmp_path: Path) -> None:
     slice_ = store.topic("/n").between(TIMES[2], TIMES[5])
-    extras = extras_of(slice_)
+    extras = extras_in(slice_)
     assert [a.name for a in extras.attachments] == [a[1] for a in ATTACHMENTS[:3]]
     assert (extras.left_out, len(extras.metadata)) == (2, 3)
     assert {c.topic for c in extras.channels} == {"/n"}
@@ -219,7 +223,7 @@ def test_nothing_is_lost_on_the_way(log: Path, tmp_path: Path) -> None:
         assert listed(other.attachments("other name")) == ATTACHMENTS
         assert other.metadata("other name") == METADATA
         query = other.all_topics()
-        write_answer(query, "mcap", tmp_path / "out.mcap", extras=extras_of(query))
+        write_answer(query, "mcap", tmp_path / "out.mcap", extras=extras_in(query))
     assert contents(tmp_path / "out.mcap") == contents(log)
 
 
@@ -352,7 +356,7 @@ def test_large_attachments_are_never_in_memory(tmp_path: Path) -> None:
             (large,) = store.attachments("a")
             large.save(tmp_path / "large")
             query = store.all_topics()
-            write_answer(query, "mcap", tmp_path / "out.mcap", extras=extras_of(query))
+            write_answer(query, "mcap", tmp_path / "out.mcap", extras=extras_in(query))
             _, peak = tracemalloc.get_traced_memory()
         finally:
             tracemalloc.stop()

@@ -22,8 +22,8 @@ from hybridlog.cli.options import VERBOSE, AsJson, Forced, Topics
 from hybridlog.cli.progress import Bar, progress_bar
 from hybridlog.cli.signals import if_stopped
 from hybridlog.formats import OUTPUTS, formats_of, is_directory, suffixes_of
+from hybridlog.formats.answer import Answer
 from hybridlog.formats.slices import IN_FORCE, Front, log_of, payload_bytes
-from hybridlog.formats.writing import Answer
 from hybridlog_storage.disk.unfinished import is_published, undone
 from hybridlog_storage.errors import PayloadError, UsageError
 from hybridlog_storage.stopping import anywhere
@@ -32,7 +32,8 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from hybridlog.attachments import Extras
-    from hybridlog.formats.writing import Line, Target
+    from hybridlog.formats.answer import Line
+    from hybridlog.formats.writing import Target
     from hybridlog.message import Message
     from hybridlog.query.answers.completeness import Completeness
     from hybridlog.query.answers.follow import Following

@@ -96,7 +96,7 @@ def export_command(given: _Given) -> None:
             if form in _LOGS:
                 from hybridlog.attachments import extras_of
 
-                extras = extras_of(one)
+                extras = extras_of(one.session, one.question)
                 if given.no_attachments:
                     extras = extras._replace(attachments=[], left_out=0)
                 _write_file(one, to, path, front, extras)

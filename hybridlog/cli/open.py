@@ -139,7 +139,9 @@ def _written(store: Store, query: Query, given: _Given) -> Path:
     from hybridlog.attachments import extras_of
 
     def write(query: Query, path: Path) -> None:
-        write_answer(query, "mcap", path, extras=extras_of(query), quiet=given.quiet)
+        write_answer(
+            query, "mcap", path, extras=extras_of(query.session, query.question), quiet=given.quiet
+        )
 
     if given.path is None:
         ids = query.recordings

@@ -20,7 +20,8 @@ from hybridlog.arrays import is_video_type
 from hybridlog.arrays.bitstream import frame_of, is_key_frame
 from hybridlog.arrays.video import VideoDecoder, pyav
 from hybridlog.drawing.images import shown_pixels
-from hybridlog.formats.writing import Answer, Sink, Target, Whole, failures, path_of
+from hybridlog.formats.answer import Answer
+from hybridlog.formats.writing import Sink, Target, Whole, failures, path_of
 from hybridlog.query.times import format_time
 from hybridlog_storage.errors import (
     DefinitionError,

@@ -25,7 +25,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from hybridlog.formats.writing import Answer, Sink, Target, failures
+from hybridlog.formats.answer import Answer
+from hybridlog.formats.writing import Sink, Target, failures
 from hybridlog.schema.arrow_types import (
     bounds_of,
     converted,

@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
 
 from hybridlog.drawing.images import Picture, picture
+from hybridlog.formats.answer import Answer
 from hybridlog.formats.raw import PICTURE_SUFFIXES, Directory
-from hybridlog.formats.writing import Answer, Sink, Target
+from hybridlog.formats.writing import Sink, Target
 from hybridlog_storage.errors import DefinitionError, PayloadError, UsageError
 
 if TYPE_CHECKING:

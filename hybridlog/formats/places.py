@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pyarrow as pa
 
-from hybridlog.formats.writing import Answer, Sink, Target
+from hybridlog.formats.answer import Answer
+from hybridlog.formats.writing import Sink, Target
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:

@@ -19,7 +19,8 @@ from hybridlog_storage.errors import UsageError
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog.formats.writing import Answer, Target
+    from hybridlog.formats.answer import Answer
+    from hybridlog.formats.writing import Target
     from hybridlog.schema.codec import Codec
     from hybridlog_storage.messages import Channel
 

@@ -17,7 +17,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hybridlog.formats.writing import Answer, Sink, Target, Whole, failures, new_directory
+from hybridlog.formats.answer import Answer
+from hybridlog.formats.writing import Sink, Target, Whole, failures, new_directory
 from hybridlog_storage.mongo.collection_names import collection_of
 
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
     from hybridlog.attachments import Extras
-    from hybridlog.formats.writing import Answer
+    from hybridlog.formats.answer import Answer
     from hybridlog.query.query import Query
     from hybridlog_storage.messages import Batch, Channel
 
@@ -96,7 +96,7 @@ def log_of(query: Query, front: Front = IN_FORCE, extras: Extras | None = None) 
         front: The latched messages in front of the answer.
         extras: What it has beside messages.
     """
-    from hybridlog.formats.writing import Answer
+    from hybridlog.formats.answer import Answer
 
     return Answer(batches=batches_of(query, front), extras=extras, profile=profile_of(query))
 
@@ -105,7 +105,7 @@ def write_mcap(query: Query, path: Path) -> None:
     """Write a slice as an MCAP file, as `hybridlog export` does; all of it or nothing."""
     from hybridlog.attachments import extras_of
 
-    OUTPUTS["mcap"].write(log_of(query, extras=extras_of(query)), path)
+    OUTPUTS["mcap"].write(log_of(query, extras=extras_of(query.session, query.question)), path)
 
 
 MAX_BYTES: Final = 16 << 30

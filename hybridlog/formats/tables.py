@@ -17,6 +17,7 @@ import pyarrow.csv
 import pyarrow.parquet
 
 from hybridlog.columns.parquet_file import leaves
+from hybridlog.formats.answer import Answer
 from hybridlog.formats.json_text import (
     PIECE_BYTES,
     base64_column,
@@ -24,7 +25,7 @@ from hybridlog.formats.json_text import (
     json_pieces,
 )
 from hybridlog.formats.jsonl import rows_within
-from hybridlog.formats.writing import Answer, Sink, Target
+from hybridlog.formats.writing import Sink, Target
 from hybridlog.schema.arrow_types import common_schema, converted, is_bytes
 from hybridlog_storage.errors import UsageError
 

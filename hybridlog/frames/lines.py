@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import pyarrow as pa
 
+from hybridlog.formats.answer import Line
 from hybridlog.formats.jsonl import json_rows, object_line
-from hybridlog.formats.writing import Line
 from hybridlog.frames.answer import Decoder
 from hybridlog.frames.builder import Block
 from hybridlog.frames.columns import flat, summary_array, with_summaries

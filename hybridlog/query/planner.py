@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 
 _GROUP_GROWTH = 64  # so many times more recordings are planned after each group
 _MAX_GROUP = 4096  # recordings planned at once, if they do not overlap
-_RENEWALS = 5  # of a question, while a ring lets files go
+_RENEWALS = 50  # of a question, while a ring lets files go
 _READ_AHEAD_FROM = 50  # messages; nothing is read ahead for fewer
 _T = TypeVar("_T")
 _Rows = TypeVar("_Rows", "MatchColumns", "Values")

@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 
 from hybridlog.cli import output
+from hybridlog.formats.answer import Answer
 from hybridlog.formats.jsonl import write_json
-from hybridlog.formats.writing import Answer
 from tests.independent import Seen, read_bag
 from tests.limits import Limit
 

@@ -17,7 +17,8 @@ from PIL import Image
 import hybridlog as hl
 from hybridlog.cli.answers import write_answer
 from hybridlog.formats import OUTPUTS
-from hybridlog.formats.writing import Answer, Sink
+from hybridlog.formats.answer import Answer
+from hybridlog.formats.writing import Sink
 from hybridlog.maintenance.expiry import expire
 from hybridlog.message import Message
 from hybridlog.query.query import Query

@@ -10,10 +10,10 @@ import pytest
 from mcap.reader import NonSeekingReader, make_reader
 from rosbags.rosbag1 import Reader
 
+from hybridlog.formats.answer import Answer
 from hybridlog.formats.mcap.writer import McapWriter
 from hybridlog.formats.raw import write_raw
 from hybridlog.formats.rosbag1.writer import BagWriter
-from hybridlog.formats.writing import Answer
 from hybridlog_storage.errors import UsageError
 from hybridlog_storage.messages import Channel, Schema
 from tests.formats.batches import STRING, STRING_MD5, batch, many, ros1_channels

@@ -614,8 +614,10 @@ STORE: dict[str, Rule] = {
     ),
     "extras": Rule(
         lambda s: (
-            sorted(c.topic for c in extras_of(s.all_topics()).channels),
-            len(extras_of(s.all_topics()).problems),
+            sorted(
+                c.topic for c in extras_of(s.all_topics().session, s.all_topics().question).channels
+            ),
+            len(extras_of(s.all_topics().session, s.all_topics().question).problems),
         ),
         lambda _: (sorted(CHANNELS), 0),
     ),

@@ -201,7 +201,8 @@ def test_extras_and_what_is_shown(tmp_path: Path) -> None:
             (attachment,) = store.attachments(LABEL)
             assert (attachment.name, b"".join(attachment.pieces())) == (record.name, b"fx: 500")
             assert [one.values for one in store.metadata(LABEL)] == [{"name": "seven"}]
-            extras = extras_of(store.topic("arm"))
+            query = store.topic("arm")
+            extras = extras_of(query.session, query.question)
             assert (len(extras.attachments), len(extras.metadata)) == (1, 1)
         done = answer("info", LABEL, "--attachments", "--json", store=found.path)
         assert [one["name"] for one in done.json] == [record.name]

@@ -326,7 +326,7 @@ def test_what_came_into_other_segments_counts_on_a_full_disk(
 
     def append(segment: SegmentFile, chunks: Any) -> Any:
         go_on.wait(60)
-        if segment.number == 0 and segment.chunks > 1:
+        if segment.number == 1:
             raise DiskFullError("no room")
         return real(segment, chunks)
 
@@ -340,7 +340,7 @@ def test_what_came_into_other_segments_counts_on_a_full_disk(
         made.writer.flush()
     counts = Counter(int(n) for chunk in made.chunks for n in chunk.batch.channel)
     assert [made.writer.written_of(TOPICS[one]) for one in (0, 1)] == [counts[1], counts[2]]
-    assert counts[2] > 1
+    assert counts[1] > 1
     made.writer.abort()
     for path in made.folder.glob("*.open"):
         recover_segment(path)
