@@ -102,7 +102,6 @@ PLACES = {
     "index_interval_bytes": "hybridlog.index.index_writer._INTERVAL_BYTES",
     "recording_filled": "hybridlog.live.recording.LiveRecording.filled",
     "recording_is_under_pressure": "hybridlog.live.recording.LiveRecording._is_under_pressure",
-    "tables_cost": "hybridlog.query.engines.tables.TablesEngine.cost",
 }
 
 

@@ -24,8 +24,8 @@ from hybridlog.drawing.density import periods as periods_of
 from hybridlog.drawing.series import series
 from hybridlog.query import periods
 from hybridlog.query.answers.field_statistics import _Running
-from hybridlog.query.engines import MatchColumns
 from hybridlog.query.planner import Planner
+from hybridlog.query.rows import MatchColumns
 from hybridlog_storage.errors import TimeError, TopicError, UsageError
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings
