@@ -609,10 +609,10 @@ class Query:
                 windows.
             TimeError: no duration, or a range outside of all recordings.
         """
-        from hybridlog.query.answers.rates import Rates
+        from hybridlog.query.answers.regularity import Regularity
 
         with self.counters.timed():
-            return Rates(self.session, self.question, self.counters).rate(window)
+            return Regularity(self.session, self.question, self.counters).rate(window)
 
     def check(self) -> list[TopicCheck]:
         """Check how regularly the topics came: rate, jitter, gap, late start, early stop, losses.
@@ -625,10 +625,10 @@ class Query:
             UsageError: `limit`, `every`, `reverse`, or another clock than the log's.
             TimeError: a range outside of all recordings.
         """
-        from hybridlog.query.answers.regularity import check
+        from hybridlog.query.answers.regularity import Regularity
 
         with self.counters.timed():
-            return check(self.session, self.question, self.counters)
+            return Regularity(self.session, self.question, self.counters).check()
 
     def stats(self, *fields: str) -> list[FieldStatistics]:
         """Statistics of the numeric fields: count, NaN, infinite, least, greatest, mean, deviation.
@@ -743,10 +743,10 @@ class Query:
                 log's, or no number of periods.
             TimeError: no duration, or a range outside of all recordings.
         """
-        from hybridlog.query.answers.rates import Rates
+        from hybridlog.query.answers.regularity import Regularity
 
         with self.counters.timed():
-            return Rates(self.session, self.question, self.counters).gaps(longer_than, periods)
+            return Regularity(self.session, self.question, self.counters).gaps(longer_than, periods)
 
     # What an answer lacks.
 
