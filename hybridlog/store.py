@@ -30,9 +30,8 @@ from hybridlog.maintenance.report import Progress, RepairReport
 from hybridlog.opened import OpenStore
 from hybridlog.query.asked import narrowed
 from hybridlog.query.choice import Choice
-from hybridlog.query.query import Query
+from hybridlog.query.query import Query, of_now
 from hybridlog.query.question import Question
-from hybridlog.query.steps import of_now
 from hybridlog.query.times import parse_range, parse_time
 from hybridlog.query.topics import namesakes
 from hybridlog.record.losses import extent_of

@@ -59,7 +59,6 @@ PLACES = {
     "ros2_pause_s": "hybridlog.live.sources.ros2.source._PAUSE_S",
     "ros2_term_s": "hybridlog.live.sources.ros2.source._TERM_S",
     "shown_bytes": "hybridlog.message._MAX_SHOWN",
-    "max_second_look": "hybridlog.query.answers.rates._MAX_SECOND_LOOK",
     "merged_bytes": "hybridlog.query.chunk_scan._MERGED_BYTES",
     "min_threaded_bytes": "hybridlog.query.chunk_scan._MIN_THREADED_BYTES",
     "small_chunk_bytes": "hybridlog.query.chunk_scan._SMALL_CHUNK_BYTES",
@@ -102,7 +101,6 @@ PLACES = {
     "index_interval_bytes": "hybridlog.index.index_writer._INTERVAL_BYTES",
     "recording_filled": "hybridlog.live.recording.LiveRecording.filled",
     "recording_is_under_pressure": "hybridlog.live.recording.LiveRecording._is_under_pressure",
-    "tables_cost": "hybridlog.query.engines.tables.TablesEngine.cost",
 }
 
 

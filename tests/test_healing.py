@@ -26,12 +26,10 @@ import hybridlog as hl
 from benchmarks.simulator.write import write_bag
 from hybridlog.index import access
 from hybridlog.query.counters import Counters
-from hybridlog.query.engines import MatchColumns
-from hybridlog.query.engines.payload_scan import PayloadScan
-from hybridlog.query.engines.tables import TablesEngine
 from hybridlog.query.index_reader import IndexReader
 from hybridlog.query.planner import Planner
 from hybridlog.query.question import Part
+from hybridlog.query.rows import MatchColumns, Rows
 from hybridlog_storage.catalog import CATALOG
 from hybridlog_storage.errors import (
     ConnectionLostError,
@@ -234,22 +232,23 @@ def test_an_unreachable_server_is_not_waited_for_by_each_question(
             assert len(tried) == 2
 
 
-def test_another_engine_goes_on_where_one_fails(
-    store: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_chunks_go_on_where_a_table_fails(store: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with hl.open(store) as opened:
         question = opened.topic(IMU).where(WHERE).question
         planner = Planner(opened.session, question, Counters())
         part = planner.parts()[0]
         want = [row for found in planner.outcomes(part) for row in zip(*found, strict=True)]
 
-        def breaking(engine: TablesEngine, part: Part) -> Iterator[MatchColumns]:
-            whole = next(PayloadScan(opened.session, Counters()).outcomes(part))
-            yield MatchColumns(*(column[:7] for column in whole))
-            yield MatchColumns(*(column[:0] for column in whole))
-            raise StoreError("gone")
+        def breaking(rows: Rows, part: Part) -> Iterator[MatchColumns]:
+            for found in outcomes(rows, part):
+                yield MatchColumns(*(column[:7] for column in found))
+                yield MatchColumns(*(column[:0] for column in found))
+                if rows.tabled(part) is not None:
+                    raise StoreError("gone")
+                yield MatchColumns(*(column[7:] for column in found))
 
-        monkeypatch.setattr(TablesEngine, "outcomes", breaking)
+        outcomes = Rows.outcomes
+        monkeypatch.setattr(Rows, "outcomes", breaking)
         planner = Planner(opened.session, question, Counters())
         got = [row for found in planner.outcomes(part) for row in zip(*found, strict=True)]
         assert got == want

@@ -78,7 +78,7 @@ def tf_command(given: _Given) -> None:
             query = given.bounded(chosen.topic(*topic))
             if len(query.topics) > 1:
                 raise UsageError(f"Times are those of one topic, not of {listed(query.topics)}.")
-            frames, stamps = frames_and_stamps(query)
+            frames, stamps = frames_and_stamps(query.session, query.question, query.counters)
             if source is None and len(frames) == 1:
                 source = frames[0]
         if source is None:

@@ -2,7 +2,7 @@
 
 A table is valid if every segment with rows in it has the catalog's digest, and the number of
 rows is the catalog's number of messages. All bytes read are verified by checksum. An invalid
-table is ignored, and other engines answer.
+table is ignored, and chunks answer.
 
 A file is opened once for all recordings and topics in it. A recording that is not found is a
 reason to look at the folders again.

@@ -15,7 +15,7 @@ from hybridlog.arrays.message_arrays import plain_type
 from hybridlog.query.answers.lost import completeness_of
 from hybridlog.query.answers.marks import marks_in
 from hybridlog.query.answers.match_times import match_times
-from hybridlog.query.answers.regularity import check
+from hybridlog.query.answers.regularity import Regularity
 from hybridlog.query.counters import Counters
 from hybridlog.query.query import Query
 from hybridlog.query.question import Question
@@ -72,7 +72,8 @@ class _Judge:
             lost = complete.messages if complete.is_exact else None
             yield self._lost("", self._contract.lost, lost)
         topics = [name for name in self._contract.topics if name in self._known]
-        checked = check(self._session, self._question(*topics), Counters()) if topics else []
+        question = self._question(*topics)
+        checked = Regularity(self._session, question, Counters()).check() if topics else []
         by_topic = {one.topic: one for one in checked}
         beyond = self._beyond()
         for name, rules in self._contract.topics.items():

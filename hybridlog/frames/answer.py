@@ -32,9 +32,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.query.chunk_scan import MessageRun
-    from hybridlog.query.engines import Values
     from hybridlog.query.planner import Planner
     from hybridlog.query.question import Part, Question, RecordedChannel
+    from hybridlog.query.rows import Values
     from hybridlog.schema.codec import Decoded
     from hybridlog_storage.catalog import RecordingEntry
 

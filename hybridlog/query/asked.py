@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 from hybridlog.query.counters import Counters
 from hybridlog.query.planner import Planner
 
 if TYPE_CHECKING:
+    from hybridlog.query.query import Query
     from hybridlog.query.question import RecordedChannel, Span
-    from hybridlog.query.steps import Steps
-
-_Query = TypeVar("_Query", bound="Steps")
 
 
-def narrowed(query: _Query, *topics: str) -> _Query:
+def narrowed(query: Query, *topics: str) -> Query:
     """The same question about one or some of its topics, by their full names.
 
     If the question is about several recordings, tables of each topic name them.
@@ -27,17 +25,17 @@ def narrowed(query: _Query, *topics: str) -> _Query:
     return type(query)(query.source, question, query.conditions)
 
 
-def channels_of(query: Steps) -> list[RecordedChannel]:
+def channels_of(query: Query) -> list[RecordedChannel]:
     """Every channel of a question."""
     return Planner(query.session, query.question, query.counters).channels()
 
 
-def field_types(query: Steps) -> dict[str, str] | None:
+def field_types(query: Query) -> dict[str, str] | None:
     """Paths that can be queried and their types; None when a topic has no fixed fields."""
     return query.session.field_types(query.topics, query.question.recordings)
 
 
-def spans_of(query: Steps) -> dict[str, Span]:
+def spans_of(query: Query) -> dict[str, Span]:
     """Log time `[begin, end)` of the messages of each recording, ns; by id, oldest first.
 
     It is known without reading messages: those at its ends may not satisfy the predicate,

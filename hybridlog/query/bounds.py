@@ -131,7 +131,7 @@ class BoundsFinder:
 
     def __init__(self, catalog: Catalog, predicate: Predicate) -> None:
         self._catalog = catalog
-        # A mean is rounded, and other engines may round it otherwise.
+        # A mean is rounded, and chunks may give another one.
         fields = {one.path: one for one in _bounded(predicate.root) if _is_plain(one)}
         self._fields = [*fields.values()]
         self._known: dict[str, dict[str, Ends]] = {}

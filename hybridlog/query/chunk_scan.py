@@ -14,7 +14,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, TypeAlias
 
 import numpy as np
 
@@ -47,22 +47,10 @@ ChunkKey = tuple[str, int, int]
 """Recording id, segment number, chunk number in the segment."""
 
 
-@dataclass(frozen=True, slots=True)
-class RowSelection:
-    """Messages of some chunks that an index found.
-
-    Attributes:
-        offsets: Payload offsets in each chunk, sorted, by chunk; int64[k].
-        unindexed: Indexes of the channels without an index. All their messages are read,
-            and a filter decides.
-    """
-
-    offsets: Mapping[ChunkKey, NDArray[np.int64]]
-    unindexed: Collection[int] = ()
-
-
-Selector = Callable[[Sequence["ChunkTask"]], RowSelection]
-"""Finds the messages of some chunks that may match, in an index."""
+Offsets: TypeAlias = "Mapping[ChunkKey, NDArray[np.int64]]"
+"""Payload offsets of messages in each chunk, sorted; int64[k]."""
+Selector = Callable[[Sequence["ChunkTask"]], Offsets]
+"""Finds the messages of some chunks that match."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,8 +122,9 @@ class ScanPlan:
         channels: Every channel that is read.
         scans: The part of each recording to read.
         clock: The clock of the bounds.
-        selector: Reduces chunks to candidates; None reads everything.
+        selector: Finds the messages of channels without a filter; None reads everything.
         filters: Decides on each message of a channel, by index of the channel.
+        selected: Segments in which the selector finds messages of a channel with a filter.
         reverse: Latest message first.
         counters: Count what is read.
     """
@@ -145,6 +134,7 @@ class ScanPlan:
     clock: Clock = "log"
     selector: Selector | None = None
     filters: Mapping[int, MessageFilter] = field(default_factory=dict)
+    selected: Mapping[int, Collection[int]] = field(default_factory=dict)
     reverse: bool = False
     counters: Counters = field(default_factory=Counters)
 
@@ -159,6 +149,11 @@ class ScanPlan:
         if self.reverse:
             return sorted(found, key=lambda t: (-t.chunk.last, t.key))
         return sorted(found, key=lambda t: (t.chunk.first, t.key))
+
+    def filtered(self, task: ChunkTask) -> list[int]:
+        """Indexes of the channels on whose messages in a chunk filters decide."""
+        segment = task.chunk.segment
+        return [one for one in self.filters if segment not in self.selected.get(one, ())]
 
 
 class ChunkScan:
@@ -220,7 +215,7 @@ class ChunkScan:
             yield _merged(small)
         plan.counters.elapsed_s = time.monotonic() - started
 
-    def _selected(self, tasks: list[ChunkTask]) -> Iterator[tuple[ChunkTask, RowSelection | None]]:
+    def _selected(self, tasks: list[ChunkTask]) -> Iterator[tuple[ChunkTask, Offsets | None]]:
         """Skip the chunks without candidates."""
         selector = self._plan.selector
         if selector is None:
@@ -230,8 +225,8 @@ class ChunkScan:
             selection = selector(group)
             for task in group:
                 own = task.scan.channels
-                held = (own[channel] for channel in task.chunk.place.channels if channel in own)
-                if task.key in selection.offsets or any(c in selection.unindexed for c in held):
+                held = {own[channel] for channel in task.chunk.place.channels if channel in own}
+                if task.key in selection or not held.isdisjoint(self._plan.filtered(task)):
                     yield task, selection
 
     def loaded(self) -> Iterator[tuple[ChunkTask, MessageRun, ChunkTask | None]]:
@@ -250,7 +245,7 @@ class ChunkScan:
     def _ahead(
         self,
         tasks: list[ChunkTask],
-        start: Callable[[ChunkTask, RowSelection | None], _Loading],
+        start: Callable[[ChunkTask, Offsets | None], _Loading],
     ) -> Iterator[tuple[ChunkTask, MessageRun, ChunkTask | None]]:
         counters = self._plan.counters
         if tasks and self._session.segment(*tasks[0].key[:2]).is_fetched:
@@ -276,8 +271,8 @@ class ChunkScan:
             yield task, run, loading[0][0] if loading else None
 
     def _announced(
-        self, items: Iterator[tuple[ChunkTask, RowSelection | None]]
-    ) -> Iterator[tuple[ChunkTask, RowSelection | None]]:
+        self, items: Iterator[tuple[ChunkTask, Offsets | None]]
+    ) -> Iterator[tuple[ChunkTask, Offsets | None]]:
         """The same, after a bucket was asked for many of them at once."""
         room = _FETCHED_BYTES if self._reads_ahead else _MERGED_BYTES
         while group := list(_up_to(items, room)):
@@ -288,14 +283,19 @@ class ChunkScan:
                 self._session.segment(*segment).fetch(places)
             yield from group
 
-    def _load(self, task: ChunkTask, selection: RowSelection | None) -> _Loaded:
+    def _load(self, task: ChunkTask, selection: Offsets | None) -> _Loaded:
         chunk = self._session.read_chunk(*task.key[:2], task.chunk.place)
-        run = self._wanted(task, chunk, selection)
-        run, unreadable, expired = self._filtered(run)
+        undecided = self._plan.filtered(task)
+        run = self._wanted(task, chunk, selection, undecided)
+        run, unreadable, expired = self._filtered(run, undecided)
         return run, chunk.length + chunk.trailer, unreadable, expired
 
     def _wanted(
-        self, task: ChunkTask, chunk: StoredChunk, selection: RowSelection | None
+        self,
+        task: ChunkTask,
+        chunk: StoredChunk,
+        selection: Offsets | None,
+        undecided: Sequence[int],
     ) -> MessageRun:
         batch, seq = chunk.batch, chunk.seq
         table = np.full(int(batch.channel.max()) + 1, -1, np.int32)
@@ -310,7 +310,8 @@ class ChunkScan:
         channel = table[batch.channel]
         mask = channel >= 0
         if selection is not None:
-            mask &= _is_selected(selection, task.key, batch, channel)
+            offsets = selection.get(task.key, np.empty(0, np.int64))
+            mask &= np.isin(channel, undecided) | np.isin(batch.places[0], offsets)
         bounds = task.scan.bounds
         if bounds is not None:
             mask &= self._inside(batch, channel, mask, bounds)
@@ -325,15 +326,15 @@ class ChunkScan:
         own.channel = channel[rows]
         return MessageRun(own, seq[rows], self._plan.channels)
 
-    def _filtered(self, run: MessageRun) -> tuple[MessageRun, int, int]:
+    def _filtered(self, run: MessageRun, undecided: Sequence[int]) -> tuple[MessageRun, int, int]:
         """The messages that satisfy the predicate, and numbers as in `Matches`."""
         filters = self._plan.filters
-        if not filters or not len(run.batch):
+        if not undecided or not len(run.batch):
             return run, 0, 0
         holds = np.ones(len(run.batch), np.bool_)
         unreadable = expired = 0
         for index in distinct(run.batch.channel).tolist():
-            if index in filters:
+            if index in undecided:
                 rows = np.flatnonzero(run.batch.channel == index)
                 channel = self._plan.channels[index]
                 found = filters[index].matches(channel, run.batch.take(rows), run.seq[rows])
@@ -392,8 +393,8 @@ class ChunkScan:
 
 
 def _up_to(
-    items: Iterator[tuple[ChunkTask, RowSelection | None]], room: int
-) -> Iterator[tuple[ChunkTask, RowSelection | None]]:
+    items: Iterator[tuple[ChunkTask, Offsets | None]], room: int
+) -> Iterator[tuple[ChunkTask, Offsets | None]]:
     """The next chunks, until they have so many bytes."""
     for item in items:
         yield item
@@ -420,18 +421,6 @@ class _Deferred:
 
     def result(self) -> _Loaded:
         return self.load()
-
-
-def _is_selected(
-    selection: RowSelection, key: ChunkKey, batch: Batch, channel: NDArray[np.int32]
-) -> NDArray[np.bool_]:
-    mask = np.isin(channel, list(selection.unindexed))
-    offsets = selection.offsets.get(key)
-    if offsets is not None and len(offsets):
-        own, _ = batch.places
-        at = np.minimum(np.searchsorted(offsets, own), len(offsets) - 1)
-        mask |= offsets[at] == own
-    return mask
 
 
 def _merged(runs: list[MessageRun]) -> MessageRun:

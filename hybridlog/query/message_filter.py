@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from hybridlog.frames.names import is_summary
-from hybridlog.query.predicate.to_bool import to_bool
+from hybridlog.query.predicate.to_bool import UndecidedError, to_bool
 from hybridlog.query.predicate.tree import Predicate
 from hybridlog.schema.codec import plain_message
 from hybridlog_storage.errors import DefinitionError, PayloadError
@@ -29,7 +29,7 @@ class Matches(NamedTuple):
         holds: bool[n], True where the predicate holds.
         unreadable: Number of messages that the predicate could not test, because they
             do not fit their definition, or lack arrays.
-        expired: Number of those that lack arrays, since their payloads were deleted.
+        expired: Number of those that lack arrays, since their payloads are gone.
     """
 
     holds: NDArray[np.bool_]
@@ -99,7 +99,7 @@ class MessageFilter:
         lacking = decoded.rows[decoded.records.lacking()] if fields else decoded.rows[:0]
         decidable = np.setdiff1d(np.arange(len(batch)), lacking, assume_unique=True)
         found = self._one_by_one(channel, batch, seq, decidable)
-        return Matches(found.holds, found.unreadable + len(lacking), len(lacking))
+        return Matches(found.holds, found.unreadable + len(lacking), found.expired + len(lacking))
 
     def _one_by_one(
         self,
@@ -109,7 +109,7 @@ class MessageFilter:
         rows: NDArray[np.intp],
     ) -> Matches:
         holds = np.zeros(len(batch), np.bool_)
-        unreadable = 0
+        unreadable = lacking = 0
         test = self._summary_test if channel.is_reduced else self._test
         for row in rows.tolist():
             try:
@@ -121,8 +121,11 @@ class MessageFilter:
                 fields = {}
             if "_meta" in self._fields:
                 fields["_meta"] = _meta_of(channel, batch, seq, row)
-            holds[row] = test(fields)
-        return Matches(holds, unreadable)
+            try:
+                holds[row] = test(fields)
+            except UndecidedError:
+                lacking += 1
+        return Matches(holds, unreadable + lacking, lacking)
 
 
 def _elements_of(predicate: Predicate, types: Mapping[str, str]) -> set[str]:

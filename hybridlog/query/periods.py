@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -59,63 +58,6 @@ class Steps:
     def usual_period(self) -> float:
         """As the function of this name."""
         return usual_period(np.concatenate(self._sampled)) if self._sampled else 0.0
-
-
-class Regularity:
-    """Times from one message of a topic to the next, in bounded memory.
-
-    Attributes:
-        messages: Number of messages.
-        first: Log time of the first one, ns; 0 without any.
-        last: Log time of the last one, ns; 0 without any.
-        gap: Longest time from one to the next, begin and end, ns; empty before there is one.
-    """
-
-    def __init__(self) -> None:
-        self.messages = self.first = self.last = 0
-        self.gap = (0, 0)
-        self._steps = Steps()
-        self._usual = 0
-        self._sum = self._squares = 0.0  # of the differences from the first step
-
-    def add(self, times: NDArray[np.int64]) -> None:
-        """Add log times of the next messages, ns, ascending."""
-        if not len(times):
-            return
-        self._steps.add(times)
-        if not self.messages:
-            self.first = self.last = int(times[0])
-        edges = np.concatenate([[self.last], times])[0 if self.messages else 1 :]
-        steps = np.diff(edges)
-        if len(steps):
-            if self.messages < 2:
-                self._usual = int(steps[0])
-            place = int(steps.argmax())
-            if self.gap == (0, 0) or steps[place] > self.gap[1] - self.gap[0]:
-                self.gap = int(edges[place]), int(edges[place + 1])
-            differences = (steps - self._usual).astype(np.float64)
-            self._sum += float(differences.sum())
-            self._squares += float(np.square(differences).sum())
-        self.messages += len(times)
-        self.last = int(times[-1])
-
-    @property
-    def rate_hz(self) -> float | None:
-        """Mean rate from the first message to the last; None of fewer than two."""
-        return mean_rate(self.messages, self.first, self.last)
-
-    @property
-    def period_ns(self) -> float | None:
-        """The usual period; None of fewer than two messages."""
-        return self._steps.usual_period() if self.messages > 1 else None
-
-    @property
-    def jitter_ns(self) -> float | None:
-        """Standard deviation of the steps; None of fewer than three messages."""
-        count = self.messages - 1
-        if count < 2:
-            return None
-        return math.sqrt(max(self._squares / count - (self._sum / count) ** 2, 0.0))
 
 
 def mean_rate(messages: int, first: int, last: int) -> float | None:

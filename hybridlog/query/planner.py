@@ -1,8 +1,6 @@
-"""Splits a question into parts and chooses an engine for each.
+"""Splits a question into parts, each one topic of one recording, and joins their answers.
 
-This is the only place that chooses. A part is one topic of one recording: an ended, a
-running and a damaged recording may need different engines. Each engine estimates the cost
-of its answer; the cheapest one answers, and if it fails, the next one.
+`rows.py` has the rows of a part.
 """
 
 from __future__ import annotations
@@ -10,43 +8,31 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from operator import itemgetter
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
 from hybridlog.query.bounds import MIN_RECORDINGS, BoundsFinder, within_bounds
-from hybridlog.query.chunk_scan import ChunkKey, ChunkScan, MessageRun, RowSelection
-from hybridlog.query.engines import Checking, Counting, Need, UndecidedError
-from hybridlog.query.engines.chunk_index import ChunkIndex, Statistics
-from hybridlog.query.engines.payload_scan import PayloadScan
+from hybridlog.query.chunk_scan import ChunkKey, ChunkScan, MessageRun
 from hybridlog.query.question import Part
 from hybridlog.query.ranges import RangeResolver
+from hybridlog.query.rows import TABLE_ERRORS, Rows, filter_of
 from hybridlog.record.marks import MARKS
 from hybridlog.schema.column import STAMP
 from hybridlog.schema.states import GONE
-from hybridlog.snapshot import UNFINISHED
-from hybridlog_storage.errors import (
-    ChangedError,
-    ResourceError,
-    SegmentError,
-    StoreError,
-    TopicError,
-)
+from hybridlog_storage.errors import ChangedError, TopicError
 from hybridlog_storage.lazy import lazy
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog.query.chunk_scan import ChunkTask, ScanPlan
+    from hybridlog.query.chunk_scan import ChunkTask, Offsets, ScanPlan
     from hybridlog.query.counters import Counters
-    from hybridlog.query.engines import Engine, MatchColumns, Objects, Values
-    from hybridlog.query.engines.running import RunningTables
-    from hybridlog.query.engines.tables import TablesEngine
     from hybridlog.query.index_reader import IndexReader
     from hybridlog.query.message_filter import MessageFilter
     from hybridlog.query.question import Question, RecordedChannel, Span
     from hybridlog.query.ranges import Ranges
+    from hybridlog.query.rows import MatchColumns, Objects, Tabled, Values
     from hybridlog.schema.states import State
     from hybridlog.session import Session
     from hybridlog_storage.summary import RecordingSummary
@@ -57,14 +43,6 @@ _RENEWALS = 50  # of a question, while a ring lets files go
 _READ_AHEAD_FROM = 50  # messages; nothing is read ahead for fewer
 _T = TypeVar("_T")
 _Rows = TypeVar("_Rows", "MatchColumns", "Values")
-_Key = tuple[int, int]
-_COUNTING: Final[tuple[type[Counting], ...]] = (
-    Statistics,
-    ChunkIndex,
-)
-"""Engines that count without reading messages; the cheapest that can answers."""
-_FALLBACK_ERRORS = (ResourceError, SegmentError, StoreError, UndecidedError)
-"""Failures of one engine that another engine may not have."""
 
 
 class Planner:
@@ -79,8 +57,6 @@ class Planner:
         self._counted: set[Part] = set()  # parts whose messages without fields are counted
         self._ranges = RangeResolver(session, question)
         self._has_many_recordings = False  # recordings
-        self._scan = PayloadScan(session, counters)
-        self._counting = tuple(engine(session, counters) for engine in _COUNTING)
 
     @lazy
     def _index(self) -> IndexReader:
@@ -90,30 +66,11 @@ class Planner:
         return IndexReader(self.session, self.counters)
 
     @lazy
-    def _tables(self) -> TablesEngine:
-        from hybridlog.query.engines.tables import TablesEngine
-
+    def _rows(self) -> Rows:
         predicate, bounds = self.question.predicate, None
         if predicate is not None and self._has_many_recordings:
             bounds = BoundsFinder(self.session.catalog, predicate)
-        return TablesEngine(self.session, self.counters, bounds=bounds)
-
-    @lazy
-    def _running(self) -> RunningTables:
-        from hybridlog.query.engines.running import RunningTables
-
-        return RunningTables(self.session, self.counters)
-
-    def _files(self, part: Part, need: Need) -> tuple[Engine, ...]:
-        """The engines that may be able to answer."""
-        if part.recording.status in UNFINISHED:
-            is_plain = part.predicate is None and need is not Need.VALUES
-            return *self._counting, *(() if is_plain else (self._running,)), self._scan
-        if part.predicate is None and need is Need.OUTCOMES:
-            return *self._counting, self._tables, self._scan
-        if part.predicate is None and need is not Need.VALUES:
-            return *self._counting, self._scan
-        return *self._counting, self._tables, self._scan
+        return Rows(self.session, self.counters, bounds)
 
     def parts(self) -> list[Part]:
         """The question, split by recording and topic; recordings oldest first.
@@ -232,9 +189,7 @@ class Planner:
     def recordings_with_any(self) -> set[str]:
         """Ids of the recordings that have a message in the answer."""
         return {
-            part.recording.id
-            for part in self._decided(self.parts())
-            if self._count_part(self._choose(part, Need.COUNT), part)
+            part.recording.id for part in self._decided(self.parts()) if self._rows.count([part])
         }
 
     def batch_hint(self, parts: list[Part]) -> list[Part]:
@@ -258,40 +213,25 @@ class Planner:
 
     def outcomes(self, part: Part) -> Iterator[MatchColumns]:
         """For each message of a part, whether it matches, in order."""
-        (part,) = self._decided([part])
-        engines = self._choose(part, Need.OUTCOMES)
-        return self._first(engines, lambda engine, own: engine.outcomes(own), part)
+        return self._lasting(part, self._rows.outcomes)
 
     def values(self, part: Part, fields: Collection[str] | None) -> Iterator[Values]:
         """Fields of the matching messages of a part, in order."""
-        (part,) = self._decided([part])
-        return self._values(part, fields, self._choose(part, Need.VALUES, fields))
-
-    def _values(
-        self, part: Part, fields: Collection[str] | None, engines: Sequence[Engine]
-    ) -> Iterator[Values]:
-        return self._first(engines, lambda engine, own: engine.values(own, fields), part)
+        return self._lasting(part, lambda own: self._rows.values(own, fields))
 
     def values_of_tables(
         self, parts: Sequence[Part], fields: Collection[str] | None
     ) -> list[Iterator[Values]] | None:
-        """The same of each part, if tables of all of them have the fields."""
-        found = []
+        """The same of each part, if tables have the fields of all their messages."""
         for part in self._decided(parts):
-            engines = self._choose(part, Need.VALUES, fields)
-            if engines[0] is not self._tables:
+            found = self._rows.tabled(part, fields)
+            if found is None or found.rest is not None:
                 return None
-            try:
-                if part.predicate is not None:
-                    self._tables.check(part)
-            except _FALLBACK_ERRORS:
-                return None
-            found.append(self._values(part, fields, engines))
-        return found
+        return [self.values(part, fields) for part in parts]
 
     def objects(self, part: Part) -> Iterator[Objects]:
         """The matching messages of a part as plain objects, in order."""
-        return self._scan.objects_of(self.plan([part]))
+        return self._rows.objects(self.plan([part]))
 
     def runs(self) -> Iterator[MessageRun]:
         """The messages of the answer, in order."""
@@ -366,49 +306,49 @@ class Planner:
         return self._again(self._plan, parts)
 
     def _plan(self, parts: Sequence[Part]) -> ScanPlan:
-        parts = self._decided(parts)
-        plan = self._scan.plan(parts, filtered=False)
+        parts, rows = self._decided(parts), self._rows
+        plan = rows.plan(parts, filtered=False)
         plan.reverse = self.question.reverse
         if self.question.predicate is None or not parts:
             return plan
-        from hybridlog.query.message_filter import MessageFilter
-
-        selecting: dict[Engine, list[Part]] = defaultdict(list)
-        unindexed: set[int] = set()
+        in_tables: dict[Part, Tabled] = {}
         filters: dict[int, MessageFilter] = {}
+        selected: dict[int, Collection[int]] = {}
         place = {(c.recording.id, c.channel_id): i for i, c in enumerate(plan.channels)}
+        plan.filters, plan.selected = filters, selected
 
-        def read(part: Part) -> None:
-            assert part.predicate is not None
-            indexes = [place[part.recording.id, c.channel_id] for c in part.channels]
-            decide = MessageFilter(part.predicate, part.field_types)
-            filters.update(dict.fromkeys(indexes, decide))  # before chunks are read for it
-            unindexed.update(indexes)
+        def read(part: Part, segments: Collection[int] = ()) -> None:
+            """Let a filter decide, but for the messages in segments with tables."""
+            decide = filter_of(part)
+            assert decide is not None
+            for channel in part.channels:
+                index = place[part.recording.id, channel.channel_id]
+                selected[index], filters[index] = segments, decide
 
         for part in parts:
-            engine = self._selecting(part)
-            if engine is self._scan:
+            found = rows.tabled(part)
+            if found is None:
                 read(part)
-            else:
-                selecting[engine].append(part)
-        plan.filters = filters
+                continue
+            in_tables[part] = found
+            if found.segments is not None:
+                read(part, found.segments)
 
-        def select(tasks: Sequence[ChunkTask]) -> RowSelection:
+        def select(tasks: Sequence[ChunkTask]) -> Offsets:
             offsets: dict[ChunkKey, list[NDArray[np.int64]]] = defaultdict(list)
-            for engine, chosen in [*selecting.items()]:
+            wanted = {task.key for task in tasks}
+            for part, found in [*in_tables.items()]:
                 try:
-                    found = engine.select(chosen, tasks)
-                except _FALLBACK_ERRORS:
-                    for part in chosen:
-                        read(part)
-                    del selecting[engine]
+                    places = rows.places(found)
+                except TABLE_ERRORS:
+                    read(part)  # before chunks are read for it
+                    del in_tables[part]
                     continue
-                for key, rows in found.offsets.items():
-                    offsets[key].append(rows)
-            merged = {key: np.sort(np.concatenate(rows)) for key, rows in offsets.items()}
-            return RowSelection(merged, unindexed)
+                for key in wanted & places.keys():
+                    offsets[key].append(places[key])
+            return {key: np.concatenate(found) for key, found in offsets.items()}
 
-        plan.selector = select if selecting else None
+        plan.selector = select if in_tables else None
         return plan
 
     def _count_unreadable(self, parts: Sequence[Part]) -> None:
@@ -422,11 +362,7 @@ class Planner:
             self._counted.add(part)
             if part.undecodable:
                 unseen = replace(part, channels=part.undecodable, undecodable=(), predicate=None)
-                self.counters.unreadable += self._count_stored(unseen)
-
-    def _count_stored(self, part: Part) -> int:
-        """Number of messages of a part without a predicate."""
-        return self._count_part(self._choose(part, Need.COUNT), part)
+                self.counters.unreadable += self._rows.count([unseen])
 
     def count_expired(self) -> Counter[State]:
         """Number of messages, in the range, whose payloads are gone, by state.
@@ -442,7 +378,7 @@ class Planner:
                 gone = tuple(one for one in channels if one.state is state)
                 if gone:
                     own = replace(part, channels=gone, undecodable=(), predicate=None)
-                    found[state] += self._count_stored(own)
+                    found[state] += self._rows.count([own])
         return found
 
     def not_indexed(self) -> tuple[tuple[str, int], ...]:
@@ -461,89 +397,34 @@ class Planner:
         for part, number in documents.items():
             channels = (*part.channels, *part.undecodable)
             whole = replace(part, channels=channels, undecodable=(), predicate=None)
-            found[part.recording.name] += max(self._count_stored(whole) - number, 0)
+            found[part.recording.name] += max(self._rows.count([whole]) - number, 0)
         return tuple((name, number) for name, number in found.items() if number)
 
-    # Choosing.
-
-    def _selecting(self, part: Part) -> Engine:
-        """The engine that finds the matching messages of a part."""
-        for engine in self._choose(part, Need.SELECTION):
-            if isinstance(engine, Checking):
-                try:
-                    engine.check(part)
-                except _FALLBACK_ERRORS:
-                    continue
-            return engine
-        return self._scan
-
-    def _choose(self, part: Part, need: Need, fields: Collection[str] | None = ()) -> list[Engine]:
-        """The engines that can answer, the cheapest first; the last one always can."""
-        costs = self._costs(self._files(part, need), part, need, fields)
-        return [engine for _, engine in costs]
-
-    def _costs(
-        self, engines: Sequence[Engine], part: Part, need: Need, fields: Collection[str] | None
-    ) -> list[tuple[float, Engine]]:
-        """Costs of the engines that can answer, in order."""
-        found = [(engine.cost(part, need, fields), engine) for engine in engines]
-        able = [(cost, engine) for cost, engine in found if cost is not None]
-        return sorted(able, key=itemgetter(0))
-
     def _count(self, parts: Sequence[Part]) -> int:
-        groups: dict[Engine, list[Part]] = defaultdict(list)
-        for part in self._decided(parts):
-            groups[self._choose(part, Need.COUNT)[0]].append(part)
-        total = 0
-        for engine, group in groups.items():
-            try:
-                total += engine.count(group)
-            except _FALLBACK_ERRORS:
-                total += sum(self._count_part(self._choose(p, Need.COUNT), p) for p in group)
-        return total
+        return self._rows.count(self._decided(parts))
 
-    def _count_part(self, engines: Sequence[Engine], part: Part) -> int:
-        """The count of the first engine that does not fail."""
-        failure: Exception | None = None
-        for engine in engines:
+    def _lasting(self, part: Part, ask: Callable[[Part], Iterator[_Rows]]) -> Iterator[_Rows]:
+        """Rows of a part, to the end if files are replaced or a table is damaged meanwhile."""
+        (part,) = self._decided([part])
+        last: tuple[int, int] | None = None
+        renewals = 0
+        while True:
             try:
-                return engine.count([part])
-            except _FALLBACK_ERRORS as error:
-                if failure is None or isinstance(failure, UndecidedError):
-                    failure = error
-        assert failure is not None
-        raise failure
-
-    def _first(
-        self,
-        engines: Sequence[Engine],
-        ask: Callable[[Engine, Part], Iterator[_Rows]],
-        part: Part,
-    ) -> Iterator[_Rows]:
-        """Items of the cheapest engine; the next one goes on where it fails."""
-        failure: Exception | None = None
-        last: _Key | None = None
-        left, renewals = [*engines], 0
-        while left:
-            engine = left.pop(0)
-            try:
-                for item in ask(engine, part):
+                for item in ask(part):
                     rest = item if last is None else _after(item, last)
+                    if rest is not None and len(rest.log_time):
+                        last = int(rest.log_time[-1]), int(rest.seq[-1])
                     if rest is not None:
                         yield rest
-                        last = _last_key(rest) or last
                 return
-            except ChangedError as error:
-                failure = error
-                if renewals < _RENEWALS:
-                    renewals += 1
-                    (part,) = self._decided(self._renewed([part]))
-                    left.insert(0, engine)
-            except _FALLBACK_ERRORS as error:
-                if failure is None or isinstance(failure, UndecidedError):
-                    failure = error
-        assert failure is not None
-        raise failure
+            except ChangedError:
+                renewals += 1
+                if renewals > _RENEWALS:
+                    raise
+                (part,) = self._decided(self._renewed([part]))
+            except TABLE_ERRORS:
+                if not self._rows.leave_table(part):
+                    raise
 
     def _check_clock(self, channel: RecordedChannel) -> None:
         if self.question.bounds is None or not channel.is_typed:
@@ -562,12 +443,7 @@ def _has_no_fields(channel: RecordedChannel) -> bool:
     return channel.is_typed and not channel.codec.indexed
 
 
-def _last_key(item: MatchColumns | Values) -> _Key | None:
-    """Log time and arrival number of the last row; None without rows."""
-    return (int(item.log_time[-1]), int(item.seq[-1])) if len(item.log_time) else None
-
-
-def _after(item: _Rows, key: _Key) -> _Rows | None:
+def _after(item: _Rows, key: tuple[int, int]) -> _Rows | None:
     """The rows behind a log time and arrival number; None without any."""
     time, seq = key
     is_before = (item.log_time < time) | ((item.log_time == time) & (item.seq <= seq))

@@ -12,22 +12,53 @@ then has the cost of the answer.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import difflib
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, replace
+from typing import TYPE_CHECKING, Any, cast
 
-from hybridlog.query.interval_answers import IntervalAnswers
-from hybridlog.query.message_answers import MessageAnswers
-from hybridlog.query.steps import of_now
-from hybridlog.query.table_answers import TableAnswers
+import numpy as np
+
+from hybridlog.query.choice import Choice
+from hybridlog.query.counters import Counters
+from hybridlog.query.planner import Planner
+from hybridlog.query.question import Clock, Question
+from hybridlog.query.times import parse_duration, parse_time
 from hybridlog.wording import listed
 from hybridlog_storage.errors import (
+    DefinitionError,
     HybridlogError,
+    PayloadError,
+    TopicError,
+    UsageError,
 )
 
 if TYPE_CHECKING:
+    import pandas as pd
+    import pyarrow as pa
+    from numpy.typing import NDArray
+
+    from hybridlog.across.align import Aligned
+    from hybridlog.message import Message
     from hybridlog.query.answers.completeness import Completeness
+    from hybridlog.query.answers.field_statistics import FieldStatistics
+    from hybridlog.query.answers.follow import Following
+    from hybridlog.query.answers.interval_queries import IntervalQueries
+    from hybridlog.query.answers.regularity import TopicCheck
+    from hybridlog.query.choice import During, Tags, Texts
+    from hybridlog.query.intervals import Intervals
+    from hybridlog.query.predicate.across import Near
+    from hybridlog.query.question import RecordedChannel
+    from hybridlog.query.times import DurationLike, TimeLike
+    from hybridlog.session import Asked, Session
+    from hybridlog_storage.messages import Batch
+    from hybridlog_storage.summary import RecordingSummary
+
+_MAX_STEP = 2**62  # longer than any topic, and an int64
 
 
-class Query(MessageAnswers, TableAnswers, IntervalAnswers):
+class Query:
     """A question about some topics of an open store. Immutable: each step returns a new one.
 
     Args:
@@ -39,6 +70,47 @@ class Query(MessageAnswers, TableAnswers, IntervalAnswers):
         counters: The cost of the last answer.
         conditions: Queries about other topics, whose answers are in the question.
     """
+
+    def __init__(
+        self, source: Asked, question: Question, conditions: tuple[Query, ...] = ()
+    ) -> None:
+        self.question = question
+        self.counters = Counters()
+        self.conditions = conditions
+        self.source = source
+
+    @property
+    def session(self) -> Session:
+        """The store at the moment that an answer is about: now, or that of a snapshot.
+
+        Raises:
+            UsageError: It was opened before this process was forked.
+        """
+        return self.source.now()
+
+    def __eq__(self, other: object) -> bool:
+        """True if both are the same question to the same open store."""
+        if not isinstance(other, Query):
+            return NotImplemented
+        return self.source is other.source and self.question == other.question
+
+    def __hash__(self) -> int:
+        """Hash of the question."""
+        return hash((id(self.source), self.question))
+
+    @property
+    def topics(self) -> tuple[str, ...]:
+        """Full names of the topics."""
+        return self.question.topics
+
+    @property
+    def recordings(self) -> tuple[str, ...]:
+        """Ids of the recordings, oldest first."""
+        return tuple(summary.id for summary in self.summaries())
+
+    def __copy__(self) -> Query:
+        """The same question with separate counters."""
+        return Query(self.source, self.question, self.conditions)
 
     def __repr__(self) -> str:
         return f"<Query {'; '.join(self._described().values())}>"
@@ -85,6 +157,599 @@ class Query(MessageAnswers, TableAnswers, IntervalAnswers):
             found["order"] = "latest first"
         return found
 
+    # Steps.
+
+    def between(self, begin: TimeLike | None, end: TimeLike | None = None) -> Query:
+        """Only messages with `begin <= time < end`.
+
+        Args:
+            begin: An int is nanoseconds since the epoch, a float seconds; text is ISO 8601,
+                or relative to each recording (`+5s`, `-10s`); None for its start.
+            end: The same; None for its end.
+        """
+        # As ints, so that equal questions are equal values: 5 is nanoseconds, 5.0 seconds.
+        bounds = (
+            parse_time(time, start=None, end=None) if isinstance(time, float) else time
+            for time in (begin, end)
+        )
+        return self._with(bounds=tuple(bounds))
+
+    def clock(self, clock: str) -> Query:
+        """The time that `between` refers to: `log` (default), `publish` or `header`.
+
+        Raises:
+            UsageError: an unknown clock.
+        """
+        if clock not in {"log", "publish", "header"}:
+            raise UsageError(f"Unknown clock {clock!r}; choose log, publish or header.")
+        return self._with(clock=cast(Clock, clock))
+
+    def where(
+        self,
+        predicate: str | Mapping[str, object],
+        within: DurationLike | tuple[DurationLike, DurationLike] | None = None,
+    ) -> Query:
+        """Only messages that satisfy a predicate; several are joined by *and*.
+
+        Args:
+            predicate: `"ranges.min < 0.5 and header.frame_id == 'laser'"`, or a MongoDB
+                filter, as a mapping or JSON, for MongoDB to answer from its index.
+                `"/odom: twist.twist.linear.x > 0.5"` asks for a message of another topic, near
+                in log time, in the same recording. Such conditions are answered now, and
+                joined by `and`, `or`, `not` and brackets.
+            within: Greatest distance in time of these messages, either way; or how long
+                before and after such a message: `t - before <= time < t + after`.
+
+        Raises:
+            WhereError: it cannot be parsed, does not fit the fields, or is not allowed.
+            UsageError: `within` lacks for other topics, or there are none for it.
+            TopicError: no such topic exists.
+            TimeError: `within` is no duration.
+        """
+        if isinstance(predicate, str):
+            if ":" in predicate:
+                from hybridlog.query.predicate.across import names_topics
+
+                if names_topics(predicate):
+                    return self._near(predicate, within)
+            checked = self.session.predicate(predicate, self.topics, self.question.recordings)
+        else:
+            from hybridlog.query.predicate.mongo_filter import mongo_filter
+
+            types = self.session.field_types(self.topics, self.question.recordings)
+            checked = mongo_filter(predicate, types)
+        if within is not None:
+            raise UsageError(
+                "`within` is for conditions on other topics: where('/odom: twist.twist.linear.x > "
+                "0.5', within='0.1s'). A second predicate is a second where()."
+            )
+        if self.question.predicate is not None:
+            checked = self.question.predicate & checked
+        return self._with(predicate=checked or None)
+
+    def limit(self, count: int) -> Query:
+        """At most this many messages.
+
+        Raises:
+            UsageError: a negative number.
+        """
+        if not isinstance(count, int) or count < 0:
+            raise UsageError(f"A limit is a whole number and not negative; {count!r} is not.")
+        return self._with(limit=count)
+
+    def every(self, step: int) -> Query:
+        """Only every n-th message of each topic, beginning with the first.
+
+        Raises:
+            UsageError: less than one.
+        """
+        if not isinstance(step, int) or step < 1:
+            raise UsageError(f"every(n) needs a number n of at least 1, not {step!r}.")
+        return self._with(every=min(step, _MAX_STEP))
+
+    def reverse(self) -> Query:
+        """Latest message first."""
+        return self._with(reverse=not self.question.reverse)
+
+    def fields(self, *paths: str) -> Query:
+        """Only these fields in tables (`header.stamp`, `pose.position`, `ranges.min`).
+
+        `publish_time`, `stamp` (of the header), `seq` (arrival number), `sequence` (the
+        sender's), `topic` and `recording` are also columns, unless a field has that name.
+
+        Raises:
+            TopicError: no topic of the query has such a field.
+        """
+        from hybridlog.frames.names import is_own
+
+        if not all(isinstance(path, str) for path in paths):
+            raise UsageError('Fields are names: fields("header.stamp", "ranges.min").')
+        known = self.session.field_types(self.topics, self.question.recordings)
+        for path in paths:
+            if known and not (_is_field(path, known) or is_own(path)):
+                raise TopicError(_no_field(path, known, self.topics))
+        return self._with(fields=tuple(paths))
+
+    def in_frame(self, frame: str) -> Query:
+        """Points and poses in tables and arrays in another frame, at the times of their headers.
+
+        By the rules of tf2. A message without a transform keeps its row, without a place;
+        `remarks` says why. Scans and clouds become lists of the fields of their points.
+
+        Args:
+            frame: Its name.
+        """
+        return self._with(frame=frame)
+
+    def tags(self, *keys: str) -> Query:
+        """Tags of the recordings as columns of tables, behind `topic` and `recording`.
+
+        A field with the name of such a column gets a trailing underscore. A recording without
+        the tag has null.
+
+        Raises:
+            TopicError: no recording of the query has such a tag.
+        """
+        session = self.session
+        places = session.chosen(self.question).tolist()
+        snapshot = session.snapshot()
+        known = {key for place in places for key in snapshot.summaries[place].tags}
+        for key in keys:
+            if key not in known:
+                raise TopicError(
+                    f"No recording of this query has a tag {key!r}. The tags are: "
+                    f"{listed(sorted(known))}."
+                )
+        return self._with(tags=tuple(dict.fromkeys(keys)))
+
+    def in_recording(
+        self,
+        *names: str,
+        tag: Tags = None,
+        has: Texts = None,
+        type: Texts = None,  # noqa: A002 - the word of the command line
+        during: During = None,
+        where: Texts = None,
+        older_than: DurationLike | None = None,
+    ) -> Query:
+        """Only these recordings: by name, id or glob, and as `Store.recordings`.
+
+        Raises:
+            TopicError: no such recording exists, or none has the topic.
+        """
+        from hybridlog.query.choosing import choose
+
+        choice = Choice.of(
+            names,
+            tag=tag,
+            has=has,
+            type=type,
+            during=during,
+            where=where,
+            older_than=older_than,
+        )
+        chosen = choose(self.session, choice)
+        if chosen.problem:
+            raise TopicError(chosen.problem)
+        return self._on(self.topics, [summary.id for summary in chosen.summaries])
+
+    def during(self, intervals: Intervals) -> Query:
+        """Only messages whose log time is in one of some intervals of their recording.
+
+        A message in several intervals is returned once. After two calls, both must hold.
+
+        Args:
+            intervals: From `intervals`, `changes` or `windows` of any query of this store,
+                or made by hand; recordings are given by id or by name.
+
+        Raises:
+            TopicError: an interval is of a recording that is not in the store.
+        """
+        intervals = intervals.by_id(self.session.snapshot().ids_called())
+        if self.question.during is not None:
+            intervals = self.question.during.common(intervals)
+        return self._with(during=intervals.merged())
+
+    def windows(self, before: DurationLike = 0, after: DurationLike = 0) -> Intervals:
+        """Time around each message: `t - before <= time < t + after`, within its recording.
+
+        A mark with an end counts from its beginning to its end.
+
+        One window per message: windows may overlap; `during` and `merged` join them.
+
+        Args:
+            before: Time before the message, a duration.
+            after: Time after the message, a duration.
+
+        Raises:
+            TimeError: `before` or `after` is no duration.
+            UsageError: both are zero, or `limit` or `every` of several topics.
+        """
+        with self.counters.timed():
+            return self._intervals().windows(before, after)
+
+    def summaries(self) -> list[RecordingSummary]:
+        """The recordings in short, oldest first; some may have no message in the answer."""
+        session = self.session
+        places = session.chosen(self.question).tolist()
+        return [session.snapshot().summaries[place] for place in places]
+
+    # Messages.
+
+    def __iter__(self) -> Iterator[Message]:
+        """The messages as they came, ordered by log time, recording and arrival.
+
+        Raises:
+            UsageError: it has `in_frame`, which is for tables and arrays.
+        """
+        self._as_they_came("Loops and `at`")
+        from hybridlog.message import messages_in
+        from hybridlog.query.answers.video import picture_of
+
+        planner = self._planner()
+        picture = picture_of(planner.session)
+        for run in planner.runs():
+            yield from messages_in(run, picture)
+
+    def follow(self, *names: str) -> Following:
+        """The messages that running recordings flush from now on, until all of them have ended.
+
+        With `between`, also those that are flushed already. Each comes once; those that are
+        flushed together are in order of log time. MongoDB is not needed.
+
+        Args:
+            names: The topics as they were written: globs take topics that appear later.
+
+        Raises:
+            UsageError: No recording of the question is running, or it has `reverse`, `during`
+                or a filter that MongoDB answers.
+        """
+        from hybridlog.query.answers.follow import Following
+
+        self.counters.reset()
+        return Following(self.source, self.question, self.counters, names)
+
+    def at(self, moment: TimeLike) -> Message:
+        """The message of `at_time`. Its arrays are read-only: copy to change them.
+
+        Raises:
+            TopicError: no such message exists.
+            UsageError: the question has a time range, `in_frame`, or another clock than log
+                time.
+        """
+        self._as_they_came("Loops and `at`")
+        return _message_at(self, moment)
+
+    def at_time(self, moment: TimeLike) -> Query:
+        """Only the message that was current at a time: the last one not after it.
+
+        Raises:
+            TopicError: no such message exists.
+            UsageError: the question has a time range, or another clock than log time.
+        """
+        from hybridlog.query.answers.last_message import just_before
+
+        now = of_now(self)
+        found = _message_at(now, moment)
+        time = found.log_time_ns
+        question = just_before(self.question, found.recording, time, time)
+        # What is lost between the message and the moment may have been the current one.
+        snapshot = now.session.snapshot()
+        place = snapshot.by_id[found.recording]
+        start, end = int(snapshot.begin[place]), int(snapshot.end[place])
+        latest = max(parse_time(moment, start=start, end=end), time)
+        since = Query(self.source, replace(question, bounds=(time, latest + 1)))
+        return Query(self.source, question, (*self.conditions, since))
+
+    def batches(self) -> Iterator[tuple[Batch, Sequence[RecordedChannel]]]:
+        """The messages in order, many at once; `batch.channel` indexes the channels.
+
+        Messages without payload are left out; `counters.reduced` counts them.
+        """
+        for run in self._planner().runs():
+            whole = np.array([not channel.is_reduced for channel in run.channels], np.bool_)
+            batch = run.batch if whole.all() else run.batch.take(whole[run.batch.channel])
+            for number in np.flatnonzero(~whole).tolist():
+                left = int((run.batch.channel == number).sum())
+                self.counters.leave_out(left, run.channels[number].state)
+            if len(batch):
+                yield batch, run.channels
+
+    def latched(
+        self, *, original_times: bool = False
+    ) -> Iterator[tuple[Batch, Sequence[RecordedChannel]]]:
+        """Latched messages from before the time range that are in force when it begins.
+
+        They are those that a subscriber receives which joins at that time, and the frames of
+        video topics from the last key frame on. Their log time is the beginning of the range.
+        Take them before `batches`, and with separate counters.
+        """
+        from hybridlog.query.answers.latched import in_force
+
+        self.counters.reset()
+        return in_force(self.session, self.question, self.counters, original_times=original_times)
+
+    def count(self) -> int:
+        """Number of messages."""
+        with self.counters.timed():
+            found = Planner(self.session, self.question, self.counters).count()
+            self.counters.messages = found
+        return found
+
+    def to_numpy(self, frame: str | None = None) -> NDArray[Any] | list[NDArray[Any]]:
+        """Every message as an array (`Message.to_numpy`): stacked if all are alike.
+
+        Messages that cannot be arrays are left out; `counters.unreadable` counts them.
+
+        Args:
+            frame: The frame of points; see `in_frame`. Their `x`, `y` and `z` are float64, NaN
+                without a transform, before their other fields. None for that of each message.
+
+        Raises:
+            PayloadError: None of the messages can be an array.
+            DefinitionError: The first of them has no definition.
+        """
+        frame = self.question.frame if frame is None else frame
+        if frame is not None:
+            from hybridlog.tf.in_frame import points_of
+
+            self.counters.reset()
+            framed = replace(self.question, frame=frame)
+            return _stacked([one.points for one in points_of(self.session, framed, self.counters)])
+        now = of_now(self)
+        scans = _scans_of(now)
+        if scans is not None:
+            return scans
+        arrays: list[NDArray[Any]] = []
+        refused: PayloadError | DefinitionError | None = None
+        unreadable = 0
+        for message in now:
+            try:
+                arrays.append(message.to_numpy())
+            except (PayloadError, DefinitionError) as error:
+                refused = refused or error
+                unreadable += 1
+        if refused is not None and not arrays:
+            raise refused
+        self.counters.unreadable += unreadable
+        return _stacked(arrays)
+
+    # Tables.
+
+    def to_arrow(self) -> pa.Table:
+        """A table: scalars and strings as columns, arrays as lists, first column log time."""
+        import pyarrow as pa
+
+        from hybridlog.frames.answer import to_arrow
+
+        if self.question.frame is not None:
+            return pa.concat_tables(self.to_tables(), promote_options="permissive")
+        return to_arrow(self._planner())
+
+    def to_polars(self) -> Any:
+        """A polars frame of the same columns, `log_time` among them.
+
+        Raises:
+            MissingDependencyError: polars is not installed.
+        """
+        from hybridlog.frames.frame import to_polars
+
+        return to_polars(self.to_arrow())
+
+    def to_pandas(self) -> pd.DataFrame:
+        """A frame of the same columns, indexed by log time (UTC, ns)."""
+        from hybridlog.frames.answer import to_pandas
+        from hybridlog.frames.frame import frame_of
+
+        if self.question.frame is not None:
+            table = self.to_arrow()
+            names = [name for name in table.column_names if name != "log_time"]
+            frame = frame_of(table["log_time"], ((name, table[name]) for name in names))
+        else:
+            frame = to_pandas(self._planner())
+        frame.attrs["hybridlog"] = asdict(self.counters)
+        return frame
+
+    def to_tables(self) -> Iterator[pa.Table]:
+        """The answer in order, in Arrow tables of bounded size; at least one, possibly empty."""
+        from hybridlog.tf.in_frame import stream
+
+        return stream(self._planner())
+
+    def to_json_lines(self) -> Iterator[list[str]]:
+        """The answer in order as lines of JSON, many at a time."""
+        from hybridlog.frames.lines import lines
+
+        self._as_they_came("Lines")
+        for batch in lines(self._planner()):
+            yield [line if isinstance(line, str) else "".join(line) for line in batch]
+
+    def resample(
+        self,
+        step: DurationLike,
+        how: str = "asof",
+        tolerance: DurationLike | None = None,
+    ) -> Aligned:
+        """The topics at regular log times: every `step` from the beginning of each recording.
+
+        With `between` or `during`, from the beginning of the range. Columns are those of
+        `Store.align`; those of a single topic have no prefix. With an aggregate, `count` is in
+        place of `distance`: the number of messages from a row to the next, or to the end.
+
+        Args:
+            step: Time between two rows, a duration.
+            how: `asof`, `nearest` or `interpolate`, as for `Store.align`. Or an aggregate of
+                the messages from a row to the next: `count`; `first` or `last`, their fields;
+                `min`, `max` or `mean` of finite numbers, null without any.
+            tolerance: Greatest distance in time; None for any.
+
+        Raises:
+            UsageError: an unknown way, a step of 0, a tolerance for an aggregate, a field that
+                has none, another clock than the log's, or limit, every or reverse.
+            TimeError: no duration, or a range outside of all recordings.
+        """
+        from hybridlog.across.align import resampled
+
+        return resampled(self.session, self.question, step, how, tolerance)
+
+    def rate(self, window: DurationLike | None = None) -> pa.Table:
+        """Number and rate of the messages of each topic.
+
+        Args:
+            window: Length of the windows, a duration; the first begins with the recording or
+                the range, the last may be shorter. None for all messages in one.
+
+        Returns:
+            `begin`, `end`, `recording` (name), `topic`, `messages` and `rate`, messages a
+            second. Without windows: from the first message to the last, and the mean rate
+            from one to the next, null if there is none.
+
+        Raises:
+            UsageError: `limit`, `every`, `reverse`, another clock than the log's, or too many
+                windows.
+            TimeError: no duration, or a range outside of all recordings.
+        """
+        from hybridlog.query.answers.regularity import Regularity
+
+        with self.counters.timed():
+            return Regularity(self.session, self.question, self.counters).rate(window)
+
+    def check(self) -> list[TopicCheck]:
+        """Check how regularly the topics came: rate, jitter, gap, late start, early stop, losses.
+
+        Returns:
+            One for each recording and topic, also for topics without messages; those that were
+            silent for most of their usual periods first, then those that have lost most.
+
+        Raises:
+            UsageError: `limit`, `every`, `reverse`, or another clock than the log's.
+            TimeError: a range outside of all recordings.
+        """
+        from hybridlog.query.answers.regularity import Regularity
+
+        with self.counters.timed():
+            return Regularity(self.session, self.question, self.counters).check()
+
+    def stats(self, *fields: str) -> list[FieldStatistics]:
+        """Statistics of the numeric fields: count, NaN, infinite, least, greatest, mean, deviation.
+
+        Args:
+            fields: Paths; also summaries (`ranges.min`), and arrays, for all their elements.
+                None for every field that is a number.
+
+        Raises:
+            TopicError: no such field exists.
+            UsageError: `limit`, `every`, `reverse`, or no field is a number.
+            TimeError: a range outside of all recordings.
+        """
+        from hybridlog.query.answers.field_statistics import statistics
+
+        self._as_they_came("Statistics")
+        now = of_now(self)
+        query = now.fields(*fields) if fields else now
+        with self.counters.timed():
+            return statistics(now.session, query.question, self.counters)
+
+    # Intervals.
+
+    def intervals(
+        self,
+        at_least: DurationLike | None = None,
+        length: DurationLike | None = None,
+        max_gap: DurationLike | None = None,
+        state: str | None = None,
+    ) -> Intervals:
+        """The longest intervals in which the predicate of `where` holds.
+
+        At any time, the last message of the topic (by log time, then arrival) determines the
+        state. Before the first message the state is unknown, and no interval covers it.
+        A state lasts until the next message, or the end of the recording. The range of
+        `between` cuts intervals; the message before it determines the state at its start.
+        Without `where`, any message holds: `max_gap` then finds when the topic was active.
+
+        Args:
+            at_least: Only intervals of at least this length.
+            length: Each interval cut into as many pieces of exactly this length as fit,
+                one after the other from its beginning.
+            max_gap: Longest time for which a message is valid; by default, until the next one.
+            state: `held`, `not held` or `unknown`: three parts of the asked time, without
+                each other. Unknown is the time before the first message, after `max_gap`, and
+                from a loss to the next stored message. Without, what the stored messages say.
+
+        Returns:
+            Intervals; their `messages` are those that satisfy the predicate, with `state` all
+            of the topic in them.
+
+        Raises:
+            UsageError: several topics, `limit`, `every`, `reverse`, another clock than the
+                log's, or an unknown state.
+            TimeError: no duration, or a range outside of all recordings.
+        """
+        with self.counters.timed():
+            found = self._intervals().states(max_gap, state)
+        if at_least is not None:
+            found = found.at_least(at_least)
+        return found if length is None else found.cut(length)
+
+    def changes(
+        self, *fields: str, pause: DurationLike = "1s", tolerance: float = 0.0
+    ) -> Intervals:
+        """Changes of fields: runs of messages that differ from the one before them.
+
+        Steps are found among the messages of one recording that satisfy `where`. A step is a
+        message with any of the fields different from the message before it. Steps at most
+        `pause` apart belong to one change, whatever messages are between them. A change begins
+        at the log time of its first step, and ends 1 ns after that of its last one.
+
+        Args:
+            fields: Paths (`position`, `position.x`); arrays are compared element by element.
+            pause: Longest time between steps of one change.
+            tolerance: Numbers are equal if they differ by at most this.
+
+        Returns:
+            Intervals; their `messages` are the steps.
+
+        Raises:
+            TopicError: no such field exists.
+            UsageError: no field, several topics, `limit`, `every`, `reverse`, or another
+                clock than the log's.
+            TimeError: no duration, or a range outside of all recordings.
+        """
+        if not fields:
+            raise UsageError("Name at least one field; `hybridlog info -t TOPIC` lists them.")
+        self._as_they_came("Changes")
+        self.fields(*fields)  # refuses unknown fields
+        with self.counters.timed():
+            return self._intervals().changes(fields, pause, tolerance)
+
+    def gaps(
+        self, longer_than: DurationLike | None = None, periods: float | None = None
+    ) -> Intervals:
+        """Times without messages of a topic, in its recordings.
+
+        A gap lasts from one message to the next, from the beginning of the recording (or of
+        the range) to the first message, or from the last message to the end. The usual period
+        is the 0.9 quantile of the times from one message to the next in the recording.
+
+        Args:
+            longer_than: Only gaps longer than this, a duration.
+            periods: Only gaps longer than so many usual periods; without both, 5.
+
+        Returns:
+            Intervals; their `messages` are 0.
+
+        Raises:
+            UsageError: several topics, `limit`, `every`, `reverse`, another clock than the
+                log's, or no number of periods.
+            TimeError: no duration, or a range outside of all recordings.
+        """
+        from hybridlog.query.answers.regularity import Regularity
+
+        with self.counters.timed():
+            return Regularity(self.session, self.question, self.counters).gaps(longer_than, periods)
+
+    # What an answer lacks.
+
     def completeness(self) -> Completeness:
         """Completeness of the last answer, or, without one, of an answer given now.
 
@@ -117,3 +782,122 @@ class Query(MessageAnswers, TableAnswers, IntervalAnswers):
             found += remarks(now.session, one.question, is_empty=nothing)
         found += remarks(now.session, self.question, is_empty=is_empty)
         return [*dict.fromkeys(found)]
+
+    def _near(
+        self, text: str, within: DurationLike | tuple[DurationLike, DurationLike] | None
+    ) -> Query:
+        """The query with the conditions on other topics as intervals."""
+        from hybridlog.query.near import everything, intervals_of, question_about, split_own
+        from hybridlog.query.predicate.across import parse_across
+
+        if within is None:
+            raise UsageError(
+                "A condition on another topic needs a time within which its message is, such as "
+                "0.1s."
+            )
+        if not isinstance(within, tuple):  # the message that is exactly so far away belongs to it
+            within = within, f"{parse_duration(within) + 1}ns"
+        before, after = within
+        own, others = split_own(parse_across(text))
+        query = now = of_now(self)
+        for predicate in own:
+            query = query.where(predicate)
+        conditions: list[Query] = []
+
+        def windows(condition: Near) -> Intervals:
+            question = question_about(now.session, query.question, condition.topic, before, after)
+            events = Query(now.source, question)
+            if condition.predicate:
+                events = events.where(condition.predicate)
+            conditions.append(events)
+            return events.windows(before, after)
+
+        whole = everything(now.session, self.question)
+        for condition in others:
+            query = query.during(intervals_of(condition, windows, whole))
+        return Query(self.source, query.question, (*self.conditions, *conditions))
+
+    def _intervals(self) -> IntervalQueries:
+        from hybridlog.query.answers.interval_queries import IntervalQueries
+
+        return IntervalQueries(self.session, self.question, self.counters)
+
+    def _with(self, **changes: Any) -> Query:
+        return Query(self.source, replace(self.question, **changes), self.conditions)
+
+    def _on(self, topics: Sequence[str], recordings: Sequence[str] | None) -> Query:
+        """The same conditions on other topics and recordings."""
+        session = self.session
+        topics, chosen = session.having(topics, recordings)
+        others = self.question.namesakes
+        if others and recordings is not None:
+            there = {*session.topics_of(recordings)}
+            others = tuple(topic for topic in others if topic in there)
+        return self._with(topics=topics, recordings=chosen, namesakes=others)
+
+    def _as_they_came(self, what: str) -> None:
+        """Refuse `in_frame` for answers that it would not change."""
+        if self.question.frame is not None:
+            raise UsageError(f"{what} are of messages as they came: leave out in_frame.")
+
+    def _planner(self) -> Planner:
+        """A planner for an answer, of a moment that begins now."""
+        self.counters.reset()
+        return Planner(self.session, self.question, self.counters)
+
+
+def of_now(query: Query) -> Query:
+    """The same question with the same counters, at the moment that begins now."""
+    found = Query(query.session, query.question, query.conditions)
+    found.counters = query.counters
+    return found
+
+
+def _is_field(path: str, known: Mapping[str, str]) -> bool:
+    from hybridlog.frames.names import is_summary
+
+    if is_summary(path, known):
+        return True
+    return any(p == path or p.startswith((f"{path}.", f"{path}[")) for p in known)
+
+
+def _no_field(path: str, known: Mapping[str, str], topics: Sequence[str]) -> str:
+    if re.search(r"\[[0-9:]", path):
+        return f"{path!r} is a part of an array, and no column: take the array, or ask in SQL."
+    near = difflib.get_close_matches(path, known, n=5, cutoff=0.4) or sorted(known)[:10]
+    return (
+        f"There is no field {path!r} on {', '.join(topics)}. Did you mean {', '.join(near)}? "
+        "`hybridlog info -t TOPIC` lists them all."
+    )
+
+
+def _stacked(arrays: list[NDArray[Any]]) -> NDArray[Any] | list[NDArray[Any]]:
+    alike = {(a.shape, a.dtype) for a in arrays}
+    return np.stack(arrays) if len(alike) == 1 else arrays
+
+
+def _message_at(query: Query, moment: TimeLike) -> Message:
+    if not query.question.is_unbounded or query.question.clock != "log":
+        raise UsageError(
+            "A message at a time is the last one by log time; `between`, `during` and "
+            "`clock` cannot be combined with it."
+        )
+    from hybridlog.query.answers.last_message import message_at
+
+    with query.counters.timed():
+        found = message_at(query.session, query.question, query.counters, moment)
+    if found is None:
+        raise TopicError(f"No message of {', '.join(query.topics)} is at or before {moment}.")
+    return found
+
+
+def _scans_of(query: Query) -> NDArray[Any] | None:
+    """Laser scans of one length as an array, from columns; None for everything else."""
+    from hybridlog.frames.answer import FIELDS, are_scans, scans_in
+
+    if not are_scans(Planner(query.session, query.question, query.counters).channels()):
+        return None
+    query.counters.reset()
+    question = replace(query.question, fields=FIELDS, tags=())
+    found = scans_in(Planner(query.session, question, query.counters))
+    return None if query.counters.unreadable or query.counters.reduced else found

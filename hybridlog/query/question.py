@@ -229,16 +229,6 @@ class Part:
         return float((cut[:, 1] - cut[:, 0]).sum()) / (whole[1] - whole[0])
 
     @property
-    def chunks(self) -> float:
-        """Estimated number of chunks with its messages; other topics may share them."""
-        whole = self.span
-        if whole is None:
-            return 0.0
-        longest = max(stats.longest for stats in self.stats)
-        whole_chunks = self.share * (whole[1] - whole[0]) / max(longest, 1)
-        return min(whole_chunks + len(self.log_windows), self.recording.chunks, self.messages)
-
-    @property
     def extent(self) -> Span | None:
         """Log time of the topic's messages in the part, ns; None without any.
 

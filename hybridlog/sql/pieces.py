@@ -19,8 +19,8 @@ import pyarrow.compute as pc
 from hybridlog.columns.clouds import NEEDED, PointColumns, is_cloud
 from hybridlog.columns.fields import without
 from hybridlog.columns.rows import Messages, Piece, own_columns
-from hybridlog.query.engines import places_of
 from hybridlog.query.question import RecordedChannel
+from hybridlog.query.rows import places_of
 from hybridlog.record.losses import lost_spans
 from hybridlog.schema.arrow_types import has_empty
 from hybridlog.schema.states import GONE, State

@@ -14,7 +14,6 @@ import pyarrow.compute as pc
 from hybridlog.frames.answer import stream, to_arrow
 from hybridlog.query.answers.lost import completeness_of
 from hybridlog.query.answers.match_times import match_times
-from hybridlog.query.asked import field_types
 from hybridlog.query.counters import Counters
 from hybridlog.query.planner import Planner
 from hybridlog.query.question import Question
@@ -27,7 +26,6 @@ from hybridlog_storage.errors import TopicError
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog.query.steps import Steps
     from hybridlog.session import Session
     from hybridlog_storage.summary import RecordingSummary
 
@@ -68,18 +66,20 @@ def frame_tree(session: Session, recording: RecordingSummary, topics: Sequence[s
     return FrameTree(builder.frames(), recording.extent, dict(builder.invalid), [*lacks])
 
 
-def frames_and_stamps(query: Steps) -> tuple[list[str], NDArray[np.int64]]:
+def frames_and_stamps(
+    session: Session, question: Question, counters: Counters
+) -> tuple[list[str], NDArray[np.int64]]:
     """The frames that the headers of a topic name, and its times.
 
     Returns:
         Names of frames, and int64[n]: header stamps, or log times without headers; ns.
     """
-    known = field_types(query) or {}
+    known = session.field_types(question.topics, question.recordings) or {}
     wanted = [name for name in ("header.stamp", "header.frame_id") if name in known]
     if "header.stamp" not in wanted:  # no message has to be read
-        times = match_times(query.session, query.question, query.counters)
+        times = match_times(session, question, counters)
         return [], np.concatenate([np.empty(0, np.int64), *(one.log_time for one in times)])
-    table = to_arrow(Planner(query.session, query.fields(*wanted).question, query.counters))
+    table = to_arrow(Planner(session, replace(question, fields=tuple(wanted)), counters))
     frames = table["header.frame_id"].unique().to_pylist() if len(wanted) == 2 else []
     return frames, table["header.stamp"].cast(pa.int64()).to_numpy()
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import statistics
 import sys
-from collections.abc import Iterator
 from fractions import Fraction
 from itertools import pairwise
 from pathlib import Path
@@ -24,8 +23,6 @@ from hybridlog.drawing.density import periods as periods_of
 from hybridlog.drawing.series import series
 from hybridlog.query import periods
 from hybridlog.query.answers.field_statistics import _Running
-from hybridlog.query.engines import MatchColumns
-from hybridlog.query.planner import Planner
 from hybridlog_storage.errors import TimeError, TopicError, UsageError
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings
@@ -39,21 +36,6 @@ from .conftest import BASE, MS, Logs
 def ends(logs: Logs, label: str) -> tuple[int, int]:
     times = [m.time for m in logs.said[label]]
     return min(times), max(times) + 1
-
-
-@pytest.fixture(params=["whole", "in blocks"])
-def blocks(request: pytest.FixtureRequest, limit: Limit, calls: Calls) -> None:
-    """Times come all at once, or a few at a time and are read again for a second look."""
-    if request.param == "whole":
-        return
-
-    def cut(found: Iterator[MatchColumns], *_: object) -> Iterator[MatchColumns]:
-        for one in found:
-            for begin in range(0, len(one.log_time), 3):
-                yield MatchColumns(*(column[begin : begin + 3] for column in one))
-
-    calls.change(Planner, "outcomes", cut)
-    limit(max_second_look=4)
 
 
 def test_rates_of_whole_recordings_come_from_the_catalog(logs: Logs) -> None:
@@ -79,7 +61,6 @@ def test_rates_of_whole_recordings_come_from_the_catalog(logs: Logs) -> None:
     ("window", "between", "where"),
     [("100ms", None, None), ("70ms", ("+95ms", "+800ms"), None), ("250ms", None, "on == true")],
 )
-@pytest.mark.usefixtures("blocks")
 def test_rates_by_window(
     logs: Logs, window: str, between: tuple[str, str] | None, where: str | None
 ) -> None:
@@ -115,7 +96,6 @@ def test_rates_by_window(
     ("longer", "periods"), [("12ms", None), (None, 2.5), (None, None), ("9ms", 2.0), ("0s", None)]
 )
 @pytest.mark.parametrize("between", [None, ("+100ms", "+700ms")])
-@pytest.mark.usefixtures("blocks")
 def test_gaps(
     logs: Logs, longer: str | None, periods: float | None, between: tuple[str, str] | None
 ) -> None:
@@ -139,7 +119,7 @@ def test_gaps(
     assert query.counters.chunks_read == 0
 
 
-def test_times_of_a_rare_topic_cost_no_payloads(tmp_path: Path, calls: Calls, limit: Limit) -> None:
+def test_times_of_a_rare_topic_cost_no_payloads(tmp_path: Path) -> None:
     """Its messages lie in chunks full of others': these are not read for times."""
     settings = SegmentSettings(chunk_size=4096)
     with hl.open(tmp_path / "store", create=True) as store:
@@ -151,13 +131,19 @@ def test_times_of_a_rare_topic_cost_no_payloads(tmp_path: Path, calls: Calls, li
         assert sum(row["messages"] for row in query.rate("10ns").to_pylist()) == 30
         assert query.counters.chunks_read == 0
 
-        # Of very many messages, a share says what the usual period is.
-        sizes: list[int] = []
-        calls(periods, "usual_period", lambda steps: sizes.append(len(steps)))
-        limit(sampled_periods=20)
         assert len(store.topic("loud").gaps(periods=1.5)) == 29
-        assert all(5 < size <= 40 for size in sizes)
-        assert sizes
+
+
+def test_of_very_many_steps_a_share_tells_the_usual_one(calls: Calls, limit: Limit) -> None:
+    sizes: list[int] = []
+    calls(periods, "usual_period", lambda steps: sizes.append(len(steps)))
+    limit(sampled_periods=20)
+    steps = periods.Steps()
+    for begin in range(0, 600, 3):
+        steps.add(np.arange(begin, begin + 3, dtype=np.int64))
+        assert steps.usual_period() == 1
+    assert max(sizes) <= 40
+    assert min(sizes[-50:]) > 5
 
 
 def test_bursts_are_no_gaps(tmp_path: Path) -> None:

@@ -22,8 +22,8 @@ import hybridlog as hl
 from hybridlog.columns.clouds import PointColumns
 from hybridlog.columns.fields import FieldShape
 from hybridlog.columns.parquet_file import ParquetFileReader
-from hybridlog.query.engines import Need
 from hybridlog.query.planner import Planner
+from hybridlog.query.rows import Rows
 from hybridlog.schema.codecs import codec_for
 from hybridlog_storage.errors import PayloadError, StoreError, TopicError, UsageError
 from hybridlog_storage.segments.segment_writer import SegmentSettings
@@ -125,9 +125,9 @@ def test_predicates_on_elements(stores: tuple[hl.Store, hl.Store], predicate: st
     query = store.topic("scan").where(predicate)
     planner = Planner(store.session, query.question, query.counters)
     (part,) = planner.parts()
-    tables, scanned = planner._tables, planner._scan
-    assert tables.cost(part, Need.COUNT) is not None
-    assert tables.count([part]) == scanned.count([part])
+    rows = Rows(store.session, query.counters)
+    assert rows.tabled(part) is not None
+    assert rows.count([part]) == rows.count_in_chunks([part])
     assert query.count() == answers[0][0]
     assert query.counters.chunks_read == 0
 

@@ -13,7 +13,6 @@ import hybridlog as hl
 from hybridlog.query.intervals import Intervals
 from hybridlog_storage.errors import SegmentError
 from tests import places
-from tests.limits import Limit
 from tests.query.conftest import AWAY, PADDING
 from tests.query.test_intervals import BASE, SECOND, Model, intervals, recorded, several
 
@@ -75,12 +74,6 @@ def test_a_count_by_time_is_what_a_loop_counts(
                 assert between.count() == looped(model, topics, both)
                 common = windows.common(both)
                 assert between.during(windows).count() == looped(model, topics, common)
-
-
-@pytest.fixture(autouse=True)
-def without_tables(limit: Limit) -> None:
-    """Let the chunk index answer."""
-    limit(tables_cost=lambda *_: None)
 
 
 def segment_of(store: hl.Store) -> Path:

@@ -12,7 +12,7 @@ from mcap.writer import Writer
 
 import hybridlog as hl
 from hybridlog.query.answers import field_statistics
-from hybridlog.query.engines.tables import TablesEngine
+from hybridlog.query.rows import Rows
 from tests import places
 from tests.calls import Calls
 from tests.scale.cost import cost_of
@@ -66,13 +66,13 @@ def test_statistics_of_many_topics_are_planned_together(
     stores: dict[int, Path], calls: Calls
 ) -> None:
     planners, planned = calls(field_statistics, "Planner"), []
-    weighed = calls(TablesEngine, "cost")
+    looked = calls(Rows, "_find")
     for count, path in stores.items():
         planners.clear()
-        weighed.clear()
+        looked.clear()
         with hl.open(path) as store:
             found = store.all_topics().stats()
-            assert len(weighed) == count  # an engine is chosen once a topic
+            assert len(looked) == count  # once a topic
             store.refresh()
             for work in (store.all_topics().stats, store.sql("show tables").rows):
                 opened = Counter(cost_of(store, work).opened)

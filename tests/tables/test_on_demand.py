@@ -12,7 +12,7 @@ import pytest
 
 import hybridlog as hl
 from hybridlog.maintenance import tables as making
-from hybridlog.query.engines.tables import TablesEngine
+from hybridlog.query.rows import Rows
 from hybridlog_storage.messages import Channel, Schema
 
 SECOND = 10**9
@@ -103,7 +103,7 @@ def test_frames_come_from_tables(store: hl.Store, monkeypatch: pytest.MonkeyPatc
         streamed = sum(part.num_rows for part in query.to_tables())
         assert streamed == table.num_rows
         with monkeypatch.context() as patch:
-            patch.setattr(TablesEngine, "cost", lambda *_: None)
+            patch.setattr(Rows, "tabled", lambda *_: None)
             decoded = query.to_arrow()
             assert query.counters.chunks_read > 0
         assert table.schema == decoded.schema

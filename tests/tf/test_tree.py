@@ -231,7 +231,7 @@ def test_the_times_of_a_topic_without_headers(log: Log) -> None:
     """Its log times, and no frame."""
     log.tree(*(said(n, "a", "b") for n in range(3)))
     query = log.store.recordings(log.store.summaries()[-1].id).topic("/tf")
-    frames, times = frames_and_stamps(query)
+    frames, times = frames_and_stamps(query.session, query.question, query.counters)
     assert frames == []
     assert times.tolist() == [message.log_time_ns for message in query]
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
@@ -17,9 +17,9 @@ from hybridlog.query.answers.lost import flush_interval_ns
 from hybridlog.query.answers.video import picture_of
 from hybridlog.query.chunk_columns import ChunkColumns
 from hybridlog.query.chunk_scan import ChunkScan, RecordingScan
-from hybridlog.query.engines.payload_scan import PayloadScan
 from hybridlog.query.planner import Planner
 from hybridlog.query.ranges import RangeResolver
+from hybridlog.query.rows import Rows
 from hybridlog.query.topics import later
 from hybridlog.record.marks import MARKS_SEGMENT
 from hybridlog.record.marks_log import without
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from hybridlog.query.chunk_columns import Chunk
     from hybridlog.query.chunk_scan import MessageRun, ScanPlan
     from hybridlog.query.counters import Counters
-    from hybridlog.query.engines import Engine
     from hybridlog.query.question import Part, Question, Span
     from hybridlog.session import Asked, Session
     from hybridlog_storage.catalog import RecordingEntry
@@ -80,7 +79,7 @@ class Following(Planner, Iterator["Message"]):
         super().__init__(session, question, counters)
         self._source = source
         self._ranges = RangeResolver(session, replace(question, bounds=None))
-        self._scan = self._arrived = _Arrived(session, counters)
+        self._rows = self._arrived = _Arrived(session, counters)
         self._takes = later(names)
         self._bounds: dict[str, Span] = {}
         self._read = {one: Counter[int]() for one in ids}  # chunks, by segment
@@ -127,6 +126,7 @@ class Following(Planner, Iterator["Message"]):
             bounds = self._bounds.get(one.id)
             self._arrived.chunks[one.id] = chunks = [*self._arrivals(entry, bounds)]
             parts += self.parts_in(one, bounds, None) if chunks else ()
+        self._counted.clear()
         return self.plan(parts), any(map(self._goes_on, summaries))
 
     def _goes_on(self, one: RecordingSummary) -> bool:
@@ -158,21 +158,20 @@ class Following(Planner, Iterator["Message"]):
             columns = ChunkColumns(MARKS_SEGMENT, entry.flushed[MARKS_SEGMENT].table)
             yield from columns.chunks(columns.within(bounds, clock, timed=timed))
 
-    def _selecting(self, part: Part) -> Engine:
-        return self._scan
 
-    def _count_unreadable(self, parts: Sequence[Part]) -> None:
-        for part in (part for part in parts if part.undecodable):
-            unseen = replace(part, channels=part.undecodable, undecodable=(), predicate=None)
-            self.counters.unreadable += self._scan.count([unseen])
-
-
-class _Arrived(PayloadScan):
+class _Arrived(Rows):
     """Reads only the chunks that have just come, in `chunks` by recording."""
 
     def __init__(self, session: Session, counters: Counters) -> None:
         super().__init__(session, counters)
         self.chunks: dict[str, list[Chunk]] = {}
+
+    def tabled(self, part: Part, fields: Collection[str] | None = ()) -> None:
+        """No tables: they have older messages, too."""
+
+    def count(self, parts: Sequence[Part]) -> int:
+        """Count what has come."""
+        return self.count_in_chunks(parts)
 
     def _scan(self, part: Part, indexes: dict[int, int]) -> RecordingScan:
         return RecordingScan(part.recording, indexes, part.bounds, self.chunks[part.recording.id])

@@ -122,7 +122,7 @@ def _unreadable(session: Session, question: Question) -> list[str]:
 def _why_expired(session: Session, question: Question) -> str:
     """Why payloads that an answer lacks are gone: a copy may be waiting for them."""
     found = _expired(session, question)
-    return ", or ".join(CAUSES[state] for state in GONE if found[state]) or CAUSES[State.EXPIRED]
+    return ", or ".join(CAUSES[state] for state in GONE if found[state]) or CAUSES[State.REDUCED]
 
 
 def _expired(session: Session, question: Question) -> Counter[State]:

@@ -1,25 +1,41 @@
-"""Regularity of topics: rates, gaps, jitter, late starts, losses."""
+"""When messages came: rates, gaps, and how regular a topic is.
+
+The times of a topic in a recording are in memory at once, 8 bytes a message.
+"""
 
 from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from itertools import groupby
+from operator import attrgetter
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
 
 from hybridlog.query.answers.lost import completeness_of, flush_interval_ns
-from hybridlog.query.answers.rates import Rates
+from hybridlog.query.intervals import MAX_PIECES, Intervals
 from hybridlog.query.latching import depth_of
-from hybridlog.query.periods import Regularity
+from hybridlog.query.periods import GAP_PERIODS, mean_rate, usual_period
+from hybridlog.query.planner import Planner
 from hybridlog.query.ranges import RangeResolver
+from hybridlog.query.times import DurationLike, parse_duration
 from hybridlog.record.losses import topics_of
+from hybridlog.wording import listed
+from hybridlog_storage.errors import UsageError
+from hybridlog_storage.times import END, placed
 
 if TYPE_CHECKING:
+    import pyarrow as pa
+    from numpy.typing import NDArray
+
     from hybridlog.query.counters import Counters
-    from hybridlog.query.question import Question, Span
+    from hybridlog.query.question import Part, Question, Span
     from hybridlog.session import Session
     from hybridlog_storage.summary import RecordingSummary
+
+    Times = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +63,7 @@ class TopicCheck:
     topic: str
     type: str
     begin_ns: int
-    messages: int
+    messages: int = 0
     rate_hz: float | None = None
     period_ns: float | None = None
     jitter_ns: float | None = None
@@ -70,63 +86,220 @@ class TopicCheck:
         return max(self.gap_ns or 0, *ends) / self.period_ns if self.period_ns else 0.0
 
 
-def check(session: Session, question: Question, counters: Counters) -> list[TopicCheck]:
-    """Regularity of topics, the worst first; see `Query.check`."""
-    lost: dict[tuple[str, str], list[int | None]] = defaultdict(list)
-    for row in completeness_of(session, question).rows:
-        lost[row["recording"], row["topic"]].append(row["count"])
-    rates = Rates(session, question, counters)
-    found = []
-    for summary, span in _spans(session, question):
-        stretches = {one.topic: one for one in rates.stretches_in(summary, span)}
-        for topic in sorted({*question.topics} & topics_of(session.entry_of(summary))):
-            measured = Regularity()
-            if topic in stretches:
-                for times in rates.times(stretches[topic]):
-                    measured.add(times)
-            counts = lost[summary.name, topic]
-            found.append(_check(session, summary, span, topic, measured=measured, lost=counts))
-    return sorted(
-        found, key=lambda one: (one.silent_periods, one.lost is None, one.lost or 0), reverse=True
+class Stretch(NamedTuple):
+    """The messages of one topic in one span of one recording.
+
+    Attributes:
+        summary: The recording.
+        span: Log time `[begin, end)`, ns.
+        part: The part of the question, without a range where that is the whole recording.
+    """
+
+    summary: RecordingSummary
+    span: Span
+    part: Part
+
+
+class Regularity:
+    """Answers about the times of messages.
+
+    Raises:
+        UsageError: the question has limit, every or reverse.
+    """
+
+    def __init__(self, session: Session, question: Question, counters: Counters) -> None:
+        if not question.returns_all or question.reverse:
+            raise UsageError(
+                "A rate is of all messages; it cannot be combined with limit, every or reverse."
+            )
+        self._session = session
+        self._question = question
+        self._planner = Planner(session, question, counters)
+        self._ranges = RangeResolver(session, question)
+
+    def rate(self, window: DurationLike | None) -> pa.Table:
+        """Messages and their rate; see `Query.rate`."""
+        size = None if window is None else parse_duration(window)
+        if size == 0:
+            raise UsageError("A window of 0 holds nothing: name a duration, such as 1s.")
+        stretches = [
+            stretch
+            for summary, span in self._ranges.spans()
+            for stretch in self._stretches(summary, span)
+        ]
+        rows = 0
+        for low, high in (one.span for one in stretches):
+            rows += 1 if size is None else -(-(high - low) // size)
+            if rows > MAX_PIECES:
+                raise UsageError(f"There are {rows} windows; use a longer one or a time range.")
+        made = [
+            self._overall(one) if size is None else self._by_window(one, size) for one in stretches
+        ]
+        return _table(stretches, made)
+
+    def gaps(self, longer_than: DurationLike | None, periods: float | None) -> Intervals:
+        """Times without messages; see `Query.gaps`."""
+        if len(self._question.topics) != 1:
+            raise UsageError(
+                f"A gap is one topic's; this question has {len(self._question.topics)}: name one "
+                f"of {listed(self._question.topics)}."
+            )
+        least = 0 if longer_than is None else parse_duration(longer_than)
+        if periods is None and longer_than is None:
+            periods = GAP_PERIODS
+        if periods is not None and not 0 < periods < float("inf"):
+            raise UsageError(f"A number of periods is more than 0, not {periods}.")
+        found: list[tuple[str, Times]] = []
+        for recording, spans in groupby(self._ranges.spans(), lambda row: row[0].id):
+            stretches = [one for row in spans for one in self._stretches(*row)]
+            times = [self._times(one.part) for one in stretches]
+            limit = float(least)
+            if periods is not None:
+                usual = usual_period(np.concatenate([np.empty(0, np.int64), *map(np.diff, times)]))
+                if not usual:
+                    continue  # one message does not tell when the next one was due
+                limit = max(limit, periods * usual)
+            for stretch, own in zip(stretches, times, strict=True):
+                edges = np.concatenate(
+                    [stretch.span[:1], own, [_end(stretch.summary, stretch.span)]]
+                )
+                rows = np.flatnonzero(np.diff(edges) > limit)
+                none = np.zeros(len(rows), np.int64)
+                found.append((recording, np.stack([edges[rows], edges[rows + 1], none], axis=1)))
+        return Intervals.of(found)
+
+    def check(self) -> list[TopicCheck]:
+        """Regularity of topics, the worst first; see `Query.check`."""
+        session, question = self._session, self._question
+        lost: dict[tuple[str, str], list[int | None]] = defaultdict(list)
+        for row in completeness_of(session, question).rows:
+            lost[row["recording"], row["topic"]].append(row["count"])
+        silent = (
+            (recording, (0, 0))
+            for recording, bounds, windows in self._ranges.resolve()
+            if recording.span is None and bounds is None and windows is None
+        )
+        found = []
+        for summary, span in [*self._ranges.spans(), *silent]:
+            parts = {one.part.topic: one.part for one in self._stretches(summary, span)}
+            entry = session.entry_of(summary)
+            for topic in sorted({*question.topics} & topics_of(entry)):
+                part, counts = parts.get(topic), lost[summary.name, topic]
+                channels = [one.channel for one in session.channels_of(entry, [topic])]
+                types = {one.schema.name for one in channels if one.schema is not None}
+                found.append(
+                    TopicCheck(
+                        summary.name,
+                        topic,
+                        ", ".join(sorted(types)),
+                        span[0],
+                        lost=None if None in counts else sum(count or 0 for count in counts),
+                        is_latched=any(map(depth_of, channels)),
+                        **({} if part is None else _measured(self._times(part), summary, span)),
+                    )
+                )
+        return sorted(
+            found,
+            key=lambda one: (one.silent_periods, one.lost is None, one.lost or 0),
+            reverse=True,
+        )
+
+    def _stretches(self, summary: RecordingSummary, span: Span) -> list[Stretch]:
+        """The topics of the question that have messages in a recording, by name."""
+        is_whole = self._question.is_unbounded
+        return [
+            Stretch(summary, span, part if is_whole else replace(part, bounds=span, clock="log"))
+            for part in sorted(self._planner.parts_in(summary, None, None), key=attrgetter("topic"))
+        ]
+
+    def _times(self, part: Part) -> Times:
+        """Log times of the matching messages, ns, ascending."""
+        found = [one.log_time[one.holds] for one in self._planner.outcomes(part)]
+        return np.concatenate([np.empty(0, np.int64), *found])
+
+    def _overall(self, stretch: Stretch) -> _Columns:
+        """First and last time, messages and mean rate."""
+        part = stretch.part
+        if part.predicate is None and part.is_unbounded:
+            count = part.messages
+            firsts = [one.first for one in part.stats if one.first is not None]
+            lasts = [one.last for one in part.stats if one.last is not None]
+            first, last = min(firsts, default=0), max(lasts, default=0)
+        else:
+            times = self._times(part)
+            count = len(times)
+            first, last = (int(times[0]), int(times[-1])) if count else (0, 0)
+        if not count:
+            first, last = stretch.span[0], stretch.span[1] - 1
+        rate = mean_rate(count, first, last)
+        return (
+            np.array([first], np.int64),
+            np.array([min(last + 1, END)], np.int64),
+            np.array([count], np.int64),
+            np.array([(np.nan if rate is None else rate) if count else 0.0]),
+        )
+
+    def _by_window(self, stretch: Stretch, size: int) -> _Columns:
+        low, high = stretch.span
+        begin = np.arange(low, high, size, dtype=np.int64)
+        end = np.append(begin[1:], high)
+        times = placed(self._times(stretch.part))
+        inside = times[(times >= low) & (times < high)]
+        messages = np.bincount((inside - low) // size, minlength=len(begin))
+        return begin, end, messages, messages * 1e9 / (end - begin)
+
+
+_Columns = tuple["Times", "Times", "Times", "NDArray[np.float64]"]
+"""Begin, end, messages and rate of windows."""
+
+
+def _end(summary: RecordingSummary, span: Span) -> int:
+    """End of a span; in an open recording, other topics may be flushed later than this one."""
+    late = flush_interval_ns(summary) if summary.status == "open" else 0
+    return max(span[0], span[1] - late)
+
+
+def _measured(times: Times, summary: RecordingSummary, span: Span) -> dict[str, Any]:
+    """Attributes of a `TopicCheck` that follow from the times of its messages."""
+    if not len(times):
+        return {}
+    first, last, steps = int(times[0]), int(times[-1]), np.diff(times)
+    found = {
+        "messages": len(times),
+        "rate_hz": mean_rate(len(times), first, last),
+        "late_ns": first - span[0],
+        "early_ns": max(_end(summary, span) - 1 - last, 0),
+    }
+    if len(steps):
+        longest = int(steps.argmax())
+        found["period_ns"] = usual_period(steps)
+        found["jitter_ns"] = float(np.std(steps)) if len(steps) > 1 else None
+        found["gap_ns"], found["gap_begin_ns"] = int(steps[longest]), int(times[longest])
+    return found
+
+
+def _table(stretches: list[Stretch], made: list[_Columns]) -> pa.Table:
+    import pyarrow as pa
+
+    from hybridlog.schema.arrow_columns import numbers
+
+    none = np.empty(0, np.int64)
+    begin, end, messages, rate = (
+        np.concatenate([none, *(columns[place] for columns in made)]) for place in range(4)
     )
+    row = np.repeat(np.arange(len(made)), [len(columns[0]) for columns in made])
 
+    def texts(names: list[str]) -> pa.Array[Any]:
+        sound = [name.encode("utf-8", "replace").decode() for name in names]
+        return pa.array(sound, pa.string()).take(numbers(row.astype(np.int64)))
 
-def _spans(session: Session, question: Question) -> Iterator[tuple[RecordingSummary, Span]]:
-    """The log time of each recording of a question, also of those without messages."""
-    resolver = RangeResolver(session, question)
-    yield from resolver.spans()
-    for recording, bounds, windows in resolver.resolve():
-        if recording.span is None and bounds is None and windows is None:
-            yield recording, (0, 0)
-
-
-def _check(
-    session: Session,
-    summary: RecordingSummary,
-    span: Span,
-    topic: str,
-    *,
-    measured: Regularity,
-    lost: Sequence[int | None],
-) -> TopicCheck:
-    channels = [one.channel for one in session.channels_of(session.entry_of(summary), [topic])]
-    begin, end = span
-    if summary.status == "open":  # other topics may be flushed later than this one
-        end = max(begin, end - flush_interval_ns(summary))
-    some = measured.messages > 0
-    return TopicCheck(
-        summary.name,
-        topic,
-        ", ".join(sorted({one.schema.name for one in channels if one.schema is not None})),
-        begin,
-        measured.messages,
-        measured.rate_hz,
-        measured.period_ns,
-        measured.jitter_ns,
-        measured.gap[1] - measured.gap[0] if measured.messages > 1 else None,
-        measured.gap[0] if measured.messages > 1 else None,
-        measured.first - begin if some else None,
-        max(end - 1 - measured.last, 0) if some else None,
-        None if None in lost else sum(count or 0 for count in lost),
-        any(map(depth_of, channels)),
+    return pa.table(
+        {
+            "begin": numbers(begin, "time"),
+            "end": numbers(end, "time"),
+            "recording": texts([one.summary.name for one in stretches]),
+            "topic": texts([one.part.topic for one in stretches]),
+            "messages": numbers(messages),
+            "rate": pa.array(rate, pa.float64(), mask=np.isnan(rate)),
+        }
     )

@@ -1,20 +1,18 @@
 """Predicates on one message in memory: the reference semantics.
 
-Every other engine gives the same answer as `to_bool` on the decoded message. Arrays may
-be summarised, as in index documents and reduced messages. A condition that a summary
-cannot decide is neither true nor false, and a predicate holds when it is certainly true.
+`to_mask` gives the same answer of columns. Arrays may be summarised, as in what is left of
+messages without payload; what a summary cannot decide raises `UndecidedError`.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TypeAlias, TypeGuard, cast
+from typing import NamedTuple, TypeAlias, TypeGuard, cast
 
-from hybridlog.query.predicate.numbers import equal, is_number, nearest, ordered
+from hybridlog.query.predicate.numbers import equal, ordered
 from hybridlog.query.predicate.regex import compile_regex
 from hybridlog.query.predicate.tree import (
     And,
@@ -41,13 +39,14 @@ from hybridlog_storage.errors import WhereError
 
 Message: TypeAlias = Mapping[str, object]
 """A decoded message: dict, list, str, bytes, bool, int, float, None."""
-Truth: TypeAlias = bool | None
-"""None if a summary cannot decide."""
-Decision: TypeAlias = Callable[[Message], Truth]
 
 _Names: TypeAlias = tuple[str, ...]
 _WITH_NUMBERS = frozenset(STATS)
 _SUMMARIES = (_WITH_NUMBERS, frozenset({"n"}))
+
+
+class UndecidedError(Exception):
+    """Only a summary of an array is there, which cannot decide."""
 
 
 def to_bool(
@@ -56,7 +55,7 @@ def to_bool(
     *,
     summarised: bool = False,
 ) -> Test:
-    """A predicate as a test of single messages.
+    """A predicate as a test of single messages; it may raise `UndecidedError`.
 
     Args:
         node: The predicate.
@@ -66,87 +65,19 @@ def to_bool(
     Raises:
         WhereError: it has a MongoDB filter.
     """
-    decide = to_truth(node, types, summarised=summarised)
-    return lambda message: decide(message) is True
+    return _node(root_of(node), _Reader(FieldTypes.of(types), summarised))
 
 
-def to_truth(
-    node: Predicate | Node,
-    types: FieldTypes | Mapping[str, str] | None = None,
-    *,
-    summarised: bool = False,
-) -> Decision:
-    """A predicate as a function that returns None when a summary cannot decide.
-
-    Args:
-        node: The predicate.
-        types: As for `to_bool`.
-        summarised: As for `to_bool`.
-
-    Raises:
-        WhereError: it has a MongoDB filter.
-    """
-    reader = _Reader(FieldTypes.of(types), summarised)
-    return _node(root_of(node), reader)
-
-
-@dataclass(frozen=True, slots=True)
-class _Hidden:
-    """Elements, or fields of elements, of an array that is present only as a summary.
+class _Summary(NamedTuple):
+    """A summary in place of an array.
 
     Attributes:
-        least: The least finite element; None if unknown, or if there is none.
-        greatest: The greatest finite element, or None.
-        surely: True if the path certainly leads to a value.
-        elements: True if the path leads to the array itself.
-        numeric: True if the elements are numbers or booleans.
-        booleans: True if they are booleans; None if unknown.
+        numbers: The summary, with `min` and `max` of numbers.
+        booleans: True if the elements may be booleans.
     """
 
-    least: object
-    greatest: object
-    surely: bool
-    elements: bool
-    numeric: bool
-    booleans: bool | None
-
-    def may_equal(self, wanted: Value) -> bool:
-        """True if an element may be equal to a value."""
-        if not self.numeric:
-            return True
-        if isinstance(wanted, bool):
-            return self.booleans is not False
-        if not is_number(wanted) or self.booleans:
-            return False
-        if isinstance(wanted, float) and not math.isfinite(wanted):
-            return True
-        if not is_number(self.least) or not is_number(self.greatest):
-            return False
-        # Ends beyond int64 may be rounded to doubles.
-        low, high = nearest(self.least), nearest(self.greatest)
-        return low <= nearest(wanted) <= high
-
-    def is_ordered(self, order: str, wanted: Value) -> Truth:
-        """True if an element satisfies the order; None if the summary cannot decide."""
-        if not self.numeric:
-            return None
-        if not self.elements:
-            return None if is_number(wanted) and not self.booleans else False
-        end = self.least if order in {"<", "<="} else self.greatest
-        if not is_number(wanted) or self.booleans or not is_number(end):
-            return False
-        rounded = isinstance(end, float) and abs(end) >= 2**63
-        if rounded and nearest(wanted) == end:
-            return None
-        found = ordered(order, end, wanted)
-        # A summary counts true as 1 and false as 0.
-        return None if found and self.booleans is None and end in {0, 1} else found
-
-
-_UNKNOWN = _Hidden(None, None, surely=False, elements=False, numeric=False, booleans=None)
-"""Result for a name in the summary of an element: nothing, if that is an array."""
-_OF_SOME_ELEMENTS = dataclasses.replace(_UNKNOWN, surely=True)
-"""A statistic of some elements of an array that is present only as a summary."""
+    numbers: Mapping[str, object]
+    booleans: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,7 +93,7 @@ class _Reader:
     summarised: bool
 
     def leaves(self, message: Message, target: Field) -> list[object]:
-        """Everything at a path: values, whole arrays, statistics of arrays, hidden elements."""
+        """Everything at a path: values, whole arrays, statistics of arrays, summaries."""
         parts = target.parts
         stat = self.types.statistic(parts)
         if stat is None:
@@ -185,23 +116,16 @@ class _Reader:
         """The elements of an array, also those of the arrays in it."""
         for value in _flat(values):
             if not self.types.known and self._is_summary(value, (), element=True):
-                yield from _hidden(value, (), None)
-            else:
-                yield value
+                raise UndecidedError
+            yield value
 
     def _typed_statistic(self, stat: Stat, array: object, parts: Parts) -> Iterator[object]:
         if isinstance(array, list | bytes):
             kind = self.types.kind(".".join(part for part in parts if isinstance(part, str)))
             if stat == "n" or kind != "other":
                 yield statistic(stat, array)
-        elif isinstance(array, _Hidden):
-            # What is known of all elements says nothing of the statistics of some.
-            yield _OF_SOME_ELEMENTS if isinstance(parts[-1], Slice) else array
         elif isinstance(array, Mapping) and stat in array:
             yield array[stat]
-
-    def _are_booleans(self, names: _Names) -> bool | None:
-        return self.types.kind(".".join(names)) == "bool" if self.types.known else None
 
     def _is_summary(
         self, value: object, names: _Names, *, element: bool
@@ -219,10 +143,7 @@ class _Reader:
     ) -> Iterator[object]:
         """The values at a path; through an array, those of each element."""
         if self._is_summary(value, names, element=element):
-            if not self.types.known and len(parts) == 1 and parts[0] in value and "min" in value:
-                yield value[str(parts[0])]
-            else:
-                yield from _hidden(value, parts, self._are_booleans(names))
+            yield self._of_summary(value, parts, names)
             return
         if not parts:
             yield value
@@ -237,6 +158,15 @@ class _Reader:
         elif isinstance(value, list):
             yield from self._into_list(value, parts, names)
 
+    def _of_summary(self, value: Mapping[str, object], parts: Parts, names: _Names) -> object:
+        """What a summary has at a path: itself, or a number where it may also be a message."""
+        if "min" in value and not self.types.known and len(parts) == 1 and parts[0] in value:
+            return value[str(parts[0])]
+        if parts:
+            raise UndecidedError
+        booleans = not self.types.known or self.types.kind(".".join(names)) == "bool"
+        return _Summary(value, booleans)
+
     def _into_list(self, values: list[object], parts: Parts, names: _Names) -> Iterator[object]:
         """The values at a path through an array."""
         part = parts[0]
@@ -245,8 +175,8 @@ class _Reader:
         # MongoDB also accepts a number as a name.
         for inner in _flat(values) if isinstance(part, str) else values:
             if self._is_summary(inner, names, element=True):
-                yield _UNKNOWN
-            elif isinstance(inner, Mapping):
+                raise UndecidedError
+            if isinstance(inner, Mapping):
                 yield from self._reach(inner, parts, names, element=True)
 
     def _values(
@@ -257,8 +187,7 @@ class _Reader:
             yield value
             return
         if self._is_summary(value, names, element=element):
-            yield from _hidden(value, parts, self._are_booleans(names))
-            return
+            raise UndecidedError
         part, rest = parts[0], parts[1:]
         if isinstance(part, Slice):
             if isinstance(value, list):
@@ -282,35 +211,6 @@ def _flat(values: object) -> Iterator[object]:
             left += reversed(value)
         else:
             yield value
-
-
-def _hidden(
-    summary: Mapping[str, object],
-    parts: Parts,
-    booleans: bool | None,  # noqa: FBT001
-) -> Iterator[_Hidden]:
-    """The hidden values behind a summary when a path continues with these parts."""
-    count = summary.get("n")
-    first = parts[0] if parts else None
-    if isinstance(first, int) and isinstance(count, int) and first >= count:
-        return
-    numeric = "min" in summary
-    if isinstance(first, Slice) and len(parts) == 2 and parts[1] in STATS:
-        yield _UNKNOWN  # or a field of that name
-        return
-    if numeric and parts and (isinstance(first, str) or len(parts) > 1):
-        return  # numbers have no fields
-    yield _Hidden(
-        summary.get("min"),
-        summary.get("max"),
-        # Without types, it may also be a message that has a field `n`.
-        surely=not parts
-        or parts == ("n",)
-        or (booleans is not None and len(parts) == 1 and isinstance(first, int | Slice)),
-        elements=not parts,
-        numeric=numeric,
-        booleans=booleans,
-    )
 
 
 def _has_statistic(values: Sequence[object], stat: Stat) -> bool:
@@ -353,14 +253,14 @@ def with_statistics(message: Message, paths: Iterable[str]) -> Message:
     return found
 
 
-def _node(node: Node, reader: _Reader) -> Decision:
+def _node(node: Node, reader: _Reader) -> Test:
     match node:
         case Not(item):
             return partial(_negated, _node(item, reader))
         case And(items):
-            return partial(_all, [_node(item, reader) for item in items])
+            return partial(_joined, [_node(item, reader) for item in items], False)
         case Or(items):
-            return partial(_any, [_node(item, reader) for item in items])
+            return partial(_joined, [_node(item, reader) for item in items], True)
         case MongoFilter():
             raise WhereError(f"{node.to_filter()} is for MongoDB; write a predicate here.")
         case Exists(target, present):
@@ -368,58 +268,51 @@ def _node(node: Node, reader: _Reader) -> Decision:
             return exists if present else partial(_negated, exists)
         case Compare(order="!=") | Member(negated=True) | Match(negated=True):
             positive = partial(_negated, partial(_holds, reader, node.field, _test_of(node)))
-            return partial(_all, [partial(_exists, reader, node.field), positive])
+            return partial(_joined, [partial(_exists, reader, node.field), positive], False)
         case Compare() | Member() | Match():
             return partial(_holds, reader, node.field, _test_of(node))
 
 
-def _negated(inner: Decision, message: Message) -> Truth:
-    found = inner(message)
-    return None if found is None else not found
+def _negated(test: Test, message: Message) -> bool:
+    return not test(message)
 
 
-def _all(tests: Sequence[Decision], message: Message) -> Truth:
-    unknown = False
+def _joined(tests: Sequence[Test], wanted: bool, message: Message) -> bool:  # noqa: FBT001
+    """True if any test is true, or, if False is wanted, False if any is false."""
+    undecided: UndecidedError | None = None
     for test in tests:
-        found = test(message)
-        if found is False:
-            return False
-        unknown |= found is None
-    return None if unknown else True
+        try:
+            if test(message) is wanted:
+                return wanted
+        except UndecidedError as error:
+            undecided = error
+    if undecided is not None:
+        raise undecided
+    return not wanted
 
 
-def _any(tests: Sequence[Decision], message: Message) -> Truth:
-    unknown = False
-    for test in tests:
-        found = test(message)
-        if found:
-            return True
-        unknown |= found is None
-    return None if unknown else False
+def _exists(reader: _Reader, target: Field, message: Message) -> bool:
+    return bool(reader.leaves(message, target))
 
 
-def _exists(reader: _Reader, target: Field, message: Message) -> Truth:
-    found = reader.leaves(message, target)
-    if any(not isinstance(leaf, _Hidden) or leaf.surely for leaf in found):
-        return True
-    return None if found else False
-
-
-_Leaf: TypeAlias = Callable[[object, bool], Truth]
+_Leaf: TypeAlias = Callable[[object, bool], bool]
 """Tests a value; the second argument is True for an element of an array."""
 
 
-def _holds(reader: _Reader, target: Field, test: _Leaf, message: Message) -> Truth:
+def _holds(reader: _Reader, target: Field, test: _Leaf, message: Message) -> bool:
     """True if a test holds for any value at a path."""
-    unknown = False
+    undecided: UndecidedError | None = None
     for leaf in reader.leaves(message, target):
         is_list = isinstance(leaf, list)
-        for value in reader.elements(leaf) if isinstance(leaf, list) else (leaf,):
-            found = test(value, is_list)
-            if found:
-                return True
-            unknown |= found is None
-    return None if unknown else False
+        try:
+            for value in reader.elements(leaf) if isinstance(leaf, list) else (leaf,):
+                if test(value, is_list):
+                    return True
+        except UndecidedError as error:
+            undecided = error
+    if undecided is not None:
+        raise undecided
+    return False
 
 
 def _test_of(node: Condition) -> _Leaf:
@@ -444,20 +337,26 @@ def _is_one_of(
     values: tuple[Value, ...],
     found: object,
     _element: bool,  # noqa: FBT001
-) -> Truth:
+) -> bool:
     if type(found) is int and found in integers:
         return True
+    if isinstance(found, _Summary):
+        raise UndecidedError
     values = values if type(found) is int else (*integers, *values)
-    if isinstance(found, _Hidden):
-        return None if any(map(found.may_equal, values)) else False
     if isinstance(found, str):
         found = repaired_text(found)
     return any(equal(found, value) for value in values)
 
 
-def _is_ordered(order: str, value: Value, found: object, element: bool) -> Truth:  # noqa: FBT001
-    if isinstance(found, _Hidden):
-        return found.is_ordered(order, value)
+def _is_ordered(order: str, value: Value, found: object, element: bool) -> bool:  # noqa: FBT001
+    if isinstance(found, _Summary):
+        end = found.numbers.get("min" if order in {"<", "<="} else "max", 0)
+        is_rounded = isinstance(end, float) and abs(end) >= 2**63
+        # A summary counts true as 1 and false as 0.
+        is_boolean = found.booleans and end in {0, 1}
+        if is_rounded or is_boolean or "min" not in found.numbers:
+            raise UndecidedError
+        return ordered(order, end, value)
     if isinstance(found, str):
         found = repaired_text(found)
     if element and isinstance(found, float) and math.isinf(found):
@@ -465,7 +364,7 @@ def _is_ordered(order: str, value: Value, found: object, element: bool) -> Truth
     return ordered(order, found, value)
 
 
-def _matches(search: Callable[[str], object], found: object, _element: bool) -> Truth:  # noqa: FBT001
-    if isinstance(found, _Hidden):
-        return False if found.numeric else None
+def _matches(search: Callable[[str], object], found: object, _element: bool) -> bool:  # noqa: FBT001
+    if isinstance(found, _Summary):
+        raise UndecidedError
     return isinstance(found, str) and search(repaired_text(found)) is not None

@@ -1,13 +1,11 @@
 """Predicates on Arrow columns of decoded messages.
 
 Columns have less information than messages: a null is a missing field or a null, and a
-summary replaces a long array. Each condition therefore gives two masks: rows for which it
-may hold, and rows for which it certainly holds. If they differ in the end, the columns
+summary replaces a long array. Where that matters, columns cannot decide, and messages must.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import reduce
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
@@ -123,7 +121,7 @@ def numbers_at(
             for each in _elements(leaves):
                 values = _as_integers(each.values)
                 is_number = pa.types.is_integer(values.type) or pa.types.is_floating(values.type)
-                if each.is_hidden or each.is_summary:
+                if each.is_summary:
                     return None
                 if is_number:
                     some, rows = _some(values, each.rows, _valid(values))
@@ -149,23 +147,13 @@ def _parts(records: Records) -> Iterator[pa.StructArray]:
 
 def _mask(root: Node, types: FieldTypes, records: pa.StructArray) -> Mask | None:
     try:
-        found = _Columns(types, records).node(root)
+        return _Columns(types, records).node(root)
     except (_UnfitError, pa.ArrowNotImplementedError):
         return None  # Arrow has no functions for lists of JSON text either
-    if found.possible is found.certain or bool((found.possible == found.certain).all()):
-        return found.certain
-    return None
 
 
 class _UnfitError(Exception):
-    """The columns lack the requested field."""
-
-
-class _Pair(NamedTuple):
-    """Masks of possible and of certain results: bool[rows] each."""
-
-    possible: Mask
-    certain: Mask
+    """The columns cannot decide."""
 
 
 class _Leaves(NamedTuple):
@@ -175,14 +163,12 @@ class _Leaves(NamedTuple):
         values: One entry for each value.
         rows: The row of each value.
         is_element: True for elements of an array: a null is then null, not missing.
-        is_hidden: True for summaries that hide the values at the path.
         is_summary: True for summaries that replace the arrays themselves.
     """
 
     values: pa.Array
     rows: Rows
     is_element: bool = False
-    is_hidden: bool = False
     is_summary: bool = False
 
 
@@ -192,63 +178,44 @@ class _Columns:
         self._records = records
         self._count = len(records)
 
-    def node(self, node: Node) -> _Pair:
-        """Masks of the rows for which a predicate may hold and certainly holds."""
+    def node(self, node: Node) -> Mask:
+        """Mask of the rows for which a predicate holds.
+
+        Raises:
+            _UnfitError: the columns cannot decide.
+        """
         match node:
             case And(items):
-                return self._joined(np.logical_and, items, start=True)
+                return reduce(np.logical_and, map(self.node, items), np.ones(self._count, np.bool_))
             case Or(items):
-                return self._joined(np.logical_or, items, start=False)
+                return reduce(np.logical_or, map(self.node, items), np.zeros(self._count, np.bool_))
             case Not(item):
-                return _not(self.node(item))
+                return ~self.node(item)
             case Exists(target, present):
                 found = self._exists(target)
-                return found if present else _not(found)
+                return found if present else ~found
             case MongoFilter():
                 raise _UnfitError
+            case Compare(order="!=") | Member(negated=True) | Match(negated=True):
+                return self._exists(node.field) & ~self._holds(node)
             case _:
-                return self._condition(node)
+                return self._holds(node)
 
-    def _joined(self, join: np.ufunc, items: Sequence[Node], *, start: bool) -> _Pair:
-        pairs = [self.node(item) for item in items] or [self._all(start)]
-        return _Pair(
-            reduce(join, (pair.possible for pair in pairs)),
-            reduce(join, (pair.certain for pair in pairs)),
-        )
-
-    def _all(self, answer: bool) -> _Pair:  # noqa: FBT001
-        mask = np.full(self._count, answer)
-        return _Pair(mask, mask)
-
-    def _condition(self, node: Compare | Member | Match) -> _Pair:
-        negated = node.order == "!=" if isinstance(node, Compare) else node.negated
-        found = self._holds(node)
-        if not negated:
-            return found
-        exists, other = self._exists(node.field), _not(found)
-        return _Pair(exists.possible & other.possible, exists.certain & other.certain)
-
-    def _exists(self, target: Field) -> _Pair:
-        possible, certain = (np.zeros(self._count, np.bool_) for _ in range(2))
+    def _exists(self, target: Field) -> Mask:
+        found = np.zeros(self._count, np.bool_)
         for leaves in self.leaves(target):
-            possible[leaves.rows] = True
-            if leaves.is_hidden:
-                continue
-            if leaves.is_element or not leaves.values.null_count:
-                certain[leaves.rows] = True
-            else:
-                certain[leaves.rows[_valid(leaves.values)]] = True
-        return _Pair(possible, certain)
+            if leaves.values.null_count and not leaves.is_element:
+                raise _UnfitError  # null, or missing
+            found[leaves.rows] = True
+        return found
 
-    def _holds(self, node: Compare | Member | Match) -> _Pair:
-        """Masks of the rows with a value that satisfies a condition, without its negation."""
-        possible, certain = (np.zeros(self._count, np.bool_) for _ in range(2))
+    def _holds(self, node: Compare | Member | Match) -> Mask:
+        """Mask of the rows with a value that satisfies a condition, without its negation."""
+        found = np.zeros(self._count, np.bool_)
         for leaves in self.leaves(node.field):
             for each in _elements(leaves):
-                found = _tested(node, each, self._types)
-                possible[each.rows[found.possible]] = True
-                certain[each.rows[found.certain]] = True
-        return _Pair(possible, certain)
+                found[each.rows[_tested(node, each, self._types)]] = True
+        return found
 
     # Paths.
 
@@ -273,8 +240,6 @@ class _Columns:
 
     def _statistic(self, leaves: _Leaves, stat: Stat) -> _Leaves:
         """A statistic of arrays whose types are known."""
-        if leaves.is_hidden:
-            return leaves
         if leaves.is_summary:
             if leaves.values.type.get_field_index(stat) < 0:
                 raise _UnfitError
@@ -285,9 +250,7 @@ class _Columns:
     def _either(self, leaves: _Leaves, stat: Stat) -> Iterator[_Leaves]:
         """A statistic of an array, or a field of that name, where types are unknown."""
         kind = leaves.values.type
-        if leaves.is_hidden or _is_scalar(kind):
-            if leaves.is_hidden:
-                yield leaves
+        if _is_scalar(kind):
             return
         if pa.types.is_struct(kind):
             if set(_names(kind)) == {"n"}:
@@ -362,32 +325,14 @@ class _Columns:
 
     def _behind(self, leaves: _Leaves, parts: Parts) -> Iterator[_Leaves]:
         """The values behind summaries when a path continues with some parts."""
-        if not self._types.known:
+        if not parts and self._types.known:
+            yield leaves._replace(is_summary=True)
+        elif len(parts) == 1 and parts[0] in _names(leaves.values.type) and not self._types.known:
             # It may also be a message with fields of these names.
-            stat = len(parts) == 1 and parts[0] in _names(leaves.values.type)
-            if not stat:
-                raise _UnfitError
             values, rows = _some(leaves.values, leaves.rows, _valid(leaves.values))
             yield _Leaves(pc.struct_field(values, str(parts[0])), rows)
-        elif not parts:
-            yield leaves._replace(is_summary=True)
         else:
-            numeric = "min" in _names(leaves.values.type)
-            if numeric and (isinstance(parts[0], str) or len(parts) > 1):
-                return
-            chosen = _valid(leaves.values)
-            if isinstance(parts[0], int):
-                counts = _numpy(pc.fill_null(pc.struct_field(leaves.values, "n"), 0))
-                chosen &= counts > parts[0]
-            values, rows = _some(leaves.values, leaves.rows, chosen)
-            yield _Leaves(values, rows, is_hidden=True)
-
-
-def _not(pair: _Pair) -> _Pair:
-    if pair.possible is pair.certain:
-        mask = ~pair.possible
-        return _Pair(mask, mask)
-    return _Pair(~pair.certain, ~pair.possible)
+            raise _UnfitError
 
 
 # Arrays.
@@ -490,7 +435,7 @@ def _elements(leaves: _Leaves) -> Iterator[_Leaves]:
     """The values that are no lists, the elements of lists and of the lists in them, and nulls."""
     values, rows = leaves.values, leaves.rows
     is_element = False
-    if leaves.is_hidden or leaves.is_summary:
+    if leaves.is_summary:
         yield leaves
         return
     while True:
@@ -506,14 +451,13 @@ def _elements(leaves: _Leaves) -> Iterator[_Leaves]:
     yield _Leaves(values, rows, is_element=is_element)
 
 
-def _tested(node: Compare | Member | Match, leaves: _Leaves, types: FieldTypes) -> _Pair:
-    """Masks of the values that may satisfy a condition and certainly do: bool[values] each."""
-    if leaves.is_hidden or leaves.is_summary:
+def _tested(node: Compare | Member | Match, leaves: _Leaves, types: FieldTypes) -> Mask:
+    """Mask of the values that satisfy a condition, without its negation: bool[values]."""
+    if leaves.is_summary:
         return _of_summaries(node, leaves, types)
     match node:
         case Match(pattern=pattern):
-            found = _matching(leaves.values, pattern)
-            return _Pair(found, found)
+            return _matching(leaves.values, pattern)
         case Compare(order="==" | "!=", value=value):
             return _equal_to(leaves, (value,))
         case Member(values=values):
@@ -522,21 +466,21 @@ def _tested(node: Compare | Member | Match, leaves: _Leaves, types: FieldTypes) 
             found = _compared(leaves.values, order, value)
             if leaves.is_element and pa.types.is_floating(leaves.values.type):
                 found &= np.isfinite(_numpy(leaves.values).astype(np.float64))
-            return _Pair(found, found)
+            return found
 
 
-def _equal_to(leaves: _Leaves, values: Sequence[Value]) -> _Pair:
+def _equal_to(leaves: _Leaves, values: Sequence[Value]) -> Mask:
     if len(values) > 1 and pa.types.is_int64(leaves.values.type) and _are_int64(values):
-        found = _numpy(pc.is_in(leaves.values, pa.array(values, pa.int64())))
-        return _Pair(found, found)
+        return _numpy(pc.is_in(leaves.values, pa.array(values, pa.int64())))
     found = np.zeros(len(leaves.values), np.bool_)
     for value in values:
         if value is not None:
             found |= _compared(leaves.values, "==", value)
-    if None not in values or not leaves.values.null_count:
-        return _Pair(found, found)
-    possible = found | ~_valid(leaves.values)
-    return _Pair(possible, possible if leaves.is_element else found)
+    if None in values and len(found) and pa.types.is_null(leaves.values.type):
+        if not leaves.is_element:
+            raise _UnfitError  # null, or missing
+        return ~found
+    return found
 
 
 def _are_int64(values: Sequence[Value]) -> bool:
@@ -618,55 +562,17 @@ def _floats_compared(numbers: NDArray[Any], order: str, value: float) -> Any:
 # Conditions on summaries.
 
 
-def _of_summaries(node: Compare | Member | Match, leaves: _Leaves, types: FieldTypes) -> _Pair:
-    """Conditions on elements of arrays that are present only as summaries."""
-    summaries = leaves.values
-    there = _valid(summaries)
-    none = np.zeros(len(summaries), np.bool_)
-    wanted = _values_of(node)
-    if None in wanted:
-        return _Pair(~none, none)
-    is_sliced = leaves.is_hidden and node.field.is_sliced
-    of_slice = is_sliced and types.statistic(node.field.parts) is not None
-    if of_slice or "min" not in _names(summaries.type):
-        return _Pair(there, none)
-    path = node.field.names
-    if types.kind(path) == "bool":
-        wanted = tuple(value for value in wanted if isinstance(value, bool))
-    low, high = (pc.struct_field(summaries, name) for name in ("min", "max"))
-    is_ordered = isinstance(node, Compare) and node.order not in {"==", "!="}
-    possible = none
-    for value in wanted:
-        rounded = not types.are_floats(path) and _is_rounded(low, value)
-        is_bounded = not leaves.is_hidden or is_sliced
-        if is_ordered and is_number(value) and is_bounded and not rounded:
-            assert isinstance(node, Compare)
-            found = _compared(low if node.order in {"<", "<="} else high, node.order, value)
-            return _Pair(found, none if is_sliced else found)
-        if is_ordered or rounded:
-            possible = possible | (there & is_number(value))
-        else:
-            possible = possible | (there & _may_equal(low, high, value))
-    return _Pair(possible, none)
+def _of_summaries(node: Compare | Member | Match, leaves: _Leaves, types: FieldTypes) -> Mask:
+    """Conditions on the elements of arrays that are present only as summaries.
 
-
-def _values_of(node: Compare | Member | Match) -> tuple[Value, ...]:
-    """The values that a field is compared with."""
-    if isinstance(node, Match):
-        return ()
-    return (node.value,) if isinstance(node, Compare) else node.values
-
-
-def _is_rounded(end: pa.Array, value: Value) -> bool:
-    """True if ends may be integers that were rounded to the double they are compared with."""
-    return pa.types.is_floating(end.type) and is_number(value) and abs(nearest(value)) >= 2**53
-
-
-def _may_equal(low: pa.Array, high: pa.Array, value: Value) -> Mask:
-    """True if an element between two ends may be equal to a value."""
-    always = np.ones(len(low), np.bool_)
-    if isinstance(value, bool) or (isinstance(value, float) and not math.isfinite(value)):
-        return always
-    if not is_number(value):
-        return ~always
-    return _compared(low, "<=", value) & _compared(high, ">=", value)
+    The ends decide what any element being greater or less is asked for; nothing else.
+    """
+    names, path = _names(leaves.values.type), node.field.names
+    if not isinstance(node, Compare) or node.order in {"==", "!="} or "min" not in names:
+        raise _UnfitError
+    end = pc.struct_field(leaves.values, "min" if node.order in {"<", "<="} else "max")
+    is_rounded = pa.types.is_floating(end.type) and not types.are_floats(path)
+    is_large = is_number(node.value) and abs(nearest(node.value)) >= 2**53
+    if types.kind(path) == "bool" or (is_rounded and is_large):
+        raise _UnfitError
+    return _compared(end, node.order, node.value)

@@ -72,8 +72,6 @@ def mask_of(text: str, records: object, types: dict[str, str] | None = None) -> 
         ("x in [1, null]", None),
         ("x exists", None),
         ("x missing", None),
-        ("x missing and x == 1", [False, False]),  # whatever the null is
-        ("x exists or x == 1 or y == 2", [True, True]),
         ("y != 3", [True, True]),
         ("y exists", [True, True]),
         ("z == 1", None),  # there is no such column
@@ -108,19 +106,15 @@ SUMMARY = pa.struct(
     [
         ("a < 2", [True, False]),
         ("a > 8", [True, False]),
-        ("a == 20", [False, False]),
         ("a == 5", None),
-        ("a != 20", [True, True]),
         ("a != 5", None),
         ("a == inf", None),
         ("a[3] < 2", None),
-        ("a[50] < 2", [False, False]),
         ("a.n == 40", [True, True]),
         ("a.min == null", [False, True]),
         ("a.max >= 9", [True, False]),
         ("a exists", [True, True]),
-        ("a == 'x'", [False, False]),
-        ("a == 5 and a.n < 40", [False, False]),
+        ("a ~ 'x'", None),
     ],
 )
 def test_summaries(text: str, expected: list[bool] | None) -> None:

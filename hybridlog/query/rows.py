@@ -1,0 +1,695 @@
+"""Rows of a topic of one recording: from tables that hold what is asked, else from chunks.
+
+A table answers what its columns can decide, for the segments that it covers. What a running
+recording has written since, and what no table can tell, is decoded from chunks. Counts and
+times without a predicate come from chunk tables and message indexes.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+
+import numpy as np
+
+from hybridlog.query.chunk_counts import Placed
+from hybridlog.query.chunk_scan import ChunkKey, ChunkScan, RecordingScan, ScanPlan
+from hybridlog.query.predicate.tree import is_meta
+from hybridlog.record.losses import lost_spans
+from hybridlog.schema.kinds import SINGLE, element_of, width_of
+from hybridlog.snapshot import UNFINISHED
+from hybridlog_storage.catalog import ChannelStats, channel_totals
+from hybridlog_storage.errors import HybridlogError, ResourceError, SegmentError, StoreError
+from hybridlog_storage.times import inside
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+    from numpy.typing import NDArray
+
+    from hybridlog.columns.topic_table import TableRows, TopicTable
+    from hybridlog.query.bounds import BoundsFinder
+    from hybridlog.query.chunk_counts import Parts
+    from hybridlog.query.chunk_scan import MessageRun
+    from hybridlog.query.counters import Counters
+    from hybridlog.query.message_filter import MessageFilter
+    from hybridlog.query.question import Part, RecordedChannel, Span
+    from hybridlog.schema.codec import Decoded
+    from hybridlog.session import Session
+    from hybridlog_storage.catalog import RecordingEntry
+    from hybridlog_storage.messages import Batch
+
+_WHOLE = 32  # elements; longer arrays are summaries in tables
+_IN_FULL = SINGLE - {"uint8", "byte", "char"}  # elements of arrays in tables with arrays
+_MAX_CACHED_TIMES = 4_000_000  # of chunks with several channels, until the question is answered
+
+
+class UndecidedError(HybridlogError):
+    """The columns of a table cannot decide a predicate."""
+
+
+TABLE_ERRORS = (ResourceError, StoreError, UndecidedError)
+"""Failures of a table after which chunks answer."""
+
+
+class MatchColumns(NamedTuple):
+    """Result of a predicate for each message, in order of log time and arrival.
+
+    Attributes:
+        log_time: int64[n], ns.
+        seq: int64[n], arrival numbers; 0 where only times are read.
+        holds: bool[n], True where the message matches.
+    """
+
+    log_time: NDArray[np.int64]
+    seq: NDArray[np.int64]
+    holds: NDArray[np.bool_]
+
+
+class Values(NamedTuple):
+    """Fields of matching messages, in order of log time and arrival.
+
+    Attributes:
+        log_time: int64[n], ns.
+        seq: int64[n], arrival numbers.
+        records: n rows, nested as the message is.
+    """
+
+    log_time: NDArray[np.int64]
+    seq: NDArray[np.int64]
+    records: pa.StructArray
+
+
+Objects: TypeAlias = "tuple[NDArray[np.int64], Sequence[Mapping[str, object]]]"
+"""Log times, ns, of messages in order, and the messages as `Codec.objects` makes them."""
+
+
+class Tabled(NamedTuple):
+    """A part of a question that has a table.
+
+    Attributes:
+        table: The table.
+        part: The part in the segments that the table covers.
+        rest: The part in other segments, whose messages are all later; None if there is none.
+        segments: Numbers of the segments that it covers; None for all.
+    """
+
+    table: TopicTable
+    part: Part
+    rest: Part | None = None
+    segments: frozenset[int] | None = None
+
+
+class _Count(NamedTuple):
+    """Numbers of messages of a part."""
+
+    matched: int
+    unreadable: int
+
+
+class Rows:
+    """Rows for the parts of one question.
+
+    Args:
+        session: The open store.
+        counters: Count what is read.
+        bounds: Gets the bounds of the columns that are read; None to leave them.
+    """
+
+    def __init__(
+        self, session: Session, counters: Counters, bounds: BoundsFinder | None = None
+    ) -> None:
+        self.session = session
+        self._counters = counters
+        self._bounds = bounds
+        self._candidates: dict[Part, Tabled | None] = {}
+        self._tabled: dict[Part, Tabled | None] = {}
+        self._counts: dict[Part, _Count] = {}
+        self._counted: set[Part] = set()
+        self._places: dict[Part, dict[ChunkKey, NDArray[np.int64]]] = {}
+        self._cached_times: dict[tuple[str, int, int], dict[int, NDArray[np.int64]]] = {}
+        self._room = _MAX_CACHED_TIMES
+
+    # The rule.
+
+    def tabled(self, part: Part, fields: Collection[str] | None = ()) -> Tabled | None:
+        """The part with its table, if that holds the fields and decides the predicate.
+
+        Args:
+            part: The part.
+            fields: Paths of the fields that are wanted; None for all.
+        """
+        found = self._candidate(part)
+        if found is None or not _holds(found, fields):
+            return None
+        if part not in self._tabled:
+            self._tabled[part] = found
+            if part.predicate is not None:
+                try:
+                    self._count_of(found)
+                except TABLE_ERRORS:
+                    self._tabled[part] = None
+        return self._tabled[part]
+
+    def leave_table(self, part: Part) -> bool:
+        """Read a part from chunks from now on; False if it is read from them already."""
+        had = self._tabled.get(part) is not None
+        self._tabled[part] = None
+        return had
+
+    def _candidate(self, part: Part) -> Tabled | None:
+        """The part with its table, if there is one with the columns."""
+        if part not in self._candidates:
+            self._candidates[part] = self._find(part)
+        return self._candidates[part]
+
+    def _find(self, part: Part) -> Tabled | None:
+        if not part.is_by_log_time or part.undecodable:
+            return None
+        asks_publish = part.predicate is not None and "_meta.pub" in part.predicate.fields()
+        if asks_publish and len({c.channel.has_publish_time for c in part.channels}) > 1:
+            return None  # the table does not say which messages have one
+        if any(True for _ in lost_spans(part.recording)):
+            return None  # lost rows must not answer
+        if part.recording.status in UNFINISHED:
+            found = self._of_sealed(part)
+        else:
+            table = self.session.table(part.recording, part.topic)
+            found = None if table is None else Tabled(table, part)
+        if found is None or found.table.reduced:
+            return None
+        if found.table.unreadable and part.predicate is None:
+            return None  # fields of such messages are not in the table
+        # A table may be older than the package that reads the messages.
+        is_older = not found.table.has_fields and any(c.codec.indexed for c in part.channels)
+        return None if is_older else found
+
+    def _of_sealed(self, part: Part) -> Tabled | None:
+        """A part of a running recording; None if no segment has a table, or times overlap."""
+        entry = part.recording
+        ids = [channel.channel_id for channel in part.channels]
+        stats: dict[int, dict[int, ChannelStats]] = {}
+        for number, _, _ in entry.spans_with(ids):
+            table = self.session.chunk_table(entry, number)
+            rows = table.parts[np.isin(table.parts["channel"], ids)]
+            stats[number] = channel_totals(replace(table, parts=rows), None)
+        messages = {n: sum(one.messages for one in own.values()) for n, own in stats.items()}
+        made = self.session.tables.of_sealed(entry, part.topic, Counter(messages))
+        if made is None:
+            return None
+        table_of_topic, segments = made
+        sealed = _within(part, stats, segments)
+        rest = _within(part, stats, stats.keys() - segments)
+        lasts = [one.last for one in sealed.stats if one.last is not None]
+        firsts = [one.first for one in rest.stats if one.first is not None]
+        if not lasts or (firsts and max(lasts) >= min(firsts)):
+            return None
+        return Tabled(table_of_topic, sealed, rest, segments)
+
+    # Answers.
+
+    def count(self, parts: Sequence[Part]) -> int:
+        """Number of matching messages in all parts."""
+        total = 0
+        in_chunks: list[Part] = []
+        alike: dict[tuple[str, Span | None, int], list[Part]] = defaultdict(list)
+        asked: list[Part] = []
+        for part in parts:
+            if part.predicate is not None:
+                asked.append(part)
+            elif part.is_unbounded:
+                total += part.messages
+            elif part.is_by_log_time:
+                alike[part.recording.id, part.bounds, id(part.windows)].append(part)
+            else:
+                in_chunks.append(part)
+        for group in alike.values():
+            try:
+                total += self._count_by_time(group)
+            except SegmentError:
+                in_chunks += group
+        self._count_by_file(asked)
+        for part in asked:
+            found = self.tabled(part)
+            if found is None:
+                in_chunks.append(part)
+                continue
+            total += self._accepted(found).matched
+            if found.rest is not None:
+                in_chunks.append(found.rest)
+        return total + (self.count_in_chunks(in_chunks) if in_chunks else 0)
+
+    def outcomes(self, part: Part) -> Iterator[MatchColumns]:
+        """For each message of the part's topic and time, whether it matches."""
+        found = self.tabled(part)
+        left: Part | None = part
+        if found is not None:
+            self._accepted(found)
+            for rows, holds in self._in_table(found):
+                yield MatchColumns(rows.t, rows.seq, holds)
+            left = found.rest
+        if left is None:
+            return
+        if left.predicate is None and left.is_by_log_time:
+            with suppress(SegmentError):
+                time = self._times_of(left)
+                left = None
+        if left is None:
+            yield MatchColumns(time, np.zeros_like(time), np.ones(len(time), np.bool_))
+        else:
+            yield from self._outcomes_in_chunks(left)
+
+    def values(self, part: Part, fields: Collection[str] | None) -> Iterator[Values]:
+        """Fields of the matching messages."""
+        found = self.tabled(part, fields)
+        left: Part | None = part
+        if found is not None:
+            self._accepted(found)
+            for rows, holds in self._in_table(found, fields):
+                chosen = rows if holds.all() else rows.take(np.flatnonzero(holds))
+                if len(chosen):
+                    yield Values(chosen.t, chosen.seq, _only(chosen.records, fields))
+            left = found.rest
+        for channel, run in self._by_channel(self.plan([left])) if left is not None else ():
+            decoded = self._decoded(channel, run.batch, fields)
+            good = decoded.rows
+            yield Values(run.batch.log_time[good], run.seq[good], decoded.arrow())
+
+    def objects(self, plan: ScanPlan) -> Iterator[Objects]:
+        """The messages of a plan as plain objects, in order."""
+        for channel, run in self._by_channel(plan):
+            found = self._decoded(channel, run.batch)
+            yield run.batch.log_time[found.rows], found.plain()
+
+    def places(self, found: Tabled) -> dict[ChunkKey, NDArray[np.int64]]:
+        """Payload offsets of the matching messages that a table has, by chunk, sorted.
+
+        Raises:
+            StoreError: The table is damaged.
+        """
+        part = found.part
+        if part not in self._places:
+            self._accepted(found)
+            places = [
+                places_of(rows.own["ref"])[holds]
+                for rows, holds in self._in_table(found, own=("ref",))
+            ]
+            self._places[part] = (
+                _offsets_by_chunk(part.recording.id, np.concatenate(places)) if places else {}
+            )
+        return self._places[part]
+
+    # Tables.
+
+    def _count_of(self, found: Tabled) -> _Count:
+        """The count in a table, which confirms that its columns can decide.
+
+        Raises:
+            UndecidedError: They cannot.
+            StoreError: They are damaged.
+        """
+        part = found.part
+        if part not in self._counts:
+            matched = unreadable = 0
+            is_bounding = self._bounds is not None and found.segments is None and part.is_unbounded
+            bounds = self._bounds.of([part]) if self._bounds is not None and is_bounding else None
+            for rows, holds in self._in_table(found):
+                matched += int(holds.sum())
+                unreadable += int(rows.is_unreadable().sum())
+                if bounds is not None:
+                    bounds.add(rows.records, [(part, 0, len(rows))])
+            self._counts[part] = _Count(matched, unreadable)
+            if bounds is not None and not unreadable:
+                bounds.note(part)
+        return self._counts[part]
+
+    def _accepted(self, found: Tabled) -> _Count:
+        """The count of a part that its table answers; counts its unreadable messages once."""
+        if found.part.predicate is None:
+            return _Count(found.part.messages, 0)
+        count = self._count_of(found)
+        if found.part not in self._counted:
+            self._counted.add(found.part)
+            self._counters.unreadable += count.unreadable
+        return count
+
+    def _count_by_file(self, parts: Sequence[Part]) -> None:
+        """Count whole parts that lie in one file: the predicate is evaluated once for all rows."""
+        by_file: dict[tuple[int, bool], list[Tabled]] = defaultdict(list)
+        for part in parts:
+            assert part.predicate is not None
+            is_whole = part not in self._counts and part.is_unbounded
+            if not is_whole or any(map(is_meta, part.predicate.fields())):
+                continue  # known of the part, not of a row
+            found = self._candidate(part)
+            if found is not None and found.segments is None and len(found.table.files) == 1:
+                by_file[found.table.files[0].number, found.table.has_arrays].append(found)
+        for group in by_file.values():
+            if len(group) > 1:
+                with suppress(UndecidedError, StoreError):  # then part by part
+                    self._count_in_file(group)
+
+    def _count_in_file(self, group: Sequence[Tabled]) -> None:
+        first = group[0]
+        types = first.part.field_types
+        file = first.table.files[0]
+        whole = self.session.tables.whole(file, arrays=first.table.has_arrays)
+        matched, unreadable, before = [np.zeros(1, np.int64)], [np.zeros(1, np.int64)], [0]
+        alike = [(one.part, one.table) for one in group if one.part.field_types == types]
+        bounds = None if self._bounds is None else self._bounds.of([part for part, _ in alike])
+        own = [(part, one) for part, table in alike for one in table.parts]
+        for rows, holds in self._in_table(first, whole=whole):
+            if bounds is not None:
+                here = [pair for pair in own if pair[1].group == len(before) - 1]
+                spans = [(part, one.begin, one.begin + one.rows) for part, one in here]
+                bounds.add(rows.records, spans)
+            before.append(before[-1] + len(rows))
+            for found, mask in ((matched, holds), (unreadable, rows.is_unreadable())):
+                found.append(found[-1][-1] + np.cumsum(mask))
+        sums, bad = np.concatenate(matched), np.concatenate(unreadable)
+        for part, table in alike:
+            places = [(before[one.group] + one.begin, one.rows) for one in table.parts]
+            self._counts[part] = _Count(
+                sum(int(sums[begin + rows] - sums[begin]) for begin, rows in places),
+                sum(int(bad[begin + rows] - bad[begin]) for begin, rows in places),
+            )
+            if bounds is not None and not self._counts[part].unreadable:
+                bounds.note(part)
+
+    def _in_table(
+        self,
+        found: Tabled,
+        fields: Collection[str] | None = (),
+        own: Collection[str] = (),
+        whole: TopicTable | None = None,
+    ) -> Iterator[tuple[TableRows, NDArray[np.bool_]]]:
+        """Rows of the part's time in its table, with the outcome for each.
+
+        Args:
+            found: The part and its table.
+            fields: Fields to read.
+            own: Columns of the table itself.
+            whole: All rows of its file, in place of its table.
+
+        Raises:
+            UndecidedError: The columns cannot decide.
+            StoreError: The table is damaged.
+        """
+        part, table = found.part, whole or found.table
+        spans = None if part.is_unbounded else [(a, b) for a, b in part.log_windows.tolist()]
+        columns = {*own}
+        if part.predicate is not None and "_meta.pub" in part.predicate.fields():
+            columns.add("pub")
+        if part.predicate is not None and part.predicate.asks_fields and table.unreadable:
+            columns.add("state")
+        try:
+            paths = _wanted(table, part, fields)
+            size = table.size(paths, own)
+            self._counters.bytes_read += int(size * min(part.share * 1.2, 1.0))
+            for rows in table.scan(paths, own=columns, spans=spans):
+                yield rows, _decided(part, rows) & ~rows.is_unreadable()
+        except StoreError:
+            if whole is None:
+                self.session.reject_table(part.recording, part.topic)
+            raise
+
+    # Chunks.
+
+    def plan(self, parts: Sequence[Part], *, filtered: bool = True) -> ScanPlan:
+        """The plan for reading some parts from chunks."""
+        channels: list[RecordedChannel] = []
+        filters: dict[int, MessageFilter] = {}
+        of_recording: dict[str, tuple[Part, dict[int, int]]] = {}
+        for part in parts:
+            _, indexes = of_recording.setdefault(part.recording.id, (part, {}))
+            decide = filter_of(part) if filtered else None
+            for channel in part.channels:
+                indexes[channel.channel_id] = len(channels)
+                if decide is not None:
+                    filters[len(channels)] = decide
+                channels.append(channel)
+        scans = [self._scan(part, indexes) for part, indexes in of_recording.values()]
+        clock = parts[0].clock if parts else "log"
+        return ScanPlan(channels, scans, clock, filters=filters, counters=self._counters)
+
+    def _scan(self, part: Part, indexes: dict[int, int]) -> RecordingScan:
+        """The chunks of a recording that may hold wanted messages."""
+        bounds, clock = part.bounds, part.clock
+        if part.windows is not None and part.is_by_log_time:
+            windows = part.log_windows
+            bounds, clock = (0, 0), "log"
+            if len(windows):
+                bounds = int(windows[0, 0]), int(windows[-1, 1])
+        is_empty = bounds is not None and bounds[0] >= bounds[1]
+        chunks = (
+            [] if is_empty else self.session.chunks(part.recording, list(indexes), bounds, clock)
+        )
+        return RecordingScan(part.recording, indexes, part.bounds, chunks, part.windows)
+
+    def count_in_chunks(self, parts: Sequence[Part]) -> int:
+        """Read the messages of some parts and count those that match."""
+        scan = ChunkScan(self.plan(parts), self.session)
+        return sum(len(run.batch) for run in scan.unordered())
+
+    def _outcomes_in_chunks(self, part: Part) -> Iterator[MatchColumns]:
+        """Read the messages in order and decide on each."""
+        from hybridlog.index.indexing import rows_by_channel
+
+        plan, decide = self.plan([part], filtered=False), filter_of(part)
+        for run in ChunkScan(plan, self.session).runs():
+            holds = np.ones(len(run.batch), np.bool_)
+            for index, rows in rows_by_channel(run.batch.channel) if decide is not None else ():
+                assert decide is not None
+                found = decide.matches(plan.channels[index], run.batch.take(rows), run.seq[rows])
+                holds[rows] = found.holds
+                self._counters.unreadable += found.unreadable
+                self._counters.without_arrays += found.expired
+            yield MatchColumns(run.batch.log_time, run.seq, holds)
+
+    def _decoded(
+        self, channel: RecordedChannel, batch: Batch, fields: Collection[str] | None = None
+    ) -> Decoded:
+        """The fields of messages; those that cannot be read, or lack some, are counted."""
+        found = channel.codec.columns(batch.buffer, batch.offset, batch.length, fields)
+        self._counters.unreadable += len(batch) - len(found.rows)
+        if channel.is_expired:
+            from hybridlog.schema.reduced_codec import without_lossy
+
+            found, lacking = without_lossy(found)
+            self._counters.leave_out(lacking, channel.state)
+        return found
+
+    def _by_channel(self, plan: ScanPlan) -> Iterator[tuple[RecordedChannel, MessageRun]]:
+        """The messages of a plan with fields in order, those of one channel at a time."""
+        for run in ChunkScan(plan, self.session).runs():
+            changes = np.flatnonzero(np.diff(run.batch.channel)) + 1
+            for own in map(run.take, np.split(np.arange(len(run.batch)), changes)):
+                channel = plan.channels[int(own.batch.channel[0])]
+                if not channel.is_typed:
+                    self._counters.reduced += len(own.batch)
+                elif len(own.batch):
+                    yield channel, own
+
+    # Times alone.
+
+    def _count_by_time(self, parts: Sequence[Part]) -> int:
+        """Number of messages of some topics of one recording in the same windows.
+
+        Raises:
+            SegmentError: A segment cannot be read, or is damaged in a part that is needed.
+        """
+        edges = parts[0].log_windows.ravel()
+        counts = np.zeros((1, max(len(edges) - 1, 0)), np.int64)
+        cut = Placed.of(self._chunk_parts(parts), edges).add_known(counts)
+        cut.add_read(edges, counts, partial(self._times, parts[0].recording))
+        return int(counts[0, ::2].sum())
+
+    def _times_of(self, part: Part) -> NDArray[np.int64]:
+        """Log times in the windows of a part, sorted.
+
+        Raises:
+            SegmentError: As for `_count_by_time`.
+        """
+        found = [np.empty(0, np.int64)]
+        parts = self._chunk_parts([part])
+        rows = parts.chunk_starts
+        for segment, chunk in zip(*(c[rows].tolist() for c in parts[:2]), strict=True):
+            times = self._times(part.recording, segment, chunk)
+            found += [times[c.channel_id] for c in part.channels if c.channel_id in times]
+        time = np.sort(np.concatenate(found))
+        return time[inside(time, part.log_windows)]
+
+    def _chunk_parts(self, parts: Sequence[Part]) -> Parts:
+        windows = parts[0].log_windows
+        span = (int(windows[0, 0]), int(windows[-1, 1])) if len(windows) else (0, 0)
+        channels = [channel.channel_id for part in parts for channel in part.channels]
+        return self.session.parts(parts[0].recording, channels, span)
+
+    def _times(
+        self, recording: RecordingEntry, segment: int, chunk: int
+    ) -> dict[int, NDArray[np.int64]]:
+        key = recording.id, segment, chunk
+        if key in self._cached_times:
+            return self._cached_times[key]
+        reader = self.session.segment(recording.id, segment)
+        read_before = reader.bytes_read
+        times = self.session.times(recording, segment, chunk)
+        self._counters.bytes_read += reader.bytes_read - read_before
+        size = sum(map(len, times.values()))
+        if len(times) > 1 and size <= self._room:  # another topic may be asked about next
+            self._cached_times[key] = times
+            self._room -= size
+        return times
+
+
+def _within(
+    part: Part, stats: Mapping[int, Mapping[int, ChannelStats]], segments: Collection[int]
+) -> Part:
+    """A part in some segments of its recording.
+
+    Args:
+        part: The part.
+        stats: Statistics of its channels in each segment, by number and id.
+        segments: Numbers of the segments.
+    """
+    totals = {channel.channel_id: ChannelStats() for channel in part.channels}
+    for number in segments:
+        for channel_id, own in stats.get(number, {}).items():
+            totals[channel_id].add(own)
+    spans = [span for span in part.recording.spans if span[0] in segments]
+    recording = replace(part.recording, spans=spans)
+    channels = tuple(
+        replace(channel, recording=recording, stats=totals[channel.channel_id])
+        for channel in part.channels
+    )
+    return replace(part, recording=recording, channels=channels)
+
+
+def filter_of(part: Part) -> MessageFilter | None:
+    """Decides the predicate of a part on messages; None without one."""
+    if part.predicate is None:
+        return None
+    from hybridlog.query.message_filter import MessageFilter
+
+    return MessageFilter(part.predicate, part.field_types)
+
+
+def places_of(references: Any) -> NDArray[np.int64]:
+    """Segment, chunk and payload offset of messages: int64[n, 3].
+
+    Args:
+        references: The column `ref` of a table.
+    """
+    columns = [references.field(n).to_numpy(zero_copy_only=False) for n in ("seg", "chunk", "off")]
+    return np.stack(columns, axis=1).astype(np.int64)
+
+
+def _offsets_by_chunk(
+    recording: str, places: NDArray[np.int64]
+) -> dict[ChunkKey, NDArray[np.int64]]:
+    """Payload offsets of messages by chunk, sorted.
+
+    Args:
+        recording: Id of the recording.
+        places: As of `places_of`, in any order.
+    """
+    places = places[np.lexsort((places[:, 2], places[:, 1], places[:, 0]))]
+    edges = np.flatnonzero(np.any(places[1:, :2] != places[:-1, :2], axis=1)) + 1
+    return {
+        (recording, int(group[0, 0]), int(group[0, 1])): group[:, 2]
+        for group in np.split(places, edges)
+        if len(group)
+    }
+
+
+def _decided(part: Part, rows: TableRows) -> NDArray[np.bool_]:
+    predicate = part.predicate
+    if predicate is None:
+        return np.ones(len(rows), np.bool_)
+    from hybridlog.query.message_filter import meta_array
+    from hybridlog.query.predicate.to_mask import to_mask
+
+    records: Any = rows.records
+    if any(map(is_meta, predicate.fields())):
+        pub = rows.own.get("pub")
+        records = meta_array(records, part.channels[0], rows.t, rows.seq, pub)
+    found = to_mask(predicate, part.field_types, records)
+    if found is None:
+        raise UndecidedError(f"The table of {part.topic} cannot tell.")
+    return found
+
+
+def _holds(found: Tabled, fields: Collection[str] | None) -> bool:
+    """True if a table holds these fields in full: no array that may be a summary.
+
+    Args:
+        found: The part and its table.
+        fields: Paths of the fields; None for all.
+    """
+    types = found.part.field_types
+    if types is None:
+        return fields is not None and not fields
+    for path in types if fields is None else fields:
+        below = [p for p in types if p == path or p.startswith((f"{path}.", f"{path}["))]
+        if not below:
+            return False
+        for name in below:
+            inner = any(other.startswith((f"{name}.", f"{name}[")) for other in types)
+            kind, width, element = types[name], width_of(types[name]), element_of(types[name])
+            is_short = width is not None and width <= _WHOLE and element in SINGLE
+            is_full = found.table.has_arrays and (element in _IN_FULL or (inner and element))
+            if not (kind in SINGLE or is_short or is_full) and not (inner and element is None):
+                return False
+    return True
+
+
+def _paths(table: TopicTable, part: Part) -> set[str]:
+    """Columns of the predicate of a part."""
+    found: set[str] = set()
+    for condition in part.predicate.conditions() if part.predicate is not None else ():
+        path = condition.field.names
+        if is_meta(condition.field.path):
+            continue
+        # `ranges.min` is a column of its own, or the least element of an array.
+        is_of_some = len(condition.field.parts) > 1 and not isinstance(
+            condition.field.parts[-2], str
+        )
+        while "." in path and not table.has(path, summaries=not is_of_some):
+            path = path.rpartition(".")[0]
+        found.add(path)
+    return found
+
+
+def _wanted(table: TopicTable, part: Part, fields: Collection[str] | None) -> set[str] | None:
+    """Columns to read: those of the predicate and the requested ones; None for all."""
+    if fields is None:
+        return None
+    return {*_paths(table, part), *(path.replace("[]", "") for path in fields)}
+
+
+def _only(records: pa.StructArray, fields: Collection[str] | None) -> pa.StructArray:
+    """The records without the columns that only the predicate needs."""
+    if fields is None:
+        return records
+    return _pruned(records, [path.replace("[]", "").split(".") for path in fields])
+
+
+def _pruned(records: pa.StructArray, paths: Sequence[Sequence[str]]) -> pa.StructArray:
+    import pyarrow as pa
+
+    from hybridlog.schema.arrow_columns import structs
+
+    names, columns = [], []
+    for field, column in zip(records.type, records.flatten(), strict=True):
+        below = [path[1:] for path in paths if path[0] == field.name]
+        if not below:
+            continue
+        is_whole = any(not path for path in below) or not pa.types.is_struct(field.type)
+        names.append(field.name)
+        columns.append(column if is_whole else _pruned(column, below))
+    if not names:
+        return structs({}, len(records))
+    return pa.StructArray.from_arrays(columns, names=names)
