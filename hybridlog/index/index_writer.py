@@ -47,7 +47,6 @@ INTERVAL_S = 5.0
 """Longest time between two passes over what was flushed, seconds."""
 _INTERVAL_BYTES = 64 << 20  # content that was flushed since the last pass, at most
 _SEND_BYTES = 8 << 20  # documents that are sent together, at most
-_CHECKPOINT_BYTES = 8 << 20  # documents of a recording that ask for a checkpoint at its end
 _GROUP_BYTES = 1 << 20  # content of small chunks that are decoded together
 _PAUSE_S = 0.002
 _RETRY_S = 2.0  # between attempts after the database has failed
@@ -91,7 +90,7 @@ class DocumentSender:
         self._database = database
         self._collections: set[str] = set()  # that exist
         self._documents: dict[str, list[NDArray[np.uint8]]] = {}
-        self._size = self._sent = 0
+        self._size = 0
         self._thread = Threads(1, "hybridlog-send")
         self._sending: Future[None] | None = None
 
@@ -139,16 +138,6 @@ class DocumentSender:
             if wait:
                 self._sending.result()
 
-    def end(self) -> None:
-        """Send the rest, and leave no large journal behind.
-
-        Raises:
-            DatabaseError: This sending has failed, or an earlier one.
-        """
-        self.send(wait=True)
-        if self._sent >= _CHECKPOINT_BYTES:
-            self._database.checkpoint()
-
     def close(self) -> None:
         """Stop sending."""
         self._thread.shutdown(wait=True, cancel_futures=True)
@@ -166,8 +155,7 @@ class DocumentSender:
             counts, widths = zip(*(table.shape for table in tables), strict=True)
             data = b"".join(table.data for table in tables)
             lengths = np.repeat(widths, counts).astype(np.int64)
-            self._database.insert_raw(collection_of(topic), data, len(lengths), lengths=lengths)
-            self._sent += len(data)
+            self._database.insert_raw(collection_of(topic), data, lengths)
         if segments:
             IndexState(self._database).put_segments(self._key, segments)
         self.messages += messages
@@ -373,7 +361,7 @@ class IndexWriter:
                     self._whole.add(segment)
         if self._sender is not None:
             with self._noting_failure():
-                self._sender.end() if has_ended else self._sender.send()
+                self._sender.send(wait=has_ended)
 
     def _read(self, segment: int) -> Iterator[list[StoredChunk]]:
         """The chunks of a segment that are missing here or in the index; small ones in groups."""
@@ -493,7 +481,7 @@ class IndexWriter:
             state = IndexState(database)
             indexed = state.one(self._entry.key)
             if indexed is None:  # it was unavailable when the recording began
-                state.put(self._entry, "open", turn=1)
+                state.begin(self._entry)
             # A killed server has lost what was not in its journal yet.
             has = {int(number) for number in indexed.segments} if indexed is not None else set()
         except DatabaseError as error:

@@ -140,7 +140,7 @@ class _Index:
         self._counts: dict[str, Counter[str]] = defaultdict(Counter)
         if count_all:
             collections = IndexState(database).document_collections()
-            counted = database.count_by(collections, "_meta.rec")
+            counted = database.count_each([(name, {}) for name in collections])
             for collection, counts in zip(collections, counted, strict=True):
                 for key, count in counts:
                     if isinstance(key, str):
@@ -155,8 +155,10 @@ class _Index:
         first, last = entry.span
         names = {collection_of(channel.topic) for channel in entry.channels}
         within = {**between(first, last + 1), "_meta.rec": entry.key}
-        counts = self.database.count_each([(name, within) for name in names])
-        return Counter(dict(zip(names, counts, strict=True)))
+        counted = self.database.count_each([(name, within) for name in names])
+        return Counter(
+            {name: n for name, counts in zip(names, counted, strict=True) for _, n in counts}
+        )
 
     def counted_again(self, entry: RecordingEntry, collections: Iterable[str]) -> Counter[str]:
         """The numbers as they are now, at any time; reads the whole collections."""
@@ -323,11 +325,10 @@ class _Check:
         """Find documents that are not in the segments."""
         if self._indexed is None:
             return
-        state = IndexState(self._indexed.database)
-        indexed = state.of([entry.key]).get(entry.key)
+        indexed = IndexState(self._indexed.database).one(entry.key)
         if indexed is None or not indexed.is_whole(entry):
             self.found("index", "it is not complete", self._rebuild)
-        elif not state.is_mirrored(entry):
+        elif not indexed.mirrors(entry):
             self.found("index", "its entry of the recording differs", self._rebuild)
         have = self._indexed.documents_of(entry)
         expected = documents_in(entry)

@@ -27,7 +27,6 @@ from hybridlog.entries import (
     text,
 )
 from hybridlog.index.index_writer import INTERVAL_S, IndexTarget, IndexWriter
-from hybridlog.maintenance.index import finish
 from hybridlog.maintenance.retention import Rules
 from hybridlog.query.latching import depth_of
 from hybridlog.wording import parse_size
@@ -128,7 +127,6 @@ class Capture:
         )
         settings = replace(settings, segment_size=int(largest))
         self._end: Mapping[str, Any] | None = None
-        self._turn = 1
         self._held = ExitStack()
         recording = new_id(name)
         with self._held:
@@ -259,16 +257,12 @@ class Capture:
         recording = self.entry.id
         if self.index.damage:
             self.catalog.put_damage(recording, self.index.damage)
-        try:
-            if failure is None:
-                database = self.index.database
-                self.entry = finish(
-                    self._directory, self.catalog, database, recording, turn=self._turn
-                )
-        except DatabaseError as error:
-            failure = error
-        if failure is not None:
-            self.entry = put_entry(self._directory, self.catalog, recording)
+        self.entry = put_entry(self._directory, self.catalog, recording)
+        if failure is None and self.index.database is not None:
+            try:
+                IndexState(self.index.database).end(self.entry)
+            except DatabaseError as error:
+                failure = error
         self._tables.close(self.entry)
         self._held.close()
         return failure
@@ -297,9 +291,8 @@ class Capture:
         with suppress(HybridlogError):
             if database is not None:
                 state = IndexState(database)
-                topics = {channel.topic for channel in self.writer.channels.values()}
-                state.clear(entry.key, topics)
-                state.remove(entry.key)
+                state.clear_everywhere([entry.key])
+                state.remove([entry.key])
         self._held.close()
 
     def _begin(
@@ -313,7 +306,7 @@ class Capture:
         create(manifest)
         entry = put_entry(self._directory, self.catalog, recording, is_open=True)
         if database is not None:
-            IndexState(database).put(entry, "open", turn=self._turn)
+            IndexState(database).begin(entry)
         return entry
 
 

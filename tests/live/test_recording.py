@@ -625,7 +625,7 @@ def test_memory_has_no_chunks_that_wait(store: hl.Store, limit: Limit) -> None:
 @pytest.mark.mongo("embedded")
 def test_a_mongod_that_stands_still_costs_nothing(store: hl.Store) -> None:
     speech = channel("/speech")
-    pid = int(json.loads((store.directory.mongod / "mongod.json").read_text())["mongod"])
+    pid = int((store.directory.mongod / "data/mongod.lock").read_text())
 
     def write() -> None:
         for number in range(2, 100):

@@ -78,7 +78,7 @@ def test_what_comes_into_a_store_is_indexed_once_by_several_that_watch(
             with hl.open(robot, mongo="none") as source, hl.open(lab, mongo=uri) as store:
                 state = IndexState(store.shared.index.connection.open())
                 indexed = state.one(source.entry(label).key)
-                return indexed is not None and indexed.state == "complete"
+                return indexed is not None and indexed.is_whole(source.entry(label))
 
         with ExitStack() as stack:
             watching, outs, errs = [], [tmp_path / "out-0", tmp_path / "out-1"], []
