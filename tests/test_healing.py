@@ -89,7 +89,7 @@ def ended(store: Path) -> None:
 
 
 def kill_mongod(store: Path) -> None:
-    pid = json.loads((store / "mongod" / "mongod.json").read_bytes())["mongod"]
+    pid = int((store / "mongod/data/mongod.lock").read_text())
     os.kill(pid, signal.SIGKILL)
     wait_for(lambda: not psutil.pid_exists(pid))
 
@@ -117,7 +117,6 @@ def heal(store: Path, way: str) -> str:
         assert "all is well" in done.out
         assert "in the files" not in done.out
         said += done.err
-    assert not list(store.glob("mongod*/data.damaged-*"))
     return said
 
 
