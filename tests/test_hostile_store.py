@@ -321,11 +321,6 @@ def test_what_is_no_plain_file(tmp_path: Path, name: str) -> None:
     assert time.monotonic() - began < 10
 
 
-def test_too_much_to_look_through(tmp_path: Path) -> None:
-    (tmp_path / "mongod" / "/".join("deep" for _ in range(50))).mkdir(parents=True)
-    assert "more than an index" in refuse(tmp_path / "mongod")
-
-
 def test_the_cure_cures(tmp_path: Path, template: Path) -> None:
     victims = Victims(tmp_path / "victims")
     store = planted(template, tmp_path, "mongod", victims.folder(None))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -23,7 +22,6 @@ from hybridlog_storage.errors import (
     SegmentError,
     TopicError,
 )
-from hybridlog_storage.mongo.collection_names import collection_of
 from hybridlog_storage.mongo.index_state import Indexed, IndexState
 
 if TYPE_CHECKING:
@@ -120,9 +118,7 @@ class StoreIndex:
                 if chunks is not None:
                     report.indexed[entry.name] = chunks
 
-    def bring(
-        self, known: RecordingEntry, *, anew: bool = False, everywhere: bool = False
-    ) -> int | None:
+    def bring(self, known: RecordingEntry, *, anew: bool = False) -> int | None:
         """Bring the index of a recording, locked by this process, up to date with its files.
 
         What is interrupted is repeated by the next opening.
@@ -130,7 +126,6 @@ class StoreIndex:
         Args:
             known: The recording.
             anew: Whether documents that are there are made again.
-            everywhere: Whether all documents are looked through for those of the recording.
 
         Returns:
             Number of chunks whose documents were made; None if none were missing.
@@ -149,10 +144,7 @@ class StoreIndex:
             return None
         if not is_whole:
             state.begin(entry, done)
-            if everywhere:
-                state.clear_everywhere([entry.key])
-            else:
-                state.clear(entry, but=done)
+            state.clear(entry, but=done)
         made = derive(directory, catalog, entry, self.database, done=done, progress=self.progress)
         state.end(put_entry(directory, catalog, entry.id))
         return made
@@ -190,36 +182,10 @@ class StoreIndex:
                 left[chosen.id] = error
         return left
 
-    def remove_rest(self, entries: Iterable[RecordingEntry]) -> None:
-        """Remove documents of no recording, and surplus documents of recordings.
-
-        Each collection is read once.
-        """
-        state = self._state
-        known = {entry.key: entry for entry in entries}
-        expected = {key: documents_in(entry) for key, entry in known.items()}
-        again: set[str] = set()
-        orphans: list[object] = []
-        collections = state.document_collections()
-        counted = self.database.count_each([(name, {}) for name in collections])
-        for collection, counts in zip(collections, counted, strict=True):
-            for key, count in counts:
-                entry = known.get(key) if isinstance(key, str) else None
-                if entry is None:
-                    orphans.append(key)
-                    continue
-                # Fewer, too: a document of no recording may have had the key of one.
-                missing = expected[entry.key][collection] - count
-                if missing < 0 or (missing > 0 and not self.catalog.damage(entry.id)):
-                    again.add(entry.key)
-        # Listed after the index: a recording that has begun meanwhile has a directory by now.
-        present = keys_present(self.directory)
-        if gone := [key for key in orphans if not (isinstance(key, str) and key in present)]:
-            state.clear_everywhere(gone)
-        for key in sorted(again):
-            entry = known[key]
-            with suppress(HeldError, TopicError), self.directory.writing(entry.id):
-                self.bring(entry, anew=True, everywhere=True)
+    def clear(self) -> None:
+        """Remove all documents but those of recordings that are being written."""
+        ids = self.directory.ids()
+        self._state.clear_all(but=[i[-16:] for i in ids if self.directory.holder(i) is not None])
 
 
 def _is_current(indexed: Indexed | None, entry: RecordingEntry) -> bool:
@@ -232,15 +198,6 @@ def keys_present(directory: StoreDirectory) -> set[str]:
     """Keys of all recordings, also of those that have lost their manifests."""
     recordings = *directory.ids(), *directory.manifests.without()
     return {recording[-16:] for recording in recordings}
-
-
-def documents_in(entry: RecordingEntry) -> Counter[str]:
-    """Number of documents of a recording in each collection."""
-    found: Counter[str] = Counter()
-    for channel in entry.channels:
-        if channel.is_indexed:
-            found[collection_of(channel.topic)] += channel.stats.messages
-    return found
 
 
 def derive(

@@ -161,7 +161,6 @@ class Capture:
             cpu_slots=pressure.cpu_slots if pressure else None,
             interval_s=pressure.index_interval_s if pressure else INTERVAL_S,
         )
-        self._held.callback(self.index.release)
         self.writer = RecordingWriter(
             folder,
             recording_metadata(self.entry),
@@ -196,7 +195,7 @@ class Capture:
 
     def expect(self, channel: Channel) -> None:
         """Prepare a channel before its first message."""
-        self.index.prepare(channel, has_documents=not self._no_index(channel.topic))
+        self.index.prepare(channel)
 
     def close(self, end: Mapping[str, Any]) -> DatabaseError | None:
         """Complete the recording; `entry` is then complete, too.
@@ -258,9 +257,9 @@ class Capture:
         if self.index.damage:
             self.catalog.put_damage(recording, self.index.damage)
         self.entry = put_entry(self._directory, self.catalog, recording)
-        if failure is None and self.index.database is not None:
+        if failure is None and self._target.database is not None:
             try:
-                IndexState(self.index.database).end(self.entry)
+                IndexState(self._target.database).end(self.entry)
             except DatabaseError as error:
                 failure = error
         self._tables.close(self.entry)
@@ -287,7 +286,7 @@ class Capture:
         with suppress(HybridlogError):
             self.catalog.remove(entry.id)
         # If MongoDB is unavailable, the next connection finds an entry without files.
-        database = self.index.database
+        database = self._target.database
         with suppress(HybridlogError):
             if database is not None:
                 state = IndexState(database)

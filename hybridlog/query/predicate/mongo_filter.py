@@ -8,12 +8,15 @@ with code in them are refused, too. Patterns have RE2's syntax, so no search tak
 from __future__ import annotations
 
 import json
-import math
 import re
 from collections.abc import Mapping
 from dataclasses import replace
-from datetime import datetime
-from typing import cast
+from typing import Any, cast
+
+import bson
+from bson.codec_options import CodecOptions, TypeRegistry
+from bson.errors import BSONError
+from bson.regex import Regex
 
 from hybridlog.query.predicate.numbers import HIGH, LOW
 from hybridlog.query.predicate.regex import RegexError, compile_regex
@@ -27,7 +30,6 @@ from hybridlog.query.predicate.tree import (
     Predicate,
     Reach,
     Value,
-    frozen,
     is_meta,
 )
 from hybridlog.query.predicate.types import STATS, FieldTypes, check, check_name
@@ -36,10 +38,8 @@ from hybridlog_storage.errors import WhereError
 
 MAX_DEPTH = 50
 """Deepest nesting; of MongoDB's 180 levels, its own rewriting takes some for each of ours."""
-MAX_NODES = 20_000
-"""Maximum number of keys and values in total."""
-MAX_CHARACTERS = 1_000_000
-"""Maximum number of characters in all keys and strings."""
+MAX_BYTES = 1_000_000
+"""Maximum size, as text and as BSON."""
 WHOLE = 32
 """Longer arrays are summaries in index documents."""
 
@@ -81,9 +81,13 @@ _EXPRESSIONS = frozenset(
     }
 )
 _OPTIONS = set("ims")
+_FLAGS = {re.IGNORECASE: "i", re.MULTILINE: "m", re.DOTALL: "s", re.UNICODE: ""}
 _UNCHECKED = {"NoneType", "dict", "list", "Decimal128", "MinKey", "MaxKey"}
 """Types of values that are compared with fields of any type."""
-_BSON_VALUES = {"Int64", "ObjectId", "Decimal128", "Timestamp", "MinKey", "MaxKey"}
+_TYPES = {
+    *("NoneType", "bool", "int", "float", "str", "bytes", "datetime"),
+    *("Int64", "ObjectId", "Decimal128", "Timestamp", "MinKey", "MaxKey", "Regex"),
+}
 
 
 Filter = dict[str, object]
@@ -96,7 +100,7 @@ def from_json(text: str) -> Filter:
     Raises:
         WhereError: it is no JSON, or too large.
     """
-    if len(text) > MAX_CHARACTERS:
+    if len(text) > MAX_BYTES:
         raise WhereError("filter not allowed: the filter is too large")
     try:
         found: Filter = json.loads(text)
@@ -114,7 +118,7 @@ def mongo_filter(
 ) -> Predicate:
     """A filter as a predicate that MongoDB answers.
 
-    Numpy scalars become Python numbers, tuples become lists, compiled patterns become `$regex`.
+    It is copied as BSON, so numpy's scalars are numbers and tuples are lists.
 
     Args:
         query: A filter as `pymongo` takes it.
@@ -126,8 +130,11 @@ def mongo_filter(
     """
     if not isinstance(query, Mapping):
         raise WhereError(f"a filter is a mapping, not {type(query).__name__}")
+    content = _encoded(query)
+    found: Filter = bson.decode(content)
+    text = str(query)
+    _check_values(found, (), 0)
     checker = _Checker()
-    found, text = _Plain().mapping(query, (), 0), str(query)
     checker.query(found, ())
     for path in checker.paths:
         if path.split(".")[0] != "_id":
@@ -140,7 +147,7 @@ def mongo_filter(
     check(Predicate(And(tuple(compared)), text), types)
     if not found:
         return Predicate(And(()), text)
-    return Predicate(MongoFilter(frozen(found), tuple(checker.paths.items())), text)
+    return Predicate(MongoFilter(content, tuple(checker.paths.items())), text)
 
 
 def misjudged(node: MongoFilter, types: FieldTypes | Mapping[str, str] | None) -> dict[str, Filter]:
@@ -205,71 +212,47 @@ def _is_place(part: str) -> bool:
     return part.isascii() and part.isdecimal() and str(int(part[:9])) == part
 
 
-class _Plain:
-    """Makes plain Python values of a filter, within bounds."""
-
-    def __init__(self) -> None:
-        self._nodes = 0
-        self._characters = 0
-
-    def mapping(self, given: Mapping[str, object], path: _Path, depth: int) -> Filter:
-        """A mapping in plain values; `path` is its place, for messages."""
-        if depth > MAX_DEPTH:
-            raise _refused(path[:3], f"is nested deeper than {MAX_DEPTH}")
-        found: Filter = {}
-        for key, value in given.items():
-            if not isinstance(key, str):
-                raise _refused(path, f"has a key that is no string: {key!r}")
-            try:
-                name = str(key)
-                name.encode()
-            except ValueError:
-                raise _refused(path, "has a name that is not valid Unicode") from None
-            if "\0" in name:
-                raise _refused(path, "has a name with a NUL character")
-            self._count(path, len(name))
-            place = (*path, name)
-            if name == "$regex" and _is_pattern(value):
-                if given.get("$options"):
-                    raise _refused(place, "has options twice")
-                found |= _regex(value, place)
-            elif name != "$options" or not _is_pattern(given.get("$regex")):
-                is_pattern = _is_pattern(value)
-                found[name] = (
-                    _regex(value, place) if is_pattern else self._value(value, place, depth)
-                )
-        return found
-
-    def _value(self, value: object, path: _Path, depth: int) -> object:
-        if isinstance(value, Mapping):
-            return self.mapping(value, path, depth + 1)
-        if isinstance(value, list | tuple):
-            if depth > MAX_DEPTH:
-                raise _refused(path[:3], f"is nested deeper than {MAX_DEPTH}")
-            # What is in a list is as deep as the list, but for lists.
-            return [self._value(one, path, depth + isinstance(one, list | tuple)) for one in value]
-        self._count(path, len(value) if isinstance(value, str | bytes) else 0)
-        found = _scalar(value, path)
-        if isinstance(found, int) and not LOW <= found <= HIGH:
-            raise _refused(path, f"{found} does not fit into 64 bits; write it as a float")
-        return found
-
-    def _count(self, path: _Path, characters: int) -> None:
-        self._nodes += 1
-        self._characters += characters
-        if self._nodes > MAX_NODES or self._characters > MAX_CHARACTERS:
-            raise _refused(path[:3], "the filter is too large")
+def _encoded(query: Mapping[str, object]) -> bytes:
+    """A filter in BSON."""
+    numbers: CodecOptions[Filter] = CodecOptions(
+        type_registry=TypeRegistry(fallback_encoder=_number)
+    )
+    try:
+        content = bson.encode(query, codec_options=numbers)
+    except RecursionError:
+        raise _refused((), f"it is nested deeper than {MAX_DEPTH}") from None
+    except UnicodeError:
+        raise _refused((), "it has a text that is not valid Unicode") from None
+    except (BSONError, OverflowError, TypeError, ValueError) as error:
+        raise _refused((), str(error)) from None
+    if len(content) > MAX_BYTES:
+        raise _refused((), "the filter is too large")
+    return content
 
 
-def _regex(pattern: object, path: _Path) -> Filter:
-    """A compiled pattern as MongoDB writes it."""
-    flags = getattr(pattern, "flags", 0)
-    table = {re.IGNORECASE: "i", re.MULTILINE: "m", re.DOTALL: "s"}
-    if not isinstance(flags, int) or flags & ~(sum(table) | re.UNICODE):
-        raise _refused(path, "may have the flags i, m and s only")
-    options = "".join(letter for flag, letter in table.items() if flags & flag)
-    found: Filter = {"$regex": getattr(pattern, "pattern", None)}
-    return {**found, "$options": options} if options else found
+def _number(value: Any) -> object:
+    """A scalar of numpy as Python's own; refuses all else that BSON does not have."""
+    if type(value).__module__ == "numpy" and value.shape == ():
+        value = value.item()
+    elif not isinstance(value, int):
+        raise TypeError(f"a value of type {type(value).__name__} is not allowed")
+    if isinstance(value, int) and not LOW <= value <= HIGH:
+        raise OverflowError(f"{value} does not fit into 64 bits; write it as a float")
+    return value
+
+
+def _check_values(value: object, path: _Path, depth: int) -> None:
+    """Check depth and types of values; `path` is their place, for messages."""
+    if depth > MAX_DEPTH:
+        raise _refused(path[:3], f"is nested deeper than {MAX_DEPTH}")
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            _check_values(inner, (*path, key), depth + isinstance(inner, dict))
+    elif isinstance(value, list):
+        for inner in value:
+            _check_values(inner, path, depth + 1)
+    elif type(value).__name__ not in _TYPES:
+        raise _refused(path, f"a value of type {type(value).__name__} is not allowed")
 
 
 class _Checker:
@@ -307,6 +290,8 @@ class _Checker:
                 raise _refused(place, "the operator is not allowed here")
             elif isinstance(value, dict) and _has_operators(value, place):
                 self._operators(above + key, value, place)
+            elif isinstance(value, Regex):
+                self._pattern(above + key, value, "", place)
             else:
                 self._compare(above + key, value, place)
 
@@ -325,13 +310,13 @@ class _Checker:
     def _operators(self, name: str, operators: Filter, path: _Path) -> None:
         for key, value in operators.items():
             place = (*path, key)
-            if key == "$not":
+            if key == "$regex" or (key == "$not" and isinstance(value, Regex)):
+                self._pattern(name, value, operators.get("$options", ""), place)
+            elif key == "$not":
                 inner = _mapping(value, place)
                 if not inner or not all(name.startswith("$") for name in inner):
                     raise _refused(place, "needs operators")
                 self._operators(name, inner, place)
-            elif key == "$regex":
-                self._pattern(name, value, operators.get("$options", ""), place)
             elif key == "$elemMatch":
                 self._element(name, value, place)
             elif key in _LISTS:
@@ -366,6 +351,11 @@ class _Checker:
 
     def _pattern(self, name: str, value: object, options: object, path: _Path) -> None:
         self._ask(name, "value")
+        if isinstance(value, Regex):
+            if options:
+                raise _refused(path, "has options twice")
+            options = "".join(_FLAGS.get(flag, "x") for flag in re.RegexFlag(value.flags))
+            value = value.pattern
         if not isinstance(value, str):
             raise _refused(path, "needs a string")
         if not isinstance(options, str) or not set(options) <= _OPTIONS:
@@ -405,7 +395,9 @@ class _Checker:
 
 
 def _without_operators(value: object, path: _Path) -> None:
-    """Refuse operators in a value to compare with."""
+    """Refuse operators and patterns in a value to compare with."""
+    if isinstance(value, Regex):
+        raise _refused(path, "a pattern is not allowed here")
     if isinstance(value, list):
         for item in value:
             _without_operators(item, path)
@@ -416,45 +408,12 @@ def _without_operators(value: object, path: _Path) -> None:
             _without_operators(item, (*path, key))
 
 
-def _scalar(value: object, path: _Path) -> object:
-    """A value as Python's own, if BSON can hold it."""
-    kind = type(value)
-    try:
-        if hasattr(value, "to_pydatetime"):  # pandas.Timestamp
-            value = value.to_pydatetime()
-        elif kind.__module__ == "numpy" and getattr(value, "shape", None) == ():
-            value = value.item()  # type: ignore[attr-defined]
-        if _is_bson(value) and kind.__name__ in _BSON_VALUES:
-            return value
-        if isinstance(value, str) and not _is_bson(value):  # bson.code.Code is a string
-            value.encode()
-            return str(value)
-        if isinstance(value, float):
-            return float(value)
-        is_date = isinstance(value, datetime) and not math.isnan(value.timestamp())
-        if is_date or value is None or isinstance(value, bool | int | bytes):
-            return value
-    except UnicodeError:
-        raise _refused(path, "has a text that is not valid Unicode") from None
-    except (OverflowError, ValueError, TypeError) as error:
-        raise _refused(path, str(error)) from None
-    raise _refused(path, f"a value of type {kind.__name__} is not allowed")
-
-
-def _is_bson(value: object) -> bool:
-    return type(value).__module__.split(".")[0] == "bson"
-
-
 def _has_operators(value: Filter, path: _Path) -> bool:
     """True if a mapping has operators as keys, not names."""
     marked = [key.startswith("$") for key in value]
     if any(marked) and not all(marked):
         raise _refused(path, "mixes operators and names")
     return any(marked)
-
-
-def _is_pattern(value: object) -> bool:
-    return isinstance(value, re.Pattern) or (_is_bson(value) and type(value).__name__ == "Regex")
 
 
 def _mapping(value: object, path: _Path) -> Filter:

@@ -155,6 +155,12 @@ class IndexState:
         for collection in self.document_collections():
             self._db.delete(collection, {"_meta.rec": {"$in": list(keys)}})
 
+    def clear_all(self, but: Collection[str]) -> None:
+        """Remove all recordings and their documents but some, which are given by their keys."""
+        self._db.delete(RECORDINGS, {"_id": {"$nin": list(but)}})
+        for collection in self.document_collections():
+            self._db.delete(collection, {"_meta.rec": {"$nin": list(but)}})
+
     def remove(self, keys: Collection[str]) -> None:
         """Remove recordings from the mirror, as the last step of their removal."""
         self._db.delete(RECORDINGS, {"_id": {"$in": list(keys)}})
