@@ -888,8 +888,7 @@ class Store:
 
     def _after_ring(self, report: RecordReport) -> None:
         """Make tables and index documents of what a ring has left."""
-        from hybridlog.maintenance.index import decode_again
-        from hybridlog.maintenance.tables import make
+        from hybridlog.maintenance.index import derive
 
         shared, entry = self._to_change(), report.entry
         index = shared.index
@@ -898,8 +897,7 @@ class Store:
         try:
             if index.connection.has_none:
                 with suppress(StoreError), self.directory.writing(entry.id, entry.name):
-                    decode_again(self.directory, self.catalog, entry)
-                make(self.directory, entry, is_new=True)
+                    derive(self.directory, self.catalog, entry)
             else:
                 self.connect()
                 report.indexed = entry.documents
@@ -1199,14 +1197,14 @@ class Store:
 
     def _mirrored(self, recording: str) -> RecordingEntry:
         """A recording whose manifest was changed, after its mirror in the index is."""
-        from hybridlog.maintenance import index
+        from hybridlog_storage.mongo.index_state import IndexState
 
         self._to_change().catch_up(recording)
         entry = self.entry(recording)
         connected = self.shared.index.connected
         if connected is not None and self.shared.index.connection.may_write:
             with suppress(ConnectionLostError):  # the next connection mirrors it
-                index.mirror(self.catalog, connected, recording)
+                IndexState(connected).show(entry)
         return entry
 
     def mark(

@@ -101,8 +101,4 @@ WAYS: dict[str, Way] = {
     "a file for the data": lambda data: _replace(data, "x"),
     "no directory": lambda data: shutil.rmtree(data.parent),
     "a file for the directory": lambda data: _replace(data.parent, "x"),
-    **{
-        f"a folder for {name}": lambda data, name=name: _replace(data.parent / name, None)
-        for name in ("users.lock", "keeper.lock", "alive.lock", "mongod.log", "mongod.json")
-    },
 }

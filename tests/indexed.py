@@ -16,5 +16,5 @@ def documents_of(store: hl.Store, *topics: str) -> list[dict[str, Any]]:
     database = store.shared.index.database_for("A test")
     found: list[dict[str, Any]] = []
     for topic in topics:
-        found += database.find(collection_of(topic), sort=[("_id", 1)])
+        found += database.find(collection_of(topic))
     return sorted(found, key=lambda one: bytes(one["_id"]))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import struct
 from pathlib import Path
 
@@ -42,8 +41,7 @@ def write_log(
 
 def mongod_of(store: hl.Store) -> Path:
     """The directory in /proc of the embedded mongod."""
-    record = json.loads((store.directory.path / "mongod" / "mongod.json").read_text())
-    return Path("/proc", str(record["mongod"]))
+    return Path("/proc", (store.directory.mongod / "data/mongod.lock").read_text().strip())
 
 
 def handles(store: hl.Store) -> int:

@@ -236,7 +236,7 @@ def unsealed(store: hl.Store, number: int, size: int, *, listed: bool) -> None:
     assert store.database is not None
     state = IndexState(store.database)
     # All chunks are in the index, and it is not done.
-    state.put(entry, "open", turn=1)
+    state.begin(entry)
     others = {n: digest for n, digest in entry.digests.items() if n != str(number)}
     state.put_segments(entry.key, others)
 
@@ -299,9 +299,7 @@ def test_a_chunk_without_arrival_numbers_comes_after_the_earlier_segments(
 
 def kill_mongod(store: Path) -> None:
     """End the mongod of this store, as its own record names it, and nothing else."""
-    import json
-
-    pid = int(json.loads((store / "mongod/mongod.json").read_text())["mongod"])
+    pid = int((store / "mongod/data/mongod.lock").read_text())
     command = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
     assert bytes(store / "mongod" / "data") in command
     os.kill(pid, signal.SIGKILL)
@@ -757,17 +755,14 @@ def test_an_altered_index_is_found_and_mended(
     [
         lambda db: db[RECORDINGS].update_one({}, {"$set": {"name": "another"}}),
         lambda db: db[RECORDINGS].update_one({}, {"$set": {"tags": {"a": "b"}}}),
-        lambda db: db[RECORDINGS].update_one({}, {"$set": {"index.state": "indexing"}}),
-        lambda db: db[RECORDINGS].update_one({}, {"$set": {"index.state": "clearing"}}),
         lambda db: db[RECORDINGS].update_one({}, {"$set": {"index.segments.0": "x"}}),
         lambda db: db[RECORDINGS].update_one({}, {"$unset": {"index": 1}}),
         lambda db: db[RECORDINGS].delete_one({}),
         lambda db: db.drop_collection(RECORDINGS),
-        lambda db: db[RECORDINGS].insert_one({"_id": "0" * 16, "index": {"state": "complete"}}),
+        lambda db: db[RECORDINGS].insert_one({"_id": "0" * 16, "index": {"segments": {}}}),
     ],
     ids=[
-        "name", "tags", "indexing", "clearing", "digest", "state-deleted", "deleted", "dropped",
-        "stranger",
+        "name", "tags", "digest", "state-deleted", "deleted", "dropped", "stranger",
     ],
 )  # fmt: skip
 def test_what_the_index_says_of_itself_is_put_right_by_the_next_who_connects(
@@ -777,16 +772,16 @@ def test_what_the_index_says_of_itself_is_put_right_by_the_next_who_connects(
     assert shared.database is not None
     with pymongo.MongoClient[dict[str, Any]](uri) as client:
         found = client[shared.database.name][RECORDINGS]
-        before = list(found.find({}, {"index.turn": 0}))
+        before = list(found.find({}, {"index.made": 0}))
         alter(client[shared.database.name])
-        assert list(found.find({}, {"index.turn": 0})) != before
+        assert list(found.find({}, {"index.made": 0})) != before
         if found.count_documents({}) == len(before):
             # All that alters the index notes first that it is not known to be whole.
             shared.catalog.put_indexed([entry.id for entry in shared.recordings()], "")
         with reopened(shared) as opened:
             everything = opened.all_topics().where("_meta.seq >= 0")
             assert everything.count() == said.total()
-            assert list(found.find({}, {"index.turn": 0})) == before
+            assert list(found.find({}, {"index.made": 0})) == before
             assert opened.verify().findings == []
 
 

@@ -148,7 +148,7 @@ def test_somebody_outside_of_the_group_changes_nothing(place: Path) -> None:
     store = place / "lab" / "store"
     where = ("--store", store)
     ann.run("record", place / "small.bag", "-q", *where)
-    wait_for(lambda: not (store / "mongod/mongod.json").exists())
+    wait_for(lambda: not (store / "mongod/data/mongod.lock").read_bytes())
     expected = ann.run(*COUNT, *where).out
     before = {p: (mode(p), p.stat().st_mtime_ns) for p in everything(store)}
     assert eve.run(*COUNT, *where).out == expected, "who can read asks by topic and time"

@@ -87,7 +87,14 @@ def ended(store: Path) -> None:
 
 
 def kill_mongod(store: Path) -> None:
-    pid = json.loads((store / "mongod" / "mongod.json").read_bytes())["mongod"]
+    kill(mongod_of(store))
+
+
+def mongod_of(store: Path) -> int:
+    return int((store / "mongod/data/mongod.lock").read_text())
+
+
+def kill(pid: int) -> None:
     os.kill(pid, signal.SIGKILL)
     wait_for(lambda: not psutil.pid_exists(pid))
 
@@ -115,7 +122,6 @@ def heal(store: Path, way: str) -> str:
         assert "all is well" in done.out
         assert "in the files" not in done.out
         said += done.err
-    assert not list(store.glob("mongod*/data.damaged-*"))
     return said
 
 
@@ -272,11 +278,11 @@ def test_what_only_mongodb_knows_is_asked_once_more(store: Path, calls: Calls) -
 @pytest.mark.parametrize("name", ["mongod", "mongod/data"])
 def test_an_index_deleted_under_an_open_store(store: Path, name: str) -> None:
     with hl.open(store, require_database=True) as opened:
-        want = documents(opened)
+        want, pid = documents(opened), mongod_of(store)
         while (store / name).exists():  # the keeper writes and removes files meanwhile
             shutil.rmtree(store / name, ignore_errors=True)
         if name == "mongod/data":
-            kill_mongod(store)
+            kill(pid)
         else:
             ended(store)  # its keeper notices
         assert sum(documents(opened)) == 0
@@ -453,7 +459,7 @@ def test_too_few_handles_are_told_as_that(store: Path) -> None:
     command = [sys.executable, "-m", "hybridlog", "verify", "--store", str(store)]
     done = subprocess.run([*LIMITED, *command], capture_output=True, text=True, check=False)
     assert done.returncode == 6, done.stderr
-    assert "ran out of file handles; the hard limit is 24. Raise it" in done.stderr
+    assert "ran out of file handles. Raise the hard limit" in done.stderr
     assert "damaged" not in done.stderr
     assert "all is well in the files" in done.stdout
     ended(store)

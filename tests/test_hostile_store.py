@@ -7,7 +7,6 @@ read, written, removed or made.
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import shutil
@@ -20,7 +19,6 @@ import pytest
 import hybridlog as hl
 from benchmarks.simulator.write import write_bag
 from hybridlog_storage.errors import HybridlogError, StoreError
-from hybridlog_storage.mongo import mongod_keeper
 from hybridlog_storage.mongo.mongod import EmbeddedMongod
 from tests import places
 from tests.cli.running import run
@@ -58,10 +56,7 @@ MONGOD_FILES = (
     "users.lock",
     "keeper.lock",
     "alive.lock",
-    "mongod.json",
-    "mongod.json.new",
     "mongod.log",
-    "mongod.log.1",
     "data/mongod.lock",
     "data/WiredTiger",
     "data/WiredTiger.wt",
@@ -326,11 +321,6 @@ def test_what_is_no_plain_file(tmp_path: Path, name: str) -> None:
     assert time.monotonic() - began < 10
 
 
-def test_too_much_to_look_through(tmp_path: Path) -> None:
-    (tmp_path / "mongod" / "/".join("deep" for _ in range(50))).mkdir(parents=True)
-    assert "more than an index" in refuse(tmp_path / "mongod")
-
-
 def test_the_cure_cures(tmp_path: Path, template: Path) -> None:
     victims = Victims(tmp_path / "victims")
     store = planted(template, tmp_path, "mongod", victims.folder(None))
@@ -347,89 +337,15 @@ def test_the_cure_cures(tmp_path: Path, template: Path) -> None:
 
 
 def test_symlinks_that_come_while_mongod_runs(tmp_path: Path) -> None:
-    """The log is put aside, and the record written, without going by names."""
     victims = Victims(tmp_path / "victims")
     directory = tmp_path / "mongod"
-    directory.mkdir()
-    with (directory / "mongod.log").open("wb") as log:
-        log.truncate(11 << 20)
     target = victims.file()
     with EmbeddedMongod(directory, linger_s=0.2):
-        assert (directory / "mongod.log.1").stat().st_size == 11 << 20
-        for name in ("mongod.log", "mongod.json", "mongod.log.1"):
-            (directory / name).unlink()
-            (directory / name).symlink_to(target)
+        (directory / "mongod.log").unlink()
+        (directory / "mongod.log").symlink_to(target)
         victims.watch()
     wait_for(lambda: not (directory / "data/mongod.lock").read_bytes())
     victims.check()
-
-
-def test_the_keeper_follows_no_symlink_by_itself(tmp_path: Path) -> None:
-    """Somebody may put one there after the keeper's starter has looked."""
-    victims = Victims(tmp_path / "victims")
-    target = victims.file(b'{"keeper": %d}' % os.getpid())
-    directory = tmp_path / "mongod"
-    directory.mkdir()
-    flags = os.O_RDWR | os.O_CREAT | os.O_APPEND
-    log = os.open(directory / "mongod.log", flags)
-    os.ftruncate(log, mongod_keeper.LOG_LIMIT + 1)
-    folder = os.open(directory, os.O_RDONLY)
-    job = mongod_keeper.Job(
-        command=[],
-        socket=str(tmp_path / "none" / "mongod.sock"),
-        record="mongod.json",
-        users_lock="users.lock",
-        log="mongod.log",
-        linger_s=0,
-        folder_fd=folder,
-        log_fd=log,
-        alive_fd=-1,
-    )
-    try:
-        for name in ("mongod.json", "mongod.json.new", "mongod.log.1", "users.lock"):
-            (directory / name).symlink_to(target)
-        victims.watch()
-        mongod_keeper._clean(job)
-        assert (directory / "mongod.json").is_symlink(), "what it leads to was not asked"
-        mongod_keeper._write_record(job, 1)
-        mongod_keeper._put_log_aside(job)
-        mongod_keeper._say(job, "done")
-        with pytest.raises(OSError):
-            mongod_keeper._open(job, "users.lock", os.O_RDWR)
-        victims.check()
-        assert json.loads((directory / "mongod.json").read_bytes())["mongod"] == 1
-        assert not (directory / "mongod.json").is_symlink()
-        aside = (directory / "mongod.log.1").lstat()
-        assert (aside.st_size, aside.st_mode & 0o777) == (mongod_keeper.LOG_LIMIT + 1, 0o600)
-        assert (directory / "mongod.log").read_text() == "hybridlog: done\n"
-        mongod_keeper._clean(job)
-        assert not (directory / "mongod.json").exists()
-    finally:
-        os.close(log)
-        os.close(folder)
-
-
-def test_a_record_leads_to_no_socket_of_another_store(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A store that came with a record of where mongod listens takes nothing away."""
-    import socket
-    import tempfile
-
-    from hybridlog_storage.disk.socket_directory import new_socket
-
-    with tempfile.TemporaryDirectory(prefix="hl-", dir="/tmp") as name:
-        monkeypatch.setenv("HYBRIDLOG_RUNTIME_DIR", name)
-        other = new_socket(tmp_path / "other" / "mongod", "mongod.sock")
-        with socket.socket(socket.AF_UNIX) as theirs:
-            theirs.bind(str(other))
-            directory = tmp_path / "mongod"
-            directory.mkdir()
-            record = f'{{"socket": "{other}", "mongod": 1}}'
-            (directory / "mongod.json").write_text(record)
-            with EmbeddedMongod(directory, linger_s=0.2):
-                assert other.exists()
-        assert other.exists()
 
 
 # --- by the commands ---
@@ -439,11 +355,11 @@ def test_the_commands(tmp_path: Path, bag: Path) -> None:
     """As a user does it, with the store's own MongoDB, and several symlinks at once."""
     store = tmp_path / "store"
     run("record", bag, "-q", store=store)
-    wait_for(lambda: not (store / "mongod/mongod.json").exists())
+    wait_for(lambda: not (store / "mongod/data/mongod.lock").read_bytes())
     victims = Victims(tmp_path / "victims")
     targets = {
         store / "mongod/mongod.log": "a",
-        store / "mongod/mongod.json.new": "b",
+        store / "mongod/data/new.wt": "b",
         places.folder(store, "small") / "writer.lock": "new",
         store / "recorders/live.json": "d",
     }

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import time
 from pathlib import Path
+from urllib.parse import unquote
 
 import psutil
 import pytest
@@ -30,7 +30,7 @@ def path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def mongod(path: Path) -> psutil.Process:
-    return psutil.Process(json.loads((path / "mongod" / "mongod.json").read_bytes())["mongod"])
+    return psutil.Process(int((path / "mongod/data/mongod.lock").read_text()))
 
 
 def test_a_server_stays_while_a_client_is_connected(path: Path, limit: Limit) -> None:
@@ -50,10 +50,9 @@ def test_a_server_stays_while_a_client_is_connected(path: Path, limit: Limit) ->
 
 def test_a_record_of_the_kernel_tells_connections(path: Path) -> None:
     with hl.open(path) as store:
-        store.connect()
-        record = json.loads((path / "mongod" / "mongod.json").read_bytes())
-        assert mongod_keeper._has_clients(record["socket"])
-        assert not mongod_keeper._has_clients(record["socket"] + "x")
+        socket = unquote(store.connect().address.removeprefix("mongodb://").rstrip("/"))
+        assert mongod_keeper._has_clients(socket)
+        assert not mongod_keeper._has_clients(socket + "x")
 
 
 def test_as_a_command(path: Path) -> None:

@@ -1052,7 +1052,7 @@ class Index:
                     "_meta.ref.chunk": lost,
                 }
             )
-        begun = {"state": "open", "turn": 1, "segments": {}}
+        begun = {"made": "", "segments": {}}
         self._db["hybridlog.recordings"].update_one(
             {"_id": self._key},
             {"$set": {"index": begun, "status": "open", "channels": [], "end": {}}},

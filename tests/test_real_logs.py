@@ -157,14 +157,16 @@ def dump(store: hl.Store) -> dict[str, list[bytes]]:
     assert store.database is not None
     found = {
         name: sorted(
-            document for raw in store.database.find_raw(name) for document in split_documents(raw)
+            document
+            for raw in store.database.each([(name, {})], lambda _: {"$match": {}})
+            for document in split_documents(raw)
         )
         for name in store.database.list_collections()
     }
     for name in ("hybridlog.recordings", "hybridlog.store"):
         documents = [bson.decode(document) for document in found[name]]
         found[name] = [
-            bson.encode({**d, "index": {**d["index"], "turn": 0}} if d["_id"] != "store" else d)
+            bson.encode({**d, "index": {**d["index"], "made": ""}} if d["_id"] != "store" else d)
             for d in documents
         ]
     return found

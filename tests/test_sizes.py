@@ -55,7 +55,8 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
         store.record(write(folder / "one.mcap", 400, 30))
         store.record(write(folder / "two.mcap", 1200, 0))
         store.record(write(folder / "mute.mcap", 10, 0), no_index=matcher(["/a", "/b"]))
-        store.connect().checkpoint()  # until then MongoDB has no size of new collections
+        # Until then MongoDB has no size of new collections.
+        store.connect()._client.admin.command("fsync")
     return folder / "store"
 
 

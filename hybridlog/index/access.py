@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from hybridlog.shared import Shared
     from hybridlog_storage.mongo.database import Database
 
-_TRIES = 5  # to connect, while the connection breaks
-_PAUSE_S = 0.1  # before the second try; doubles each time
 _REST_S = 10.0
 """Seconds after a failure in which questions do not try to connect again."""
 
@@ -101,7 +99,7 @@ class IndexAccess:
         return database
 
     def connect(self, *, brings: bool = True) -> Database:
-        """Connect to the index and bring it up to date; try again if the connection breaks.
+        """Connect to the index and bring it up to date; once more if the connection breaks.
 
         Args:
             brings: False to leave it as it is.
@@ -113,14 +111,13 @@ class IndexAccess:
         with self._connecting:
             if self.connected is not None and (self._is_complete or not brings):
                 return self.connected
+            was_connected = self.connected is not None
             try:
-                if self.connected is not None:  # it may have been lost: a new one follows
-                    with suppress(ConnectionLostError):
-                        return self._connect(brings=brings)
-                for tried in range(1, _TRIES):
-                    with suppress(ConnectionBrokenError):
-                        return self._connect(brings=brings)
-                    time.sleep(_PAUSE_S * 2 ** (tried - 1))
+                try:
+                    return self._connect(brings=brings)
+                except ConnectionLostError as error:
+                    if not was_connected and not isinstance(error, ConnectionBrokenError):
+                        raise
                 return self._connect(brings=brings)
             except BaseException as error:
                 self.disconnect()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable
-from contextlib import suppress
 from functools import wraps
 from typing import TYPE_CHECKING, NamedTuple, ParamSpec, TypeVar
 
@@ -156,7 +155,11 @@ class Connection:
                 cache_mb = self._cache_mb or _bounded_cache_mb(self._directory.settings.cache_mb)
                 self._mongod = EmbeddedMongod(self._directory.mongod, cache_mb=cache_mb)
             try:
-                uri = _started(self._mongod)
+                uri = self._mongod.start()
+            except StoreError as error:
+                # A read-only store has no embedded MongoDB, but its segments can be read.
+                self.has_none = True
+                raise DatabaseError(str(error)) from error
             except (DatabaseError, MissingDependencyError, ResourceError) as error:
                 self.has_none = not isinstance(error, DiskFullError)
                 raise
@@ -227,23 +230,6 @@ class Connection:
             place = lease.place_of(self._directory)
             lease.check(state.mark(), place, database, embedded=True)
             state.claim(place)
-
-
-def _started(mongod: EmbeddedMongod) -> str:
-    """URI of the embedded MongoDB; it may end once while it starts.
-
-    Raises:
-        DatabaseError: It does not start.
-        MissingDependencyError: No mongod is installed.
-        ResourceError: It lacks memory, file handles or disk.
-    """
-    try:
-        with suppress(DatabaseError):
-            return mongod.start()
-        return mongod.start()
-    except StoreError as error:
-        # A read-only store has no embedded MongoDB, but its segments can be read.
-        raise DatabaseError(str(error)) from error
 
 
 def _bounded_cache_mb(stored: int | None) -> int:

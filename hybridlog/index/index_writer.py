@@ -7,10 +7,11 @@ position a file says what the index has.
 
 from __future__ import annotations
 
+import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from queue import Empty, SimpleQueue
@@ -21,10 +22,8 @@ import numpy as np
 from hybridlog.index.indexing import ChunkIndexer
 from hybridlog_storage.catalog import decoded_rows
 from hybridlog_storage.errors import DatabaseError, HybridlogError, SegmentError
-from hybridlog_storage.manifests import manifests_at
 from hybridlog_storage.mongo.collection_names import collection_of
 from hybridlog_storage.mongo.index_state import IndexState
-from hybridlog_storage.segments.gone_log import open_log
 from hybridlog_storage.segments.segment_file import OPEN_SUFFIX, sealed_name
 from hybridlog_storage.segments.segment_reader import ChunkPlace, SegmentReader
 from hybridlog_storage.threads import Threads
@@ -47,7 +46,6 @@ INTERVAL_S = 5.0
 """Longest time between two passes over what was flushed, seconds."""
 _INTERVAL_BYTES = 64 << 20  # content that was flushed since the last pass, at most
 _SEND_BYTES = 8 << 20  # documents that are sent together, at most
-_CHECKPOINT_BYTES = 8 << 20  # documents of a recording that ask for a checkpoint at its end
 _GROUP_BYTES = 1 << 20  # content of small chunks that are decoded together
 _PAUSE_S = 0.002
 _RETRY_S = 2.0  # between attempts after the database has failed
@@ -79,30 +77,19 @@ class DocumentSender:
 
     Attributes:
         messages: Number of those whose documents it has sent.
-        segments: Numbers of the segments whose documents are all in the index.
     """
 
     def __init__(self, entry: RecordingEntry, database: Database) -> None:
         self.messages = 0
-        self.segments: set[int] = set()
         self._added = 0  # messages, and segments, since the last sending
         self._ended: dict[str, str] = {}
         self._key = entry.key
         self._database = database
         self._collections: set[str] = set()  # that exist
         self._documents: dict[str, list[NDArray[np.uint8]]] = {}
-        self._size = self._sent = 0
+        self._size = 0
         self._thread = Threads(1, "hybridlog-send")
         self._sending: Future[None] | None = None
-
-    def prepare(self, topics: Collection[str]) -> None:
-        """Create the collections of topics before their first documents."""
-        if not self._collections:
-            # One command, where creating each would be one for each topic.
-            self._collections.update(self._database.list_collections())
-        for name in {*map(collection_of, topics)} - self._collections:
-            self._database.ensure_collection(name)
-            self._collections.add(name)
 
     def add(self, documents: Sequence[Documents], entries: Sequence[ChunkEntry]) -> None:
         """Add the documents of chunks.
@@ -139,16 +126,6 @@ class DocumentSender:
             if wait:
                 self._sending.result()
 
-    def end(self) -> None:
-        """Send the rest, and leave no large journal behind.
-
-        Raises:
-            DatabaseError: This sending has failed, or an earlier one.
-        """
-        self.send(wait=True)
-        if self._sent >= _CHECKPOINT_BYTES:
-            self._database.checkpoint()
-
     def close(self) -> None:
         """Stop sending."""
         self._thread.shutdown(wait=True, cancel_futures=True)
@@ -159,19 +136,23 @@ class DocumentSender:
         messages: int,
         segments: Mapping[str, str],
     ) -> None:
-        self.prepare(documents.keys())
+        if not self._collections:
+            # One command, where creating each would be one for each topic.
+            self._collections.update(self._database.list_collections())
         for topic, tables in documents.items():
             if not tables:
                 continue
+            name = collection_of(topic)
+            if name not in self._collections:
+                self._database.ensure_collection(name)
+                self._collections.add(name)
             counts, widths = zip(*(table.shape for table in tables), strict=True)
             data = b"".join(table.data for table in tables)
             lengths = np.repeat(widths, counts).astype(np.int64)
-            self._database.insert_raw(collection_of(topic), data, len(lengths), lengths=lengths)
-            self._sent += len(data)
+            self._database.insert_raw(name, data, lengths)
         if segments:
             IndexState(self._database).put_segments(self._key, segments)
         self.messages += messages
-        self.segments.update(map(int, segments))
 
 
 class IndexWriter:
@@ -179,8 +160,8 @@ class IndexWriter:
 
     One thread reads the chunks that were flushed: every few seconds, after many bytes, when a
     segment is sealed and at the end. A failing database stops the index, never the recording:
-    the index goes on where it was as soon as the database answers again, at the latest when it
-    is next brought up to date.
+    the index goes on with what comes after the database answers again, and the end of the
+    recording brings what it has missed.
 
     Args:
         recording: The recording's directory.
@@ -193,8 +174,7 @@ class IndexWriter:
         interval_s: Longest time between two passes, seconds.
 
     Attributes:
-        failure: The error that stopped the index; None while it works.
-        database: The present connection to the index; None without one.
+        failure: The error that stopped the index; None while it works. At the end, the last one.
         damage: Chunks that could not be read back: reason by segment and number.
     """
 
@@ -210,8 +190,7 @@ class IndexWriter:
         cpu_slots: AbstractContextManager[Any] | None = None,
         interval_s: float = INTERVAL_S,
     ) -> None:
-        self.failure = target.failure
-        self.database = target.database
+        self.failure = self._last_failure = target.failure
         self.damage: dict[tuple[int, int], str] = {}
         self._recording = recording
         self._entry = entry
@@ -227,26 +206,20 @@ class IndexWriter:
         self._sealed: dict[int, str] = {}  # their digests
         self._flushed = 0  # messages
         self._unread = 0  # bytes since the last pass
-        self._decoded: Counter[int] = Counter()  # chunks of segments that are not read yet
-        self._counts: dict[int, int] = {}  # chunks of those that are read
-        self._digests: dict[int, str] = {}  # of these
-        self._messages: Counter[int] = Counter()  # of each segment
-        self._added: Counter[int] = Counter()  # chunks of each that this sender got
-        self._whole: set[int] = set()  # segments of which it got all
-        self._had: set[int] = set()  # those that the index had before it
-        self._next = 0  # the first one that is not read
+        self._read_to: Counter[int] = Counter()  # chunks of segments that are not read yet
         self._stats: dict[int, dict[int, Mapping[int, ChannelStats]]] = {}  # by segment and chunk
         self._readers: dict[int, SegmentReader] = {}
         self._sender: DocumentSender | None = None
         if target.database is not None:
             self._sender = DocumentSender(entry, target.database)
+        self._gaps: set[int] = set()  # segments of which the index has missed something
         self._indexed = 0
         self._retry_at = 0.0
-        self._renewed: list[Database] = []
+        self._renewed: Database | None = None
         self._crash: BaseException | None = None
         self._has_ended = self._is_abandoned = False
         # No event: a thread that is interrupted in `set` may leave it locked forever.
-        self._calls: SimpleQueue[str] = SimpleQueue()
+        self._calls: SimpleQueue[None] = SimpleQueue()
         self._thread = threading.Thread(target=self._run, name="hybridlog-index", daemon=True)
         self._thread.start()
 
@@ -263,11 +236,7 @@ class IndexWriter:
     @property
     def first_unread(self) -> int:
         """Number of the first segment that it may still read."""
-        sender = self._sender
-        if sender is None:
-            return self._next
-        has = self._had | sender.segments
-        return next((n for n in range(self._next) if n not in has), self._next)
+        return min([*self._places], default=sys.maxsize)
 
     def submit(self, chunk: StoredChunk, channels: Mapping[int, Channel]) -> None:
         """Note a chunk that is in its segment."""
@@ -276,69 +245,49 @@ class IndexWriter:
         self._channels = channels
         self._places.setdefault(chunk.segment, []).append(_place_of(chunk))
         self._flushed += len(chunk.batch)
-        self._messages[chunk.segment] += len(chunk.batch)
         self._unread += len(chunk.batch.buffer)
         if self._unread >= _INTERVAL_BYTES:
             self._unread = 0
-            self._calls.put("")
+            self._calls.put(None)
 
     def seal(self, sealed: Sealed) -> None:
         """Note that a segment has all its chunks."""
         self._places.setdefault(sealed.segment, [])
         self._sealed[sealed.segment] = sealed.digest
-        self._calls.put("")
+        self._calls.put(None)
 
-    def prepare(self, channel: Channel, *, has_documents: bool) -> None:
-        """Prepare a channel before its first message.
-
-        Args:
-            channel: The channel.
-            has_documents: Whether its messages get documents in MongoDB.
-        """
+    def prepare(self, channel: Channel) -> None:
+        """Prepare a channel before its first message."""
         self._indexer.prepare(channel)
-        if has_documents:
-            self._calls.put(channel.topic)
 
     def close(self) -> None:
         """Read all chunks; raise errors other than those of the database."""
-        self._has_ended = True
         self._end()
         if self._crash is not None:
             raise self._crash
+        self.failure = self._last_failure
 
     def abandon(self) -> None:
         """Stop without reading waiting chunks."""
-        self._has_ended = self._is_abandoned = True
+        self._is_abandoned = True
         self._end()
 
-    def release(self) -> None:
-        """Close the connections made by this object; `database` may be one of them."""
-        for database in self._renewed:
-            database.close()
-        self._renewed.clear()
-
     def _end(self) -> None:
-        self._calls.put("")
+        self._has_ended = True
+        self._calls.put(None)
         self._thread.join()
 
     # The methods below run on the thread of the index.
 
     def _run(self) -> None:
         try:
-            due = 0.0
-            while True:
-                topic = ""
+            has_ended = False
+            while not has_ended:
                 with suppress(Empty):
-                    topic = self._calls.get(timeout=max(due - time.monotonic(), 0))
+                    self._calls.get(timeout=self._interval_s)
                 has_ended = self._has_ended  # after the call, or its end would be waited for
-                if topic and not has_ended:
-                    self._prepare(topic)
-                    continue
                 if not self._is_abandoned:
                     self._advance(has_ended=has_ended)
-                if has_ended:
-                    return
-                due = time.monotonic() + self._interval_s
         except BaseException as error:
             self._crash = error
         finally:
@@ -346,66 +295,40 @@ class IndexWriter:
             for segment in [*self._readers]:
                 self._close_reader(segment)
 
-    def _prepare(self, topic: str) -> None:
-        if self._sender is not None:
-            with self._noting_failure():
-                self._sender.prepare([topic])
-
     def _advance(self, *, has_ended: bool) -> None:
         """Read what was flushed since the last pass."""
-        if self.failure is not None and (has_ended or time.monotonic() >= self._retry_at):
+        if self.failure is not None and not has_ended and time.monotonic() >= self._retry_at:
             self._reconnect()
-        # The digests first: what sealed segments have is known then.
-        sealed = dict(self._sealed)
-        behind = self._counts if self._sender is not None else ()
-        for segment in sorted({*self._places, *behind} - self._whole):
-            with self._noting_failure():
-                for group in self._read(segment):
-                    self._take(group)
-                    if self._is_abandoned:
-                        return
+        sealed = dict(self._sealed)  # first: all chunks of these are known then
+        for segment in sorted([*self._places]):
+            for group in self._read(segment):
+                self._take(group)
+                if self._is_abandoned:
+                    return
             if segment in sealed:
                 self._end_segment(segment, sealed[segment])
-            if segment in self._counts:
-                self._close_reader(segment)
-                if self._sender is not None:
-                    self._sender.end_segment(segment, self._digests[segment])
-                    self._whole.add(segment)
         if self._sender is not None:
             with self._noting_failure():
-                self._sender.end() if has_ended else self._sender.send()
+                self._sender.send(wait=has_ended)
 
     def _read(self, segment: int) -> Iterator[list[StoredChunk]]:
-        """The chunks of a segment that are missing here or in the index; small ones in groups."""
-        known = self._places.get(segment)
-        places = None if known is None else [*known]  # before the size of the file is read
-        start = count = self._counts.get(segment, 0)
-        if places is not None:
-            start, count = self._decoded[segment], len(places)
-        if self._sender is not None:
-            start = min(start, self._added[segment])
-        if start >= count:
+        """The chunks of a segment that were not read yet; small ones in groups."""
+        places = self._places[segment][self._read_to[segment] :]  # before the file's size is read
+        if not places:
             return
+        self._read_to[segment] += len(places)
         reader = self._open(segment)
         reader.grow()
         group: list[StoredChunk] = []
         size = 0
-        for place in (reader.summary().chunks if places is None else places)[start:]:
+        for place in places:
             while self._pause_indexing():
                 time.sleep(_PAUSE_S)
             try:
                 chunk = reader.read_chunk(place)
             except SegmentError as error:
-                is_known = (segment, place.number) in self.damage
-                if not is_known and (places is None or place.number < self._decoded[segment]):
-                    # It was read before, and has expired meanwhile.
-                    raise DatabaseError(
-                        "MongoDB has lost documents of messages that have expired since; they "
-                        "are made again when the recording has ended."
-                    ) from error
                 self.damage[segment, place.number] = str(error)
                 continue
-            self.damage.pop((segment, place.number), None)
             size += len(chunk.batch.buffer)
             if group and size > _GROUP_BYTES:
                 yield group
@@ -417,32 +340,30 @@ class IndexWriter:
     def _take(self, chunks: Sequence[StoredChunk]) -> None:
         """Make rows and documents of chunks of one segment."""
         segment = chunks[0].segment
-        is_read = segment not in self._places
-        new = [] if is_read else [c for c in chunks if c.number >= self._decoded[segment]]
-        for chunk in new:
+        for chunk in chunks:
             with self._cpu_slots:
                 self._tables.add(chunk, self._channels)
         with self._cpu_slots:
             documents, entries = self._indexer.documents_of(chunks, self._channels)
-        for entry in entries[len(chunks) - len(new) :]:
-            self._stats.setdefault(segment, {})[entry.number] = entry.stats
-            self._decoded[segment] = entry.number + 1
-        if self._sender is not None:
-            self._added[segment] = chunks[-1].number + 1
-            with self._noting_failure():
-                self._sender.add(documents, entries)
+        self._stats.setdefault(segment, {}).update({entry.number: entry.stats for entry in entries})
+        if self._sender is None:
+            self._gaps.add(segment)
+            return
+        with self._noting_failure():
+            self._sender.add(documents, entries)
 
     def _end_segment(self, segment: int, digest: str) -> None:
         """Store the decoding results of a segment, if all of it could be read."""
-        places, stats = self._places.pop(segment), self._stats.pop(segment, {})
-        if len(stats) == len(places):
-            rows = decoded_rows([stats[number] for number in range(len(places))])
+        stats, count = self._stats.pop(segment, {}), len(self._places[segment])
+        if len(stats) == count:
+            rows = decoded_rows([stats[number] for number in range(count)])
             with suppress(HybridlogError):  # it is derived, and the disk may be full
                 self._catalog.put_stamps(self._entry.id, [(segment, digest, rows)])
-        del self._decoded[segment], self._sealed[segment]
-        self._counts[segment], self._digests[segment] = len(places), digest
-        while self._next in self._counts:
-            self._next += 1
+        del self._places[segment], self._read_to[segment], self._sealed[segment]
+        self._close_reader(segment)
+        if self._sender is not None and segment not in self._gaps:
+            self._sender.end_segment(segment, digest)
+        self._gaps.discard(segment)
 
     def _open(self, segment: int) -> SegmentReader:
         """The reader of a segment, which may still grow."""
@@ -452,11 +373,8 @@ class IndexWriter:
         path = self._recording / f"{segment:06d}{OPEN_SUFFIX}"
         try:
             reader = SegmentReader(path, segment, direct=True)
-        except SegmentError:  # it is sealed by now, and payloads of it may have expired
-            manifest = manifests_at(self._recording).read(self._recording.name)
-            rows = manifest.rows.get(segment, [])
-            sealed = path.with_name(rows[0].name if rows else sealed_name(segment))
-            reader = open_log(sealed, segment)
+        except SegmentError:  # it is sealed by now
+            reader = SegmentReader(path.with_name(sealed_name(segment)), segment)
         self._readers[segment] = reader
         return reader
 
@@ -475,34 +393,32 @@ class IndexWriter:
 
     def _fail(self, error: DatabaseError) -> None:
         self._stop_sending()
-        self.failure = error
+        self._gaps.update(self._read_to)  # of what was sent, some may be lost
+        self.failure = self._last_failure = error
         self._retry_at = time.monotonic() + _RETRY_S
 
     def _stop_sending(self) -> None:
         if self._sender is not None:
             self._sender.close()
             self._indexed, self._sender = self.indexed, None
+        if self._renewed is not None:
+            self._renewed.close()
+            self._renewed = None
 
     def _reconnect(self) -> None:
-        """Go on after a failure of the database, from what a new connection has."""
+        """Go on after a failure of the database, with what comes from now on."""
         if self._target.renew is None:
             return
         try:
-            database = self._target.renew()
-            self._renewed.append(database)
-            state = IndexState(database)
-            indexed = state.one(self._entry.key)
-            if indexed is None:  # it was unavailable when the recording began
-                state.put(self._entry, "open", turn=1)
-            # A killed server has lost what was not in its journal yet.
-            has = {int(number) for number in indexed.segments} if indexed is not None else set()
+            self._renewed = self._target.renew()
+            state = IndexState(self._renewed)
+            if state.one(self._entry.key) is None:  # it was unavailable when the recording began
+                state.begin(self._entry)
         except DatabaseError as error:
             self._fail(error)
             return
-        self.database, self.failure = database, None
-        self._whole, self._had, self._added = set(has), has, Counter()
-        self._indexed = sum(self._messages[number] for number in has)
-        self._sender = DocumentSender(self._entry, database)
+        self.failure = None
+        self._sender = DocumentSender(self._entry, self._renewed)
 
 
 def _place_of(chunk: StoredChunk) -> ChunkPlace:

@@ -45,7 +45,7 @@ class Index:
         """Rebuild the index from the segments, recording by recording.
 
         Args:
-            recordings: The recordings; None for all, which also removes unknown documents.
+            recordings: The recordings; None for all, of an index that is emptied first.
             progress: Called after each chunk.
 
         Returns:
@@ -61,10 +61,10 @@ class Index:
         shared.invalidate()
         chosen = shared.now().select(recordings)
         index = StoreIndex(shared.directory, shared.catalog, database, progress)
-        left = index.rebuild(chosen)
         if recordings is None:
-            index.remove_rest(shared.now().recordings())
-        elif left:
+            index.clear()
+        left = index.rebuild(chosen)
+        if recordings is not None and left:
             raise next(iter(left.values()))
         shared.invalidate()
         return shared.now().as_now([entry.id for entry in chosen if entry.id not in left])

@@ -260,8 +260,8 @@ class LiveRecording:
     def expect(self, *channels: Channel) -> None:
         """Prepare for channels before their first message.
 
-        Parsing a definition and creating a collection take some ten milliseconds each.
-        It is better to spend them before messages come.
+        Parsing a definition takes some ten milliseconds. It is better to spend them before
+        messages come.
 
         Raises:
             UsageError: A channel cannot be stored, or the recording was closed.

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 
 from hybridlog.entries import free_name_in, text
 from hybridlog.maintenance import tables
-from hybridlog.maintenance.index import remove_documents
 from hybridlog.query.times import TimeLike, format_time, parse_time
 from hybridlog.record.losses import extent_of
 from hybridlog_storage.disk.directory import LOCK_WAIT_S, gone
@@ -284,7 +283,6 @@ def remove(
 def _clear(database: Database, entry: RecordingEntry) -> None:
     """Remove a recording from the index."""
     state = IndexState(database)
-    indexed = state.one(entry.key)
-    if indexed is not None:
-        state.put(entry, "removing", turn=indexed.turn + 1)
-    remove_documents(database, entry.key, indexed)
+    state.begin(entry)
+    state.clear(entry)
+    state.remove([entry.key])

@@ -210,15 +210,14 @@ def repair_index(
         indexed = known.get(entry.key)
         if entry.status == "open":
             continue
-        if _is_restored(directory, catalog, entry):
-            if not index.rebuild([entry]):
-                done.append(Repaired(entry.name, "index", "damaged chunks are readable again"))
-            continue
-        if indexed is not None and indexed.is_whole(entry) and entry.is_decoded:
+        is_restored = _is_restored(directory, catalog, entry)
+        is_whole = indexed is not None and indexed.is_whole(entry) and entry.is_decoded
+        if is_whole and not is_restored:
             continue
         with suppress(HeldError, TopicError), directory.writing(entry.id):
-            chunks = index.catch_up(entry.id)
-            done.append(Repaired(entry.name, "index", f"{chunks} chunks indexed"))
+            chunks = index.bring(entry, anew=is_restored)
+            how = "damaged chunks are readable again" if is_restored else f"{chunks} chunks indexed"
+            done.append(Repaired(entry.name, "index", how))
     return done
 
 

@@ -12,7 +12,6 @@ from hybridlog.columns import rows_file
 from hybridlog.columns.recording_logs import RecordingRows, walk
 from hybridlog.entries import describe, steady_inventory, with_said
 from hybridlog.maintenance import tables
-from hybridlog.maintenance.index import documents_in
 from hybridlog_storage.disk.directory import LOCK
 from hybridlog_storage.errors import ManifestError, SegmentError, StoreError
 from hybridlog_storage.manifest import encode
@@ -140,7 +139,7 @@ class _Index:
         self._counts: dict[str, Counter[str]] = defaultdict(Counter)
         if count_all:
             collections = IndexState(database).document_collections()
-            counted = database.count_by(collections, "_meta.rec")
+            counted = database.count_each([(name, {}) for name in collections])
             for collection, counts in zip(collections, counted, strict=True):
                 for key, count in counts:
                     if isinstance(key, str):
@@ -155,8 +154,10 @@ class _Index:
         first, last = entry.span
         names = {collection_of(channel.topic) for channel in entry.channels}
         within = {**between(first, last + 1), "_meta.rec": entry.key}
-        counts = self.database.count_each([(name, within) for name in names])
-        return Counter(dict(zip(names, counts, strict=True)))
+        counted = self.database.count_each([(name, within) for name in names])
+        return Counter(
+            {name: n for name, counts in zip(names, counted, strict=True) for _, n in counts}
+        )
 
     def counted_again(self, entry: RecordingEntry, collections: Iterable[str]) -> Counter[str]:
         """The numbers as they are now, at any time; reads the whole collections."""
@@ -323,14 +324,16 @@ class _Check:
         """Find documents that are not in the segments."""
         if self._indexed is None:
             return
-        state = IndexState(self._indexed.database)
-        indexed = state.of([entry.key]).get(entry.key)
+        indexed = IndexState(self._indexed.database).one(entry.key)
         if indexed is None or not indexed.is_whole(entry):
             self.found("index", "it is not complete", self._rebuild)
-        elif not state.is_mirrored(entry):
+        elif not indexed.mirrors(entry):
             self.found("index", "its entry of the recording differs", self._rebuild)
         have = self._indexed.documents_of(entry)
-        expected = documents_in(entry)
+        expected: Counter[str] = Counter()
+        for channel in entry.channels:
+            if channel.is_indexed:
+                expected[collection_of(channel.topic)] += channel.stats.messages
         if self._indexed.count_all and +have != +expected:
             # The recording may have ended since all documents were counted.
             have = self._indexed.counted_again(entry, have.keys() | expected.keys())

@@ -22,7 +22,7 @@ from hybridlog_storage.errors import (
 from hybridlog_storage.mongo.collection_names import collection_of
 from hybridlog_storage.mongo.index_columns import KEY, key_columns
 from hybridlog_storage.mongo.index_documents import between
-from hybridlog_storage.mongo.index_state import IndexState
+from hybridlog_storage.mongo.index_state import Indexed, IndexState
 from hybridlog_storage.stopping import check_wanted
 from hybridlog_storage.times import END
 
@@ -46,7 +46,7 @@ _TOO_LARGE: Filter = {"_meta.error": {"$regex": "take more than [0-9]+ MiB$"}}
 _T = TypeVar("_T")
 Query = tuple[str, Filter]
 """A collection and a filter."""
-_Indexed = Mapping[str, tuple[int, Mapping[str, str]]]
+_Indexed = Mapping[str, Indexed]
 
 
 class Found(NamedTuple):
@@ -114,7 +114,7 @@ class IndexReader:
         A recording has each number once, whatever the topic.
         """
         found: dict[str, list[NDArray[np.int64]]] = defaultdict(list)
-        for raw in asked.database.find_each(asked.queries(parts, own), KEY):
+        for raw in asked.database.each(asked.queries(parts, own), lambda _: {"$project": KEY}):
             check_wanted()
             keys = key_columns(raw)
             self._counters.documents_read += len(keys)
@@ -142,9 +142,9 @@ class IndexReader:
             database = self._session.shared.index.index_as_it_is()
             keys = {part.recording.key for part in parts}
             try:
-                indexed = IndexState(database).segments(keys)
+                indexed = IndexState(database).of(keys, ())
                 found = ask(_Asked(database, parts, indexed))
-                if _turns(IndexState(database).segments(keys)) == _turns(indexed):
+                if _made(IndexState(database).of(keys, ())) == _made(indexed):
                     return found
             except ConnectionLostError as error:
                 failure = error
@@ -170,7 +170,8 @@ class _Asked:
         """Number of documents of the parts whose recordings are not in the index as a whole."""
         doubtful = []
         for part in self._parts:
-            _, segments = self._indexed.get(part.recording.key, (0, {}))
+            indexed = self._indexed.get(part.recording.key)
+            segments = {} if indexed is None else indexed.segments
             is_there = part.recording.digests.items() <= segments.items()
             if part.recording.status == "open" or not is_there:
                 doubtful.append(part)
@@ -182,9 +183,9 @@ class _Asked:
             (row, query) for row, part in enumerate(parts) for query in self.queries([part], own)
         ]
         found = [0] * len(parts)
-        numbers = self.database.count_each([query for _, query in queries])
-        for (row, _), number in zip(queries, numbers, strict=True):
-            found[row] += number
+        counted = self.database.count_each([query for _, query in queries])
+        for (row, _), counts in zip(queries, counted, strict=True):
+            found[row] += sum(number for _, number in counts)
         return found
 
     def check_arrays(self, filters: Iterable[MongoFilter]) -> None:
@@ -233,8 +234,8 @@ class _Asked:
         return found
 
 
-def _turns(indexed: _Indexed) -> dict[str, int]:
-    return {key: turn for key, (turn, _) in indexed.items()}
+def _made(indexed: _Indexed) -> dict[str, str]:
+    return {key: one.made for key, one in indexed.items()}
 
 
 def _predicate(part: Part) -> Predicate:

@@ -27,7 +27,6 @@ from hybridlog.entries import (
     text,
 )
 from hybridlog.index.index_writer import INTERVAL_S, IndexTarget, IndexWriter
-from hybridlog.maintenance.index import finish
 from hybridlog.maintenance.retention import Rules
 from hybridlog.query.latching import depth_of
 from hybridlog.wording import parse_size
@@ -128,7 +127,6 @@ class Capture:
         )
         settings = replace(settings, segment_size=int(largest))
         self._end: Mapping[str, Any] | None = None
-        self._turn = 1
         self._held = ExitStack()
         recording = new_id(name)
         with self._held:
@@ -163,7 +161,6 @@ class Capture:
             cpu_slots=pressure.cpu_slots if pressure else None,
             interval_s=pressure.index_interval_s if pressure else INTERVAL_S,
         )
-        self._held.callback(self.index.release)
         self.writer = RecordingWriter(
             folder,
             recording_metadata(self.entry),
@@ -198,7 +195,7 @@ class Capture:
 
     def expect(self, channel: Channel) -> None:
         """Prepare a channel before its first message."""
-        self.index.prepare(channel, has_documents=not self._no_index(channel.topic))
+        self.index.prepare(channel)
 
     def close(self, end: Mapping[str, Any]) -> DatabaseError | None:
         """Complete the recording; `entry` is then complete, too.
@@ -259,16 +256,12 @@ class Capture:
         recording = self.entry.id
         if self.index.damage:
             self.catalog.put_damage(recording, self.index.damage)
-        try:
-            if failure is None:
-                database = self.index.database
-                self.entry = finish(
-                    self._directory, self.catalog, database, recording, turn=self._turn
-                )
-        except DatabaseError as error:
-            failure = error
-        if failure is not None:
-            self.entry = put_entry(self._directory, self.catalog, recording)
+        self.entry = put_entry(self._directory, self.catalog, recording)
+        if failure is None and self._target.database is not None:
+            try:
+                IndexState(self._target.database).end(self.entry)
+            except DatabaseError as error:
+                failure = error
         self._tables.close(self.entry)
         self._held.close()
         return failure
@@ -293,13 +286,12 @@ class Capture:
         with suppress(HybridlogError):
             self.catalog.remove(entry.id)
         # If MongoDB is unavailable, the next connection finds an entry without files.
-        database = self.index.database
+        database = self._target.database
         with suppress(HybridlogError):
             if database is not None:
                 state = IndexState(database)
-                topics = {channel.topic for channel in self.writer.channels.values()}
-                state.clear(entry.key, topics)
-                state.remove(entry.key)
+                state.clear_everywhere([entry.key])
+                state.remove([entry.key])
         self._held.close()
 
     def _begin(
@@ -313,7 +305,7 @@ class Capture:
         create(manifest)
         entry = put_entry(self._directory, self.catalog, recording, is_open=True)
         if database is not None:
-            IndexState(database).put(entry, "open", turn=self._turn)
+            IndexState(database).begin(entry)
         return entry
 
 

@@ -462,7 +462,7 @@ def test_the_order_does_not_depend_on_indexes_of_the_user(store: hl.Store) -> No
     assert len(query.intervals()) == 1
     assert len(query.changes("s", pause=0)) == 6
     assert seconds(query.intervals()) == model.states(lambda m: m.value["s"] > 2, (0, 2**62), None)
-    database.drop("state")
+    database.drop_index("state", [("s", 1)])
 
 
 @pytest.fixture

@@ -103,22 +103,6 @@ def test_no_question_asks_once_a_recording(tmp_path: Path) -> None:
     assert "create" not in {one.name for one in few["record"]}, "once a topic, though it exists"
 
 
-@pytest.mark.parametrize("is_large", [False, True])
-def test_a_large_recording_leaves_no_journal(
-    tmp_path: Path, limit: Limit, *, is_large: bool
-) -> None:
-    """Its end asks the server for one checkpoint; that of a small one does not."""
-    if is_large:
-        limit(index_checkpoint_bytes=1)
-    log = logs.write(tmp_path / "one.mcap", logs.content(0, MESSAGES))
-    with hl.open(tmp_path / "store", create=True, require_database=True) as store:
-        with commands() as sent:
-            store.connect()
-            store.record(log, name="one")
-            store.index.rebuild(["one"])
-        assert [one.name for one in sent].count("fsync") == (2 if is_large else 0)
-
-
 def test_some_of_many_recordings(tmp_path: Path, limit: Limit) -> None:
     """Many are asked together, in one range of time."""
     path = tmp_path / "store"

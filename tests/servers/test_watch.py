@@ -78,7 +78,7 @@ def test_what_comes_into_a_store_is_indexed_once_by_several_that_watch(
             with hl.open(robot, mongo="none") as source, hl.open(lab, mongo=uri) as store:
                 state = IndexState(store.shared.index.connection.open())
                 indexed = state.one(source.entry(label).key)
-                return indexed is not None and indexed.state == "complete"
+                return indexed is not None and indexed.is_whole(source.entry(label))
 
         with ExitStack() as stack:
             watching, outs, errs = [], [tmp_path / "out-0", tmp_path / "out-1"], []
@@ -103,6 +103,7 @@ def test_what_comes_into_a_store_is_indexed_once_by_several_that_watch(
             for n in (1, 2):
                 arrive(robot, lab, f"drive-{n}")
             eventually(lambda: is_indexed("drive-1") and is_indexed("drive-2"), "not indexed")
+            eventually(lambda: "drive-2" in "".join(out.read_text() for out in outs), "not told")
             server.kill()
             arrive(robot, lab, "drive-3")
             eventually(lambda: all_say("MongoDB"), "nobody says that MongoDB is away")

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from hybridlog_storage.catalog import ChannelStats, ChunkEntry, RecordingEntry, channel_entry
+from hybridlog_storage.catalog import ChannelStats, RecordingEntry, channel_entry
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.mongo.collection_names import CATALOG_PREFIX
 from hybridlog_storage.mongo.database import Database
@@ -22,6 +22,7 @@ from hybridlog_storage.mongo.index_state import (
 
 ONE, OTHER = "0123456789abcdef" * 2, "fedcba9876543210" * 2
 DIGESTS = {"0": "a", "1": "b", "10": "c"}
+HOUR = 3600 * 10**9
 
 
 @pytest.fixture
@@ -61,25 +62,6 @@ def recording(of: str = ONE, topics: tuple[str, ...] = ("/ä b", "/b")) -> Recor
     )
 
 
-def chunk(segment: int, number: int, of: str = ONE) -> ChunkEntry:
-    told = ChannelStats(
-        messages=segment * 100 + number,
-        payload_bytes=7,
-        unreadable=1,
-        first=-5,
-        last=2**62,
-        first_stamp=3,
-        last_stamp=4,
-        stamped=2,
-        skew_sum=0.1,
-        skew_min=-3,
-        skew_max=9,
-        longest=2**62,
-    )
-    each = {3: told, 1: ChannelStats(messages=1)}
-    return ChunkEntry(of, segment, number, number * 1000, 90, 10, 1, 2, -5, 2**62, each)
-
-
 def document(of: str, at: int, segment: int, number: int) -> dict[str, object]:
     key = bytes.fromhex(of[-16:])
     _id = key_bound(at)[:8] + key + number.to_bytes(8, "big")
@@ -95,35 +77,20 @@ def indexed(state: IndexState, of: str = ONE) -> Indexed | None:
 # How far a recording is.
 
 
-@pytest.mark.parametrize("step", ["open", "clearing", "indexing", "complete", "removing"])
-def test_a_state_comes_back(state: IndexState, step: str) -> None:
+def test_a_recording_is_whole_only_when_all_digests_fit(state: IndexState) -> None:
     entry = recording()
     assert indexed(state) is None
-    state.put(entry, step, turn=3, segments={"0": "a"})  # type: ignore[arg-type]
-    found = indexed(state)
-    assert found is not None
-    assert (found.id, found.state, found.turn) == (ONE, step, 3)
-    assert dict(found.segments) == {"0": "a"}
-    assert dict(found.damage) == {}
-    assert found.mirrors(entry)
-    assert not found.is_whole(entry)
-
-
-def test_a_recording_is_whole_only_when_state_and_all_digests_fit(state: IndexState) -> None:
-    entry = recording()
-    state.put(entry, "complete", turn=1, segments=DIGESTS)
-    found = indexed(state)
-    assert found is not None
-    assert found.is_whole(entry)
-    for digests in (
-        {**DIGESTS, "1": "x"}, {"0": "a"}, {**DIGESTS, "2": "d"}, {},
-    ):  # fmt: skip
-        assert not found.is_whole(replace(entry, digests=digests))
-    for step in ("open", "clearing", "indexing", "removing"):
-        state.put(entry, step, turn=1, segments=DIGESTS)  # type: ignore[arg-type]
-        again = indexed(state)
-        assert again is not None
-        assert not again.is_whole(entry), step
+    state.begin(entry, {"0": "a"})
+    for digests in ({"0": "a"}, {"0": "a", "1": "b"}, DIGESTS):
+        found = indexed(state)
+        assert found is not None
+        assert found.mirrors(entry)
+        assert found.is_whole(replace(entry, digests=digests))
+        assert not found.is_whole(replace(entry, digests={**digests, "0": "x"}))
+        assert not found.is_whole(replace(entry, digests={**digests, "2": "d"}))
+        state.put_segments(ONE[-16:], {"1": "b"})
+        if digests != {"0": "a"}:
+            state.end(entry)
 
 
 @pytest.mark.parametrize(
@@ -137,7 +104,7 @@ def test_the_mirror_shows_a_recording_as_it_was_or_as_it_is(
     state: IndexState, name: str, value: object
 ) -> None:
     entry = recording()
-    state.put(entry, "complete", turn=4, segments=DIGESTS, damage={(0, 1): "x"})
+    state.begin(entry, DIGESTS)
     changed = replace(entry, **{name: value})
     before = indexed(state)
     assert before is not None
@@ -154,51 +121,26 @@ def test_the_mirror_shows_a_recording_as_it_was_or_as_it_is(
 
 def test_the_mirror_is_what_other_programs_read(state: IndexState, database: Database) -> None:
     entry = recording()
-    state.put(entry, "complete", turn=1, segments=DIGESTS)
+    state.begin(replace(entry, name="before", channels=[]))
+    state.end(entry)
     (found,) = database.find(RECORDINGS, {})
     assert found["_id"] == ONE[-16:]
-    assert found.pop("index") == {"state": "complete", "turn": 1, "segments": DIGESTS}
+    index = found.pop("index")
+    assert index == {"made": index["made"], "segments": DIGESTS}
     del found["_id"]
     document = entry.to_document()
     del document["held"]
     assert found == document
 
 
-def test_what_the_mirror_says_otherwise_is_seen(state: IndexState, database: Database) -> None:
-    entry = recording()
-    assert not state.is_mirrored(entry)
-    for change in (
-        {"$set": {"extra": 1}}, {"$unset": {"name": 1}}, {"$inc": {"channels.0.stats.first": 1}},
-        {"$set": {"channels": 5}}, {"$set": {"spans": [[0, 5]]}}, {"$push": {"notes": "x"}},
-        {"$set": {"end.losses": [{"cause": "x"}]}}, {"$unset": {"channels.0.stats.skew_sum": 1}},
-    ):  # fmt: skip
-        state.put(entry, "complete", turn=1, segments=DIGESTS, damage={(0, 1): "x"})
-        assert state.is_mirrored(entry)
-        database.update(RECORDINGS, {"_id": ONE[-16:]}, change)
-        assert not state.is_mirrored(entry), change
-
-
-def test_chunks_without_documents_are_known(state: IndexState) -> None:
-    damage = {(0, 1): "unreadable", (12, 3): "gone"}
-    state.put(recording(), "complete", turn=1, segments=DIGESTS, damage=damage)
-    found = indexed(state)
-    assert found is not None
-    assert found.damage == damage
-    state.put(recording(), "complete", turn=1, segments=DIGESTS)
-    found = indexed(state)
-    assert found is not None
-    assert found.damage == {}
-
-
 def test_only_the_recordings_that_are_asked_for(state: IndexState) -> None:
-    state.put(recording(), "complete", turn=1, segments=DIGESTS)
-    state.put(recording(OTHER), "open", turn=2)
+    state.begin(recording(), DIGESTS)
+    state.begin(recording(OTHER))
     assert state.of().keys() == {ONE[-16:], OTHER[-16:]}
+    assert state.count() == 2
     assert state.of([OTHER[-16:], "0" * 16]).keys() == {OTHER[-16:]}
     assert state.of([]) == {}
-    both = [ONE[-16:], OTHER[-16:]]
-    assert state.segments(both) == {ONE[-16:]: (1, DIGESTS), OTHER[-16:]: (2, {})}
-    assert state.segments([OTHER[-16:], "0" * 16]) == {OTHER[-16:]: (2, {})}
+    assert state.of([ONE[-16:]], ())[ONE[-16:]].shown == {}
 
 
 def test_what_another_program_has_put_there_is_not_whole(
@@ -207,29 +149,19 @@ def test_what_another_program_has_put_there_is_not_whole(
     database.replace(RECORDINGS, {"_id": ONE[-16:]}, {"_id": ONE[-16:]})
     found = indexed(state)
     assert found is not None
-    assert (found.state, found.turn) == ("indexing", 0)
-    assert state.segments([ONE[-16:]]) == {ONE[-16:]: (0, {})}
     assert not found.is_whole(recording())
     assert not found.mirrors(recording())
 
 
 def test_whoever_asks_sees_that_documents_were_about_to_go(state: IndexState) -> None:
-    entry, key = recording(), ONE[-16:]
-    seen = []
-    for step, turn in (("open", 0), ("complete", 0), ("clearing", 1), ("complete", 1)):
-        segments = DIGESTS if step == "complete" else {}
-        state.put(entry, step, turn=turn, segments=segments)  # type: ignore[arg-type]
-        seen.append(state.segments([key])[key])
-    assert seen == [(0, {}), (0, DIGESTS), (1, {}), (1, DIGESTS)]
-
-
-def test_an_index_says_which_segments_it_has(state: IndexState) -> None:
-    state.put(recording(), "open", turn=1)
-    for number, digest in DIGESTS.items():
-        state.put_segments(ONE[-16:], {number: digest})
-    found = indexed(state)
-    assert found is not None
-    assert (found.state, found.segments) == ("open", DIGESTS)
+    entry, seen = recording(), []
+    for step in (state.begin, state.end, state.begin, state.end):
+        step(entry)
+        found = indexed(state)
+        assert found is not None
+        seen.append(found)
+    assert [one.segments for one in seen] == [{}, DIGESTS, {}, DIGESTS]
+    assert seen[0].made == seen[1].made != seen[2].made == seen[3].made
 
 
 # Documents.
@@ -248,14 +180,14 @@ def filled(state: IndexState, database: Database) -> IndexState:
 
 
 def left(database: Database, of: str, name: str = "one") -> list[int]:
-    found = database.find(name, {"_meta.rec": of[-16:]}, sort=[("_id", 1)])
+    found = database.find(name, {"_meta.rec": of[-16:]})
     return [d["_meta"]["ref"]["seg"] for d in found]
 
 
 def test_clearing_removes_the_documents_of_one_recording(
     filled: IndexState, database: Database
 ) -> None:
-    filled.clear(ONE[-16:], ["/one", "/not_there"])
+    filled.clear(recording(topics=("/one", "/not_there")))
     assert left(database, ONE) == []
     assert left(database, ONE, "two") == list(range(5))
     assert left(database, OTHER) == list(range(5))
@@ -264,16 +196,20 @@ def test_clearing_removes_the_documents_of_one_recording(
 def test_clearing_leaves_the_segments_that_are_to_stay(
     filled: IndexState, database: Database
 ) -> None:
-    filled.clear(ONE[-16:], ["/one"], but=[1, 3])
+    filled.clear(recording(topics=("/one",)), but=["1", "3"])
     assert left(database, ONE) == [1, 3]
     assert left(database, OTHER) == list(range(5))
 
 
 def test_clearing_looks_at_some_times_only(filled: IndexState, database: Database) -> None:
-    filled.clear(ONE[-16:], ["/one"], (1, 3))
-    assert left(database, ONE) == [0, 4]
-    filled.clear(ONE[-16:], ["/one"], (4, 2**63 - 1))
-    assert left(database, ONE) == [0]
+    entry = recording(topics=("/one",))
+    entry.channels[0].stats = ChannelStats(messages=1, first=HOUR + 2, last=HOUR + 3)
+    filled.clear(replace(entry, spans=[(0, HOUR + 2, HOUR + 3)]))
+    assert left(database, ONE) == [0, 1]
+    # Topics and times of the mirror are looked at, too.
+    filled.begin(recording(topics=("/two",)))
+    filled.clear(recording(topics=("/one",)))
+    assert left(database, ONE) == left(database, ONE, "two") == []
     assert left(database, OTHER) == list(range(5))
 
 
@@ -283,7 +219,7 @@ def test_documents_of_what_is_no_recording_can_be_cleared(
 ) -> None:
     made = {"_id": b"x" * 24, "_meta": {"rec": key}}
     database.replace("one", {"_id": made["_id"]}, made)
-    filled.clear(key)
+    filled.clear_everywhere([key])
     assert database.count("one", {"_id": made["_id"]}) == 0
     assert left(database, ONE) == left(database, OTHER) == list(range(5))
 
@@ -291,15 +227,15 @@ def test_documents_of_what_is_no_recording_can_be_cleared(
 def test_a_recording_leaves_the_mirror_last_and_alone(
     filled: IndexState, database: Database
 ) -> None:
-    filled.put(recording(), "removing", turn=1)
-    filled.put(recording(OTHER), "complete", turn=1)
-    filled.remove(ONE[-16:])
+    filled.begin(recording())
+    filled.begin(recording(OTHER))
+    filled.remove([ONE[-16:]])
     assert filled.of().keys() == {OTHER[-16:]}
     assert left(database, ONE) == list(range(5))
 
 
 def test_collections_of_topics_are_not_ours(filled: IndexState, database: Database) -> None:
-    filled.put(recording(), "complete", turn=1)
+    filled.begin(recording())
     filled.claim({"id": "x"})
     assert sorted(filled.document_collections()) == ["one", "two"]
     assert {RECORDINGS, STORE} <= set(database.list_collections())
@@ -311,7 +247,7 @@ def test_collections_of_topics_are_not_ours(filled: IndexState, database: Databa
 
 def test_a_database_says_whose_it_is(state: IndexState) -> None:
     assert state.mark() is None
-    state.put(recording(), "clearing", turn=1)
+    state.begin(recording())
     assert state.mark() is None
     one = state.claim({"id": "a", "host": "h", "path": "/p"})
     assert state.mark() == one
@@ -323,8 +259,5 @@ def test_a_database_says_whose_it_is(state: IndexState) -> None:
 
 def test_the_mirror_of_many_topics_fits_into_a_document(state: IndexState) -> None:
     entry = recording(topics=tuple(f"/robot/part{number}" for number in range(65_535)))
-    state.put(entry, "complete", turn=1, segments=DIGESTS)
-    assert state.is_mirrored(entry)
+    state.begin(entry, DIGESTS)
     assert state.of()[entry.key].is_whole(entry)
-    other = replace(entry, channels=[*entry.channels[1:], entry.channels[0]])
-    assert not state.is_mirrored(other)

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import shutil
 import signal
@@ -13,6 +12,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from urllib.parse import unquote
 
 import psutil
 import pytest
@@ -48,14 +48,14 @@ sys.stdin.readline()
 """
 
 
-def record(directory: Path) -> dict[str, object]:
-    return json.loads((directory / "mongod.json").read_text())
-
-
 def pids(directory: Path) -> tuple[int, int]:
-    """Process ids of mongod and its keeper."""
-    found = record(directory)
-    return int(str(found["mongod"])), int(str(found["keeper"]))
+    """Process ids of mongod, by its own lock file, and of its keeper."""
+    mongod = int((directory / "data" / "mongod.lock").read_text())
+    return mongod, psutil.Process(mongod).ppid()
+
+
+def socket_of(uri: str) -> Path:
+    return Path(unquote(uri.removeprefix("mongodb://").partition("/?")[0]))
 
 
 def is_running(pid: int) -> bool:
@@ -196,11 +196,11 @@ def test_comes_up_private_and_without_a_port_and_goes_with_its_user(directory: P
             line.split()[6]: line.split()[-1]
             for line in Path(f"/proc/{mongod}/net/unix").read_text().splitlines()[1:]
         }
-        path = Path(str(record(directory)["socket"]))
+        path = socket_of(uri)
         assert str(path) in {unix[inode] for inode in inodes & unix.keys()}, "the check sees it"
         assert not inodes & tcp
 
-        for place in (path, path.parent, path.parent.parent):
+        for place in (path, path.parent):
             assert place.stat().st_mode & 0o077 == 0
         assert os.getsid(keeper) != os.getsid(0), "Ctrl-C reaches the terminal's session only"
         data = sum(file.stat().st_size for file in (directory / "data").rglob("*.*"))
@@ -209,8 +209,7 @@ def test_comes_up_private_and_without_a_port_and_goes_with_its_user(directory: P
         user.stop()
     user.stop()
     gone(mongod, keeper)
-    assert not path.parent.exists()
-    assert not (directory / "mongod.json").exists()
+    assert not path.exists()
 
 
 def test_a_user_within_the_linger_time_finds_the_same_mongod(directory: Path) -> None:
@@ -255,7 +254,6 @@ def test_users_that_come_while_it_is_ended_wait_and_start_it_anew(directory: Pat
     for _ in range(3):
         with EmbeddedMongod(directory, linger_s=0) as user:
             assert ping(user.start())
-    assert not (directory / "mongod.log.1").exists()
 
 
 @pytest.mark.usefixtures("directory")
@@ -274,7 +272,7 @@ def test_runs_under_a_locale_that_is_not_installed(
         assert ping(user.start())
 
 
-def test_a_long_log_is_put_aside(directory: Path) -> None:
+def test_a_long_log_is_emptied(directory: Path) -> None:
     directory.mkdir()
     log = directory / "mongod.log"
     with log.open("wb") as file:
@@ -282,7 +280,6 @@ def test_a_long_log_is_put_aside(directory: Path) -> None:
     with EmbeddedMongod(directory, linger_s=LINGER_S) as user:
         assert user.log == log
         assert log.stat().st_size < 1 << 20
-    assert (directory / "mongod.log.1").stat().st_size == 11 << 20
 
 
 # --- faults ---
@@ -325,22 +322,20 @@ def test_a_killed_mongod_comes_up_again_with_what_was_written(directory: Path) -
     assert "killed by signal 9" in user.log.read_text()
 
 
-def test_everything_killed_and_a_stale_socket_and_record(directory: Path) -> None:
-    with EmbeddedMongod(directory, linger_s=LINGER_S):
+def test_everything_killed_and_a_stale_socket(directory: Path) -> None:
+    with EmbeddedMongod(directory, linger_s=LINGER_S) as user:
+        path = socket_of(user.start())
         mongod, keeper = pids(directory)
         for pid in (keeper, mongod):
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
         gone(mongod, keeper)
-    assert (directory / "mongod.json").exists()
-    path = Path(str(record(directory)["socket"]))
-    path.parent.mkdir(parents=True, exist_ok=True)
     path.unlink(missing_ok=True)
     with socket.socket(socket.AF_UNIX) as stale:
         stale.bind(str(path))
     with EmbeddedMongod(directory, linger_s=LINGER_S) as user:
         assert ping(user.start())
-        assert not path.exists()
+        assert socket_of(user.start()) == path
 
 
 def test_a_store_removed_and_made_anew_under_a_running_mongod(directory: Path) -> None:
@@ -354,50 +349,19 @@ def test_a_store_removed_and_made_anew_under_a_running_mongod(directory: Path) -
     second = pids(directory)
     assert not set(first) & set(second)
     gone(*first)
-    assert pids(directory) == second, "the first keeper leaves the second's record alone"
+    assert pids(directory) == second, "the first keeper leaves the second's socket alone"
     assert ping(user.start())
     user.stop()
     gone(*second)
 
 
-def test_a_stale_record_names_nothing_else_to_remove(
-    directory: Path, tmp_path: Path, runtime: Path
-) -> None:
-    directory.mkdir()
-    foreign = runtime / "foreign"
-    foreign.mkdir(mode=0o700)
-    with socket.socket(socket.AF_UNIX) as other:
-        other.bind(str(foreign / "agent.sock"))
-    (directory / "mongod.json").write_text(
-        json.dumps({"socket": str(foreign / "agent.sock"), "mongod": 1})
-    )
+def test_a_store_that_is_moved_takes_its_mongod_along(directory: Path, tmp_path: Path) -> None:
     with EmbeddedMongod(directory, linger_s=LINGER_S) as user:
-        assert ping(user.start())
-    assert (foreign / "agent.sock").exists()
-
-
-@pytest.mark.parametrize("content", [b"", b"{", b"[1]", b'{"socket": 3, "mongod": "x"}', b"\xff"])
-def test_a_damaged_record_is_no_record(directory: Path, content: bytes) -> None:
-    directory.mkdir()
-    (directory / "mongod.json").write_bytes(content)
-    assert EmbeddedMongod(directory)._read_record() is None
-
-
-def test_a_record_may_not_lead_to_a_socket_in_a_public_place(
-    directory: Path, runtime: Path
-) -> None:
-    directory.mkdir()
-    public = runtime / "public"
-    public.mkdir(mode=0o755)
-    public.chmod(0o755)
-    with socket.socket(socket.AF_UNIX) as theirs:
-        theirs.bind(str(public / "mongod.sock"))
-    (directory / "mongod.json").write_text(
-        json.dumps({"socket": str(public / "mongod.sock"), "mongod": 1})
-    )
-    assert EmbeddedMongod(directory)._read_record() is None
-    public.chmod(0o700)
-    assert EmbeddedMongod(directory)._read_record() is not None
+        uri = user.start()
+        directory.rename(tmp_path / "moved")
+        with EmbeddedMongod(tmp_path / "moved") as other:
+            assert other.start() == uri
+        (tmp_path / "moved").rename(directory)
 
 
 def test_a_directory_that_cannot_be_written(runtime: Path) -> None:
@@ -508,7 +472,7 @@ def test_a_mongod_that_never_answers(
     limit(mongod_silence_s=1.0)
     with pytest.raises(DatabaseError, match="did not answer within 1 s"):
         EmbeddedMongod(directory, linger_s=LINGER_S).start()
-    wait_for(lambda: not (directory / "mongod.json").exists())
+    wait_for(lambda: not processes_on(directory))
 
 
 def test_data_that_another_mongod_has_open(directory: Path, runtime: Path) -> None:
@@ -524,13 +488,11 @@ def test_data_that_another_mongod_has_open(directory: Path, runtime: Path) -> No
             other.kill()
 
 
-def marked(directory: Path, **extra: bytes) -> Path:
+def marked(directory: Path) -> Path:
     """Data files that no mongod has written, and that a fake one does not look at."""
     data = directory / "data"
     data.mkdir(parents=True)
     (data / "WiredTiger.turtle").write_bytes(b"old")
-    for name, content in extra.items():
-        (data / name).write_bytes(content)
     return data
 
 
@@ -545,69 +507,28 @@ def test_damaged_data_files_are_replaced(directory: Path) -> None:
         assert "Fatal assertion" in str(user.damage)
         assert kept(user.start()) == 0
         assert user.damage is None, "told once"
-        assert inside(directory) == ["data", "mongod.json", "mongod.log"], "nothing is left"
+        assert inside(directory) == ["data", "mongod.log"], "nothing is left"
 
 
-def test_data_files_that_new_ones_cannot_replace_are_put_back(
+def test_data_files_are_replaced_once_and_then_the_log_is_told(
     directory: Path, fake: Callable[[str], None], tmp_path: Path
 ) -> None:
-    """If mongod cannot use new files either, it is not the fault of the old ones."""
     starts = tmp_path / "starts"
     script = f"""ls {directory}/data | tr '\\n' ' ' >> {starts}; echo >> {starts}
 echo '{{"s":"F","msg":"oh","attr":{{"error":"WT_PANIC"}}}}'; kill -6 $$"""
     fake(script)
-    data = marked(directory)
+    marked(directory)
     user = EmbeddedMongod(directory, linger_s=LINGER_S)
     with pytest.raises(DatabaseError, match=r"oh .*WT_PANIC"):
         user.start()
     assert starts.read_text().split("\n") == ["WiredTiger.turtle ", "", ""], "old, new"
-    assert (data / "WiredTiger.turtle").read_bytes() == b"old"
-    assert user.damage is None
     assert inside(directory) == ["data", "mongod.log"]
-
-
-def test_a_mongod_that_cannot_start_at_all_is_no_damage(
-    directory: Path, fake: Callable[[str], None], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Later, when it can, what it said before is not held against the data files."""
-    used_once(directory)
-    script = """echo '{"s":"F","msg":"oh","attr":{"error":"WT_PANIC"}}'; kill -6 $$"""
-    fake(script)
-    with pytest.raises(DatabaseError, match="WT_PANIC"):
-        EmbeddedMongod(directory, linger_s=LINGER_S).start()
-    monkeypatch.delenv("HYBRIDLOG_MONGOD")
-    with EmbeddedMongod(directory, linger_s=LINGER_S) as user:
-        assert user.damage is None
-        assert kept(user.start()) == 1
-
-
-def test_damaged_data_files_are_removed_at_once_if_room_is_short(
-    directory: Path, fake: Callable[[str], None], tmp_path: Path, limit: Limit
-) -> None:
-    seen = tmp_path / "seen"
-    script = f"""ls {directory} > {seen}; echo '{{"s":"F","msg":"oh"}}'; kill -6 $$"""
-    fake(script)
-    limit(mongod_room_bytes=1 << 62)
-    data = marked(directory)
-    with pytest.raises(DatabaseError):
-        EmbeddedMongod(directory, linger_s=LINGER_S).start()
-    assert "damaged" not in seen.read_text()
-    assert not list(data.iterdir())
-
-
-def test_what_an_interrupted_replacement_has_left_is_removed(directory: Path) -> None:
-    left = directory / "data.damaged-0123abcd"
-    left.mkdir(parents=True)
-    (left / "big").write_bytes(b"x")
-    with EmbeddedMongod(directory, linger_s=LINGER_S) as user:
-        assert user.damage is None
-        assert not left.exists()
 
 
 @pytest.mark.parametrize(
     ("words", "end", "error", "told"),
     [
-        ("24: Too many open files", "exit 14", ResourceError, r"file handles; .*ulimit -n"),
+        ("24: Too many open files", "exit 14", ResourceError, r"file handles.*ulimit -n"),
         ("std::bad_alloc", "kill -6 $$", ResourceError, "out of memory"),
         ("11: Resource temporarily unavailable", "kill -6 $$", ResourceError, "out of memory"),
         ("No space left on device", "exit 14", DiskFullError, "free some"),
@@ -661,14 +582,21 @@ def test_damage_that_the_last_mongod_noticed_late(
 
 
 @pytest.mark.parametrize("is_whole", [True, False])
-def test_a_file_for_a_folder_or_a_folder_for_a_file(directory: Path, *, is_whole: bool) -> None:
-    folders = ("users.lock", "keeper.lock", "alive.lock", "mongod.json")
-    for name in () if is_whole else (*folders, "mongod.json.new", "mongod.log"):
-        (directory / name).mkdir(parents=True)
-        (directory / name / "inner").write_text("x")
+def test_a_file_for_a_folder(directory: Path, *, is_whole: bool) -> None:
+    if not is_whole:
+        directory.mkdir()
     (directory if is_whole else directory / "data").write_text("x")
     with EmbeddedMongod(directory, linger_s=LINGER_S) as user:
         assert ping(user.start())
+
+
+@pytest.mark.parametrize("name", ["users.lock", "mongod.log", "data/link"])
+def test_what_does_not_belong_there_is_named(directory: Path, tmp_path: Path, name: str) -> None:
+    path = directory / name
+    path.parent.mkdir(parents=True)
+    path.symlink_to(tmp_path) if name == "data/link" else path.mkdir()
+    with pytest.raises(StoreError, match=r"does not belong there.*Remove .*mongod"):
+        EmbeddedMongod(directory).start()
 
 
 def test_a_socket_directory_that_is_a_symlink_or_open_to_others(

@@ -8,12 +8,15 @@ with code in them are refused, too. Patterns have RE2's syntax, so no search tak
 from __future__ import annotations
 
 import json
-import math
 import re
 from collections.abc import Mapping
 from dataclasses import replace
-from datetime import datetime
-from typing import cast
+from typing import Any, cast
+
+import bson
+from bson.codec_options import CodecOptions, TypeRegistry
+from bson.errors import BSONError
+from bson.regex import Regex
 
 from hybridlog.query.predicate.numbers import HIGH, LOW
 from hybridlog.query.predicate.regex import RegexError, compile_regex
@@ -27,7 +30,6 @@ from hybridlog.query.predicate.tree import (
     Predicate,
     Reach,
     Value,
-    frozen,
     is_meta,
 )
 from hybridlog.query.predicate.types import STATS, FieldTypes, check, check_name
@@ -36,10 +38,8 @@ from hybridlog_storage.errors import WhereError
 
 MAX_DEPTH = 50
 """Deepest nesting; of MongoDB's 180 levels, its own rewriting takes some for each of ours."""
-MAX_NODES = 20_000
-"""Maximum number of keys and values in total."""
-MAX_CHARACTERS = 1_000_000
-"""Maximum number of characters in all keys and strings."""
+MAX_BYTES = 1_000_000
+"""Maximum size, as text and as BSON."""
 WHOLE = 32
 """Longer arrays are summaries in index documents."""
 
@@ -81,9 +81,13 @@ _EXPRESSIONS = frozenset(
     }
 )
 _OPTIONS = set("ims")
+_FLAGS = {re.IGNORECASE: "i", re.MULTILINE: "m", re.DOTALL: "s", re.UNICODE: ""}
 _UNCHECKED = {"NoneType", "dict", "list", "Decimal128", "MinKey", "MaxKey"}
 """Types of values that are compared with fields of any type."""
-_BSON_VALUES = {"Int64", "ObjectId", "Decimal128", "Timestamp", "MinKey", "MaxKey"}
+_TYPES = {
+    *("NoneType", "bool", "int", "float", "str", "bytes", "datetime"),
+    *("Int64", "ObjectId", "Decimal128", "Timestamp", "MinKey", "MaxKey", "Regex"),
+}
 
 
 Filter = dict[str, object]
@@ -96,7 +100,7 @@ def from_json(text: str) -> Filter:
     Raises:
         WhereError: it is no JSON, or too large.
     """
-    if len(text) > MAX_CHARACTERS:
+    if len(text) > MAX_BYTES:
         raise WhereError("filter not allowed: the filter is too large")
     try:
         found: Filter = json.loads(text)
@@ -114,7 +118,7 @@ def mongo_filter(
 ) -> Predicate:
     """A filter as a predicate that MongoDB answers.
 
-    Numpy scalars become Python numbers, tuples become lists, compiled patterns become `$regex`.
+    It is copied as BSON, so numpy's scalars are numbers and tuples are lists.
 
     Args:
         query: A filter as `pymongo` takes it.
@@ -126,8 +130,12 @@ def mongo_filter(
     """
     if not isinstance(query, Mapping):
         raise WhereError(f"a filter is a mapping, not {type(query).__name__}")
+    content = _encoded(query)
+    found: Filter = bson.decode(content)
+    text = str(query)
+    _check_values(found, (), 0)
     checker = _Checker()
-    found, text = checker.query(query, (), 0), str(query)
+    checker.query(found, ())
     for path in checker.paths:
         if path.split(".")[0] != "_id":
             check_name(text, _field(path), types)
@@ -139,7 +147,7 @@ def mongo_filter(
     check(Predicate(And(tuple(compared)), text), types)
     if not found:
         return Predicate(And(()), text)
-    return Predicate(MongoFilter(frozen(found), tuple(checker.paths.items())), text)
+    return Predicate(MongoFilter(content, tuple(checker.paths.items())), text)
 
 
 def misjudged(node: MongoFilter, types: FieldTypes | Mapping[str, str] | None) -> dict[str, Filter]:
@@ -204,8 +212,51 @@ def _is_place(part: str) -> bool:
     return part.isascii() and part.isdecimal() and str(int(part[:9])) == part
 
 
+def _encoded(query: Mapping[str, object]) -> bytes:
+    """A filter in BSON."""
+    numbers: CodecOptions[Filter] = CodecOptions(
+        type_registry=TypeRegistry(fallback_encoder=_number)
+    )
+    try:
+        content = bson.encode(query, codec_options=numbers)
+    except RecursionError:
+        raise _refused((), f"it is nested deeper than {MAX_DEPTH}") from None
+    except UnicodeError:
+        raise _refused((), "it has a text that is not valid Unicode") from None
+    except (BSONError, OverflowError, TypeError, ValueError) as error:
+        raise _refused((), str(error)) from None
+    if len(content) > MAX_BYTES:
+        raise _refused((), "the filter is too large")
+    return content
+
+
+def _number(value: Any) -> object:
+    """A scalar of numpy as Python's own; refuses all else that BSON does not have."""
+    if type(value).__module__ == "numpy" and value.shape == ():
+        value = value.item()
+    elif not isinstance(value, int):
+        raise TypeError(f"a value of type {type(value).__name__} is not allowed")
+    if isinstance(value, int) and not LOW <= value <= HIGH:
+        raise OverflowError(f"{value} does not fit into 64 bits; write it as a float")
+    return value
+
+
+def _check_values(value: object, path: _Path, depth: int) -> None:
+    """Check depth and types of values; `path` is their place, for messages."""
+    if depth > MAX_DEPTH:
+        raise _refused(path[:3], f"is nested deeper than {MAX_DEPTH}")
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            _check_values(inner, (*path, key), depth + isinstance(inner, dict))
+    elif isinstance(value, list):
+        for inner in value:
+            _check_values(inner, path, depth + 1)
+    elif type(value).__name__ not in _TYPES:
+        raise _refused(path, f"a value of type {type(value).__name__} is not allowed")
+
+
 class _Checker:
-    """Checks a filter.
+    """Checks a filter of plain values.
 
     Attributes:
         paths: How the filter asks for each path.
@@ -215,268 +266,158 @@ class _Checker:
     def __init__(self) -> None:
         self.paths: dict[str, Reach] = {}
         self.compared: list[Compare | Match] = []
-        self._nodes = 0
-        self._characters = 0
 
-    def query(
-        self, query: Mapping[str, object], path: _Path, depth: int, above: str = ""
-    ) -> Filter:
-        """A filter in plain Python values.
+    def query(self, query: Filter, path: _Path, above: str = "") -> None:
+        """Check a filter.
 
         Args:
             query: The filter.
             path: Its place, for messages.
-            depth: Its depth.
             above: The path of the array whose elements it is about, and a dot.
         """
-        found: Filter = {}
-        for key, value in self._items(query, path, depth):
-            inner = (*path, key)
+        for key, value in query.items():
+            place = (*path, key)
             if key in _LOGICAL:
-                if not isinstance(value, list | tuple) or not value:
-                    raise _refused(inner, "needs a list of filters")
-                found[key] = [
-                    self.query(_mapping(item, inner), inner, depth + 1, above) for item in value
-                ]
+                if not isinstance(value, list) or not value:
+                    raise _refused(place, "needs a list of filters")
+                for item in value:
+                    self.query(_mapping(item, place), place, above)
             elif key == "$expr" and not above:
-                found[key] = self._expression(value, inner, depth + 1)
+                self._expression(value, place)
             elif key == "$comment" and not above:
-                found[key] = self._literal(value, inner, depth + 1)
+                _without_operators(value, place)
             elif key.startswith("$"):
-                raise _refused(inner, "the operator is not allowed here")
+                raise _refused(place, "the operator is not allowed here")
+            elif isinstance(value, dict) and _has_operators(value, place):
+                self._operators(above + key, value, place)
+            elif isinstance(value, Regex):
+                self._pattern(above + key, value, "", place)
             else:
-                found[key] = self._condition(above + key, value, inner, depth + 1)
-        return found
+                self._compare(above + key, value, place)
 
     def _ask(self, name: str, reach: Reach) -> None:
         """Note that the filter asks for a path, and how."""
         if self.paths.get(name, "exists") == "exists" or reach == "whole":
             self.paths[name] = reach
 
-    def _compared(self, name: str, value: object, path: _Path, depth: int) -> object:
-        """A value that a field is compared with, in plain Python values."""
-        found = self._literal(value, path, depth)
-        if type(found).__name__ not in _UNCHECKED:
-            self.compared.append(Compare(_field(name), "==", cast("Value", found)))
-        return found
+    def _compare(self, name: str, value: object, path: _Path) -> None:
+        """Check a value that a field is compared with."""
+        self._ask(name, "whole" if isinstance(value, dict | list) else "value")
+        _without_operators(value, path)
+        if type(value).__name__ not in _UNCHECKED:
+            self.compared.append(Compare(_field(name), "==", cast("Value", value)))
 
-    def _condition(self, name: str, value: object, path: _Path, depth: int) -> object:
-        if isinstance(value, Mapping) and _has_operators(value, path):
-            return self._operators(name, value, path, depth)
-        if _is_pattern(value):
-            return self._regex(name, value, "", path)
-        self._ask(name, "whole" if isinstance(value, Mapping | list | tuple) else "value")
-        return self._compared(name, value, path, depth)
-
-    def _operators(
-        self, name: str, operators: Mapping[str, object], path: _Path, depth: int
-    ) -> Filter:
-        found: Filter = {}
-        for key, value in self._items(operators, path, depth):
-            inner = (*path, key)
-            if key == "$not":
-                found[key] = self._not(name, value, inner, depth)
-            elif key == "$regex":
-                found |= self._regex(name, value, operators.get("$options", ""), inner)
+    def _operators(self, name: str, operators: Filter, path: _Path) -> None:
+        for key, value in operators.items():
+            place = (*path, key)
+            if key == "$regex" or (key == "$not" and isinstance(value, Regex)):
+                self._pattern(name, value, operators.get("$options", ""), place)
+            elif key == "$not":
+                inner = _mapping(value, place)
+                if not inner or not all(name.startswith("$") for name in inner):
+                    raise _refused(place, "needs operators")
+                self._operators(name, inner, place)
+            elif key == "$elemMatch":
+                self._element(name, value, place)
+            elif key in _LISTS:
+                self._members(name, value, place)
+            elif key in _LITERAL:
+                self._compare(name, value, place)
+            elif key in _PLAIN:
+                self._ask(name, "exists" if key == "$exists" else "value")
+                _without_operators(value, place)
             elif key != "$options" or "$regex" not in operators:
-                found[key] = self._operand(name, key, value, inner, depth)
-        return found
+                raise _refused(place, "the operator is not allowed here")
 
-    def _operand(self, name: str, operator: str, value: object, path: _Path, depth: int) -> object:
-        """The operand of an operator, in plain Python values."""
-        if operator == "$elemMatch":
-            return self._element(name, value, path, depth)
-        if operator in _LISTS:
-            return self._members(name, value, path, depth)
-        if operator not in _LITERAL | _PLAIN:
-            raise _refused(path, "the operator is not allowed here")
-        is_nested = isinstance(value, Mapping | list | tuple) and operator in _LITERAL
-        self._ask(name, "exists" if operator == "$exists" else "whole" if is_nested else "value")
-        if operator in _PLAIN:
-            return self._literal(value, path, depth + 1)
-        return self._compared(name, value, path, depth + 1)
-
-    def _members(self, name: str, value: object, path: _Path, depth: int) -> list[object]:
-        if not isinstance(value, list | tuple):
+    def _members(self, name: str, value: object, path: _Path) -> None:
+        if not isinstance(value, list):
             raise _refused(path, "needs a list")
-        is_nested = any(isinstance(item, Mapping | list | tuple) for item in value)
-        self._ask(name, "whole" if is_nested else "value")
-        members: list[object] = []
+        self._ask(name, "value")
         for item in value:
-            if path[-1] == "$all" and isinstance(item, Mapping) and set(item) == {"$elemMatch"}:
-                inner = (*path, "$elemMatch")
-                element = self._element(name, item["$elemMatch"], inner, depth + 1)
-                members.append({"$elemMatch": element})
+            if path[-1] == "$all" and isinstance(item, dict) and set(item) == {"$elemMatch"}:
+                self._element(name, item["$elemMatch"], (*path, "$elemMatch"))
             else:
-                members.append(self._compared(name, item, path, depth + 1))
-        return members
+                self._compare(name, item, path)
 
-    def _not(self, name: str, value: object, path: _Path, depth: int) -> Filter:
-        if _is_pattern(value):
-            return self._regex(name, value, "", path)
-        inner = _mapping(value, path)
-        if not inner or not all(isinstance(key, str) and key[:1] == "$" for key in inner):
-            raise _refused(path, "needs operators")
-        return self._operators(name, inner, path, depth + 1)
-
-    def _element(self, name: str, value: object, path: _Path, depth: int) -> Filter:
-        """The condition on an element of an array."""
+    def _element(self, name: str, value: object, path: _Path) -> None:
+        """Check the condition on an element of an array."""
         self._ask(name, "value")
         inner = _mapping(value, path)
-        keys = [key for key in inner if isinstance(key, str) and key.startswith("$")]
-        if keys and not set(keys) & _LOGICAL and "$expr" not in keys:
-            return self._operators(name, inner, path, depth + 1)
-        return self.query(inner, path, depth + 1, f"{name}.")
+        keys = {key for key in inner if key.startswith("$")}
+        if keys and not keys & {*_LOGICAL, "$expr"}:
+            self._operators(name, inner, path)
+        else:
+            self.query(inner, path, f"{name}.")
 
-    def _regex(self, name: str, value: object, options: object, path: _Path) -> Filter:
+    def _pattern(self, name: str, value: object, options: object, path: _Path) -> None:
         self._ask(name, "value")
-        if _is_pattern(value):
+        if isinstance(value, Regex):
             if options:
                 raise _refused(path, "has options twice")
-            flags = getattr(value, "flags", 0)
-            table = {re.IGNORECASE: "i", re.MULTILINE: "m", re.DOTALL: "s"}
-            if not isinstance(flags, int) or flags & ~(sum(table) | re.UNICODE):
-                raise _refused(path, "may have the flags i, m and s only")
-            options = "".join(letter for flag, letter in table.items() if flags & flag)
-            value = getattr(value, "pattern", None)
+            options = "".join(_FLAGS.get(flag, "x") for flag in re.RegexFlag(value.flags))
+            value = value.pattern
         if not isinstance(value, str):
             raise _refused(path, "needs a string")
         if not isinstance(options, str) or not set(options) <= _OPTIONS:
             raise _refused(path, "may have the options i, m and s only")
-        self._count(path, len(value))
-        flags = "".join(sorted(set(options)))
         try:
-            compile_regex(f"(?{flags}){value}" if flags else str(value))
+            compile_regex(f"(?{options}){value}" if options else value)
         except RegexError as error:
             raise _refused(path, f"the pattern is refused: {error}") from None
-        self.compared.append(Match(_field(name), str(value), negated=False))
-        found: Filter = {"$regex": str(value)}
-        return {**found, "$options": flags} if flags else found
+        self.compared.append(Match(_field(name), value, negated=False))
 
-    def _expression(self, value: object, path: _Path, depth: int) -> object:
-        """An aggregation expression."""
-        if isinstance(value, list | tuple):
-            self._enter(path, depth)
-            return [self._expression(item, path, depth + 1) for item in value]
-        if not isinstance(value, Mapping):
-            if isinstance(value, str) and value.startswith("$"):
-                self._ask_in_expression(value, path)
-            return self._literal(value, path, depth)
-        items = self._items(value, path, depth)
-        operators = [key for key, _ in items if key.startswith("$")]
-        if operators and len(items) != 1:
-            raise _refused(path, "an expression has one operator")
-        checked: dict[str, object] = {}
-        for key, inner in items:
-            place = (*path, key)
-            if key.startswith("$") and (
-                key not in _EXPRESSIONS or (key == "$filter" and key in path)
-            ):
-                raise _refused(place, "the operator is not allowed here")
-            check = self._literal if key == "$literal" else self._expression
-            checked[key] = check(inner, place, depth + 1)
-        return checked
+    def _expression(self, value: object, path: _Path) -> None:
+        """Check an aggregation expression."""
+        if isinstance(value, list):
+            for item in value:
+                self._expression(item, path)
+        elif isinstance(value, dict):
+            if len(value) != 1 and any(key.startswith("$") for key in value):
+                raise _refused(path, "an expression has one operator")
+            for key, inner in value.items():
+                place = (*path, key)
+                is_known = key in _EXPRESSIONS and (key != "$filter" or key not in path)
+                if key.startswith("$") and not is_known:
+                    raise _refused(place, "the operator is not allowed here")
+                if key == "$literal":
+                    _without_operators(inner, place)
+                else:
+                    self._expression(inner, place)
+        elif isinstance(value, str) and value.startswith("$"):
+            name = value[1:]
+            if name.startswith("$"):
+                variable, _, name = name[1:].partition(".")
+                if variable not in {"ROOT", "CURRENT"}:
+                    return  # of a path that is noted already
+                if not name:
+                    raise _refused(path, f"{value} is the whole document; name a field")
+            self._ask(name, "whole")
 
-    def _ask_in_expression(self, text: str, path: _Path) -> None:
-        name = text[1:]
-        if name.startswith("$"):
-            variable, _, name = name[1:].partition(".")
-            if variable not in {"ROOT", "CURRENT"}:
-                return  # of a path that is noted already
-            if not name:
-                raise _refused(path, f"{text} is the whole document; name a field")
-        self._ask(name, "whole")
 
-    def _literal(self, value: object, path: _Path, depth: int) -> object:
-        """A value to compare with; no operator has a meaning in it."""
-        if isinstance(value, Mapping):
-            checked: dict[str, object] = {}
-            for key, item in self._items(value, path, depth):
-                if key.startswith("$"):
-                    raise _refused((*path, key), "the operator is not allowed here")
-                checked[key] = self._literal(item, (*path, key), depth + 1)
-            return checked
-        if isinstance(value, list | tuple):
-            self._enter(path, depth)
-            return [self._literal(item, path, depth + 1) for item in value]
-        self._count(path, len(value) if isinstance(value, str | bytes) else 0)
-        if isinstance(value, int) and not LOW <= value <= HIGH:
-            raise _refused(path, f"{value} does not fit into 64 bits; write it as a float")
-        return _scalar(value, path)
-
-    def _items(
-        self, value: Mapping[str, object], path: _Path, depth: int
-    ) -> list[tuple[str, object]]:
-        self._enter(path, depth)
-        items: list[tuple[str, object]] = []
+def _without_operators(value: object, path: _Path) -> None:
+    """Refuse operators and patterns in a value to compare with."""
+    if isinstance(value, Regex):
+        raise _refused(path, "a pattern is not allowed here")
+    if isinstance(value, list):
+        for item in value:
+            _without_operators(item, path)
+    elif isinstance(value, dict):
         for key, item in value.items():
-            if not isinstance(key, str):
-                raise _refused(path, f"has a key that is no string: {key!r}")
-            try:
-                plain = str(key)
-                plain.encode()
-            except ValueError:
-                raise _refused(path, "has a name that is not valid Unicode") from None
-            if "\0" in plain:
-                raise _refused(path, "has a name with a NUL character")
-            self._count(path, len(plain))
-            items.append((plain, item))
-        return items
-
-    def _enter(self, path: _Path, depth: int) -> None:
-        if depth > MAX_DEPTH:
-            raise _refused(path[:3], f"is nested deeper than {MAX_DEPTH}")
-
-    def _count(self, path: _Path, characters: int) -> None:
-        self._nodes += 1
-        self._characters += characters
-        if self._nodes > MAX_NODES or self._characters > MAX_CHARACTERS:
-            raise _refused(path[:3], "the filter is too large")
+            if key.startswith("$"):
+                raise _refused((*path, key), "the operator is not allowed here")
+            _without_operators(item, (*path, key))
 
 
-def _scalar(value: object, path: _Path) -> object:
-    """A value as Python's own, if BSON can hold it."""
-    kind = type(value)
-    try:
-        if hasattr(value, "to_pydatetime"):  # pandas.Timestamp
-            value = value.to_pydatetime()
-        elif kind.__module__ == "numpy" and getattr(value, "shape", None) == ():
-            value = value.item()  # type: ignore[attr-defined]
-        if _is_bson(value) and kind.__name__ in _BSON_VALUES:
-            return value
-        if isinstance(value, str) and not _is_bson(value):  # bson.code.Code is a string
-            value.encode()
-            return str(value)
-        if isinstance(value, float):
-            return float(value)
-        is_date = isinstance(value, datetime) and not math.isnan(value.timestamp())
-        if is_date or value is None or isinstance(value, bool | int | bytes):
-            return value
-    except UnicodeError:
-        raise _refused(path, "has a text that is not valid Unicode") from None
-    except (OverflowError, ValueError, TypeError) as error:
-        raise _refused(path, str(error)) from None
-    raise _refused(path, f"a value of type {kind.__name__} is not allowed")
-
-
-def _is_bson(value: object) -> bool:
-    return type(value).__module__.split(".")[0] == "bson"
-
-
-def _has_operators(value: Mapping[str, object], path: _Path) -> bool:
+def _has_operators(value: Filter, path: _Path) -> bool:
     """True if a mapping has operators as keys, not names."""
-    marked = [isinstance(key, str) and key.startswith("$") for key in value]
+    marked = [key.startswith("$") for key in value]
     if any(marked) and not all(marked):
         raise _refused(path, "mixes operators and names")
     return any(marked)
 
 
-def _is_pattern(value: object) -> bool:
-    return isinstance(value, re.Pattern) or (_is_bson(value) and type(value).__name__ == "Regex")
-
-
-def _mapping(value: object, path: _Path) -> Mapping[str, object]:
-    if not isinstance(value, Mapping):
+def _mapping(value: object, path: _Path) -> Filter:
+    if not isinstance(value, dict):
         raise _refused(path, "needs a mapping")
     return value
 

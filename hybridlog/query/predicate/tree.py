@@ -164,18 +164,18 @@ class MongoFilter(_Node):
     """A MongoDB filter, at the root of a predicate or in an `And` there.
 
     Attributes:
-        filter: The filter, as returned by `frozen`.
+        filter: The filter in BSON.
         paths: The paths that it asks for, and how.
     """
 
-    filter: object
+    filter: bytes
     paths: tuple[tuple[str, Reach], ...]
 
     def to_filter(self) -> dict[str, object]:
         """The filter as a new dictionary."""
-        found = thawed(self.filter)
-        assert isinstance(found, dict)
-        return found
+        import bson
+
+        return bson.decode(self.filter)
 
     @property
     def asks_fields(self) -> bool:
@@ -260,25 +260,6 @@ def nodes(node: Node) -> Iterator[Node]:
             yield from nodes(item)
         case _:
             pass
-
-
-def frozen(value: object) -> object:
-    """A value of a MongoDB filter, with tuples for mappings and lists."""
-    if isinstance(value, Mapping):
-        return "{}", tuple((name, frozen(inner)) for name, inner in value.items())
-    if isinstance(value, list):
-        return "[]", tuple(map(frozen, value))
-    return value
-
-
-def thawed(value: object) -> object:
-    """A value of a MongoDB filter from its frozen form."""
-    match value:
-        case ("{}", tuple(items)):
-            return {name: thawed(inner) for name, inner in items}
-        case ("[]", tuple(items)):
-            return [thawed(inner) for inner in items]
-    return value
 
 
 def spelled(node: Node) -> str:

@@ -37,43 +37,35 @@ def new_socket(directory: Path, name: str) -> Path:
     Raises:
         StoreError: The path is too long, or the directory is not private to this user.
     """
-    return _private(socket_base() / f"{_part(directory)}-{secrets.token_hex(4)}", name)
+    return _private(socket_base() / f"{_part(directory)}-{secrets.token_hex(4)}" / name)
 
 
-def is_socket_of(path: str, directory: Path) -> bool:
-    """True if `new_socket` may have returned a path for a directory."""
-    place = Path(path)
-    own = place.parent
-    return own.parent == socket_base() and own.name.startswith(f"{_part(directory)}-")
+def lasting_socket(file: int) -> Path:
+    """Path of a socket that goes with an open file, the same in every process.
 
-
-def link_of(path: Path, directory: Path) -> Path:
-    """A path that always leads to the present socket of a directory: a link to it.
+    Args:
+        file: Descriptor of the file.
 
     Raises:
-        OSError: The link cannot be made.
+        StoreError: As for `new_socket`.
     """
-    link = socket_base() / f"{_part(directory)}.sock"
-    if not link.is_symlink() or link.readlink() != path:
-        fresh = link.with_suffix(f".{secrets.token_hex(4)}")
-        fresh.symlink_to(path)
-        fresh.rename(link)
-    return link
+    about = os.fstat(file)
+    return _private(socket_base() / f"{about.st_dev:x}-{about.st_ino:x}.sock")
 
 
 def _part(directory: Path) -> str:
     return hashlib.sha256(os.fsencode(directory)).hexdigest()[:8]
 
 
-def _private(directory: Path, name: str) -> Path:
-    """Create a directory that only this user can open, and its parent."""
-    own = directory.parent
-    if len(os.fsencode(directory / name)) > MAX_SOCKET_PATH:
+def _private(socket: Path) -> Path:
+    """Create the directories of a socket, which only this user can open."""
+    base = socket_base()
+    if len(os.fsencode(socket)) > MAX_SOCKET_PATH:
         raise StoreError(
-            f"{own.parent} is too long a path for a socket: set HYBRIDLOG_RUNTIME_DIR to a short "
+            f"{base.parent} is too long a path for a socket: set HYBRIDLOG_RUNTIME_DIR to a short "
             f"one."
         )
-    for path in (own, directory):
+    for path in dict.fromkeys((base, socket.parent)):
         try:
             path.mkdir(mode=0o700)
         except FileExistsError:
@@ -88,7 +80,7 @@ def _private(directory: Path, name: str) -> Path:
                 f"{path} must be a directory that only this user can open, and is "
                 f"not. Remove it, or set HYBRIDLOG_RUNTIME_DIR to another directory."
             )
-    return directory / name
+    return socket
 
 
 def is_private(directory: Path) -> bool:

@@ -5,22 +5,19 @@ both directions, thousands at a time, and never become Python objects. pymongo i
 on first use, since its import takes longer than most commands.
 
 Every command may be repeated: documents are inserted under their own `_id`, and other
-changes have the same result twice. So a command is sent again when its connection breaks,
-and a long answer goes on behind the last document received. In a replica set, writes are
-acknowledged by a majority of the members, whatever the URI says: an acknowledged write then
-outlives the loss of the primary. Reads go to the primary.
+changes have the same result twice. So a command is sent again when its connection breaks.
+Writes are acknowledged by a majority of a replica set's members, and reads see only what such
+a majority has, whatever the URI says: what was read outlives the loss of the primary.
 """
 
 from __future__ import annotations
 
 import contextlib
 import functools
-import operator
 import re
-import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 import numpy as np
 
@@ -37,9 +34,7 @@ from hybridlog_storage.settings import LOGIN_CURE
 if TYPE_CHECKING:
     from numpy.typing import NDArray
     from pymongo import MongoClient
-    from pymongo.collection import Collection
     from pymongo.database import Database as PymongoDatabase
-    from pymongo.write_concern import WriteConcern
 
     from hybridlog_storage.messages import Buffer
 
@@ -47,9 +42,6 @@ Document = dict[str, Any]
 """A decoded document with values of the `bson` package."""
 Sort = Sequence[tuple[str, int]]
 """Field paths with 1 (ascending) or -1 (descending)."""
-ReadConcern = Literal["local", "majority"]
-"""What a read of a replica set may see: everything that the primary has, or only what cannot be
-rolled back. A single server knows no difference."""
 _T = TypeVar("_T")
 
 BATCH_BYTES = 16 << 20
@@ -60,9 +52,7 @@ OLDEST_SERVER = (5, 3)
 """The first MongoDB with clustered collections."""
 
 _MAX_QUESTIONS_PER_COMMAND = 100
-"""Most questions in one command."""
 _MAX_COMMAND_BYTES = 4 << 20
-
 _GONE_S = 1.0  # seconds without an answer after which the server counts as ended
 _TRIES = 3  # for a command whose connection breaks
 _ELECTION_S = 20.0  # seconds for a replica set to elect a primary; it takes about 12
@@ -78,13 +68,7 @@ _WRONG_QUESTION = frozenset(
         9,  # FailedToParse
         14,  # TypeMismatch
         15,  # Overflow: nested too deep
-        27,  # IndexNotFound: $text, $near
         31,  # PathNotViable
-        52,  # DollarPrefixedFieldName
-        56,  # EmptyFieldName
-        57,  # DottedFieldName
-        72,  # InvalidOptions
-        139,  # JSInterpreterFailure
         168,  # InvalidPipelineOperator
         241,  # ConversionFailure
     }
@@ -127,11 +111,7 @@ class Database:
     def __init__(self, client: MongoClient[Document], name: str, address: str) -> None:
         self.is_lost = False
         self._client = client
-        self._is_replicated = _is_replicated(client)
-        self._write_concern = _write_concern(client, is_replicated=self._is_replicated)
-        self._database: PymongoDatabase[Document] = client.get_database(
-            name, write_concern=self._write_concern
-        )
+        self._database: PymongoDatabase[Document] = client[name]
         self._address = address
 
     @classmethod
@@ -174,24 +154,16 @@ class Database:
                 f"{name!r} cannot be the name of hybridlog's database: use up to 38 letters, "
                 f"digits, - and _, and none of {', '.join(sorted(_RESERVED_NAMES))}."
             )
-        given = {option.lower() for option in parsed["options"]}
-        # Members other than the primary may lack documents that the index is said to have.
-        options: dict[str, object] = {"appname": "hybridlog", "readPreference": "primary"}
-        if "serverselectiontimeoutms" not in given:
-            is_set = len(parsed["nodelist"]) > 1 or "replicaset" in given or parsed["fqdn"]
-            wait_s = timeout_s + (_ELECTION_S if is_set else 0)
-            options["serverSelectionTimeoutMS"] = int(wait_s * 1000)
-        if "connecttimeoutms" not in given:
-            options["connectTimeoutMS"] = int(timeout_s * 1000)
+        if parsed["options"].get("w") == 0:
+            raise UsageError(f"{address}: w=0 would lose errors; leave it out.")
         try:
             with _mapped(address):
-                client: MongoClient[Document] = MongoClient(uri, **options)  # type: ignore[arg-type]
+                client: MongoClient[Document] = MongoClient(uri, **_options(parsed, timeout_s))  # type: ignore[arg-type]
         except OSError as error:
             raise _unusable_file(address, error) from error
+        self = cls(client, name, address)
         try:
-            if not client.write_concern.acknowledged:
-                raise UsageError(f"{address}: w=0 would lose errors; leave it out.")
-            version = _retried(client, address, client.server_info)
+            version = self._again(client.server_info)
             if tuple(version["versionArray"][:2]) < OLDEST_SERVER:
                 raise DatabaseError(
                     f"MongoDB at {address} has version {version['version']}; hybridlog needs "
@@ -200,7 +172,7 @@ class Database:
         except BaseException:
             client.close()
             raise
-        return cls(client, name, address)
+        return self
 
     @property
     def name(self) -> str:
@@ -239,14 +211,18 @@ class Database:
 
     def _again(self, command: Callable[[], _T], *, question: bool = False) -> _T:
         """Run a command, again if its connection breaks."""
-        with self._noting():
-            return _retried(self._client, self._address, command, question=question)
+        from pymongo.errors import AutoReconnect, CursorNotFound, ServerSelectionTimeoutError
 
-    @contextlib.contextmanager
-    def _noting(self) -> Iterator[None]:
-        """Note a lost connection."""
+        left = _TRIES
         try:
-            yield
+            with _mapped(self._address, question=question):
+                while True:
+                    try:
+                        return command()
+                    except (AutoReconnect, CursorNotFound) as error:
+                        left -= 1
+                        if not left or isinstance(error, ServerSelectionTimeoutError):
+                            raise
         except ConnectionLostError:
             self.is_lost = True
             raise
@@ -289,14 +265,7 @@ class Database:
 
         self._again(create)
 
-    def insert_raw(
-        self,
-        collection: str,
-        documents: Buffer,
-        count: int,
-        *,
-        lengths: NDArray[np.int64] | None = None,
-    ) -> int:
+    def insert_raw(self, collection: str, documents: Buffer, lengths: NDArray[np.int64]) -> int:
         """Insert documents as they are.
 
         An existing `_id` is skipped: documents are a pure function of the segment, so the
@@ -305,20 +274,20 @@ class Database:
 
         Args:
             collection: The target, created by `ensure_collection`.
-            documents: `count` BSON documents, one after the other.
-            count: Their number.
-            lengths: int64[count], bytes of each document; avoids walking over them.
+            documents: BSON documents, one after the other.
+            lengths: int64[count], bytes of each.
 
         Returns:
             Number of new documents; fewer after a repeated command.
 
         Raises:
-            ValueError: `documents` does not hold `count` documents of the given lengths.
             DiskFullError: The server has no space left.
             DatabaseError: It refuses a document, or does not answer.
         """
         whole = memoryview(documents).cast("B")
-        ends = _document_ends(whole, count, lengths)
+        ends = np.concatenate([[0], np.cumsum(lengths)])
+        if ends[-1] != len(whole):
+            raise ValueError(f"the documents end at byte {ends[-1]} of {len(whole)}")
         inserted = 0
         for first, last in _batches(ends):
             start, end = int(ends[first]), int(ends[last])
@@ -335,9 +304,8 @@ class Database:
             "insert": collection,
             "documents": [_pass_through(documents)],
             "ordered": False,
+            "writeConcern": self._database.write_concern.document,
         }
-        if not self._write_concern.is_server_default:
-            command["writeConcern"] = self._write_concern.document
 
         def insert() -> Document:
             from pymongo.errors import NotPrimaryError
@@ -357,126 +325,73 @@ class Database:
             raise _refused(self._address, failed.get("code", 0), str(failed.get("errmsg", "")))
         return int(reply["n"])
 
-    def find_raw(
+    def each(
+        self,
+        questions: Sequence[tuple[str, Mapping[str, object]]],
+        stage: Callable[[int], Mapping[str, object]],
+    ) -> Iterator[bytes]:
+        """Concatenated BSON documents that many questions find, in few round trips.
+
+        Their pipelines are joined, since MongoDB reads a whole clustered collection for `$or` of
+        ranges.
+
+        Args:
+            questions: Collection and filter of each, the latter with a range of `_id`. What
+                about a hundred of them find must fit into memory.
+            stage: Returns the last stage of a pipeline, by the number of the question.
+        """
+        from bson import encode
+
+        with _mapped(self._address, question=True):
+            size = max((len(encode(query)) for _, query in questions), default=1)
+        step = max(1, min(_MAX_QUESTIONS_PER_COMMAND, _MAX_COMMAND_BYTES // size))
+        for first in range(0, len(questions), step):
+            (collection, pipeline), *others = [
+                # With the order, MongoDB considers the range of `_id` beside another index.
+                (where, [{"$match": dict(query)}, {"$sort": {"_id": 1}}, stage(place)])
+                for place, (where, query) in enumerate(questions[first : first + step], first)
+            ]
+            for where, stages in others:
+                pipeline.append({"$unionWith": {"coll": where, "pipeline": stages}})
+            of = self._database[collection]
+
+            def ask(of: Any = of, pipeline: Any = pipeline) -> bytes:
+                # As many as fit 16 MiB; by default the server's first batch has 101 documents.
+                return b"".join(
+                    of.aggregate_raw_batches(pipeline, batchSize=1 << 30, allowDiskUse=True)
+                )
+
+            yield self._again(ask, question=True)
+
+    def find(
         self,
         collection: str,
         filter: Mapping[str, object] | None = None,  # noqa: A002 - MongoDB's word
         projection: Mapping[str, object] | None = None,
         *,
-        sort: Sort | None = None,
-    ) -> Iterator[bytes]:
-        """Find documents as bytes: each item is several concatenated BSON documents.
+        limit: int = 0,
+    ) -> list[Document]:
+        """Find documents; for small answers.
 
         Args:
             collection: The collection; one that does not exist is empty.
             filter: MongoDB's filter document.
             projection: MongoDB's projection document.
-            sort: Order; None for the order of the collection, which is that of `_id`.
+            limit: Most documents; 0 for all.
         """
-        of, shape = self._collection(collection), None if projection is None else dict(projection)
-
-        def ask(query: Document) -> Any:
-            return of.find_raw_batches(
-                query,
-                shape,
-                sort=sort or None,
-                # As many as fit 16 MiB; by default the server's first batch has 101 documents.
-                batch_size=1 << 30,
-            )
-
-        is_keyed = projection is None or projection.get("_id", 1)
-        order = _key_order(sort) if is_keyed else 0
-        return self._found(ask, dict(filter or {}), order, _last_key)
-
-    def find(
-        self,
-        collection: str,
-        filter: Mapping[str, object] | None = None,  # noqa: A002
-        projection: Mapping[str, object] | None = None,
-        *,
-        sort: Sort | None = None,
-        limit: int = 0,
-        batch_size: int = 0,
-        read: ReadConcern = "local",
-    ) -> Iterator[Document]:
-        """Find documents one by one; for small answers.
-
-        The arguments are those of `find_raw`, and `read` for what the answer may hold; `limit`
-        0 is for all documents.
-        """
-        of = self._collection(collection, read)
-
-        def ask(query: Document) -> Any:
-            return of.find(
-                query,
-                None if projection is None else dict(projection),
-                sort=sort or None,
-                limit=limit,
-                batch_size=batch_size,
-            )
-
-        is_keyed = not limit and (projection is None or projection.get("_id", 1))
-        order = _key_order(sort) if is_keyed else 0
-        return self._found(ask, dict(filter or {}), order, operator.itemgetter("_id"))
-
-    def _found(
-        self,
-        ask: Callable[[Document], Any],
-        query: Document,
-        order: int,
-        key: Callable[[Any], object],
-    ) -> Iterator[Any]:
-        """Items of a cursor; goes on behind the last one if the connection breaks.
-
-        Args:
-            ask: Makes the cursor for a filter.
-            query: The filter.
-            order: 1 or -1 if the items are in the order of `_id`; 0 to go on only while there
-                is no item yet.
-            key: The last `_id` of an item.
-        """
-        last: Any = None
-        tries = _TRIES
-        with self._noting(), _mapped(self._address, question=True):
-            while True:
-                rest = query
-                if last is not None:
-                    rest = {"$and": [query, {"_id": {"$gt" if order > 0 else "$lt": key(last)}}]}
-                try:
-                    with _closing(ask(rest)) as cursor:
-                        for item in cursor:
-                            yield item
-                            last, tries = item, _TRIES
-                            if order and self._has_moved(cursor.address):
-                                break
-                        else:
-                            return
-                except _broken() as error:
-                    tries -= 1
-                    if not tries or (last is not None and not order):
-                        raise
-                    _wait(self._client, error)
-
-    def _has_moved(self, address: tuple[str, int] | None) -> bool:
-        """True if a member of a replica set is no longer its primary.
-
-        A cursor there would wait for it, as long as for another primary.
-        """
-        is_set = self._client.topology_description.topology_type_name.startswith("ReplicaSet")
-        return is_set and self._client.primary != address
+        of, shape = self._database[collection], None if projection is None else dict(projection)
+        return self._again(
+            lambda: list(of.find(dict(filter or {}), shape, limit=limit)), question=True
+        )
 
     def find_one(
         self,
         collection: str,
         filter: Mapping[str, object] | None = None,  # noqa: A002
         projection: Mapping[str, object] | None = None,
-        *,
-        sort: Sort | None = None,
-        read: ReadConcern = "local",
     ) -> Document | None:
         """Find the first document, None if no document matches. Arguments as in `find`."""
-        found = self.find(collection, filter, projection, sort=sort, limit=1, read=read)
-        return next(found, None)
+        return next(iter(self.find(collection, filter, projection, limit=1)), None)
 
     def count(
         self,
@@ -492,153 +407,51 @@ class Database:
             collection: The collection; one that does not exist is empty.
             filter: MongoDB's filter document.
         """
-        of = self._collection(collection)
+        of = self._database[collection]
+        if not filter:
+            return self._again(of.estimated_document_count)
+        return self._again(lambda: of.count_documents(dict(filter)), question=True)
 
-        def ask() -> int:
-            if not filter:
-                return of.estimated_document_count()
-            # A sharded cluster would count documents twice while it moves them.
-            if self._client.is_mongos:
-                return of.count_documents(dict(filter))
-            # Costs less than a pipeline, as which the driver would send it.
-            reply = self._database.command("count", of.name, query=dict(filter))
-            return int(reply["n"])
+    def count_each(
+        self, questions: Sequence[tuple[str, Mapping[str, object]]]
+    ) -> list[list[tuple[Any, int]]]:
+        """For each question, the recordings of what it finds, and how many documents each has."""
+        from bson import decode_all
 
-        return self._again(ask, question=True)
+        def count(place: int) -> Document:
+            by = {"place": {"$literal": place}, "rec": "$_meta.rec"}
+            return {"$group": {"_id": by, "n": {"$sum": 1}}}
 
-    def count_each(self, questions: Sequence[tuple[str, Mapping[str, object]]]) -> list[int]:
-        """Count the documents that match each of many questions, in few round trips.
-
-        Meant for questions with a range of `_id`: MongoDB tries for each whether that range
-        or another index is faster.
-        """
-        numbers = [0] * len(questions)
-        for place, number in self._grouped(questions, lambda place: {"$literal": place}):
-            numbers[place] = number
+        numbers: list[list[tuple[Any, int]]] = [[] for _ in questions]
+        for raw in self.each(questions, count):
+            for found in decode_all(raw):
+                numbers[found["_id"]["place"]].append((found["_id"].get("rec"), found["n"]))
         return numbers
-
-    def count_by(self, collections: Sequence[str], field: str) -> list[list[tuple[Any, int]]]:
-        """The values of a field in each of some collections, and how many documents have each."""
-        numbers: list[list[tuple[Any, int]]] = [[] for _ in collections]
-        questions: list[tuple[str, Document]] = [(name, {}) for name in collections]
-        for key, number in self._grouped(
-            questions, lambda place: {"place": {"$literal": place}, "value": f"${field}"}
-        ):
-            numbers[key["place"]].append((key.get("value"), number))
-        return numbers
-
-    def _grouped(
-        self,
-        questions: Sequence[tuple[str, Mapping[str, object]]],
-        key: Callable[[int], object],
-    ) -> Iterator[tuple[Any, int]]:
-        """Numbers of documents by a key, which may differ between questions."""
-        for first, part in _batched(questions):
-            pipelines = []
-            for place, (collection, query) in enumerate(part, first):
-                count: Document = {"$group": {"_id": key(place), "n": {"$sum": 1}}}
-                pipelines.append((collection, [{"$match": dict(query)}, _IN_ORDER, count]))
-            collection, pipeline = _union(pipelines)
-            for found in self.aggregate(collection, pipeline):
-                yield found["_id"], int(found["n"])
-
-    def find_each(
-        self,
-        questions: Sequence[tuple[str, Mapping[str, object]]],
-        projection: Mapping[str, object] | None = None,
-    ) -> Iterator[bytes]:
-        """Find the documents of many questions, one after the other, as in `find_raw`.
-
-        Args:
-            questions: Collection and filter of each, the latter with a range of `_id`. The
-                documents that about a hundred of them find must fit into memory.
-            projection: MongoDB's projection document; names the fields to return.
-        """
-        shape = [] if projection is None else [{"$project": dict(projection)}]
-        for _, part in _batched(questions):
-            if len(part) == 1:  # one command; a pipeline takes two
-                yield from self.find_raw(*part[0], projection, sort=[("_id", 1)])
-                continue
-            parts = [(where, [{"$match": dict(query)}, _IN_ORDER, *shape]) for where, query in part]
-            collection, pipeline = _union(parts)
-            of = self._collection(collection)
-
-            def ask(of: Any = of, pipeline: list[Document] = pipeline) -> list[bytes]:
-                found = of.aggregate_raw_batches(pipeline, batchSize=1 << 30, allowDiskUse=True)
-                with _closing(found) as cursor:
-                    return [*cursor]
-
-            yield from self._again(ask, question=True)
-
-    def aggregate(
-        self,
-        collection: str,
-        pipeline: Sequence[Mapping[str, object]],
-    ) -> Iterator[Document]:
-        """Run an aggregation pipeline that only reads.
-
-        Args:
-            collection: The collection; one that does not exist is empty.
-            pipeline: The stages.
-        """
-        of = self._collection(collection)
-        stages = [dict(stage) for stage in pipeline]
-        yield from self._found(lambda _: of.aggregate(stages, allowDiskUse=True), {}, 0, dict)
 
     def replace(
         self,
         collection: str,
         filter: Mapping[str, object],  # noqa: A002
         document: Mapping[str, object],
-        *,
-        upsert: bool = True,
     ) -> None:
         """Replace the first matching document, or insert it if none matches."""
-        of = self._collection(collection)
-        self._again(lambda: of.replace_one(dict(filter), dict(document), upsert=upsert))
+        of = self._database[collection]
+        self._again(lambda: of.replace_one(dict(filter), dict(document), upsert=True))
 
     def update(
         self,
         collection: str,
         filter: Mapping[str, object],  # noqa: A002
         change: Mapping[str, object],
-        *,
-        upsert: bool = False,
-    ) -> int:
-        """Apply update operators to every matching document; return their number.
-
-        Args:
-            collection: The collection.
-            filter: MongoDB's filter document.
-            change: The operators. They may be applied twice, so what they count is only a sign
-                that something has changed.
-            upsert: Whether to insert a document if none matches.
-        """
-        of = self._collection(collection)
-        result = self._again(lambda: of.update_many(dict(filter), dict(change), upsert=upsert))
-        return result.matched_count
+    ) -> None:
+        """Apply update operators, which may be applied twice, to every matching document."""
+        of = self._database[collection]
+        self._again(lambda: of.update_many(dict(filter), dict(change)))
 
     def delete(self, collection: str, filter: Mapping[str, object]) -> int:  # noqa: A002
         """Delete every matching document; return their number. `{}` deletes all."""
-        of = self._collection(collection)
+        of = self._database[collection]
         return self._again(lambda: of.delete_many(dict(filter))).deleted_count
-
-    def checkpoint(self) -> None:
-        """Have the server write what is only in its journal, which it then shortens.
-
-        A server that refuses it, such as a shared one with users, does it by itself in time.
-        """
-        from pymongo.errors import OperationFailure
-
-        def ask() -> None:
-            with contextlib.suppress(OperationFailure):
-                self._client.admin.command("fsync")
-
-        self._again(ask)
-
-    def drop(self, collection: str) -> None:
-        """Remove a collection if it exists."""
-        self._again(self._collection(collection).drop)
 
     def drop_all(self) -> None:
         """Remove the whole database."""
@@ -651,12 +464,12 @@ class Database:
 
     def create_index(self, collection: str, keys: Sort) -> None:
         """Create an index on fields unless it exists."""
-        of = self._collection(collection)
+        of = self._database[collection]
         self._again(lambda: of.create_index(list(keys)))
 
     def indexes(self, collection: str) -> list[tuple[tuple[str, int], ...]]:
         """Fields of all indexes but the one on `_id`, each with 1 or -1, sorted."""
-        of = self._collection(collection)
+        of = self._database[collection]
         found = [
             tuple((str(field), int(order)) for field, order in about["key"].items())
             for about in self._again(lambda: list(of.list_indexes()))
@@ -667,162 +480,40 @@ class Database:
         """Drop the index with these keys; return whether it existed."""
         if tuple(keys) not in self.indexes(collection):
             return False
-        of = self._collection(collection)
+        of = self._database[collection]
         self._again(lambda: of.drop_index(list(keys)))
         return True
 
     def stats(self, collection: str) -> CollectionStats:
         """Size of a collection."""
-        from pymongo.errors import OperationFailure
-
-        pipeline: list[Document] = [{"$collStats": {"storageStats": {}}}]
-        of = self._collection(collection)
-
-        def ask() -> Document:
-            try:
-                return next(iter(of.aggregate(pipeline)), {})
-            except OperationFailure as error:
-                if error.code != 26:  # NamespaceNotFound
-                    raise
-                return {}
-
-        found = self._again(ask)
-        about = found.get("storageStats", {})
+        found = self._again(lambda: self._database.command("collStats", collection))
         return CollectionStats(
-            documents=int(about.get("count", 0)),
-            storage_bytes=int(about.get("storageSize", 0)),
-            index_bytes=int(about.get("totalIndexSize", 0)),
+            documents=int(found.get("count", 0)),
+            storage_bytes=int(found.get("storageSize", 0)),
+            index_bytes=int(found.get("totalIndexSize", 0)),
         )
 
-    def _collection(self, name: str, read: ReadConcern = "local") -> Collection[Document]:
-        from pymongo.read_concern import ReadConcern as PymongoReadConcern
 
-        if read == "local" or not self._is_replicated:
-            return self._database[name]
-        return self._database.get_collection(name, read_concern=PymongoReadConcern(read))
-
-
-_IN_ORDER: Document = {"$sort": {"_id": 1}}
-"""Lets MongoDB consider a range of `_id` for a pipeline: with another matching index, it does
-so only if that saves sorting."""
-
-
-def _batched(
-    questions: Sequence[tuple[str, Mapping[str, object]]],
-) -> Iterator[tuple[int, Sequence[tuple[str, Mapping[str, object]]]]]:
-    """Groups of questions that fit into one command, with the number of the first.
-
-    Pipelines are joined, since MongoDB reads a whole clustered collection for `$or` of ranges.
-    """
-    from bson import encode
-
-    if not questions:
-        return
-    with _mapped("MongoDB", question=True):
-        size = max(len(encode(query)) for _, query in questions)
-    step = max(1, min(_MAX_QUESTIONS_PER_COMMAND, _MAX_COMMAND_BYTES // size))
-    for first in range(0, len(questions), step):
-        yield first, questions[first : first + step]
-
-
-def _union(parts: Sequence[tuple[str, list[Document]]]) -> tuple[str, list[Document]]:
-    """One pipeline with the results of several, one after the other."""
-    collection, pipeline = parts[0]
-    others = [{"$unionWith": {"coll": where, "pipeline": stages}} for where, stages in parts[1:]]
-    return collection, [*pipeline, *others]
-
-
-def _is_replicated(client: MongoClient[Document]) -> bool:
-    """True for a replica set, a member of one, and a sharded cluster, once it has answered."""
-    about = client.topology_description
-    members = about.server_descriptions().values()
-    return about.topology_type_name == "Sharded" or any(m.replica_set_name for m in members)
-
-
-def _write_concern(client: MongoClient[Document], *, is_replicated: bool) -> WriteConcern:
-    """The URI's, but with a majority of a replica set's members, and not waiting for ever."""
-    from pymongo.write_concern import WriteConcern
-
-    given: Document = client.write_concern.document
-    if not is_replicated:
-        return WriteConcern(**given)
-    number = given.get("w", 1)
-    wanted = "majority" if isinstance(number, int) else number  # a name is one of the server's
-    return WriteConcern(**{"wtimeout": int(_REPLICATION_S * 1000), **given, "w": wanted})
-
-
-def _broken() -> tuple[type[Exception], ...]:
-    """Errors after which a command is sent again: the connection or the cursor is gone."""
-    from pymongo.errors import AutoReconnect, CursorNotFound
-
-    return AutoReconnect, CursorNotFound
-
-
-def _retried(
-    client: MongoClient[Document],
-    address: str,
-    command: Callable[[], _T],
-    *,
-    question: bool = False,
-) -> _T:
-    """Run a command that may be repeated, again if its connection breaks."""
-    with _mapped(address, question=question):
-        for _ in range(_TRIES - 1):
-            try:
-                return command()
-            except _broken() as error:
-                _wait(client, error)
-        return command()
-
-
-def _wait(client: MongoClient[Document], error: Exception) -> None:
-    """Wait until the server answers again after an error.
-
-    Raises:
-        PyMongoError: It does not: the error. A replica set is given the time of an election, by
-            the next command.
-    """
-    from pymongo import timeout
-    from pymongo.errors import PyMongoError, ServerSelectionTimeoutError
-
-    if isinstance(error, ServerSelectionTimeoutError):
-        raise error  # after all the time that there is
-    if client.topology_description.topology_type_name.startswith("ReplicaSet"):
-        return
-    try:
-        with timeout(_GONE_S):
-            client.admin.command("ping")
-    except PyMongoError:
-        raise error from None
-
-
-@contextlib.contextmanager
-def _closing(cursor: Any) -> Iterator[Any]:
-    """Close a cursor; its server may have ended, which closing would wait for."""
-    from pymongo import timeout
-
-    try:
-        yield cursor
-    finally:
-        with timeout(_GONE_S):
-            cursor.close()
-
-
-def _key_order(sort: Sort | None) -> int:
-    """1 or -1 if documents come in the order of `_id`, or the other way round; else 0."""
-    (first, order), *more = sort or [("_id", 1)]
-    return order if first == "_id" and not more else 0
-
-
-def _last_key(documents: bytes) -> object:
-    """The `_id` of the last of several documents."""
-    from bson import decode
-
-    position, length = 0, 0
-    while position < len(documents):
-        (length,) = struct.unpack_from("<i", documents, position)
-        position += length
-    return decode(documents[position - length :])["_id"]
+def _options(parsed: Mapping[str, Any], timeout_s: float) -> dict[str, object]:
+    """The options of a connection, beside those in its parsed URI."""
+    given = {option.lower(): value for option, value in parsed["options"].items()}
+    # Members other than the primary may lack documents that the index is said to have.
+    options: dict[str, object] = {
+        "appname": "hybridlog",
+        "readPreference": "primary",
+        "readConcernLevel": "majority",
+    }
+    if not isinstance(given.get("w"), str):  # a name is one of the server's
+        options["w"] = "majority"
+    if "wtimeoutms" not in given:
+        options["wtimeoutMS"] = int(_REPLICATION_S * 1000)
+    if "serverselectiontimeoutms" not in given:
+        is_set = len(parsed["nodelist"]) > 1 or "replicaset" in given or parsed["fqdn"]
+        wait_s = timeout_s + (_ELECTION_S if is_set else 0)
+        options["serverSelectionTimeoutMS"] = int(wait_s * 1000)
+    if "connecttimeoutms" not in given:
+        options["connectTimeoutMS"] = int(timeout_s * 1000)
+    return options
 
 
 def without_secrets(uri: str) -> str:
@@ -832,65 +523,6 @@ def without_secrets(uri: str) -> str:
         return "the given URI"
     # From the last @, since an unencoded password may contain any character.
     return f"{scheme}://{rest.rpartition('@')[2].partition('?')[0]}"
-
-
-def shut_down(uri: str) -> None:
-    """Ask the server to end; ignore errors."""
-    from pymongo import MongoClient
-    from pymongo.errors import PyMongoError
-
-    with contextlib.suppress(PyMongoError):
-        client: MongoClient[Document] = MongoClient(uri, serverSelectionTimeoutMS=2000)
-        with client:
-            client.admin.command("shutdown")
-
-
-def _document_ends(
-    documents: memoryview, count: int, lengths: NDArray[np.int64] | None
-) -> NDArray[np.int64]:
-    """Start and end of each document: int64[count + 1], byte offsets.
-
-    Raises:
-        ValueError: The lengths do not add up, or differ from those in the documents.
-    """
-    ends = np.zeros(count + 1, dtype=np.int64)
-    if lengths is None:
-        _walk(documents, ends)
-    else:
-        if len(lengths) != count:
-            raise ValueError(f"{len(lengths)} lengths were given for {count} documents")
-        np.cumsum(lengths, out=ends[1:])
-    if ends[-1] != len(documents) or ends.max() > len(documents):
-        raise ValueError(f"{count} documents end at byte {ends[-1]} of {len(documents)}")
-    if count and np.diff(ends).min() < 5:
-        raise ValueError("a document has a length below 5 bytes")
-    content = np.frombuffer(documents, dtype=np.uint8)
-    if lengths is not None:
-        stated = content[ends[:-1, None] + np.arange(4)].view("<i4")[:, 0]
-        if not np.array_equal(stated, lengths):
-            raise ValueError("the lengths given are not those in the documents")
-    if content[ends[1:] - 1].any():
-        raise ValueError("a document does not end with a zero byte")
-    if count and np.diff(ends).max() > BATCH_BYTES:
-        raise DatabaseError(
-            f"A document of {np.diff(ends).max()} bytes is larger than MongoDB allows "
-            f"({BATCH_BYTES} bytes)."
-        )
-    return ends
-
-
-def _walk(documents: memoryview, ends: NDArray[np.int64]) -> None:
-    length = struct.Struct("<i").unpack_from
-    size = len(documents)
-    position = 0
-    for row in range(1, len(ends)):
-        if position + 5 > size:
-            raise ValueError(f"{len(ends) - 1} documents are stated, {row - 1} are there")
-        step = length(documents, position)[0]
-        if not 5 <= step <= size - position:
-            raise ValueError(f"document {row - 1} has an impossible length, {step} bytes")
-        position += step
-        ends[row] = position
 
 
 def _batches(ends: NDArray[np.int64]) -> Iterator[tuple[int, int]]:

@@ -1,19 +1,17 @@
 """Stores in MongoDB the indexing progress of each recording.
 
 `hybridlog.recordings` mirrors the catalog for other programs. It also states for each
-recording whether its index is complete, and from which segments it was made. The index is
-used only if both match, and in a replica set only if a majority of its members has them:
-then the documents, written before, cannot be lost. A segment is noted after its documents, so
-a killed server has not lost any of them.
+recording which segments have all their documents. Reads see only what a majority of a replica
+set has, so the documents, written before, cannot be lost.
 """
 
 from __future__ import annotations
 
 import secrets
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from itertools import chain
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 from hybridlog_storage.catalog import RecordingEntry
 from hybridlog_storage.mongo.collection_names import CATALOG_PREFIX, collection_of
@@ -23,17 +21,10 @@ from hybridlog_storage.mongo.index_documents import between
 RECORDINGS: Final = f"{CATALOG_PREFIX}recordings"
 STORE: Final = f"{CATALOG_PREFIX}store"
 """Collection that names the store that owns a database."""
-_ENTRIES_PER_BATCH: Final = (
-    500  # entries decoded at once; each takes some kilobytes as a dictionary
-)
-
-State = Literal["open", "clearing", "indexing", "complete", "removing"]
-"""State of a recording's index: being recorded, documents being removed for a rebuild, being
-indexed, complete, being removed for good."""
+_AROUND_NS: Final = 3600 * 10**9  # what a crash has cut may be so far from the rest
 _CHANNEL_BYTES: Final = 600  # of a channel in the mirror, without its texts
 _MAX_CHANNEL_BYTES: Final = 8 << 20  # of all: a document of MongoDB has at most 16 MiB
-_OF_CHANNELS: Final = ("channels.topic", "channels.stats.first", "channels.stats.last")
-_MAX_NAMES: Final = (
+_SHOWN: Final = (
     "name",
     "tags",
     "status",
@@ -51,33 +42,24 @@ class Indexed:
     """The state of a recording's index.
 
     Attributes:
-        id: The recording.
-        state: Progress of the index.
+        made: Drawn at random when the documents were begun. Who reads the same before and after
+            a question knows that none were removed meanwhile.
         segments: Digest of each completely indexed segment, by its number as text.
-        turn: Counts how often its documents were removed or rebuilt.
-        topics: Topics of its documents, as far as known.
-        span: First and last log time of its documents, ns, as far as known; None without any.
         shown: Name, tags, notes and marks in the mirror.
-        damage: Chunks that could not be read for indexing: reason by segment and number.
     """
 
-    id: str
-    state: State
+    made: str
     segments: Mapping[str, str]
-    turn: int
-    topics: tuple[str, ...] = ()
-    span: tuple[int, int] | None = None
     shown: Mapping[str, Any] = field(default_factory=dict)
-    damage: Mapping[tuple[int, int], str] = field(default_factory=dict)
 
     def mirrors(self, entry: RecordingEntry) -> bool:
         """True if the mirror of a recording with the same segments is current."""
         document = _mirrored(entry)
-        return all(self.shown.get(name) == document[name] for name in _MAX_NAMES)
+        return all(self.shown.get(name) == document[name] for name in _SHOWN)
 
     def is_whole(self, entry: RecordingEntry) -> bool:
-        """True if the index of a recording is complete and current."""
-        return self.state == "complete" and dict(self.segments) == entry.digests
+        """True if all documents of a recording are there."""
+        return dict(self.segments) == entry.digests
 
 
 class IndexState:
@@ -90,95 +72,44 @@ class IndexState:
         """The index state of a recording by its key; None if it is unknown."""
         return self.of([key]).get(key)
 
-    def of(self, keys: Collection[str] | None = None) -> dict[str, Indexed]:
-        """The index states of these recordings, or of all, by key."""
+    def of(
+        self, keys: Collection[str] | None = None, shown: Collection[str] = _SHOWN
+    ) -> dict[str, Indexed]:
+        """The index states of these recordings, or of all, by key; `shown` are read, too."""
         chosen: dict[str, object] = {} if keys is None else {"_id": {"$in": sorted(keys)}}
         found: dict[str, Indexed] = {}
-        wanted = {"id": 1, "index": 1, **dict.fromkeys((*_OF_CHANNELS, *_MAX_NAMES), 1)}
-        for document in self._db.find(
-            RECORDINGS, chosen, wanted, batch_size=_ENTRIES_PER_BATCH, read="majority"
-        ):
+        for document in self._db.find(RECORDINGS, chosen, dict.fromkeys(("index", *shown), 1)):
             index = document.get("index") or {}
-            channels = document.get("channels") or ()
-            topics = {str(channel.get("topic", "")) for channel in channels}
-            firsts, lasts = (
-                [t for c in channels if (t := (c.get("stats") or {}).get(name)) is not None]
-                for name in ("first", "last")
-            )
             found[document["_id"]] = Indexed(
-                str(document.get("id", "")),
-                index.get("state", "indexing"),
+                str(index.get("made", "")),
                 dict(index.get("segments") or {}),
-                int(index.get("turn", 0)),
-                tuple(sorted(topics)),
-                (min(firsts), max(lasts)) if firsts and lasts else None,
-                {name: document.get(name) for name in _MAX_NAMES},
-                {(d["seg"], d["chunk"]): d["reason"] for d in index.get("damage") or ()},
+                {name: document.get(name) for name in shown},
             )
         return found
 
     def count(self) -> int:
         """Number of recordings in the mirror; may be wrong after the server was killed."""
-        return self._db.stats(RECORDINGS).documents
+        return self._db.count(RECORDINGS)
 
-    def segments(self, keys: Collection[str]) -> dict[str, tuple[int, dict[str, str]]]:
-        """Turn, and digests of the indexed segments, of recordings by key, without unknown ones.
-
-        Who reads the same before and after a question has been told of all removals meanwhile.
-        """
-        chosen, wanted = {"_id": {"$in": sorted(keys)}}, {"index.turn": 1, "index.segments": 1}
-        found = self._db.find(RECORDINGS, chosen, wanted, read="majority")
-        indexed = ((one["_id"], one.get("index") or {}) for one in found)
-        return {
-            key: (int(index.get("turn", 0)), dict(index.get("segments") or {}))
-            for key, index in indexed
-        }
-
-    def put(
-        self,
-        entry: RecordingEntry,
-        state: State,
-        *,
-        turn: int,
-        segments: Mapping[str, str] | None = None,
-        damage: Mapping[tuple[int, int], str] | None = None,
-    ) -> None:
-        """Mirror a recording and store the progress of its index.
+    def begin(self, entry: RecordingEntry, segments: Mapping[str, str] | None = None) -> None:
+        """Mirror a recording whose documents are about to be made, or removed.
 
         Args:
             entry: The recording.
-            state: Progress of the index.
-            turn: Greater than before if documents are about to be removed.
-            segments: Digest of each indexed segment, by its number as text.
-            damage: Chunks that could not be read: reason by segment and number.
+            segments: Digest of each segment whose documents stay, by its number as text.
         """
-        unreadable = [
-            {"seg": segment, "chunk": chunk, "reason": reason}
-            for (segment, chunk), reason in sorted((damage or {}).items())
-        ]
-        document = {
-            **_mirrored(entry),
-            "_id": entry.key,
-            "index": {
-                "state": state,
-                "turn": turn,
-                "segments": dict(segments or {}),
-                **({"damage": unreadable} if unreadable else {}),
-            },
-        }
+        index = {"made": secrets.token_hex(8), "segments": dict(segments or {})}
+        document = {**_mirrored(entry), "_id": entry.key, "index": index}
         self._db.replace(RECORDINGS, {"_id": entry.key}, document)
 
     def show(self, entry: RecordingEntry) -> None:
         """Mirror a recording; leave the state of its index unchanged."""
         self._db.update(RECORDINGS, {"_id": entry.key}, {"$set": _mirrored(entry)})
 
-    def is_mirrored(self, entry: RecordingEntry) -> bool:
-        """True if the mirror of a recording equals its catalog entry."""
-        found = self._db.find_one(RECORDINGS, {"_id": entry.key})
-        if found is None:
-            return False
-        document = {name: found[name] for name in found if name not in {"_id", "index"}}
-        return document == _mirrored(entry)
+    def end(self, entry: RecordingEntry) -> None:
+        """Mirror a recording all of whose documents are in the index."""
+        done = {**_mirrored(entry), "index.segments": entry.digests}
+        self._db.update(RECORDINGS, {"_id": entry.key}, {"$set": done})
 
     def put_segments(self, key: str, segments: Mapping[str, str]) -> None:
         """Store that the index of a recording has all documents of some segments.
@@ -190,35 +121,49 @@ class IndexState:
         digests = {f"index.segments.{number}": digest for number, digest in segments.items()}
         self._db.update(RECORDINGS, {"_id": key}, {"$set": digests})
 
-    def clear(
-        self,
-        key: object,
-        topics: Iterable[str] | None = None,
-        span: tuple[int, int] | None = None,
-        but: Collection[int] = (),
-    ) -> None:
+    def clear(self, entry: RecordingEntry, but: Collection[str] = ()) -> None:
         """Remove the index documents of a recording.
 
-        Args:
-            key: Key of the recording, or another value of `_meta.rec` in foreign documents.
-            topics: Those that may have documents; None for all documents, which takes a scan.
-            span: First and last log time of its documents of these topics, ns; None for any.
-            but: Segments whose documents stay.
-        """
-        chosen: dict[str, object] = {"_meta.rec": key}
-        if but:
-            chosen["_meta.ref.seg"] = {"$nin": sorted(but)}
-        if topics is None:
-            for collection in self.document_collections():
-                self._db.delete(collection, chosen)
-            return
-        bounds = (None, None) if span is None else (span[0], span[1] + 1)
-        for topic in topics:
-            self._db.delete(collection_of(topic), {**chosen, **between(*bounds)})
+        They are looked for in its topics, within its times and an hour around them: a crash may
+        have cut messages whose documents are here.
 
-    def remove(self, key: str) -> None:
-        """Remove a recording from the mirror, as the last step of its removal."""
-        self._db.delete(RECORDINGS, {"_id": key})
+        Args:
+            entry: The recording.
+            but: Numbers of the segments whose documents stay, as text.
+        """
+        topics = {channel.topic for channel in entry.channels}
+        times = [*(entry.span or ())]
+        mirror = self._db.find_one(RECORDINGS, {"_id": entry.key}, {"channels": 1}) or {}
+        for channel in mirror.get("channels") or ():
+            stats = channel.get("stats") or {}
+            topics.add(str(channel.get("topic", "")))
+            times += [at for name in ("first", "last") if (at := stats.get(name)) is not None]
+        chosen: dict[str, object] = {"_meta.rec": entry.key}
+        if times:
+            chosen.update(between(max(0, min(times) - _AROUND_NS), max(times) + _AROUND_NS))
+        if but:
+            chosen["_meta.ref.seg"] = {"$nin": sorted(map(int, but))}
+        for topic in topics:
+            self._db.delete(collection_of(topic), chosen)
+
+    def clear_everywhere(self, keys: Collection[object]) -> None:
+        """Remove all documents of recordings, looking through everything.
+
+        Args:
+            keys: Their keys, or other values of `_meta.rec` in foreign documents.
+        """
+        for collection in self.document_collections():
+            self._db.delete(collection, {"_meta.rec": {"$in": list(keys)}})
+
+    def clear_all(self, but: Collection[str]) -> None:
+        """Remove all recordings and their documents but some, which are given by their keys."""
+        self._db.delete(RECORDINGS, {"_id": {"$nin": list(but)}})
+        for collection in self.document_collections():
+            self._db.delete(collection, {"_meta.rec": {"$nin": list(but)}})
+
+    def remove(self, keys: Collection[str]) -> None:
+        """Remove recordings from the mirror, as the last step of their removal."""
+        self._db.delete(RECORDINGS, {"_id": {"$in": list(keys)}})
 
     def document_collections(self) -> list[str]:
         """Names of the collections that hold index documents."""

@@ -4,13 +4,12 @@
 standard library, so it starts fast and stays small. It outlives the process that started
 it: mongod belongs to all processes on a store, not to the first one.
 
-    python -I -S mongod_keeper.py '{"command": [...], ...}'
+    python -I -S mongod_keeper.py ALIVE_FD LINGER_S SOCKET MONGOD ARGUMENT...
 
-It inherits two open, locked files. The lock on the first means that a keeper is running;
-it ends with this process. mongod inherits the second, so its lock means that mongod has
-not ended, even after its keeper was killed. The keeper also inherits the open folder of
-these files, and the open log. It opens files only relative to that folder, and follows no
-symlink there.
+It runs in the directory of mongod, with the log as standard output, and inherits two open,
+locked files. The lock on the first means that a keeper is running; it ends with this process.
+mongod inherits the second, ALIVE_FD, so its lock means that mongod has not ended, even after
+its keeper was killed.
 """
 
 from __future__ import annotations
@@ -18,7 +17,6 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import fcntl
-import json
 import os
 import resource
 import signal
@@ -27,10 +25,9 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TypedDict
 
 LOG_LIMIT = 10 << 20
-"""Bytes of log after which it is rotated; one older log is kept."""
+"""Bytes of log after which it is emptied."""
 OPEN_FILES = 64_000
 """Limit of mongod's open files: about two for each collection."""
 END_LIMIT_S = 30.0
@@ -38,8 +35,6 @@ END_LIMIT_S = 30.0
 POLL_S = 0.25
 POLL_AT_START_S = 0.05
 YOUNG_S = 3.0
-LOG_CHECK_S = 10.0
-RECORD_LIMIT = 64 << 10
 PUBLISHED_S = 86_400.0
 """Most seconds for which mongod waits for clients."""
 CONNECTED = b"03"
@@ -47,100 +42,56 @@ CONNECTED = b"03"
 _PR_SET_PDEATHSIG = 1
 
 
-class Job(TypedDict):
-    """The starter's request. Files are names in the folder.
+def main(alive: int, linger_s: float, socket: str, command: list[str]) -> int:
+    """Run mongod until it is unused; return the exit status of this process.
 
-    Attributes:
-        command: mongod and its arguments.
-        socket: Path of mongod's unix socket, the only file in its directory.
-        record: File that names the socket while this keeper runs.
-        users_lock: File on which every process that uses mongod holds a shared lock.
-        log: Name of the log.
+    Args:
+        alive: Descriptor whose lock mongod shares.
         linger_s: Seconds for which mongod runs after its last use.
-        folder_fd: Descriptor of the folder.
-        log_fd: Descriptor of the log for mongod's output, for reading and appending.
-        alive_fd: Descriptor whose lock mongod shares.
+        socket: Its unix socket.
+        command: mongod and its arguments.
     """
-
-    command: list[str]
-    socket: str
-    record: str
-    users_lock: str
-    log: str
-    linger_s: float
-    folder_fd: int
-    log_fd: int
-    alive_fd: int
-
-
-def main(job: Job) -> int:
-    """Run mongod until it is unused; return the exit status of this process."""
     os.umask(0o077)
     end_signals: list[int] = []
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         signal.signal(number, lambda got, _frame: end_signals.append(got))
     try:
-        mongod = _start(job)
+        mongod = _start(alive, command)
     except OSError as error:
-        _say(job, f"cannot run {job['command'][0]}: {error}")
-        _clean(job)
+        _say(f"cannot run {command[0]}: {error}")
         return 1
     is_removed = False
     try:
-        users = _open(job, job["users_lock"], os.O_RDWR)
-        _write_record(job, mongod.pid)
-        is_removed = _wait(job, mongod, users, end_signals)
-    except OSError as error:  # the record cannot be written on a full disk
-        _say(job, f"the keeper of mongod failed: {error}")
+        users = os.open("users.lock", os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC)
+        is_removed = _wait(mongod, users, socket, linger_s, end_signals)
+    except OSError as error:
+        _say(f"the keeper of mongod failed: {error}")
     finally:
         status = mongod.poll()
         if status is None:
             _end(mongod, at_once=is_removed)
         else:
-            _say(job, f"mongod ended by itself, {describe_status(status)}")
-        _clean(job)
+            how = f"killed by signal {-status}" if status < 0 else f"with exit status {status}"
+            _say(f"mongod ended by itself, {how}")
+        with contextlib.suppress(OSError):
+            Path(socket).unlink()  # one that was killed has left it
     return 0
 
 
-def describe_status(status: int) -> str:
-    """Describe a process's return code."""
-    return f"killed by signal {-status}" if status < 0 else f"with exit status {status}"
-
-
-def _start(job: Job) -> subprocess.Popen[bytes]:
+def _start(alive: int, command: list[str]) -> subprocess.Popen[bytes]:
     _raise_limits()
-    _put_log_aside(job)
+    _empty_long_log()
     # C, since mongod does not start under a locale that is not installed, and ssh passes
     # on the locale of the other side.
     environment = {**os.environ, "LC_ALL": "C"}
-    _say(job, "starts mongod")
+    _say("starts mongod")
     return subprocess.Popen(  # noqa: S603 - the starter's own command
-        job["command"],
+        command,
         stdin=subprocess.DEVNULL,
-        stdout=job["log_fd"],
-        stderr=job["log_fd"],
         env=environment,
-        pass_fds=(job["alive_fd"],),
+        pass_fds=(alive,),
         preexec_fn=_die_with(os.getpid()),  # noqa: PLW1509 - there are no threads
     )
-
-
-def _open(job: Job, name: str, flags: int) -> int:
-    """Open a file in the folder; a symlink in its place is an error."""
-    safe = flags | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
-    return os.open(name, safe, 0o600, dir_fd=job["folder_fd"])
-
-
-def _new_file(job: Job, name: str) -> int:
-    """Create a file in the folder for writing; replace a file or symlink of its name."""
-    with contextlib.suppress(FileNotFoundError):
-        os.unlink(name, dir_fd=job["folder_fd"])
-    return _open(job, name, os.O_WRONLY | os.O_CREAT | os.O_EXCL)
-
-
-def _write(fd: int, content: bytes) -> None:
-    while content:
-        content = content[os.write(fd, content) :]
 
 
 def _die_with(keeper: int) -> Callable[[], None] | None:
@@ -169,34 +120,37 @@ def _raise_limits() -> None:
             resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
 
 
-def _wait(job: Job, mongod: subprocess.Popen[bytes], users: int, end_signals: list[int]) -> bool:
+def _wait(
+    mongod: subprocess.Popen[bytes],
+    users: int,
+    socket: str,
+    linger_s: float,
+    end_signals: list[int],
+) -> bool:
     """Wait until mongod has ended, a signal asks to end, or it is idle (`users` is then locked).
 
     Returns:
         Whether the store was removed, and mongod's data with it.
     """
     born = time.monotonic()
-    checked_log = born
     idle_since: float | None = None
     while mongod.poll() is None and not end_signals:
         now = time.monotonic()
         if os.fstat(users).st_nlink == 0:
             return True
         if _lock(users):
-            if _is_published(users) or _has_clients(job["socket"]):
+            if _is_published(users) or _has_clients(socket):
                 idle_since = None
             elif idle_since is None:
                 idle_since = now
-            if idle_since is not None and now - idle_since >= job["linger_s"]:
+            if idle_since is not None and now - idle_since >= linger_s:
                 # It stays locked: new users wait until mongod and this process have ended,
                 # and then start a new one.
                 return False
             fcntl.flock(users, fcntl.LOCK_UN)
         else:
             idle_since = None
-        if now - checked_log > LOG_CHECK_S:
-            checked_log = now
-            _put_log_aside(job)
+        _empty_long_log()
         time.sleep(POLL_AT_START_S if now - born < YOUNG_S else POLL_S)
     return False
 
@@ -235,55 +189,16 @@ def _end(mongod: subprocess.Popen[bytes], *, at_once: bool) -> None:
         mongod.wait()
 
 
-def _write_record(job: Job, pid: int) -> None:
-    fresh = job["record"] + ".new"
-    content = json.dumps({"socket": job["socket"], "mongod": pid, "keeper": os.getpid()})
-    fd = _new_file(job, fresh)
-    try:
-        _write(fd, content.encode())
-    finally:
-        os.close(fd)
-    folder = job["folder_fd"]
-    os.rename(fresh, job["record"], src_dir_fd=folder, dst_dir_fd=folder)
-
-
-def _clean(job: Job) -> None:
-    with contextlib.suppress(OSError, ValueError, LookupError, TypeError):
-        # Another keeper may have written a record since.
-        fd = _open(job, job["record"], os.O_RDONLY)
-        try:
-            keeper = json.loads(os.read(fd, RECORD_LIMIT))["keeper"]
-        finally:
-            os.close(fd)
-        if keeper == os.getpid():
-            os.unlink(job["record"], dir_fd=job["folder_fd"])
-    socket = Path(job["socket"])
+def _empty_long_log() -> None:
+    """Empty a long log. mongod appends, so its descriptor stays valid."""
     with contextlib.suppress(OSError):
-        socket.unlink()
+        if os.fstat(1).st_size > LOG_LIMIT:
+            os.ftruncate(1, 0)
+
+
+def _say(text: str) -> None:
     with contextlib.suppress(OSError):
-        socket.parent.rmdir()
-
-
-def _put_log_aside(job: Job) -> None:
-    """Rotate a long log. mongod appends, so its descriptor stays valid."""
-    log = job["log_fd"]
-    with contextlib.suppress(OSError):
-        if os.fstat(log).st_size <= LOG_LIMIT:
-            return
-        aside = _new_file(job, job["log"] + ".1")
-        try:
-            at = 0
-            while part := os.pread(log, 1 << 20, at):
-                _write(aside, part)
-                at += len(part)
-        finally:
-            os.close(aside)
-        os.ftruncate(log, 0)
-
-
-def _say(job: Job, text: str) -> None:
-    with contextlib.suppress(OSError):
-        _write(job["log_fd"], f"hybridlog: {text}\n".encode())
+        os.write(1, f"hybridlog: {text}\n".encode())
 
 
 if __name__ == "__main__":
@@ -291,4 +206,5 @@ if __name__ == "__main__":
     # has to reap it.
     if os.fork():
         os._exit(0)
-    sys.exit(main(json.loads(sys.argv[1])))
+    given_alive, given_linger, given_socket, *given = sys.argv[1:]
+    sys.exit(main(int(given_alive), float(given_linger), given_socket, given))

@@ -51,12 +51,11 @@ Document = dict[str, object]
         ({"a": {"$elemMatch": {"b": {"$regex": "(?=a)"}}}}, "RE2"),
         ({"$expr": {"$eq": ["$$ROOT", 1]}}, "whole document"),
         ({"$expr": {"$eq": [{"$getField": "a"}, 1]}}, r"\$getField"),
-        ({"a": {"$in": [re.compile("a")]}}, "Pattern"),
+        ({"a": {"$in": [re.compile("a")]}}, "pattern"),
         ({"a": {"$regex": "a", "$options": "x"}}, "options"),
         ({"a": {"$options": "i"}}, r"\$options"),
         ({"a": re.compile("(?=a)")}, "RE2"),
-        ({"a": re.compile("a", re.VERBOSE)}, "flags"),
-        ({"a": re.compile(b"a")}, "string"),
+        ({"a": re.compile("a", re.VERBOSE)}, "options i, m and s"),
         ({"a": Regex("(?<=a)")}, "RE2"),
         ({"a": {"$mod": [2**63, 0]}}, "64 bits"),
         ({"a": [1, {"b": -(2**63) - 1}]}, "64 bits"),
@@ -67,9 +66,9 @@ Document = dict[str, object]
         ({"a": "\ud800"}, "Unicode"),
         ({"\ud800": 1}, "Unicode"),
         ({"a\0": 1}, "NUL"),
-        ({5: 1}, "no string"),
+        ({5: 1}, "string keys"),
         ({"a": "x" * 2_000_000}, "too large"),
-        ({"a": [0] * 30_000}, "too large"),
+        ({"a": [0] * 200_000}, "too large"),
     ],
 )
 def test_refused(query: Document, place: str) -> None:
@@ -105,12 +104,10 @@ def test_values_become_plain() -> None:
     }
     (node,) = mongo_filter(query, None).filters
     plain = node.to_filter()
-    assert plain == {
-        "a": [1, 2, 0.5, "s", True],
-        "b": {"$regex": "^x", "$options": "i"},
-        "c": {"$regex": "y", "$not": {"$regex": "z", "$options": "m"}},
-    }
+    assert plain["a"] == [1, 2, 0.5, "s", True]
     assert [type(value) for value in plain["a"]] == [int, int, float, str, bool]  # type: ignore[attr-defined]
+    assert plain["b"] == Regex.from_native(query["b"])  # type: ignore[type-var]
+    assert [*plain["c"]] == ["$regex", "$not"]  # type: ignore[call-overload]
 
 
 def test_the_paths_it_asks_for() -> None:
