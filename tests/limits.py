@@ -14,8 +14,6 @@ PLACES = {
     "column_file_open_files": "hybridlog.columns.column_file._OPEN_FILES",
     "shared_file_rows": "hybridlog.columns.folders.MAX_SHARED_ROWS",
     "settled_ns": "hybridlog.columns.folders._STABLE_NS",
-    "parquet_block_bytes": "hybridlog.columns.parquet_file.BLOCK",
-    "parquet_write_bytes": "hybridlog.columns.parquet_file._WRITTEN",
     "table_group_rows": "hybridlog.columns.table_writer.GROUP_ROWS",
     "long_table_rows": "hybridlog.columns.table_writer.LONG_ROWS",
     "table_arena_bytes": "hybridlog.columns.table_writer._ARENA",

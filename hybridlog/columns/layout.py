@@ -55,6 +55,8 @@ ORIGINAL: Final = b"hybridlog.name"
 """Metadata of a column: the name of its field, if it differs."""
 SUMMARY: Final = b"hybridlog.summary"
 """Metadata of a column: the name of the array whose summaries it has."""
+EMPTY: Final = b"hybridlog.empty"
+"""Metadata of a column of booleans, or of arrays of them: its messages have no fields."""
 OWN: Final = b"hybridlog.own"
 """Metadata of a column that is none of a field, besides `OWN_COLUMNS`."""
 ABOUT: Final = b"hybridlog"
@@ -223,8 +225,6 @@ class About:
         bounds: For each row group: its rows, then log time and arrival number of its first and
             last row. The keys are zeros in a file of several topics or recordings.
         span: First byte of the row groups, and the one after their end.
-        body: Bytes before the footer.
-        checksums: CRC-32 of each block of the body, 8 hexadecimal digits each.
         version: Version of the format.
         of_rows: What a file of rows says of them besides; empty in a table.
     """
@@ -232,8 +232,6 @@ class About:
     recordings: Sequence[Section]
     bounds: tuple[tuple[int, int, int, int, int], ...]
     span: tuple[int, int] = (0, 0)
-    body: int = 0
-    checksums: str = field(default="", repr=False)
     version: int = VERSION
     of_rows: Mapping[str, Any] = field(default_factory=dict, repr=False)
 
@@ -271,7 +269,7 @@ class About:
             about = cls(**values)
             begin, end = values["span"]
             is_sound = (
-                0 <= begin <= end <= values["body"]
+                0 <= begin <= end
                 and all(len(bound) == 5 for bound in about.bounds)
                 and sum(section.rows for section in about.recordings) == about.rows
             )

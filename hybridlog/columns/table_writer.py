@@ -323,7 +323,7 @@ class TableWriter:
             return
         with self._harmless():
             self._channels.update(channels)
-            if chunk.fields is None:
+            if chunk.batch.left is None:
                 self._collect(chunk)
             else:
                 self._add_expired(chunk)
@@ -479,16 +479,19 @@ class TableWriter:
 
     def _add_expired(self, chunk: StoredChunk) -> None:
         """Make rows of what is left of expired messages."""
-        from hybridlog.columns.rows_file import rows_of
-
         messages = Messages.of(chunk, 0)
-        for rows, columns in chunk.fields or ():
-            own = messages.take(rows)
-            for number, at in rows_by_channel(own.channel):
-                topic, _, state = self._topic_of(number)
-                found = rows_of(columns.take(at))
-                if topic.is_wanted:
-                    topic.add(Piece(chunk.segment, own.take(at), *found, state=state))
+        for number, own in rows_by_channel(chunk.batch.channel):
+            topic, _, state = self._topic_of(number)
+            if not topic.is_wanted:
+                continue
+            left = chunk.batch.take(own).left
+            assert left is not None
+            if state is State.REDUCED:
+                topic.add(Piece(chunk.segment, messages.take(own), None, state=state))
+            for part, at, rows in left.by_part():
+                piece = Piece(chunk.segment, messages.take(own[at]), None, state=state)
+                piece.fields, piece.errors = part.columns(rows), part.errors(rows)
+                topic.add(piece)
         self._has_grown = True
 
     @contextmanager

@@ -9,6 +9,7 @@ import numpy as np
 
 from hybridlog.query.chunk_scan import ChunkScan, RecordingScan, RowSelection, ScanPlan
 from hybridlog.query.engines import MatchColumns, Need, Values
+from hybridlog.schema.codec import columns_of
 
 if TYPE_CHECKING:
     from hybridlog.query.chunk_scan import ChunkTask, MessageRun
@@ -89,12 +90,12 @@ class PayloadScan:
         self, channel: RecordedChannel, batch: Batch, fields: Collection[str] | None = None
     ) -> Decoded:
         """The fields of messages; those that cannot be read, or lack some, are counted."""
-        found = channel.codec.columns(batch.buffer, batch.offset, batch.length, fields)
+        found = columns_of(channel.codec, batch, fields)
         self._counters.unreadable += len(batch) - len(found.rows)
         if channel.is_expired:
-            from hybridlog.schema.reduced_codec import without_lossy
+            from hybridlog.schema.left import without_lacking
 
-            found, lacking = without_lossy(found)
+            found, lacking = without_lacking(found)
             self._counters.leave_out(lacking, channel.state)
         return found
 
