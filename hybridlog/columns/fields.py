@@ -13,14 +13,12 @@ renamed from its field has the field's name in its metadata.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from itertools import zip_longest
 from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
-from bson.int64 import Int64
 
 from hybridlog.columns.layout import EMPTY, ORIGINAL, RESERVED, SUMMARY, column_names
 from hybridlog.schema.arrow_columns import structs
@@ -33,10 +31,8 @@ from hybridlog.schema.arrow_types import (
     is_array,
     is_bytes,
     is_list,
-    is_time,
     lengths_of,
     missing_of,
-    plain_values,
     summary,
     with_values,
 )
@@ -45,7 +41,6 @@ LIMIT: Final = 32
 """Maximum number of elements of an array stored in full."""
 SUMMARY_FIELDS: Final = ("n", "min", "max", "mean")
 """Fields of a summary of numbers."""
-_LONG: Final = (pa.int64(), pa.uint32(), pa.uint64())
 
 
 class UnfitError(Exception):
@@ -229,60 +224,6 @@ def records_of(
     if is_list(kind) and _is_changed(kind.value_field):
         return with_values(columns, records_of(columns.flatten(), is_summarised, above))
     return columns
-
-
-def summaries_in(
-    columns: Array, above: tuple[str, ...] = ()
-) -> Iterator[tuple[tuple[str, ...], Array]]:
-    """Columns of summaries, but for those inside lists, and the paths of their arrays."""
-    for field, column in zip(columns.type, columns.flatten(), strict=True):
-        path = (*above, original_name(field))
-        if has_summaries(field):
-            yield path, column
-        elif pa.types.is_struct(field.type):
-            yield from summaries_in(column, path)
-
-
-def documents(columns: Array, *, typed: bool = True) -> list[dict[str, Any]]:
-    """Columns as index documents: arrays, or summaries of long ones, and without what is null.
-
-    Args:
-        columns: A struct array; its fields are the columns.
-        typed: True if a definition fixes the width of integers.
-    """
-    names = [original_name(field) for field in columns.type]
-    cells = [
-        _cells(column, field, typed=typed)
-        for field, column in zip(columns.type, columns.flatten(), strict=True)
-    ]
-    rows = zip(*cells, strict=True) if cells else [()] * len(columns)
-    return [{n: v for n, v in zip(names, row, strict=True) if v is not None} for row in rows]
-
-
-def _cells(array: Array, field: Any, *, typed: bool) -> list[Any]:
-    kind, is_empty = array.type, EMPTY in (field.metadata or {})
-    if has_summaries(field):
-        found = array.to_pylist()
-        return [None if one is None else {k: _whole(v) for k, v in one.items()} for one in found]
-    if pa.types.is_struct(kind):
-        there = array.is_valid().to_pylist()
-        return [d if v else None for d, v in zip(documents(array, typed=typed), there, strict=True)]
-    if is_list(kind):
-        inner = field if is_empty else kind.value_field
-        values = iter(_cells(array.flatten(), inner, typed=typed))
-        counted = zip(lengths_of(array).tolist(), array.is_valid().to_pylist(), strict=True)
-        return [[next(values) for _ in range(n)] if there else None for n, there in counted]
-    if is_bytes(kind):
-        return [None if n is None else {"n": Int64(n)} for n in pc.binary_length(array).to_pylist()]
-    values = plain_values(array)
-    if is_empty:
-        return [None if there is None else {} for there in values]
-    return [*map(_whole, values)] if is_time(kind) or (typed and kind in _LONG) else values
-
-
-def _whole(value: Any) -> Any:
-    """An integer as int64 of BSON, whatever its value."""
-    return Int64(value) if isinstance(value, int) else value
 
 
 def _filled(summaries: Array, lists: Array | None) -> Array:

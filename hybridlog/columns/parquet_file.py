@@ -17,12 +17,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import pyarrow as pa
-import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from hybridlog.columns.fields import has_summaries, original_name
 from hybridlog.columns.layout import ABOUT, OWN, OWN_COLUMNS, About, Section
-from hybridlog.schema.arrow_types import is_list
+from hybridlog.schema.arrow_types import is_bytes, is_list
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk import durability, files
 from hybridlog_storage.errors import HybridlogError, StoreError, exhausted
@@ -34,7 +33,6 @@ if TYPE_CHECKING:
 _WRITTEN: Final = 1 << 20  # bytes buffered before a write
 _TAIL: Final = 8  # bytes: length of the footer, `PAR1`
 _MAX_FOOTER: Final = 256 << 20
-_SAMPLE: Final = 256  # values of a column that decide about a dictionary
 _RUNNING: Final = frozenset({"t", "log_time", "seq", "pub", "stamp", "ref.chunk", "ref.off"})
 _SEAL: Final = re.compile(rb"hybridlog-footer:([0-9a-f]{8})")
 _BLANK: Final = b"hybridlog-footer:00000000"
@@ -66,10 +64,8 @@ class ParquetFileWriter:
 
     Args:
         path: The file, in the folder of a recording's unfinished tables.
-        sample: Example rows; their schema is the file's.
+        schema: Its columns.
         level: Level of zstd.
-        is_all: True if the example rows are all rows of the file. Then floats without NaN
-            have statistics: DuckDB answers wrongly from those of floats with NaN among them.
         reused: Row groups of the file that this one replaces.
         in_front: True to write the new row groups in front of the kept ones.
         front: Bytes in front of the row groups, which no reader of Parquet looks at.
@@ -81,10 +77,9 @@ class ParquetFileWriter:
     def __init__(
         self,
         path: Path,
-        sample: pa.Table,
+        schema: pa.Schema,
         *,
         level: int = 1,
-        is_all: bool = False,
         reused: ReusedBytes | None = None,
         in_front: bool = False,
         front: bytes = b"",
@@ -92,28 +87,25 @@ class ParquetFileWriter:
         self.path = path
         self._bounds: list[tuple[int, int, int, int, int]] = []
         self._sink = _Sink(path)
-        kinds = {leaf.path: leaf.kind for leaf in leaves(sample.schema)}
-        encodings = {
-            leaf: "DELTA_BINARY_PACKED" for leaf, kind in kinds.items() if _runs(leaf, kind)
-        }
-        repeating = [
-            leaf
-            for leaf, array in _leaf_values(sample.slice(0, _SAMPLE))
-            if leaf not in encodings and _repeats(array)
+        kinds = {leaf.path: leaf.kind for leaf in leaves(schema)}
+        running = [path for path, kind in kinds.items() if _runs(path, kind)]
+        # DuckDB answers wrongly from statistics of floats with NaN among them.
+        ordered = [
+            path
+            for path, kind in kinds.items()
+            if not (is_bytes(kind) or pa.types.is_floating(kind))
         ]
-        ordered = {leaf for leaf, kind in kinds.items() if _is_ordered(kind)}
-        if is_all:
-            ordered |= {leaf for leaf, array in _leaf_values(sample) if _has_no_nan(array)}
+        repeating = [path for path in ordered if path not in running and kinds[path] != pa.bool_()]
         try:
             self._file = pa.PythonFile(self._sink, mode="w")
             self._writer = pq.ParquetWriter(
                 self._file,
-                sample.schema,
+                schema,
                 compression="zstd",
                 compression_level=level,
                 use_dictionary=repeating,
-                column_encoding=encodings,
-                write_statistics=[leaf for leaf in kinds if leaf in ordered],
+                column_encoding=dict.fromkeys(running, "DELTA_BINARY_PACKED"),
+                write_statistics=ordered,
                 write_page_checksum=True,
             )
             if front:
@@ -496,15 +488,6 @@ class _Source:
         """Do nothing: the file remains open as long as its reader."""
 
 
-def _is_ordered(kind: pa.DataType) -> bool:
-    """True for types whose least and greatest values every reader understands."""
-    return not (pa.types.is_floating(kind) or pa.types.is_binary(kind))
-
-
-def _has_no_nan(array: pa.Array[Any]) -> bool:
-    return pa.types.is_floating(array.type) and not pc.any(pc.is_nan(array)).as_py()
-
-
 class Leaf(NamedTuple):
     """A column in Parquet's order.
 
@@ -546,36 +529,6 @@ def _leaves(
         inner = kind.field(number)
         of_array = names if has_summaries(field) else array
         yield from _leaves(inner, f"{path}.{inner.name}", names, of_array)
-
-
-def _leaf_values(table: pa.Table) -> Iterator[tuple[str, pa.Array[Any]]]:
-    """The values of each column, in Parquet's order."""
-    for top, column in zip(table.schema, table.columns, strict=True):
-        array = column.combine_chunks()
-        if isinstance(array, pa.ChunkedArray):
-            array = pa.concat_arrays(array.chunks) if array.num_chunks else pa.nulls(0, top.type)
-        yield from _inner_values(top.name, array)
-
-
-def _inner_values(path: str, array: pa.Array[Any]) -> Iterator[tuple[str, pa.Array[Any]]]:
-    if isinstance(array, pa.ExtensionArray):  # JSON text
-        array = array.storage
-    if pa.types.is_struct(array.type):
-        for number in range(array.type.num_fields):
-            inner = array.type.field(number)
-            yield from _inner_values(f"{path}.{inner.name}", array.field(number))
-    elif is_list(array.type):
-        yield from _inner_values(f"{path}.list.element", array.flatten())
-    else:
-        yield path, array
-
-
-def _repeats(array: pa.Array[Any]) -> bool:
-    """True if a dictionary is worthwhile: half of the first values are repeated."""
-    if pa.types.is_boolean(array.type):
-        return False
-    some = array.slice(0, 4 * _SAMPLE)
-    return bool(2 * len(some.unique()) <= max(len(some), 2))
 
 
 def _runs(path: str, kind: pa.DataType) -> bool:

@@ -17,21 +17,23 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+from bson.int64 import Int64
 
 from hybridlog.columns.column_file import ColumnFile, names_of
 from hybridlog.columns.fields import (
     SUMMARY_FIELDS,
     FieldShape,
-    documents,
+    has_summaries,
+    original_name,
     records_of,
-    summaries_in,
     without,
 )
-from hybridlog.columns.layout import OWN_COLUMNS
+from hybridlog.columns.layout import EMPTY, OWN_COLUMNS
 from hybridlog.columns.parquet_file import ParquetFileReader
 from hybridlog.columns.rows import Messages, own_columns
 from hybridlog.columns.rows import Piece as TablePiece
 from hybridlog.schema.arrow_columns import structs
+from hybridlog.schema.arrow_types import Array, is_bytes, is_list, is_time, lengths_of, plain_values
 from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.states import State, state_of
 from hybridlog_storage.cache import Cache
@@ -40,7 +42,7 @@ from hybridlog_storage.manifest import File, Part, hasher, rows_line
 from hybridlog_storage.messages import Batch, Left
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Mapping, Sequence
+    from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -49,6 +51,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.segments.chunk import StoredChunk
 
 _OWN: Final = frozenset(OWN_COLUMNS)
+_LONG: Final = (pa.int64(), pa.uint32(), pa.uint64())
 RESTORE: Final = " Restore it from a copy; `hybridlog verify` shows what is affected."
 
 
@@ -249,7 +252,7 @@ class LeftRows:
 
     def documents(self, rows: NDArray[np.int64], *, typed: bool) -> list[dict[str, object]]:
         """The fields as in index documents; `typed` to tell int64 from int32."""
-        return documents(self._columns.take(pa.array(rows)), typed=typed)
+        return _documents(self._columns.take(pa.array(rows)), typed=typed)
 
     def records(self, rows: NDArray[np.int64], summarised: Collection[str] = ()) -> pa.StructArray:
         """The fields. Long arrays are null; those at the paths of `summarised` are summaries."""
@@ -262,7 +265,7 @@ class LeftRows:
         """bool[n], True where a wanted array is not there."""
         wanted = None if fields is None else [names_of(path) for path in fields]
         found = np.zeros(len(rows), np.bool_)
-        for path, summary in summaries_in(self._columns.take(pa.array(rows))):
+        for path, summary in _summaries_in(self._columns.take(pa.array(rows))):
             if ".".join(path) not in but and (wanted is None or _asks(wanted, path)):
                 found |= summary.is_valid().to_numpy(zero_copy_only=False)
         return found
@@ -316,3 +319,59 @@ def messages_left(parts: Sequence[pa.StructArray]) -> tuple[Batch, NDArray[np.in
         Left([*map(LeftRows, parts)], part, row, *place),
     )
     return batch, numbers("seq", np.int64)
+
+
+def _summaries_in(
+    columns: Array, above: tuple[str, ...] = ()
+) -> Iterator[tuple[tuple[str, ...], Array]]:
+    """Columns of summaries, but for those inside lists, and the paths of their arrays."""
+    for field, column in zip(columns.type, columns.flatten(), strict=True):
+        path = (*above, original_name(field))
+        if has_summaries(field):
+            yield path, column
+        elif pa.types.is_struct(field.type):
+            yield from _summaries_in(column, path)
+
+
+def _documents(columns: Array, *, typed: bool) -> list[dict[str, Any]]:
+    """Columns as index documents: arrays, or summaries of long ones, and without what is null.
+
+    Args:
+        columns: A struct array; its fields are the columns.
+        typed: True if a definition fixes the width of integers.
+    """
+    names = [original_name(field) for field in columns.type]
+    cells = [
+        _cells(column, field, typed=typed)
+        for field, column in zip(columns.type, columns.flatten(), strict=True)
+    ]
+    rows = zip(*cells, strict=True) if cells else [()] * len(columns)
+    return [{n: v for n, v in zip(names, row, strict=True) if v is not None} for row in rows]
+
+
+def _cells(array: Array, field: Any, *, typed: bool) -> list[Any]:
+    kind, is_empty = array.type, EMPTY in (field.metadata or {})
+    if has_summaries(field):
+        found = array.to_pylist()
+        return [None if one is None else {k: _whole(v) for k, v in one.items()} for one in found]
+    if pa.types.is_struct(kind):
+        there = array.is_valid().to_pylist()
+        return [
+            d if v else None for d, v in zip(_documents(array, typed=typed), there, strict=True)
+        ]
+    if is_list(kind):
+        inner = field if is_empty else kind.value_field
+        values = iter(_cells(array.flatten(), inner, typed=typed))
+        counted = zip(lengths_of(array).tolist(), array.is_valid().to_pylist(), strict=True)
+        return [[next(values) for _ in range(n)] if there else None for n, there in counted]
+    if is_bytes(kind):
+        return [None if n is None else {"n": Int64(n)} for n in pc.binary_length(array).to_pylist()]
+    values = plain_values(array)
+    if is_empty:
+        return [None if there is None else {} for there in values]
+    return [*map(_whole, values)] if is_time(kind) or (typed and kind in _LONG) else values
+
+
+def _whole(value: Any) -> Any:
+    """An integer as int64 of BSON, whatever its value."""
+    return Int64(value) if isinstance(value, int) else value

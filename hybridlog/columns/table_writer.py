@@ -211,7 +211,7 @@ class _File:
         self._has_publish_time = has_publish_time
         self._writer: ParquetFileWriter | None = None
 
-    def write(self, pieces: list[Piece], *, is_all: bool) -> None:
+    def write(self, pieces: list[Piece]) -> None:
         """Write rows as row groups.
 
         Raises:
@@ -223,7 +223,7 @@ class _File:
         table = self._topic.table(pieces, self._has_publish_time)
         if self._writer is None:
             self.schema = table.schema
-            self._writer = ParquetFileWriter(self.path, table, is_all=is_all)
+            self._writer = ParquetFileWriter(self.path, table.schema)
         elif table.schema != self.schema:
             table = self._fitting(table)
         step = _rows_of_group(table)
@@ -546,14 +546,14 @@ class TableWriter:
         unfinished = topic.files.setdefault(segment, [])
         if unfinished:
             try:
-                unfinished[-1].write(pieces, is_all=False)
+                unfinished[-1].write(pieces)
             except UnfitError:
                 pass
             else:
                 return 0
         file = _File(self._new_part(), topic, self._has_publish_time)
         unfinished.append(file)
-        file.write(pieces, is_all=segment in self._cut)
+        file.write(pieces)
         return 1
 
     def _new_part(self) -> Path:

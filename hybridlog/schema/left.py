@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NoReturn, Protocol
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 
@@ -23,35 +23,11 @@ if TYPE_CHECKING:
     from hybridlog_storage.messages import Buffer, Left
 
 
-class Part(Protocol):
-    """Rows of a file. In each method `rows`, int64[n], are the wanted ones."""
-
-    def errors(self, rows: NDArray[np.int64]) -> list[tuple[NDArray[np.intp], str]]:
-        """Which of these did not fit their definition, by reason."""
-
-    def surplus(self, rows: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """bool[n], True where bytes were left over behind the message."""
-
-    def sha256(self, row: int) -> bytes:
-        """The hash of a payload."""
-
-    def documents(self, rows: NDArray[np.int64], *, typed: bool) -> list[dict[str, object]]:
-        """The fields as in index documents; `typed` to tell int64 from int32."""
-
-    def records(self, rows: NDArray[np.int64], summarised: Collection[str] = ()) -> pa.StructArray:
-        """The fields. Long arrays are null; those at the paths of `summarised` are summaries."""
-
-    def lacking(
-        self, rows: NDArray[np.int64], fields: Collection[str] | None, but: Collection[str]
-    ) -> NDArray[np.bool_]:
-        """bool[n], True where an array is not there, see `LeftFields.lacking`."""
-
-
 class LeftFields(Objects):
     """Fields of messages whose payloads are gone.
 
     Args:
-        places: Where each is: its part, and the row there.
+        places: Where their rows are; parts are `hybridlog.columns.rows_file.LeftRows`.
         fields: Dotted paths of those wanted in `arrow`, each with all below it; None for all.
         empty: No messages, as the codec of the payloads decodes them.
     """

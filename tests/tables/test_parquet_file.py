@@ -45,7 +45,7 @@ def table() -> pa.Table:
 
 def write(path: Path, table: pa.Table, groups: int = 2, **about: str) -> Section:
     rows = table.num_rows
-    writer = ParquetFileWriter(path, table)
+    writer = ParquetFileWriter(path, table.schema)
     for _ in range(groups):
         writer.write(table)
     section = Section("id", 0, {"0": about.get("digest", "d")}, {"/a": TopicCounts(rows * groups)})
@@ -62,7 +62,7 @@ def path(tmp_path: Path) -> Path:
 
 def test_a_discarded_file_is_let_go_in_silence(path: Path, table: pa.Table) -> None:
     """When pyarrow's writer is collected, it writes a footer to the file that is gone."""
-    writer = ParquetFileWriter(path, table)
+    writer = ParquetFileWriter(path, table.schema)
     writer.write(table)
     writer.discard()
     writer._writer.close()
@@ -159,7 +159,7 @@ def test_what_a_file_replaces_keeps_its_place(path: Path) -> None:
         numbers = np.random.default_rng(number).random(len(rows))
         table = pa.table({"x": numbers, "t": rows, "seq": rows})
         in_front = kept is not None and len(kept.data) * 1.3 < kept.offset
-        writer = ParquetFileWriter(path, table, reused=kept, in_front=in_front)
+        writer = ParquetFileWriter(path, table.schema, reused=kept, in_front=in_front)
         writer.write(table)
         section = Section("id", 0, {}, {"/a": TopicCounts(table.num_rows)})
         writer.close([section])
