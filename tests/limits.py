@@ -18,7 +18,6 @@ PLACES = {
     "long_table_rows": "hybridlog.columns.table_writer.LONG_ROWS",
     "table_arena_bytes": "hybridlog.columns.table_writer._ARENA",
     "table_left_bytes": "hybridlog.columns.table_writer._LEFT",
-    "table_in_place_bytes": "hybridlog.columns.table_writer._MIN_IN_PLACE_BYTES",
     "table_open_files": "hybridlog.columns.table_writer._OPEN_FILES",
     "table_pending_bytes": "hybridlog.columns.table_writer._PENDING",
     "table_reserve_bytes": "hybridlog.columns.table_writer._RESERVE",

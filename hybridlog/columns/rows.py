@@ -44,12 +44,12 @@ class Messages(NamedTuple):
     offset: NDArray[np.int64]
 
     @classmethod
-    def of(cls, chunk: StoredChunk, begin: int) -> Messages:
-        """Messages of a chunk, whose payloads are copied to a buffer `-begin` bytes further on."""
+    def of(cls, chunk: StoredChunk) -> Messages:
+        """Messages of a chunk, over its buffer."""
         batch = chunk.batch
         number = np.full(len(batch), chunk.number, np.int32)
         return cls(
-            batch.offset - begin,
+            batch.offset,
             batch.places[1].copy(),
             batch.channel.copy(),
             batch.log_time.copy(),

@@ -75,7 +75,7 @@ class RowColumns:
         """
         batch = chunk.batch.take(rows)
         state = State.REDUCED if self._is_reduced else State.EXPIRED
-        piece = TablePiece(chunk.segment, Messages.of(chunk, 0).take(rows), None, state=state)
+        piece = TablePiece(chunk.segment, Messages.of(chunk).take(rows), None, state=state)
         decoded = None
         if self._codec.indexed and not self._is_reduced:
             decoded = self._codec.columns(batch.buffer, batch.offset, batch.length)

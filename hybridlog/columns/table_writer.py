@@ -1,6 +1,6 @@
 """Writes the tables of a recording during indexing.
 
-Payloads of small messages are collected and decoded by columns, 8 MiB at a time. Rows
+Chunks are collected and decoded by columns, 8 MiB at a time. Rows
 remain in memory until their segment is sealed, or until there are too many. Then they
 become row groups of an unfinished file of their topic. Topics with few rows wait until the
 recording has ended, and go to files that recordings share.
@@ -40,8 +40,8 @@ from hybridlog.index.indexing import rows_by_channel
 from hybridlog.schema.codec import Codec
 from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.states import State, encoding_of, state_of
-from hybridlog_storage.buffers import buffers
 from hybridlog_storage.disk import files
+from hybridlog_storage.disk.copying import joined
 from hybridlog_storage.ordering import order_of
 from hybridlog_storage.settings import read_settings
 
@@ -58,8 +58,7 @@ GROUP_ROWS: Final = 131_072
 """Maximum number of rows in a row group."""
 GROUP_BYTES: Final = 32 << 20
 """Maximum bytes of the columns of a row group in memory."""
-_ARENA = 8 << 20  # bytes of payloads collected: each topic's part costs a millisecond
-_MIN_IN_PLACE_BYTES = 4 << 20  # chunk size, bytes, from which a chunk is decoded in place
+_ARENA = 8 << 20  # bytes of chunks collected: each topic's part costs a millisecond
 _ROWS = 1 << 18  # messages collected
 _PENDING = 16 << 20  # bytes of rows waiting in memory
 _LEFT = _PENDING // 4  # bytes of the smallest topics, which continue to wait for more rows
@@ -145,7 +144,7 @@ class _Topic:
         """
         import pyarrow as pa
 
-        from hybridlog.columns.fields import joined
+        from hybridlog.columns.fields import joined as joined_columns
 
         messages = Messages.joined([piece.messages for piece in pieces])
         segment = np.repeat(
@@ -160,7 +159,7 @@ class _Topic:
                 pa.nulls(piece.rows, kind) if piece.fields is None else piece.fields
                 for piece in pieces
             ]
-            fields = joined([pa.nulls(0, kind), *found])
+            fields = joined_columns([pa.nulls(0, kind), *found])
         columns = {
             name: pa.repeat(pa.scalar(value), len(segment))
             for name, value in (("recording", self.recording), ("topic", self.name))
@@ -236,10 +235,11 @@ class _File:
         """Rows with the columns of the file."""
         import pyarrow as pa
 
-        from hybridlog.columns.fields import UnfitError, joined
+        from hybridlog.columns.fields import UnfitError
+        from hybridlog.columns.fields import joined as joined_columns
 
         kind = pa.struct(list(self.schema))
-        fitting = joined([pa.nulls(0, kind), table.to_struct_array().combine_chunks()])
+        fitting = joined_columns([pa.nulls(0, kind), table.to_struct_array().combine_chunks()])
         if fitting.type != kind:
             raise UnfitError("the file has other columns")
         return pa.Table.from_struct_array(fitting).cast(self.schema)
@@ -290,11 +290,7 @@ class TableWriter:
         self._numbers = 0
         self._has_ended = False
         self.has_failed = False
-        self._arena: NDArray[np.uint8] | None = None
-        self._filled = 0
-        self._held: list[Messages] = []
-        self._held_rows = 0
-        self._held_segment = -1
+        self._held: list[StoredChunk] = []  # of one segment
         self._channels: dict[int, Channel] = {}
         self._has_grown = False  # rows were decoded since the last look at their size
         self._topics: dict[tuple[str, str], _Topic] = {}
@@ -308,9 +304,8 @@ class TableWriter:
     @property
     def rows_in_memory(self) -> int:
         """Number of rows waiting to be written."""
-        return self._held_rows + sum(
-            piece.rows for topic in self._topics.values() for piece in topic.pieces
-        )
+        pieces = (piece.rows for topic in self._topics.values() for piece in topic.pieces)
+        return sum(len(chunk.batch) for chunk in self._held) + sum(pieces)
 
     def seal(self, segment: int, digest: str, messages: int) -> None:
         """Register a sealed segment. Thread safe."""
@@ -318,7 +313,7 @@ class TableWriter:
             self._sealed[segment] = digest, messages
 
     def add(self, chunk: StoredChunk, channels: Mapping[int, Channel]) -> None:
-        """Add the messages of a chunk; its buffer is not used afterwards."""
+        """Add the messages of a chunk."""
         if self._has_ended:
             return
         with self._harmless():
@@ -358,8 +353,6 @@ class TableWriter:
         self._topics.clear()
         self._of_channel.clear()
         self._held.clear()
-        self._held_rows = 0
-        self._arena = None
         if self._has_parts:
             with suppress(OSError):
                 files.remove_tree(self._parts)
@@ -379,40 +372,31 @@ class TableWriter:
     # From chunks to rows in memory.
 
     def _collect(self, chunk: StoredChunk) -> None:
-        batch = chunk.batch
-        begin, rows = int(batch.offset.min()), len(batch)
-        size = int((batch.offset + batch.length).max()) - begin
-        is_full = self._filled + size > _ARENA or self._held_rows + rows > _ROWS
-        is_enough = size >= min(_MIN_IN_PLACE_BYTES, _ARENA)
-        if is_enough or is_full or chunk.segment != self._held_segment:
+        if self._held and self._held[0].segment != chunk.segment:
             self._decode()
-        self._held_segment = chunk.segment
-        data = np.frombuffer(batch.buffer, np.uint8, size, begin)
-        self._held.append(Messages.of(chunk, begin - self._filled))
-        self._held_rows += rows
-        if is_enough:
-            self._decode(data)
-            return
-        if self._arena is None:
-            self._arena = buffers.take(_ARENA)
-        self._arena[self._filled : self._filled + size] = data
-        self._filled += size
+        self._held.append(chunk)
+        batches = [one.batch for one in self._held]
+        if sum(len(b.buffer) for b in batches) >= _ARENA or sum(map(len, batches)) >= _ROWS:
+            self._decode()
 
-    def _decode(self, data: NDArray[np.uint8] | None = None) -> None:
+    def _decode(self) -> None:
         """Make rows of the collected messages."""
         if not self._held:
             return
-        if data is None:
-            assert self._arena is not None
-            data = self._arena[: self._filled]
         self._has_grown = True
-        messages = Messages.joined(self._held)
-        self._held.clear()
-        self._filled = self._held_rows = 0
+        held, self._held = self._held, []
+        messages = Messages.joined([*map(Messages.of, held)])
+        batch = joined([chunk.batch for chunk in held])
+        messages = messages._replace(at=batch.offset)
+        data = np.frombuffer(batch.buffer, np.uint8)
         for topic, codec, state, part in self._by_topic(messages):
             if topic.is_wanted:
+                piece = Piece(held[0].segment, part, None, state=state)
+                piece.has_arrays = topic.has_arrays
                 with self._only(topic):
-                    topic.add(self._piece(topic, codec, state, part, data))
+                    if codec.indexed and state is State.WHOLE:
+                        self._add_fields(piece, topic, codec, data)
+                    topic.add(piece)
 
     def _by_topic(self, messages: Messages) -> Iterator[tuple[_Topic, Codec, State, Messages]]:
         """The messages, grouped by topic and encoding."""
@@ -447,19 +431,6 @@ class TableWriter:
             self._has_publish_time[number] = channel.has_publish_time
         return found
 
-    def _piece(
-        self,
-        topic: _Topic,
-        codec: Codec,
-        state: State,
-        messages: Messages,
-        data: NDArray[np.uint8],
-    ) -> Piece:
-        piece = Piece(self._held_segment, messages, None, state=state, has_arrays=topic.has_arrays)
-        if codec.indexed and state is State.WHOLE:
-            self._add_fields(piece, topic, codec, data)
-        return piece
-
     def _add_fields(
         self, piece: Piece, topic: _Topic, codec: Codec, data: NDArray[np.uint8]
     ) -> None:
@@ -479,7 +450,7 @@ class TableWriter:
 
     def _add_expired(self, chunk: StoredChunk) -> None:
         """Make rows of what is left of expired messages."""
-        messages = Messages.of(chunk, 0)
+        messages = Messages.of(chunk)
         for number, own in rows_by_channel(chunk.batch.channel):
             topic, _, state = self._topic_of(number)
             if not topic.is_wanted:
@@ -580,7 +551,7 @@ class TableWriter:
                 if self._seen[segment] == messages
             ]
         for segment in sorted(ready):
-            if self._held_segment == segment:
+            if self._held and self._held[0].segment == segment:
                 self._decode()
             with self._lock:
                 digest, _ = self._sealed.pop(segment)

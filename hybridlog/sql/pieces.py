@@ -345,7 +345,7 @@ class _ChunkRows:
         for number, channel in self._source.channels.items():
             rows = np.flatnonzero(chunk.batch.channel == number)
             if len(rows):
-                yield self._rows(chunk, channel, Messages.of(chunk, 0).take(rows), paths, counts)
+                yield self._rows(chunk, channel, Messages.of(chunk).take(rows), paths, counts)
 
     def _rows(
         self,
