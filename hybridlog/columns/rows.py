@@ -149,6 +149,18 @@ def own_columns(
     }
 
 
+def as_table(own: Mapping[str, Any], fields: Any) -> Any:
+    """Columns of rows as a table; `fields` is a struct array, or None."""
+    import pyarrow as pa
+
+    schema = [pa.field(name, column.type) for name, column in own.items()]
+    arrays = [*own.values()]
+    if fields is not None:
+        schema += list(fields.type)
+        arrays += fields.flatten()
+    return pa.Table.from_arrays(arrays, schema=pa.schema(schema))
+
+
 def _errors(pieces: Sequence[Piece], states: NDArray[np.int8]) -> Any:
     """Reasons why messages are unreadable; sets their states."""
     import pyarrow as pa

@@ -30,7 +30,7 @@ from hybridlog.columns.fields import (
 )
 from hybridlog.columns.layout import EMPTY, OWN_COLUMNS
 from hybridlog.columns.parquet_file import ParquetFileReader
-from hybridlog.columns.rows import Messages, own_columns
+from hybridlog.columns.rows import Messages, as_table, own_columns
 from hybridlog.columns.rows import Piece as TablePiece
 from hybridlog.schema.arrow_columns import structs
 from hybridlog.schema.arrow_types import Array, is_bytes, is_list, is_time, lengths_of, plain_values
@@ -99,12 +99,7 @@ class RowColumns:
         ref = own["ref"]
         names = [field.name for field in ref.type]
         own["ref"] = structs({**dict(zip(names, ref.flatten(), strict=True)), **more}, len(rows))
-        schema = [pa.field(name, column.type) for name, column in own.items()]
-        arrays = [*own.values()]
-        if piece.fields is not None:
-            schema += list(piece.fields.type)
-            arrays += piece.fields.flatten()
-        return pa.Table.from_arrays(arrays, schema=pa.schema(schema))
+        return as_table(own, piece.fields)
 
 
 class Place(NamedTuple):

@@ -35,7 +35,7 @@ from hybridlog.columns.layout import (
     topics_of,
     type_prefix,
 )
-from hybridlog.columns.rows import Messages, Piece, own_columns
+from hybridlog.columns.rows import Messages, Piece, as_table, own_columns
 from hybridlog.index.indexing import rows_by_channel
 from hybridlog.schema.codec import Codec
 from hybridlog.schema.codecs import codec_for
@@ -165,12 +165,7 @@ class _Topic:
             for name, value in (("recording", self.recording), ("topic", self.name))
         }
         columns |= own_columns(pieces, messages, segment, fields, has_publish_time)
-        known = list(map(pa.field, columns, [column.type for column in columns.values()]))
-        arrays = list(columns.values())
-        if fields is not None:
-            known += [fields.type.field(number) for number in range(fields.type.num_fields)]
-            arrays += fields.flatten()
-        table = pa.Table.from_arrays(arrays, schema=pa.schema(known))
+        table = as_table(columns, fields)
         order = order_of(messages.log_time, messages.seq)
         return table if order is None else table.take(pa.array(order))
 
@@ -385,35 +380,28 @@ class TableWriter:
             return
         self._has_grown = True
         held, self._held = self._held, []
-        messages = Messages.joined([*map(Messages.of, held)])
         batch = joined([chunk.batch for chunk in held])
-        messages = messages._replace(at=batch.offset)
+        messages = Messages.joined([*map(Messages.of, held)])._replace(at=batch.offset)
         data = np.frombuffer(batch.buffer, np.uint8)
-        for topic, codec, state, part in self._by_topic(messages):
-            if topic.is_wanted:
-                piece = Piece(held[0].segment, part, None, state=state)
-                piece.has_arrays = topic.has_arrays
-                with self._only(topic):
-                    if codec.indexed and state is State.WHOLE:
-                        self._add_fields(piece, topic, codec, data)
-                    topic.add(piece)
+        for topic, codec, state, rows in self._by_topic(messages.channel):
+            piece = Piece(held[0].segment, messages.take(rows), None, state=state)
+            piece.has_arrays = topic.has_arrays
+            with self._only(topic):
+                if codec.indexed and state is State.WHOLE:
+                    self._add_fields(piece, topic, codec, data)
+                topic.add(piece)
 
-    def _by_topic(self, messages: Messages) -> Iterator[tuple[_Topic, Codec, State, Messages]]:
-        """The messages, grouped by topic and encoding."""
-        numbers = np.flatnonzero(np.bincount(messages.channel)).tolist()
-        found = {number: self._topic_of(number) for number in numbers}
-        place: dict[tuple[_Topic, Codec, State], int] = {}
-        for kind in found.values():
-            place.setdefault(kind, len(place))
-        kinds = list(place)
-        if len(kinds) == 1:
-            yield *kinds[0], messages
-            return
-        table = np.zeros(numbers[-1] + 1, np.int32)
-        table[numbers] = [place[kind] for kind in found.values()]
-        for number, rows in rows_by_channel(table[messages.channel]):
-            if kinds[number][0].is_wanted:
-                yield *kinds[number], messages.take(rows)
+    def _by_topic(
+        self, channel: NDArray[np.int32]
+    ) -> Iterator[tuple[_Topic, Codec, State, NDArray[np.intp]]]:
+        """Rows of messages, grouped by topic and encoding."""
+        found: dict[tuple[_Topic, Codec, State], list[NDArray[np.intp]]] = {}
+        for number, rows in rows_by_channel(channel):
+            kind = self._topic_of(number)
+            if kind[0].is_wanted:
+                found.setdefault(kind, []).append(rows)
+        for kind, parts in found.items():
+            yield *kind, np.concatenate(parts)
 
     def _topic_of(self, number: int) -> tuple[_Topic, Codec, State]:
         found = self._of_channel.get(number)
@@ -451,10 +439,7 @@ class TableWriter:
     def _add_expired(self, chunk: StoredChunk) -> None:
         """Make rows of what is left of expired messages."""
         messages = Messages.of(chunk)
-        for number, own in rows_by_channel(chunk.batch.channel):
-            topic, _, state = self._topic_of(number)
-            if not topic.is_wanted:
-                continue
+        for topic, _, state, own in self._by_topic(chunk.batch.channel):
             left = chunk.batch.take(own).left
             assert left is not None
             if state is State.REDUCED:
