@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias, cast
 
 import numpy as np
 
 from hybridlog.query.times import format_time
-from hybridlog.schema.codec import one_message
+from hybridlog.schema.codec import columns_of, readable
 from hybridlog.schema.column import Records
-from hybridlog.schema.states import State
+from hybridlog.schema.states import GONE, State
 from hybridlog_storage.errors import HybridlogError
 
 if TYPE_CHECKING:
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
     from hybridlog.query.chunk_scan import MessageRun
     from hybridlog.query.question import RecordedChannel
+    from hybridlog.schema.codec import Decoded
     from hybridlog_storage.messages import Batch
 
 
@@ -130,7 +131,7 @@ class Message:
     def payload(self) -> memoryview:
         """The serialized message without a copy."""
         if self.is_reduced:
-            self._codec.decode(self._view)
+            self.decode()
         return self._view
 
     @property
@@ -157,6 +158,8 @@ class Message:
             PayloadError: the payload does not fit its definition.
             DefinitionError: no usable definition exists.
         """
+        if self.state in GONE:
+            self._documents.refuse(self._row)
         return self._codec.decode(self._view)
 
     def content(self) -> pa.StructScalar | Mapping[str, Any]:
@@ -169,7 +172,7 @@ class Message:
             PayloadError: the payload does not fit its definition.
             DefinitionError: no usable definition exists.
         """
-        decoded = one_message(self._codec, self._view)
+        decoded = self._documents.decoded(self._row)
         has_columns = isinstance(decoded.records, Records)
         values: Any = decoded.arrow() if has_columns else decoded.plain()
         return cast("pa.StructScalar | Mapping[str, Any]", values[0])
@@ -215,13 +218,35 @@ class Documents:
             self._make(int(self._batch.channel[row]))
         return document_of(self._bodies[row])
 
+    def decoded(self, row: int) -> Decoded:
+        """The columns of one message.
+
+        Raises:
+            PayloadError: The payload does not fit its definition.
+            DefinitionError: There is no definition to read it by.
+        """
+        codec = self._channels[int(self._batch.channel[row])].codec
+        return readable(columns_of(codec, self._batch.take(slice(row, row + 1))))
+
+    def refuse(self, row: int) -> NoReturn:
+        """Refuse a payload that is gone.
+
+        Raises:
+            PayloadError: Always.
+        """
+        from hybridlog.schema.left import missing_payload
+
+        left = self._batch.left
+        assert left is not None
+        digest = left.parts[left.part[row]].sha256(int(left.row[row]))
+        state = self._channels[int(self._batch.channel[row])].state
+        raise missing_payload(state, int(left.length[row]), digest)
+
     def _make(self, index: int) -> None:
-        from hybridlog.schema.index_bodies import index_bodies
+        from hybridlog.schema.index_bodies import bodies_of
 
         rows = np.flatnonzero(self._batch.channel == index)
-        part = self._batch.take(rows)
-        codec = self._channels[index].codec
-        for group in index_bodies(codec, part.buffer, part.offset, part.length):
+        for group in bodies_of(self._channels[index].codec, self._batch.take(rows)):
             for row, body in zip(rows[group.rows].tolist(), group.body, strict=True):
                 self._bodies[row] = body.tobytes()
 

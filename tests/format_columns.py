@@ -64,14 +64,11 @@ class Columns:
         (seal,) = re.finditer(rb"hybridlog-footer:([0-9a-f]{8})", footer)
         blank = footer[: seal.start(1)] + b"0" * 8 + footer[seal.end(1) :]
         demand(seal[1] == b"%08x" % zlib.crc32(blank), "the checksum of a footer")
-        file = pq.ParquetFile(pa.BufferReader(data))
+        file = pq.ParquetFile(pa.BufferReader(data), page_checksum_verification=True)
         about = json.loads(file.metadata.metadata[b"hybridlog"])
-        demand(about["version"] == 2 and about["body"] == begin, "the body of a file")
+        demand(about["version"] == 2, "the version of a file")
         (section,) = about["recordings"]
         demand(section["id"] == self._recording, "a file of another recording")
-        blocks = [data[at : min(at + (32 << 10), begin)] for at in range(0, begin, 32 << 10)]
-        checksums = "".join(f"{zlib.crc32(block):08x}" for block in blocks)
-        demand(checksums == about["checksums"], "the checksum of a block")
         (counts,) = section["topics"].values()
         rows = sum(part[0] for part in listed["parts"].values())
         demand(counts == [rows, 0, 0, 0], "the rows of a file")

@@ -47,7 +47,8 @@ class Told(NamedTuple):
     log_time: int
     publish_time: int | None
     sequence: int
-    payload: bytes
+    payload: bytes | dict[str, Any]
+    """The payload, or the row that is left of it."""
 
 
 class Chunk(NamedTuple):
@@ -367,7 +368,7 @@ class Segment:
         return 37 + 4 + len(body.text()) + 8
 
     def _told(
-        self, seq: int, channel: int, log_time: int, publish: int, sequence: int, payload: bytes
+        self, seq: int, channel: int, log_time: int, publish: int, sequence: int, payload: Any
     ) -> Told:
         schema, topic, encoding, metadata = self.channels[channel]
         known = "hybridlog.no_publish_time" not in metadata
@@ -458,7 +459,7 @@ class GoneSegment(Segment):
             ref = row["ref"]
             demand((ref["seg"], ref["chunk"]) == (self.line["number"], number), "a row")
             about = row["seq"], row["channel"], row["t"], row["pub"]
-            yield ref["off"], self._told(*about, ref["sequence"], ref["left"])
+            yield ref["off"], self._told(*about, ref["sequence"], ref.get("reduced", row))
 
 
 # --- recordings -----------------------------------------------------------------------

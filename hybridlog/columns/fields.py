@@ -20,7 +20,7 @@ from typing import Any, Final
 import numpy as np
 import pyarrow as pa
 
-from hybridlog.columns.layout import ORIGINAL, RESERVED, SUMMARY, column_names
+from hybridlog.columns.layout import EMPTY, ORIGINAL, RESERVED, SUMMARY, column_names
 from hybridlog.schema.arrow_columns import structs
 from hybridlog.schema.arrow_types import (
     COLUMNS,
@@ -85,19 +85,22 @@ class FieldShape:
         if kind in self._plain:
             return array
         columns: list[Array] = []
-        about: list[tuple[str, bool]] = []
+        about: list[tuple[str, bool, bool]] = []
         for number, field in enumerate(kind):
             values = array.field(number)
             if _has_summary(field.type):
                 columns += self._split(values)
-                about += [(field.name, False), (f"{field.name}_summary", True)]
+                is_empty = _is_empty(field.type)
+                about += [(field.name, False, is_empty), (f"{field.name}_summary", True, False)]
             else:
                 columns.append(self._column(values))
-                about.append((field.name, False))
-        named = list(column_names([name for name, _ in about], reserved))
+                about.append((field.name, False, _is_empty(field.type)))
+        named = list(column_names([name for name, _, _ in about], reserved))
         fields = [
-            _named(column, name, values.type, is_summary=is_summary)
-            for (name, column), (_, is_summary), values in zip(named, about, columns, strict=True)
+            _named(column, name, values.type, is_summary=is_summary, is_empty=is_empty)
+            for (name, column), (_, is_summary, is_empty), values in zip(
+                named, about, columns, strict=True
+            )
         ]
         if kind == pa.struct(fields) and not any(field.metadata for field in fields):
             self._plain.add(kind)
@@ -146,10 +149,20 @@ def _over(array: Array, limit: int) -> Any:
     return found
 
 
-def _named(column: str, name: str, kind: Any, *, is_summary: bool) -> Any:
+def _is_empty(kind: Any) -> bool:
+    """True for messages without fields, and arrays of them."""
+    while is_list(kind):
+        kind = kind.value_type
+    return pa.types.is_struct(kind) and not kind.num_fields
+
+
+def _named(column: str, name: str, kind: Any, *, is_summary: bool, is_empty: bool) -> Any:
     if is_summary:
         return pa.field(column, kind, metadata={SUMMARY: name.removesuffix("_summary")})
-    return pa.field(column, kind, metadata={ORIGINAL: name} if column != name else None)
+    about = {ORIGINAL: name} if column != name else {}
+    if is_empty:
+        about[EMPTY] = ""
+    return pa.field(column, kind, metadata=about or None)
 
 
 def original_name(field: Any) -> str:

@@ -320,8 +320,7 @@ class TableFolders:
         files.remove_tree(part)
         writer = ParquetFileWriter(
             part,
-            table,
-            is_all=True,
+            table.schema,
             reused=reused,
             in_front=in_front,
         )

@@ -18,9 +18,11 @@ import hashlib
 import json
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import msgspec
 
 from hybridlog.schema.states import encoding_of
 from hybridlog_storage.errors import StoreError
@@ -55,6 +57,8 @@ ORIGINAL: Final = b"hybridlog.name"
 """Metadata of a column: the name of its field, if it differs."""
 SUMMARY: Final = b"hybridlog.summary"
 """Metadata of a column: the name of the array whose summaries it has."""
+EMPTY: Final = b"hybridlog.empty"
+"""Metadata of a column of booleans, or of arrays of them: its messages have no fields."""
 OWN: Final = b"hybridlog.own"
 """Metadata of a column that is none of a field, besides `OWN_COLUMNS`."""
 ABOUT: Final = b"hybridlog"
@@ -211,9 +215,6 @@ class Section:
         return self.begin, self.id
 
 
-_OF_SECTION: Final = tuple(one.name for one in fields(Section))
-
-
 @dataclass(frozen=True, slots=True)
 class About:
     """The description of a file of tables, stored in the file itself.
@@ -223,8 +224,6 @@ class About:
         bounds: For each row group: its rows, then log time and arrival number of its first and
             last row. The keys are zeros in a file of several topics or recordings.
         span: First byte of the row groups, and the one after their end.
-        body: Bytes before the footer.
-        checksums: CRC-32 of each block of the body, 8 hexadecimal digits each.
         version: Version of the format.
         of_rows: What a file of rows says of them besides; empty in a table.
     """
@@ -232,8 +231,6 @@ class About:
     recordings: Sequence[Section]
     bounds: tuple[tuple[int, int, int, int, int], ...]
     span: tuple[int, int] = (0, 0)
-    body: int = 0
-    checksums: str = field(default="", repr=False)
     version: int = VERSION
     of_rows: Mapping[str, Any] = field(default_factory=dict, repr=False)
 
@@ -248,12 +245,7 @@ class About:
 
     def to_json(self) -> str:
         """The description as JSON text."""
-        values = {one.name: getattr(self, one.name) for one in fields(self)}
-        # Not by `asdict`, which copies each number.
-        values["recordings"] = [
-            {name: getattr(section, name) for name in _OF_SECTION} for section in self.recordings
-        ]
-        return json.dumps(values, separators=(",", ":"))
+        return msgspec.json.encode(self).decode()
 
     @classmethod
     def from_json(cls, text: bytes) -> About:
@@ -263,25 +255,13 @@ class About:
             StoreError: the text is invalid, or of another version.
         """
         try:
-            values: dict[str, Any] = json.loads(text)
-            if values["version"] != VERSION:
-                raise StoreError("the table has another version")
-            values["bounds"] = tuple(tuple(map(int, bound)) for bound in values["bounds"])
-            values["recordings"] = [_section(**one) for one in values["recordings"]]
-            about = cls(**values)
-            begin, end = values["span"]
-            is_sound = (
-                0 <= begin <= end <= values["body"]
-                and all(len(bound) == 5 for bound in about.bounds)
-                and sum(section.rows for section in about.recordings) == about.rows
-            )
-        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+            about = msgspec.json.decode(text, type=cls)
+        except (ValueError, RecursionError) as error:
             raise StoreError("the description of the table cannot be read") from error
-        if not is_sound:
+        if about.version != VERSION:
+            raise StoreError("the table has another version")
+        begin, end = about.span
+        rows = sum(section.rows for section in about.recordings)
+        if not 0 <= begin <= end or rows != about.rows:
             raise StoreError("the description of the table contradicts itself")
         return about
-
-
-def _section(topics: Mapping[str, Sequence[int]], **others: Any) -> Section:
-    counts = {str(topic): TopicCounts(*map(int, found)) for topic, found in topics.items()}
-    return Section(topics=counts, **others)

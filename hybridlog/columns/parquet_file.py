@@ -1,7 +1,6 @@
-"""Parquet files with a checksum for every byte.
+"""Parquet files whose pages have Parquet's checksums, and whose footer has one of its own.
 
-Parquet has checksums for pages at most, not for page headers or the footer. Here, blocks of
-the body have checksums in the footer, and the footer has its own. Other readers ignore both.
+Other readers ignore both.
 
 Files are read with `pread`: truncation of a mapped file would kill the process.
 """
@@ -18,12 +17,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import pyarrow as pa
-import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from hybridlog.columns.fields import has_summaries, original_name
 from hybridlog.columns.layout import ABOUT, OWN, OWN_COLUMNS, About, Section
-from hybridlog.schema.arrow_types import is_list
+from hybridlog.schema.arrow_types import is_bytes, is_list
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk import durability, files
 from hybridlog_storage.errors import HybridlogError, StoreError, exhausted
@@ -32,12 +30,9 @@ from hybridlog_storage.manifest import hasher
 if TYPE_CHECKING:
     from hybridlog_storage.messages import Buffer
 
-BLOCK: Final = 32 << 10
-"""Bytes of the body with one checksum."""
 _WRITTEN: Final = 1 << 20  # bytes buffered before a write
 _TAIL: Final = 8  # bytes: length of the footer, `PAR1`
 _MAX_FOOTER: Final = 256 << 20
-_SAMPLE: Final = 256  # values of a column that decide about a dictionary
 _RUNNING: Final = frozenset({"t", "log_time", "seq", "pub", "stamp", "ref.chunk", "ref.off"})
 _SEAL: Final = re.compile(rb"hybridlog-footer:([0-9a-f]{8})")
 _BLANK: Final = b"hybridlog-footer:00000000"
@@ -69,10 +64,8 @@ class ParquetFileWriter:
 
     Args:
         path: The file, in the folder of a recording's unfinished tables.
-        sample: Example rows; their schema is the file's.
+        schema: Its columns.
         level: Level of zstd.
-        is_all: True if the example rows are all rows of the file. Then floats without NaN
-            have statistics: DuckDB answers wrongly from those of floats with NaN among them.
         reused: Row groups of the file that this one replaces.
         in_front: True to write the new row groups in front of the kept ones.
         front: Bytes in front of the row groups, which no reader of Parquet looks at.
@@ -84,10 +77,9 @@ class ParquetFileWriter:
     def __init__(
         self,
         path: Path,
-        sample: pa.Table,
+        schema: pa.Schema,
         *,
         level: int = 1,
-        is_all: bool = False,
         reused: ReusedBytes | None = None,
         in_front: bool = False,
         front: bytes = b"",
@@ -95,28 +87,26 @@ class ParquetFileWriter:
         self.path = path
         self._bounds: list[tuple[int, int, int, int, int]] = []
         self._sink = _Sink(path)
-        kinds = {leaf.path: leaf.kind for leaf in leaves(sample.schema)}
-        encodings = {
-            leaf: "DELTA_BINARY_PACKED" for leaf, kind in kinds.items() if _runs(leaf, kind)
-        }
-        repeating = [
-            leaf
-            for leaf, array in _leaf_values(sample.slice(0, _SAMPLE))
-            if leaf not in encodings and _repeats(array)
+        kinds = {leaf.path: leaf.kind for leaf in leaves(schema)}
+        running = [path for path, kind in kinds.items() if _runs(path, kind)]
+        # DuckDB answers wrongly from statistics of floats with NaN among them.
+        ordered = [
+            path
+            for path, kind in kinds.items()
+            if not (is_bytes(kind) or pa.types.is_floating(kind))
         ]
-        ordered = {leaf for leaf, kind in kinds.items() if _is_ordered(kind)}
-        if is_all:
-            ordered |= {leaf for leaf, array in _leaf_values(sample) if _has_no_nan(array)}
+        repeating = [path for path in ordered if path not in running and kinds[path] != pa.bool_()]
         try:
             self._file = pa.PythonFile(self._sink, mode="w")
             self._writer = pq.ParquetWriter(
                 self._file,
-                sample.schema,
+                schema,
                 compression="zstd",
                 compression_level=level,
                 use_dictionary=repeating,
-                column_encoding=encodings,
-                write_statistics=[leaf for leaf in kinds if leaf in ordered],
+                column_encoding=dict.fromkeys(running, "DELTA_BINARY_PACKED"),
+                write_statistics=ordered,
+                write_page_checksum=True,
             )
             if front:
                 self._file.write(front)
@@ -167,11 +157,11 @@ class ParquetFileWriter:
                 if span[1] > self._behind.offset:
                     raise NoRoomError
                 self._put(self._behind)
-            body, checksums = self._sink.end_body()
+            self._sink.end_body()
             # Keys of rows of several topics are no bounds.
             is_one = sum(len(section.topics) for section in sections) == 1
             bounds = self._bounds if is_one else [(one[0], 0, 0, 0, 0) for one in self._bounds]
-            about = About(sections, tuple(bounds), span, body, checksums, of_rows=dict(rows or {}))
+            about = About(sections, tuple(bounds), span, of_rows=dict(rows or {}))
             self._writer.add_key_value_metadata(
                 {ABOUT.decode(): about.to_json(), _SEALED_BY: _BLANK.decode()}
             )
@@ -202,8 +192,6 @@ class _Sink:
         self._fd = files.open_file(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL)
         self._waiting = bytearray()
         self._position = 0
-        self._checksums: list[str] = []
-        self._rest = bytearray()  # of the body, less than a block
         self._footer: bytearray | None = None
         self._digest = hasher()
 
@@ -216,24 +204,14 @@ class _Sink:
         if self._footer is not None:
             self._footer += data
             return len(data)
-        self._rest += data
-        whole = len(self._rest) // BLOCK * BLOCK
-        if whole:
-            view = memoryview(self._rest)
-            self._checksums += [_checksum(view[at : at + BLOCK]) for at in range(0, whole, BLOCK)]
-            view.release()
-            del self._rest[:whole]
         self._waiting += data
         if len(self._waiting) >= _WRITTEN:
             self._flush()
         return len(data)
 
-    def end_body(self) -> tuple[int, str]:
-        """Begin the footer; returns size and checksums of the body."""
-        if self._rest:
-            self._checksums.append(_checksum(self._rest))
+    def end_body(self) -> None:
+        """Begin the footer."""
         self._footer = bytearray()
-        return self._position, "".join(self._checksums)
 
     def finish(self, *, sync: bool) -> tuple[int, str]:
         """Seal the footer, write all remaining bytes; return size and digest of the file."""
@@ -294,12 +272,12 @@ class ParquetFileReader:
             self._source = _Source(path)
             metadata = pq.read_metadata(pa.BufferReader(b"PAR1" + self._source.footer))
             self.about = About.from_json(metadata.metadata.get(ABOUT, b""))
-            self._source.trust(self.about)
             self._parquet = pq.ParquetFile(
                 pa.PythonFile(self._source, mode="r"),
                 metadata=metadata,
                 pre_buffer=False,
                 buffer_size=0,
+                page_checksum_verification=True,
             )
             self.schema: pa.Schema = self._parquet.schema_arrow
             groups = [metadata.row_group(n).num_rows for n in range(metadata.num_row_groups)]
@@ -342,11 +320,11 @@ class ParquetFileReader:
         """The bytes of its row groups.
 
         Raises:
-            StoreError: they are damaged.
+            StoreError: they cannot be read.
         """
         begin, end = self.about.span
         try:
-            return ReusedBytes(begin, self._source.checked(begin, end))
+            return ReusedBytes(begin, self._source.raw(begin, end))
         except (OSError, StoreError) as error:
             raise self._damaged(error) from error
 
@@ -388,13 +366,13 @@ class ParquetFileReader:
         return table
 
     def check(self) -> str:
-        """Read every byte and every value; returns BLAKE3 of all bytes.
+        """Read every value; returns BLAKE3 of all bytes.
 
         Raises:
             StoreError: a part is damaged.
         """
         try:
-            digest = self._source.check()
+            digest = self._source.digest()
         except (OSError, StoreError) as error:
             raise self._damaged(error) from error
         self.table()
@@ -410,7 +388,7 @@ class ParquetFileReader:
 
 
 class _Source:
-    """Provides Parquet's bytes, after verifying the checksum of each block."""
+    """Provides Parquet's bytes, after verifying the checksum of the footer."""
 
     def __init__(self, path: Path) -> None:
         self.closed = False
@@ -422,13 +400,11 @@ class _Source:
         with self._lock:
             self._open()
         self.size = os.fstat(self._fd).st_size
-        self._checksums: list[bytes] = []
-        tail = self._raw(self.size - _TAIL, _TAIL) if self.size > 2 * _TAIL else b""
+        tail = self.raw(self.size - _TAIL, self.size) if self.size > 2 * _TAIL else b""
         length = int.from_bytes(tail[:4], "little") + _TAIL
         if tail[4:] != b"PAR1" or length > min(self.size - 4, _MAX_FOOTER):
             raise StoreError("its end is missing")
-        self._body = self.size - length
-        self.footer = self._raw(self._body, length)
+        self.footer = self.raw(self.size - length, self.size)
         found = list(_SEAL.finditer(self.footer))
         if len(found) != 1:
             raise StoreError("its footer has no checksum")
@@ -437,19 +413,11 @@ class _Source:
         if _checksum(blank).encode() != found[0][1]:
             raise StoreError("the checksum of its footer differs")
 
-    def trust(self, about: About) -> None:
-        """Allow reading of the body."""
-        if about.body != self._body or len(about.checksums) != -(-about.body // BLOCK) * 8:
-            raise StoreError("the size of its body differs from that in its footer")
-        text = about.checksums.encode()
-        self._checksums = [text[at : at + 8] for at in range(0, len(text), 8)]
-
-    def check(self) -> str:
-        """Read and verify the whole body; returns BLAKE3 of all bytes."""
+    def digest(self) -> str:
+        """BLAKE3 of all bytes."""
         digest = hasher()
-        for at in range(0, self._body, 64 * BLOCK):
-            digest.update(self.checked(at, min(at + 64 * BLOCK, self._body)))
-        digest.update(self.footer)
+        for at in range(0, self.size, _WRITTEN):
+            digest.update(self.raw(at, min(at + _WRITTEN, self.size)))
         return digest.hexdigest()
 
     def fetch(self, group: Any, leaves: Iterable[int]) -> None:
@@ -463,7 +431,7 @@ class _Source:
                     begin = column.dictionary_page_offset or column.data_page_offset
                     begin = min(begin, column.data_page_offset)
                     end = begin + column.total_compressed_size
-                    ranges.append((begin // BLOCK * BLOCK, -(-end // BLOCK) * BLOCK))
+                    ranges.append((begin, end))
                 files.fetch(self._fd, ranges)
 
     def read(self, size: int = -1) -> bytes:
@@ -471,24 +439,17 @@ class _Source:
         begin = self._position
         end = self.size if size < 0 else min(begin + size, self.size)
         self._position = max(begin, end)
-        if begin >= self._body:
-            return self.footer[begin - self._body : end - self._body]
-        if end <= self._body:
-            return self.checked(begin, end)
-        return self.checked(begin, self._body) + self.footer[: end - self._body]
+        return self.raw(begin, end) if begin < end else b""
 
-    def checked(self, begin: int, end: int) -> bytes:
-        """Bytes of the body, verified."""
-        first, last = begin // BLOCK, -(-end // BLOCK)
-        start = first * BLOCK
-        data = self._raw(start, min(last * BLOCK, self._body) - start)
-        view = memoryview(data)
-        for number in range(first, last):
-            at = number * BLOCK - start
-            block = view[at : at + BLOCK]
-            if _checksum(block).encode() != self._checksums[number]:
-                raise StoreError(f"the checksum of the block at byte {number * BLOCK} differs")
-        return data[begin - start : end - start]
+    def raw(self, begin: int, end: int) -> bytes:
+        """Some bytes of the file."""
+        with self._lock:
+            if self._fd < 0:
+                self._open()
+            data = files.pread(self._fd, end - begin, begin)
+        if len(data) != end - begin:
+            raise StoreError("it was truncated")
+        return data
 
     def __del__(self) -> None:
         self.release()
@@ -509,15 +470,6 @@ class _Source:
             raise StoreError("it was replaced")
         self._same = same
 
-    def _raw(self, offset: int, size: int) -> bytes:
-        with self._lock:
-            if self._fd < 0:
-                self._open()
-            data = files.pread(self._fd, size, offset)
-        if len(data) != size:
-            raise StoreError("it was truncated")
-        return data
-
     def seek(self, position: int, whence: int = os.SEEK_SET) -> int:
         base = {os.SEEK_SET: 0, os.SEEK_CUR: self._position, os.SEEK_END: self.size}[whence]
         self._position = base + position
@@ -534,15 +486,6 @@ class _Source:
 
     def close(self) -> None:
         """Do nothing: the file remains open as long as its reader."""
-
-
-def _is_ordered(kind: pa.DataType) -> bool:
-    """True for types whose least and greatest values every reader understands."""
-    return not (pa.types.is_floating(kind) or pa.types.is_binary(kind))
-
-
-def _has_no_nan(array: pa.Array[Any]) -> bool:
-    return pa.types.is_floating(array.type) and not pc.any(pc.is_nan(array)).as_py()
 
 
 class Leaf(NamedTuple):
@@ -586,36 +529,6 @@ def _leaves(
         inner = kind.field(number)
         of_array = names if has_summaries(field) else array
         yield from _leaves(inner, f"{path}.{inner.name}", names, of_array)
-
-
-def _leaf_values(table: pa.Table) -> Iterator[tuple[str, pa.Array[Any]]]:
-    """The values of each column, in Parquet's order."""
-    for top, column in zip(table.schema, table.columns, strict=True):
-        array = column.combine_chunks()
-        if isinstance(array, pa.ChunkedArray):
-            array = pa.concat_arrays(array.chunks) if array.num_chunks else pa.nulls(0, top.type)
-        yield from _inner_values(top.name, array)
-
-
-def _inner_values(path: str, array: pa.Array[Any]) -> Iterator[tuple[str, pa.Array[Any]]]:
-    if isinstance(array, pa.ExtensionArray):  # JSON text
-        array = array.storage
-    if pa.types.is_struct(array.type):
-        for number in range(array.type.num_fields):
-            inner = array.type.field(number)
-            yield from _inner_values(f"{path}.{inner.name}", array.field(number))
-    elif is_list(array.type):
-        yield from _inner_values(f"{path}.list.element", array.flatten())
-    else:
-        yield path, array
-
-
-def _repeats(array: pa.Array[Any]) -> bool:
-    """True if a dictionary is worthwhile: half of the first values are repeated."""
-    if pa.types.is_boolean(array.type):
-        return False
-    some = array.slice(0, 4 * _SAMPLE)
-    return bool(2 * len(some.unique()) <= max(len(some), 2))
 
 
 def _runs(path: str, kind: pa.DataType) -> bool:

@@ -17,11 +17,15 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
     from pathlib import Path
 
+    import numpy as np
+    from numpy.typing import NDArray
+
     from hybridlog.columns.column_file import OpenFiles
     from hybridlog.columns.rows_file import RowsFile
     from hybridlog.columns.topic_table import TopicTable
     from hybridlog_storage.manifest import File
-    from hybridlog_storage.segments.chunk import ExpiredMessages, StoredChunk
+    from hybridlog_storage.messages import Batch
+    from hybridlog_storage.segments.chunk import StoredChunk
     from hybridlog_storage.segments.segment_reader import (
         ChunkPlace,
         SegmentReader,
@@ -67,19 +71,19 @@ class RecordingRows:
                 found[file.number].append(file)
         return found
 
-    def left(self, log: int, chunk: int) -> ExpiredMessages:
-        """What is left of a chunk.
+    def left(self, log: int, chunk: int) -> tuple[Batch, NDArray[np.int64]]:
+        """What is left of a chunk, and the arrival numbers of its messages.
 
         Raises:
             SegmentError: It is missing or damaged.
         """
-        from hybridlog.columns.rows_file import expired_messages
+        from hybridlog.columns.rows_file import messages_left
 
         try:
             found = [file.rows(chunk) for file in self._of(log) if chunk in file.places]
             if not found:
                 raise SegmentError(self._problems.get(log) or "its rows are in no file")
-            return expired_messages(found)
+            return messages_left(found)
         except SegmentError:
             raise
         except StoreError as error:

@@ -44,12 +44,12 @@ class Messages(NamedTuple):
     offset: NDArray[np.int64]
 
     @classmethod
-    def of(cls, chunk: StoredChunk, begin: int) -> Messages:
-        """Messages of a chunk, whose payloads are copied to a buffer `-begin` bytes further on."""
+    def of(cls, chunk: StoredChunk) -> Messages:
+        """Messages of a chunk, over its buffer."""
         batch = chunk.batch
         number = np.full(len(batch), chunk.number, np.int32)
         return cls(
-            batch.offset - begin,
+            batch.offset,
             batch.places[1].copy(),
             batch.channel.copy(),
             batch.log_time.copy(),
@@ -147,6 +147,18 @@ def own_columns(
             names=["seg", "chunk", "off", "len"],
         ),
     }
+
+
+def as_table(own: Mapping[str, Any], fields: Any) -> Any:
+    """Columns of rows as a table; `fields` is a struct array, or None."""
+    import pyarrow as pa
+
+    schema = [pa.field(name, column.type) for name, column in own.items()]
+    arrays = [*own.values()]
+    if fields is not None:
+        schema += list(fields.type)
+        arrays += fields.flatten()
+    return pa.Table.from_arrays(arrays, schema=pa.schema(schema))
 
 
 def _errors(pieces: Sequence[Piece], states: NDArray[np.int8]) -> Any:

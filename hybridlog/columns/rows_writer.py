@@ -149,7 +149,7 @@ class RowsWriter:
         try:
             if file.writer is None:
                 front = self._front if file.name == self.names[0] else b""
-                file.writer = ParquetFileWriter(path, table, level=_LEVEL, front=front)
+                file.writer = ParquetFileWriter(path, table.schema, level=_LEVEL, front=front)
             file.writer.write(table)
         except OSError as error:
             raise durability.explain(error, path, "writing") from error

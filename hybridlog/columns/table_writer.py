@@ -1,6 +1,6 @@
 """Writes the tables of a recording during indexing.
 
-Payloads of small messages are collected and decoded by columns, 8 MiB at a time. Rows
+Chunks are collected and decoded by columns, 8 MiB at a time. Rows
 remain in memory until their segment is sealed, or until there are too many. Then they
 become row groups of an unfinished file of their topic. Topics with few rows wait until the
 recording has ended, and go to files that recordings share.
@@ -35,13 +35,13 @@ from hybridlog.columns.layout import (
     topics_of,
     type_prefix,
 )
-from hybridlog.columns.rows import Messages, Piece, own_columns
+from hybridlog.columns.rows import Messages, Piece, as_table, own_columns
 from hybridlog.index.indexing import rows_by_channel
 from hybridlog.schema.codec import Codec
 from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.states import State, encoding_of, state_of
-from hybridlog_storage.buffers import buffers
 from hybridlog_storage.disk import files
+from hybridlog_storage.disk.copying import joined
 from hybridlog_storage.ordering import order_of
 from hybridlog_storage.settings import read_settings
 
@@ -58,8 +58,7 @@ GROUP_ROWS: Final = 131_072
 """Maximum number of rows in a row group."""
 GROUP_BYTES: Final = 32 << 20
 """Maximum bytes of the columns of a row group in memory."""
-_ARENA = 8 << 20  # bytes of payloads collected: each topic's part costs a millisecond
-_MIN_IN_PLACE_BYTES = 4 << 20  # chunk size, bytes, from which a chunk is decoded in place
+_ARENA = 8 << 20  # bytes of chunks collected: each topic's part costs a millisecond
 _ROWS = 1 << 18  # messages collected
 _PENDING = 16 << 20  # bytes of rows waiting in memory
 _LEFT = _PENDING // 4  # bytes of the smallest topics, which continue to wait for more rows
@@ -145,7 +144,7 @@ class _Topic:
         """
         import pyarrow as pa
 
-        from hybridlog.columns.fields import joined
+        from hybridlog.columns.fields import joined as joined_columns
 
         messages = Messages.joined([piece.messages for piece in pieces])
         segment = np.repeat(
@@ -160,18 +159,13 @@ class _Topic:
                 pa.nulls(piece.rows, kind) if piece.fields is None else piece.fields
                 for piece in pieces
             ]
-            fields = joined([pa.nulls(0, kind), *found])
+            fields = joined_columns([pa.nulls(0, kind), *found])
         columns = {
             name: pa.repeat(pa.scalar(value), len(segment))
             for name, value in (("recording", self.recording), ("topic", self.name))
         }
         columns |= own_columns(pieces, messages, segment, fields, has_publish_time)
-        known = list(map(pa.field, columns, [column.type for column in columns.values()]))
-        arrays = list(columns.values())
-        if fields is not None:
-            known += [fields.type.field(number) for number in range(fields.type.num_fields)]
-            arrays += fields.flatten()
-        table = pa.Table.from_arrays(arrays, schema=pa.schema(known))
+        table = as_table(columns, fields)
         order = order_of(messages.log_time, messages.seq)
         return table if order is None else table.take(pa.array(order))
 
@@ -211,7 +205,7 @@ class _File:
         self._has_publish_time = has_publish_time
         self._writer: ParquetFileWriter | None = None
 
-    def write(self, pieces: list[Piece], *, is_all: bool) -> None:
+    def write(self, pieces: list[Piece]) -> None:
         """Write rows as row groups.
 
         Raises:
@@ -223,7 +217,7 @@ class _File:
         table = self._topic.table(pieces, self._has_publish_time)
         if self._writer is None:
             self.schema = table.schema
-            self._writer = ParquetFileWriter(self.path, table, is_all=is_all)
+            self._writer = ParquetFileWriter(self.path, table.schema)
         elif table.schema != self.schema:
             table = self._fitting(table)
         step = _rows_of_group(table)
@@ -236,10 +230,11 @@ class _File:
         """Rows with the columns of the file."""
         import pyarrow as pa
 
-        from hybridlog.columns.fields import UnfitError, joined
+        from hybridlog.columns.fields import UnfitError
+        from hybridlog.columns.fields import joined as joined_columns
 
         kind = pa.struct(list(self.schema))
-        fitting = joined([pa.nulls(0, kind), table.to_struct_array().combine_chunks()])
+        fitting = joined_columns([pa.nulls(0, kind), table.to_struct_array().combine_chunks()])
         if fitting.type != kind:
             raise UnfitError("the file has other columns")
         return pa.Table.from_struct_array(fitting).cast(self.schema)
@@ -290,11 +285,7 @@ class TableWriter:
         self._numbers = 0
         self._has_ended = False
         self.has_failed = False
-        self._arena: NDArray[np.uint8] | None = None
-        self._filled = 0
-        self._held: list[Messages] = []
-        self._held_rows = 0
-        self._held_segment = -1
+        self._held: list[StoredChunk] = []  # of one segment
         self._channels: dict[int, Channel] = {}
         self._has_grown = False  # rows were decoded since the last look at their size
         self._topics: dict[tuple[str, str], _Topic] = {}
@@ -308,9 +299,8 @@ class TableWriter:
     @property
     def rows_in_memory(self) -> int:
         """Number of rows waiting to be written."""
-        return self._held_rows + sum(
-            piece.rows for topic in self._topics.values() for piece in topic.pieces
-        )
+        pieces = (piece.rows for topic in self._topics.values() for piece in topic.pieces)
+        return sum(len(chunk.batch) for chunk in self._held) + sum(pieces)
 
     def seal(self, segment: int, digest: str, messages: int) -> None:
         """Register a sealed segment. Thread safe."""
@@ -318,12 +308,12 @@ class TableWriter:
             self._sealed[segment] = digest, messages
 
     def add(self, chunk: StoredChunk, channels: Mapping[int, Channel]) -> None:
-        """Add the messages of a chunk; its buffer is not used afterwards."""
+        """Add the messages of a chunk."""
         if self._has_ended:
             return
         with self._harmless():
             self._channels.update(channels)
-            if chunk.fields is None:
+            if chunk.batch.left is None:
                 self._collect(chunk)
             else:
                 self._add_expired(chunk)
@@ -358,8 +348,6 @@ class TableWriter:
         self._topics.clear()
         self._of_channel.clear()
         self._held.clear()
-        self._held_rows = 0
-        self._arena = None
         if self._has_parts:
             with suppress(OSError):
                 files.remove_tree(self._parts)
@@ -379,57 +367,41 @@ class TableWriter:
     # From chunks to rows in memory.
 
     def _collect(self, chunk: StoredChunk) -> None:
-        batch = chunk.batch
-        begin, rows = int(batch.offset.min()), len(batch)
-        size = int((batch.offset + batch.length).max()) - begin
-        is_full = self._filled + size > _ARENA or self._held_rows + rows > _ROWS
-        is_enough = size >= min(_MIN_IN_PLACE_BYTES, _ARENA)
-        if is_enough or is_full or chunk.segment != self._held_segment:
+        if self._held and self._held[0].segment != chunk.segment:
             self._decode()
-        self._held_segment = chunk.segment
-        data = np.frombuffer(batch.buffer, np.uint8, size, begin)
-        self._held.append(Messages.of(chunk, begin - self._filled))
-        self._held_rows += rows
-        if is_enough:
-            self._decode(data)
-            return
-        if self._arena is None:
-            self._arena = buffers.take(_ARENA)
-        self._arena[self._filled : self._filled + size] = data
-        self._filled += size
+        self._held.append(chunk)
+        batches = [one.batch for one in self._held]
+        if sum(len(b.buffer) for b in batches) >= _ARENA or sum(map(len, batches)) >= _ROWS:
+            self._decode()
 
-    def _decode(self, data: NDArray[np.uint8] | None = None) -> None:
+    def _decode(self) -> None:
         """Make rows of the collected messages."""
         if not self._held:
             return
-        if data is None:
-            assert self._arena is not None
-            data = self._arena[: self._filled]
         self._has_grown = True
-        messages = Messages.joined(self._held)
-        self._held.clear()
-        self._filled = self._held_rows = 0
-        for topic, codec, state, part in self._by_topic(messages):
-            if topic.is_wanted:
-                with self._only(topic):
-                    topic.add(self._piece(topic, codec, state, part, data))
+        held, self._held = self._held, []
+        batch = joined([chunk.batch for chunk in held])
+        messages = Messages.joined([*map(Messages.of, held)])._replace(at=batch.offset)
+        data = np.frombuffer(batch.buffer, np.uint8)
+        for topic, codec, state, rows in self._by_topic(messages.channel):
+            piece = Piece(held[0].segment, messages.take(rows), None, state=state)
+            piece.has_arrays = topic.has_arrays
+            with self._only(topic):
+                if codec.indexed and state is State.WHOLE:
+                    self._add_fields(piece, topic, codec, data)
+                topic.add(piece)
 
-    def _by_topic(self, messages: Messages) -> Iterator[tuple[_Topic, Codec, State, Messages]]:
-        """The messages, grouped by topic and encoding."""
-        numbers = np.flatnonzero(np.bincount(messages.channel)).tolist()
-        found = {number: self._topic_of(number) for number in numbers}
-        place: dict[tuple[_Topic, Codec, State], int] = {}
-        for kind in found.values():
-            place.setdefault(kind, len(place))
-        kinds = list(place)
-        if len(kinds) == 1:
-            yield *kinds[0], messages
-            return
-        table = np.zeros(numbers[-1] + 1, np.int32)
-        table[numbers] = [place[kind] for kind in found.values()]
-        for number, rows in rows_by_channel(table[messages.channel]):
-            if kinds[number][0].is_wanted:
-                yield *kinds[number], messages.take(rows)
+    def _by_topic(
+        self, channel: NDArray[np.int32]
+    ) -> Iterator[tuple[_Topic, Codec, State, NDArray[np.intp]]]:
+        """Rows of messages, grouped by topic and encoding."""
+        found: dict[tuple[_Topic, Codec, State], list[NDArray[np.intp]]] = {}
+        for number, rows in rows_by_channel(channel):
+            kind = self._topic_of(number)
+            if kind[0].is_wanted:
+                found.setdefault(kind, []).append(rows)
+        for kind, parts in found.items():
+            yield *kind, np.concatenate(parts)
 
     def _topic_of(self, number: int) -> tuple[_Topic, Codec, State]:
         found = self._of_channel.get(number)
@@ -446,19 +418,6 @@ class TableWriter:
             found = self._of_channel[number] = topic, codec_for(channel), state
             self._has_publish_time[number] = channel.has_publish_time
         return found
-
-    def _piece(
-        self,
-        topic: _Topic,
-        codec: Codec,
-        state: State,
-        messages: Messages,
-        data: NDArray[np.uint8],
-    ) -> Piece:
-        piece = Piece(self._held_segment, messages, None, state=state, has_arrays=topic.has_arrays)
-        if codec.indexed and state is State.WHOLE:
-            self._add_fields(piece, topic, codec, data)
-        return piece
 
     def _add_fields(
         self, piece: Piece, topic: _Topic, codec: Codec, data: NDArray[np.uint8]
@@ -479,16 +438,16 @@ class TableWriter:
 
     def _add_expired(self, chunk: StoredChunk) -> None:
         """Make rows of what is left of expired messages."""
-        from hybridlog.columns.rows_file import rows_of
-
-        messages = Messages.of(chunk, 0)
-        for rows, columns in chunk.fields or ():
-            own = messages.take(rows)
-            for number, at in rows_by_channel(own.channel):
-                topic, _, state = self._topic_of(number)
-                found = rows_of(columns.take(at))
-                if topic.is_wanted:
-                    topic.add(Piece(chunk.segment, own.take(at), *found, state=state))
+        messages = Messages.of(chunk)
+        for topic, _, state, own in self._by_topic(chunk.batch.channel):
+            left = chunk.batch.take(own).left
+            assert left is not None
+            if state is State.REDUCED:
+                topic.add(Piece(chunk.segment, messages.take(own), None, state=state))
+            for part, at, rows in left.by_part():
+                piece = Piece(chunk.segment, messages.take(own[at]), None, state=state)
+                piece.fields, piece.errors = part.columns(rows), part.errors(rows)
+                topic.add(piece)
         self._has_grown = True
 
     @contextmanager
@@ -543,14 +502,14 @@ class TableWriter:
         unfinished = topic.files.setdefault(segment, [])
         if unfinished:
             try:
-                unfinished[-1].write(pieces, is_all=False)
+                unfinished[-1].write(pieces)
             except UnfitError:
                 pass
             else:
                 return 0
         file = _File(self._new_part(), topic, self._has_publish_time)
         unfinished.append(file)
-        file.write(pieces, is_all=segment in self._cut)
+        file.write(pieces)
         return 1
 
     def _new_part(self) -> Path:
@@ -577,7 +536,7 @@ class TableWriter:
                 if self._seen[segment] == messages
             ]
         for segment in sorted(ready):
-            if self._held_segment == segment:
+            if self._held and self._held[0].segment == segment:
                 self._decode()
             with self._lock:
                 digest, _ = self._sealed.pop(segment)

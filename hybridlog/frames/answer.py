@@ -19,9 +19,9 @@ from hybridlog.frames.names import is_summary, own_columns, summary_of, tag_colu
 from hybridlog.index.indexing import rows_by_channel
 from hybridlog.schema.arrow_columns import TIME, numbers, structs
 from hybridlog.schema.arrow_types import common_schema
-from hybridlog.schema.codec import stamp_array
+from hybridlog.schema.codec import columns_of, stamp_array
 from hybridlog.schema.column import STAMP
-from hybridlog.schema.reduced_codec import ExpiredFields, without_lossy
+from hybridlog.schema.left import LeftFields, without_lacking
 from hybridlog_storage.errors import DefinitionError
 from hybridlog_storage.messages import Batch
 
@@ -233,16 +233,15 @@ class Decoder:
 
     def decoded(self, number: int, batch: Batch) -> Decoded:
         """The fields of messages of one channel; those that cannot be read are counted."""
-        where = batch.buffer, batch.offset, batch.length
-        found = self.channels[number].codec.columns(*where, self._fields[number])
+        found = columns_of(self.channels[number].codec, batch, self._fields[number])
         self._counters.unreadable += len(batch) - len(found.rows)
         channel, records = self.channels[number], found.records
-        if isinstance(records, ExpiredFields) and records.is_typed:
+        if isinstance(records, LeftFields) and records.is_typed:
             requested = {path.replace("[]", "") for path in self._chosen or ()}
             summarised = {path.rpartition(".")[0] for path in requested} - requested
             self._counters.lacking += int(records.lacking(summarised).sum())
-        elif isinstance(records, ExpiredFields):
-            found, lacking = without_lossy(found)
+        elif isinstance(records, LeftFields):
+            found, lacking = without_lacking(found)
             self._counters.leave_out(lacking, channel.state)
         return found
 
@@ -260,12 +259,10 @@ class Decoder:
         order = seq + self._ranks.get(channel.recording.key, 0)  # examples have no messages
         topic = channel.channel.topic
         values = decoded.records
-        summaries = self._summaries(values, channel) if isinstance(values, ExpiredFields) else {}
+        summaries = self._summaries(values, channel) if isinstance(values, LeftFields) else {}
         return Block(topic, batch.log_time, order, own, records, batch.payload_bytes, summaries)
 
-    def _summaries(
-        self, records: ExpiredFields, channel: RecordedChannel
-    ) -> dict[str, pa.Array[Any]]:
+    def _summaries(self, records: LeftFields, channel: RecordedChannel) -> dict[str, pa.Array[Any]]:
         """The requested summaries of arrays of expired messages."""
         known = {path.path: path.type for path in channel.codec.paths()}
         requested = (path.replace("[]", "") for path in self._chosen or ())

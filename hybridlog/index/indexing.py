@@ -15,7 +15,7 @@ import numpy as np
 from hybridlog.schema.codec import Codec, stamps_of
 from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.column import STAMP
-from hybridlog.schema.index_bodies import index_bodies
+from hybridlog.schema.index_bodies import bodies_of
 from hybridlog_storage.catalog import ChannelStats, ChunkEntry
 from hybridlog_storage.messages import Batch, Channel
 from hybridlog_storage.mongo.index_documents import DocumentAssembler, Origin, Placed
@@ -78,7 +78,7 @@ class ChunkIndexer:
                 batch, placed.number[rows], has_publish_time=channel.has_publish_time
             )
             tables: list[NDArray[np.uint8]] = []
-            for group in index_bodies(codec, batch.buffer, batch.offset, batch.length):
+            for group in bodies_of(codec, batch):
                 if group.stamps is not None:
                     found.stamped(group.rows, group.stamps)
                 if group.error is not None:

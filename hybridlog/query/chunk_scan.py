@@ -302,7 +302,7 @@ class ChunkScan:
         for channel_id, index in task.scan.channels.items():
             if channel_id < len(table):
                 table[channel_id] = index
-        if chunk.fields is not None and not {*task.chunk.place.channels} & {*task.scan.channels}:
+        if batch.left is not None and not {*task.chunk.place.channels} & {*task.scan.channels}:
             raise StoreError(
                 f"Payloads of recording {task.scan.recording.name!r} were deleted while it was "
                 "read. Ask again."

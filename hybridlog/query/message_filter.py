@@ -11,7 +11,7 @@ import numpy as np
 from hybridlog.frames.names import is_summary
 from hybridlog.query.predicate.to_bool import UndecidedError, to_bool
 from hybridlog.query.predicate.tree import Predicate
-from hybridlog.schema.codec import plain_message
+from hybridlog.schema.codec import columns_of, plain_message
 from hybridlog_storage.errors import DefinitionError, PayloadError
 
 if TYPE_CHECKING:
@@ -67,9 +67,7 @@ class MessageFilter:
             return self._one_by_one(channel, batch, seq, np.arange(len(batch)))
         from hybridlog.query.predicate.to_mask import to_mask
 
-        decoded = channel.codec.columns(
-            batch.buffer, batch.offset, batch.length, self._fields - {"_meta"}
-        )
+        decoded = columns_of(channel.codec, batch, self._fields - {"_meta"})
         records = decoded.arrow()
         if "_meta" in self._fields:
             good = decoded.rows
@@ -91,14 +89,15 @@ class MessageFilter:
         self, channel: RecordedChannel, batch: Batch, seq: NDArray[np.int64]
     ) -> Matches:
         """Decide on expired messages; not on those that lack an array that is asked for."""
-        from hybridlog.schema.reduced_codec import ExpiredFields
+        from hybridlog.schema.left import LeftFields
 
         fields = self._elements
-        decoded = channel.codec.columns(batch.buffer, batch.offset, batch.length, fields)
-        assert isinstance(decoded.records, ExpiredFields)
+        decoded = columns_of(channel.codec, batch, fields)
+        assert isinstance(decoded.records, LeftFields)
         lacking = decoded.rows[decoded.records.lacking()] if fields else decoded.rows[:0]
         decidable = np.setdiff1d(np.arange(len(batch)), lacking, assume_unique=True)
-        found = self._one_by_one(channel, batch, seq, decidable)
+        known = dict(zip(decoded.rows.tolist(), decoded.plain(), strict=True))
+        found = self._one_by_one(channel, batch, seq, decidable, known)
         return Matches(found.holds, found.unreadable + len(lacking), found.expired + len(lacking))
 
     def _one_by_one(
@@ -107,14 +106,19 @@ class MessageFilter:
         batch: Batch,
         seq: NDArray[np.int64],
         rows: NDArray[np.intp],
+        known: Mapping[int, dict[str, Any]] | None = None,
     ) -> Matches:
+        """Decide on some rows, whose fields may be known by row."""
         holds = np.zeros(len(batch), np.bool_)
         unreadable = lacking = 0
         test = self._summary_test if channel.is_reduced else self._test
         for row in rows.tolist():
             try:
-                fields = plain_message(channel.codec, batch.payload(row), self._fields)
-            except (PayloadError, DefinitionError):
+                if known is None:
+                    fields = plain_message(channel.codec, batch.payload(row), self._fields)
+                else:
+                    fields = known[row]
+            except (PayloadError, DefinitionError, KeyError):
                 if self._fields != {"_meta"}:
                     unreadable += 1
                     continue

@@ -20,6 +20,7 @@ from hybridlog.query.chunk_counts import Placed
 from hybridlog.query.chunk_scan import ChunkKey, ChunkScan, RecordingScan, ScanPlan
 from hybridlog.query.predicate.tree import is_meta
 from hybridlog.record.losses import lost_spans
+from hybridlog.schema.codec import columns_of
 from hybridlog.schema.kinds import SINGLE, element_of, width_of
 from hybridlog.snapshot import UNFINISHED
 from hybridlog_storage.catalog import ChannelStats, channel_totals
@@ -473,12 +474,12 @@ class Rows:
         self, channel: RecordedChannel, batch: Batch, fields: Collection[str] | None = None
     ) -> Decoded:
         """The fields of messages; those that cannot be read, or lack some, are counted."""
-        found = channel.codec.columns(batch.buffer, batch.offset, batch.length, fields)
+        found = columns_of(channel.codec, batch, fields)
         self._counters.unreadable += len(batch) - len(found.rows)
         if channel.is_expired:
-            from hybridlog.schema.reduced_codec import without_lossy
+            from hybridlog.schema.left import without_lacking
 
-            found, lacking = without_lossy(found)
+            found, lacking = without_lacking(found)
             self._counters.leave_out(lacking, channel.state)
         return found
 

@@ -23,7 +23,7 @@ from hybridlog.schema.column import Scalars
 from hybridlog.schema.summary import summarise
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Sequence
 
     from numpy.typing import NDArray
 
@@ -363,6 +363,29 @@ def converted(array: Array, kind: pa.DataType) -> Array:
     raise pa.ArrowInvalid(f"{array.type} is not {kind}")
 
 
+def narrowed(array: Array, kind: pa.DataType) -> Array:
+    """The same of structs that have more fields, or are booleans since they have none.
+
+    Raises:
+        pa.ArrowInvalid: As `converted`.
+    """
+    if _types.is_struct(kind) and not kind.num_fields:
+        return structs({}, len(array), missing_of(array))
+    if _types.is_struct(kind) and _types.is_struct(array.type):
+        have = dict(zip([field.name for field in array.type], array.flatten(), strict=True))
+        children = {
+            field.name: narrowed(have[field.name], field.type)
+            if field.name in have
+            else pa.nulls(len(array), field.type)
+            for field in kind
+        }
+        return structs(children, len(array), missing_of(array), kind)
+    if is_list(kind) and is_list(array.type) and kind != array.type:
+        values = narrowed(array.flatten(), kind.value_type)
+        return converted(with_values(array, values), kind)
+    return converted(array, kind)
+
+
 def _numbers_of(array: Array) -> Array:
     """Bytes as lists of numbers, without a copy."""
     validity, places, data = array.buffers()
@@ -477,66 +500,20 @@ def _summarised(array: Array) -> Summary | None:
     return summarise(Scalars(values.to_numpy(zero_copy_only=False)), bounds)
 
 
-# Documents, where long arrays are summaries.
-
-
-def without_summaries(fields: Mapping[str, Any], kind: pa.DataType) -> dict[str, Any]:
-    """Fields of a document that a struct type has, but for arrays with summaries in them."""
-    found: dict[str, Any] = {}
-    for inner in kind:
-        value = fields.get(inner.name)
-        if isinstance(value, dict) and _types.is_struct(inner.type):
-            found[inner.name] = without_summaries(value, inner.type)
-        elif not _lacks(value, inner.type):
-            found[inner.name] = value
-    return found
-
-
-def lacks_arrays(
-    fields: Mapping[str, Any], kind: pa.DataType, but: Collection[str] = (), above: str = ""
-) -> bool:
-    """True if a document has a summary for an array of a struct type, or in one.
+def part_of_summary(records: Array, path: Sequence[str], name: str) -> Array | None:
+    """One number of the summary of an array in records; None if summaries of it lack that.
 
     Args:
-        fields: The document.
-        kind: The type.
-        but: Dotted paths of arrays that may be summaries.
-        above: Path of the document, with a dot behind it.
-    """
-    return any(
-        _lacks(fields.get(inner.name), inner.type, but, f"{above}{inner.name}")
-        for inner in kind
-        if f"{above}{inner.name}" not in but
-    )
-
-
-def _lacks(value: Any, kind: pa.DataType, but: Collection[str] = (), path: str = "") -> bool:
-    if _types.is_struct(kind):
-        return isinstance(value, dict) and lacks_arrays(value, kind, but, f"{path}.")
-    if not is_array(kind):
-        return False
-    if isinstance(value, dict):
-        return True
-    return is_list(kind) and any(_lacks(one, kind.value_type) for one in value or ())
-
-
-def stored_statistic(
-    documents: Sequence[Any], kind: pa.DataType, path: Sequence[str], what: str
-) -> Array | None:
-    """One number of the summary of an array in documents; None if there is none.
-
-    Args:
-        documents: The documents.
-        kind: Type of the messages.
+        records: A struct array, in which the array is a summary, or of a fixed length.
         path: Names on the path of the array.
-        what: `n`, `min`, `max` or `mean`.
+        name: As for `statistic`.
     """
-    for name in path:
-        kind = kind.field(name).type
-        documents = [one.get(name) if isinstance(one, dict) else None for one in documents]
-    lists = pa.array([one if isinstance(one, list) else None for one in documents], kind)
-    made = statistic(lists, what)
-    if made is None or not made.null_count:
-        return made
-    stored = [one.get(what) if isinstance(one, dict) else None for one in documents]
-    return pc.coalesce(made, pa.array(stored, made.type))
+    for inner in path:
+        at = records.type.get_field_index(inner) if _types.is_struct(records.type) else -1
+        if at < 0:
+            return None
+        records = records.flatten()[at]
+    if is_array(records.type):
+        return statistic(records, name)
+    at = records.type.get_field_index(name) if is_summary(records.type) else -1
+    return None if at < 0 else records.flatten()[at]

@@ -7,7 +7,7 @@ documents are made from its result, in one way for all encodings.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NoReturn, Protocol
+from typing import TYPE_CHECKING, Any, NoReturn, Protocol, cast
 
 import numpy as np
 
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.schema.definition import FieldPath
+    from hybridlog.schema.left import LeftCodec
     from hybridlog.schema.objects import Objects
     from hybridlog_storage.messages import Batch, Buffer
 
@@ -208,6 +209,13 @@ def decode_each(
     return Decoded(np.array(rows, np.intp), form(objects), unreadable, no_rows())
 
 
+def columns_of(codec: Codec, batch: Batch, fields: Collection[str] | None = None) -> Decoded:
+    """Decode messages of one channel, with or without their payloads; see `Codec.columns`."""
+    if batch.left is not None and len(batch) and batch.left.part[0] >= 0:
+        return cast("LeftCodec", codec).columns_of(batch.left, fields)
+    return codec.columns(batch.buffer, batch.offset, batch.length, fields)
+
+
 def one_message(codec: Codec, payload: Buffer) -> Decoded:
     """The columns of one message.
 
@@ -216,7 +224,15 @@ def one_message(codec: Codec, payload: Buffer) -> Decoded:
         DefinitionError: There is no definition to read it by.
     """
     size = np.array([memoryview(payload).nbytes], np.int64)
-    decoded = codec.columns(payload, np.zeros(1, np.int64), size)
+    return readable(codec.columns(payload, np.zeros(1, np.int64), size))
+
+
+def readable(decoded: Decoded) -> Decoded:
+    """The same of one message.
+
+    Raises:
+        PayloadError: The payload does not fit its definition.
+    """
     if decoded.unreadable:
         raise PayloadError(f"the payload cannot be read: {decoded.unreadable[0].reason}")
     return decoded
@@ -244,7 +260,7 @@ def stamps_of(codec: Codec, batch: Batch) -> tuple[NDArray[np.intp], NDArray[np.
     Returns:
         Rows of the messages that have a stamp, and the stamps, ns.
     """
-    decoded = codec.columns(batch.buffer, batch.offset, batch.length, {STAMP})
+    decoded = columns_of(codec, batch, {STAMP})
     found = stamp_array(decoded.arrow())
     if found is None:
         return np.empty(0, np.intp), np.empty(0, np.int64)

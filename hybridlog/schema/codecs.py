@@ -39,10 +39,10 @@ def codec_for(channel: Channel) -> Codec:
     schema = channel.schema
     state = state_of(channel.message_encoding)
     if state in GONE:
-        from hybridlog.schema.reduced_codec import ExpiredCodec
+        from hybridlog.schema.left import LeftCodec
 
         encoding = encoding_of(channel.message_encoding, channel.metadata)
-        return ExpiredCodec(codec_for(replace(channel, message_encoding=encoding)), state)
+        return LeftCodec(codec_for(replace(channel, message_encoding=encoding)), state)
     if schema is not None and has_hidden_fields(channel):
         return OpaqueCodec(
             f"{schema.name}: the definition in the source is empty, but its md5sum says that it "

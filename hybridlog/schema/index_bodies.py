@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from hybridlog.schema.codec import no_rows
+from hybridlog.schema.codec import columns_of, no_rows
 from hybridlog.schema.column import Records, header_stamps
 from hybridlog.schema.document import TooLarge, bodies
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.schema.codec import Codec, Decoded
-    from hybridlog_storage.messages import Buffer
+    from hybridlog_storage.messages import Batch, Buffer
 
 ARRAY_LIMIT: Final = 32
 """Arrays of more elements are summarised."""
@@ -65,6 +65,13 @@ def index_bodies(
             yield BodyGroup(np.arange(len(offset)), np.empty((len(offset), 0), np.uint8), None)
         return
     yield from decoded_bodies(codec.columns(buffer, offset, length), array_limit=array_limit)
+
+
+def bodies_of(codec: Codec, batch: Batch) -> Iterator[BodyGroup]:
+    """Make index bodies of messages of one channel, with or without payloads."""
+    if codec.indexed:
+        return decoded_bodies(columns_of(codec, batch))
+    return index_bodies(codec, batch.buffer, batch.offset, batch.length)
 
 
 def decoded_bodies(decoded: Decoded, *, array_limit: int = ARRAY_LIMIT) -> Iterator[BodyGroup]:

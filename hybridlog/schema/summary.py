@@ -16,9 +16,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
-_LONG = 4096  # elements of a row from which a loop over rows is faster
-_BLOCK = 16384
-_TABLE = 65536  # elements of equally long rows summed at once, limited by the cache
 _LARGE = 2.0**900  # smaller doubles do not overflow when they are added
 _LANES = 256  # number of 8-bit values that fit into a 16-bit sum, or 16-bit values into 32 bits
 
@@ -106,8 +103,8 @@ def summarise(values: Scalars, offset: NDArray[np.int64]) -> Summary:
     """Summarise every row of a ragged array.
 
     The summary of a row depends on its elements alone, to the last bit. Sums of floats use
-    one `reduceat`, which adds each segment separately and in the same order. Long rows are
-    summed by blocks. A regular-grid reduction is never used, because its order may differ.
+    one `reduceat`, which adds each segment separately and in the same order. A regular-grid
+    reduction is never used, because its order may differ.
 
     Args:
         values: All elements.
@@ -120,11 +117,6 @@ def summarise(values: Scalars, offset: NDArray[np.int64]) -> Summary:
         elements = elements.view(np.uint8)
     with np.errstate(all="ignore"):
         if elements.dtype.kind == "f":
-            long = counts >= _LONG
-            if long.any():
-                if counts[0] <= _BLOCK and _are_equal(counts):
-                    return _equal_floats(elements.reshape(len(counts), -1), offset, counts)
-                return _with_long_floats(elements, offset, counts, long)
             return _floats(elements, offset, counts)
         return _integers(elements, offset[:-1], counts)
 
@@ -205,76 +197,5 @@ def _floats(
     return Summary(counts, low, high, mean, has)
 
 
-def _equal_floats(
-    table: NDArray[Any], offset: NDArray[np.int64], counts: NDArray[np.int64]
-) -> Summary:
-    """Summaries of rows of equal length, one block at most: `_with_long_floats` in fewer steps.
-
-    Separate steps for a row cost as much as its numbers, and at each step another thread may
-    take the interpreter lock.
-    """
-    rows, count = table.shape
-    total = np.empty(rows, np.float64)
-    scratch = np.empty((max(min(_TABLE // count, rows), 1), count), np.float64)
-    for start in range(0, rows, len(scratch)):
-        some = table[start : start + len(scratch)]
-        wide = scratch[: len(some)]
-        wide[:] = some
-        np.add.reduce(wide, axis=1, out=total[start : start + len(some)])
-    if not np.isfinite(total).all():
-        return _with_long_floats(table.reshape(-1), offset, counts, np.ones(rows, np.bool_))
-    zero = table.dtype.type(0)
-    low, high = (
-        (extreme.reduce(table, axis=1) + zero).astype(np.float64)
-        for extreme in (np.minimum, np.maximum)
-    )
-    return Summary(counts, low, high, total / count + 0.0, np.ones(rows, np.bool_))
-
-
 def _are_equal(counts: NDArray[np.int64]) -> bool:
     return bool((counts == counts[0]).all())
-
-
-def _with_long_floats(
-    elements: NDArray[Any],
-    offset: NDArray[np.int64],
-    counts: NDArray[np.int64],
-    long: NDArray[np.bool_],
-) -> Summary:
-    """Summaries of rows of which some are long enough for a loop."""
-    low, high, mean = (np.zeros(len(counts), np.float64) for _ in range(3))
-    has = np.ones(len(counts), np.bool_)
-    short = ~long
-    if short.any():
-        rest = elements[np.repeat(short, counts)]
-        found = _floats(rest, np.append(0, np.cumsum(counts[short])), counts[short])
-        low[short], high[short], mean[short] = found.min, found.max, found.mean
-        has[short] = found.has
-    for row in np.flatnonzero(long).tolist():
-        part = elements[offset[row] : offset[row + 1]]
-        total = _sum_of_finite(part)
-        if total is None:
-            found = _floats(part, np.array([0, len(part)]), counts[row : row + 1])
-            low[row], high[row], mean[row] = found.min[0], found.max[0], found.mean[0]
-            has[row] = found.has[0]
-        else:
-            low[row], high[row] = part.min() + 0.0, part.max() + 0.0
-            mean[row] = total / len(part) + 0.0
-    return Summary(counts, low, high, mean, has)
-
-
-def _sum_of_finite(part: NDArray[Any]) -> float | None:
-    """The sum of a long row, None if an element or the sum is not finite.
-
-    It is computed block by block, in doubles that stay in the processor's cache. An element
-    that is not finite shows in the sum, so no search is needed.
-    """
-    scratch = np.empty(min(_BLOCK, len(part)), np.float64)
-    sums = []
-    for start in range(0, len(part), _BLOCK):
-        block = part[start : start + _BLOCK]
-        wide = scratch[: len(block)]
-        wide[:] = block
-        sums.append(float(np.add.reduce(wide)))
-    total = sum(sums)
-    return total if np.isfinite(total) else None

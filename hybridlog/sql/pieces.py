@@ -226,7 +226,7 @@ class TopicOfRecording:
         """Type of the points of the first clouds that can be read; None of other messages."""
         channels = {i: one for i, one in self.channels.items() if is_cloud(one.channel)}
         for (segment, number), place in self.places.items():
-            if channels.keys().isdisjoint(place.channels):
+            if place.is_expired or channels.keys().isdisjoint(place.channels):
                 continue
             with suppress(StoreError):
                 batch = self.chunk(segment, number, ScanCounts()).batch
@@ -345,7 +345,7 @@ class _ChunkRows:
         for number, channel in self._source.channels.items():
             rows = np.flatnonzero(chunk.batch.channel == number)
             if len(rows):
-                yield self._rows(chunk, channel, Messages.of(chunk, 0).take(rows), paths, counts)
+                yield self._rows(chunk, channel, Messages.of(chunk).take(rows), paths, counts)
 
     def _rows(
         self,

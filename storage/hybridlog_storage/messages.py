@@ -9,9 +9,9 @@ into a chunk.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -120,6 +120,53 @@ def with_expired(channels: Mapping[int, Channel], ids: Iterable[int]) -> dict[in
     return found
 
 
+@dataclass(frozen=True, slots=True)
+class Left:
+    """The rows of messages without payload. All columns have the same length n.
+
+    Attributes:
+        parts: Rows of files, see `hybridlog.columns.rows_file.LeftRows`.
+        part: int32[n], index in these; -1 of a message that has its payload.
+        row: int64[n], row of the part.
+        offset: int64[n], byte where each payload starts in its chunk, whether it is there or not.
+        length: int64[n], its bytes.
+    """
+
+    parts: Sequence[Any]
+    part: NDArray[np.int32]
+    row: NDArray[np.int64]
+    offset: NDArray[np.int64]
+    length: NDArray[np.int64]
+
+    def take(self, rows: NDArray[np.intp] | NDArray[np.bool_] | slice) -> Left:
+        """Select messages."""
+        places = self.row[rows], self.offset[rows], self.length[rows]
+        return Left(self.parts, self.part[rows], *places)
+
+    def by_part(self) -> Iterator[tuple[Any, NDArray[np.intp], NDArray[np.int64]]]:
+        """Each part, the messages that have their rows there, and these rows."""
+        for number in np.unique(self.part[self.part >= 0]).tolist():
+            own = np.flatnonzero(self.part == number)
+            yield self.parts[number], own, self.row[own]
+
+    @classmethod
+    def joined(cls, batches: Sequence[Batch]) -> Left | None:
+        """Those of several batches; None if all messages have their payloads."""
+        if all(batch.left is None for batch in batches):
+            return None
+        parts: list[Any] = []
+        columns = []
+        for batch in batches:
+            of = batch.left
+            if of is None:
+                none = np.full(len(batch), -1, np.int32)
+                of = cls((), none, none.astype(np.int64), batch.offset, batch.length)
+            part = np.where(of.part < 0, of.part, of.part + np.int32(len(parts)))
+            columns.append((part, of.row, of.offset, of.length))
+            parts += of.parts
+        return cls(parts, *map(np.concatenate, zip(*columns, strict=True)))
+
+
 @dataclass(slots=True)
 class Batch:
     """Messages whose payloads lie in one buffer. All columns have the same length n.
@@ -129,13 +176,12 @@ class Batch:
     Attributes:
         buffer: The bytes with all payloads.
         offset: int64[n], byte where each payload starts in `buffer`.
-        length: int64[n], bytes of each payload.
+        length: int64[n], bytes of each payload; 0 where it is gone.
         channel: int32[n], index of each message's channel in the owner's channel list.
         log_time: int64[n], nanoseconds since the epoch.
         publish_time: int64[n], nanoseconds since the epoch.
         sequence: uint32[n], the sender's sequence number, 0 without one.
-        place: int64[n, 2], offset and bytes of each payload in its chunk, where `buffer` holds
-            what is left of expired messages; None where it holds the payloads.
+        left: The rows of messages whose payloads are gone; None if none is.
     """
 
     buffer: Buffer
@@ -145,7 +191,7 @@ class Batch:
     log_time: NDArray[np.int64]
     publish_time: NDArray[np.int64]
     sequence: NDArray[np.uint32]
-    place: NDArray[np.int64] | None = None
+    left: Left | None = None
 
     def __len__(self) -> int:
         """Number of messages."""
@@ -154,9 +200,8 @@ class Batch:
     @property
     def places(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Offset and bytes of each payload in its chunk, whether it is still there or not."""
-        if self.place is None:
-            return self.offset, self.length
-        return self.place[:, 0], self.place[:, 1]
+        of = self if self.left is None else self.left
+        return of.offset, of.length
 
     def take(self, rows: NDArray[np.intp] | NDArray[np.bool_] | slice) -> Batch:
         """Select rows, over the same buffer."""
@@ -168,7 +213,7 @@ class Batch:
             self.log_time[rows],
             self.publish_time[rows],
             self.sequence[rows],
-            None if self.place is None else self.place[rows],
+            None if self.left is None else self.left.take(rows),
         )
 
     def payload(self, row: int) -> memoryview:

@@ -117,12 +117,18 @@ def test_damaged_recordings_are_refused_and_others_are_copied(
     source = tmp_path / "damaged"
     shutil.copytree(robots, source)
     _flip_a_bit(places.segment(source, "recorded", 1))
+    _flip_a_bit(next(places.folder(source, "expired").glob("*.rows.parquet")))
     places.segment(source, "noted").unlink()
+    for name in ("secret", "000000.mcap.old", "000077.rows.parquet"):
+        (places.folder(source, "calm") / name).write_bytes(b"not listed")
     report = copied(source, to(tmp_path / "lab"))
-    assert sorted(report.copied) == ["calm", "damaged", "driven", "expired"]
-    assert "is damaged: its bytes do not have the digest" in report.refused["recorded"]
+    assert sorted(report.copied) == ["calm", "damaged", "driven"]
+    for name in ("recorded", "expired"):
+        assert "is damaged: its bytes do not have the digest" in report.refused[name]
     assert "cannot be copied: No such file" in report.refused["noted"]
-    assert names_in(tmp_path / "lab") == ["calm", "damaged", "driven", "expired"]
+    assert names_in(tmp_path / "lab") == ["calm", "damaged", "driven"]
+    there = places.folder(tmp_path / "lab", "calm")
+    assert files_in(there) == files_in(places.folder(robots, "calm"))
 
 
 def test_fields_come_first_and_payloads_later(robots: Path, tmp_path: Path, to: To) -> None:

@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 import hybridlog as hl
 from hybridlog.columns.recording_logs import RecordingRows
 from hybridlog.columns.rows_file import RowsFile
-from hybridlog.maintenance.expiry import write_rows
+from hybridlog.maintenance.expiry import expire, write_rows
 from hybridlog_storage import manifest as truth
-from hybridlog_storage.errors import SegmentError, StoreError
+from hybridlog_storage.errors import PayloadError, SegmentError, StoreError
 from hybridlog_storage.manifest import File
 from hybridlog_storage.messages import EXPIRED_IDS, Channel, Schema
 from hybridlog_storage.segments.gone_log import GoneLog, open_log
@@ -128,3 +128,32 @@ def check_all(folder: Path, made: File) -> None:
         for place in gone.summary().chunks:
             gone.read_chunk(place)
     RowsFile(folder, made).check()
+
+
+def test_fields_of_json_are_left(tmp_path: Path) -> None:
+    """A null is no field then, and numbers of a chunk are all floats if one is."""
+    said = [
+        b'{"n": 1, "e": {}, "s": "a", "deep": {"x": [1, 2], "e": [{}, {}]}}',
+        b'{"n": 2, "e": {}, "s": "b", "deep": {"x": [], "e": []}, "more": [[1], [2, 3]]}',
+        b'{"n": 3, "mixed": 1, "big": 123456789012345678901234567890}',
+        b'{"n": 4, "mixed": "one", "t": true, "log_time": 7, "_id": 1}',
+        b'{"n": 5, "long": %s}' % str([*range(40)]).encode(),
+        b"[1, 2]",
+        b"none",
+    ]
+    log_of(tmp_path / "store", [(2, one, at, at) for at, one in enumerate(said)])
+    with hl.open(tmp_path / "store", mongo="none") as store:
+        before = [message.fields for message in store.all_topics() if message.seq < 6]
+        places_of = [(m.seq, m.log_time_ns) for m in store.all_topics()]
+        (entry,) = store.recordings()
+        with store.directory.writing(entry.id):
+            expire(store.directory, entry.id, [*map(int, entry.digests)])
+        store.refresh()
+        left = [*store.all_topics()]
+        assert {message.state.value for message in left} == {"expired"}
+        assert [(m.seq, m.log_time_ns) for m in left] == places_of
+        assert [message.fields for message in left if message.seq < 6] == before
+        assert store.topic("said").where("n >= 3").count() == 3
+        assert store.topic("said").where("deep.x[0] == 1").count() == 1
+        with pytest.raises(PayloadError, match=r"deleted to make room.*65 bytes"):
+            bytes(left[0].payload)

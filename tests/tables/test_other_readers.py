@@ -137,19 +137,14 @@ def test_duckdb_finds_what_there_is(recorded: hl.Store) -> None:
         assert count == sum(holds(message.value) for message in messages), where
 
 
-def test_floats_have_statistics_where_there_is_no_nan(store: hl.Store, tmp_path: Path) -> None:
+def test_floats_have_no_statistics(recorded: hl.Store) -> None:
     """DuckDB 2.0 answers `b > 2.0` wrongly from those of floats with NaN."""
-    for name, make in (("a", payload), ("b", varied)):
-        said = [(BASE + n, "/a", make(n)) for n in range(60)]
-        store.record(write_log(tmp_path / f"{name}.mcap", said), name=name)
-        (path,) = (store.directory.path / "tables").glob("*/*.parquet")
-        group = pq.read_metadata(path).row_group(0)
-        columns = {c.path_in_schema: c for c in map(group.column, range(group.num_columns))}
-        assert columns["topic"].statistics.min == "/a"
-        assert columns["recording"].statistics.has_min_max
-        assert columns["i8"].statistics.has_min_max
-        found = columns["f64"].statistics
-        assert (found is not None and found.has_min_max) == (name == "a")
+    path, *_ = (recorded.directory.path / "tables").glob("test_State~*/*.parquet")
+    group = pq.read_metadata(path).row_group(0)
+    columns = {c.path_in_schema: c for c in map(group.column, range(group.num_columns))}
+    for name in ("topic", "recording", "i8"):
+        assert columns[name].statistics.has_min_max
+    assert columns["f64"].statistics is None
 
 
 KINDS = {

@@ -114,12 +114,12 @@ def references(block: TableRows) -> list[tuple[int, int, int, int]]:
 
 
 @pytest.mark.parametrize(
-    ("arena", "enough", "rows", "pending"),
+    ("arena", "rows", "pending"),
     [
-        (8 << 20, 4 << 20, 1 << 18, 48 << 20),
-        (3000, 2000, 1 << 18, 48 << 20),
-        (3000, 2000, 5, 20_000),
-        (1, 1, 1, 1),
+        (8 << 20, 1 << 18, 48 << 20),
+        (3000, 1 << 18, 48 << 20),
+        (3000, 5, 20_000),
+        (1, 1, 1),
     ],
 )
 def test_tables_are_what_the_messages_say(
@@ -127,13 +127,11 @@ def test_tables_are_what_the_messages_say(
     tmp_path: Path,
     limit: Limit,
     arena: int,
-    enough: int,
     rows: int,
     pending: int,
 ) -> None:
     limit(
         table_arena_bytes=arena,
-        table_in_place_bytes=enough,
         table_collected_rows=rows,
         table_pending_bytes=pending,
         table_left_bytes=pending // 4,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hybridlog_storage.messages import Batch, Buffer, LooseBatch
+from hybridlog_storage.messages import Batch, Buffer, Left, LooseBatch
 from hybridlog_storage.ordering import distinct
 
 if TYPE_CHECKING:
@@ -83,15 +83,8 @@ def joined(batches: Sequence[Batch]) -> Batch:
         np.concatenate([b.log_time for b in batches]),
         np.concatenate([b.publish_time for b in batches]),
         np.concatenate([b.sequence for b in batches]),
-        _places(batches),
+        Left.joined(batches),
     )
-
-
-def _places(batches: Sequence[Batch]) -> NDArray[np.int64] | None:
-    """Places of the payloads, if some have expired."""
-    if all(batch.place is None for batch in batches):
-        return None
-    return np.concatenate([np.stack(batch.places, axis=1) for batch in batches])
 
 
 def interleave(batches: Sequence[Batch], order: NDArray[np.intp]) -> Batch:
@@ -111,7 +104,7 @@ def interleave(batches: Sequence[Batch], order: NDArray[np.intp]) -> Batch:
     for batch in batches:
         copy_payloads(batch, target, place[at : at + len(batch)])
         at += len(batch)
-    places = _places(batches)
+    left = Left.joined(batches)
     return Batch(
         target,
         offset,
@@ -120,5 +113,5 @@ def interleave(batches: Sequence[Batch], order: NDArray[np.intp]) -> Batch:
         np.concatenate([b.log_time for b in batches])[order],
         np.concatenate([b.publish_time for b in batches])[order],
         np.concatenate([b.sequence for b in batches])[order],
-        None if places is None else places[order],
+        None if left is None else left.take(order),
     )

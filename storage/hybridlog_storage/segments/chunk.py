@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING
 
 from hybridlog_storage.checksum import crc32, crc32_combine
 from hybridlog_storage.mcap.mcap_content import MESSAGE_HEAD
@@ -16,8 +16,6 @@ from hybridlog_storage.segments.segment_format import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     import numpy as np
     from numpy.typing import NDArray
 
@@ -110,21 +108,6 @@ def pack(
     )
 
 
-class ExpiredMessages(NamedTuple):
-    """The remains of the messages of a chunk whose log is gone.
-
-    Attributes:
-        batch: The messages; `channel` holds the ids as the log had them.
-        seq: int64[n], arrival numbers.
-        fields: Rows of the batch, and the columns of their table that rows files have, an Arrow
-            struct each; a pair for each topic.
-    """
-
-    batch: Batch
-    seq: NDArray[np.int64]
-    fields: Sequence[tuple[NDArray[np.intp], Any]]
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StoredChunk:
     """A chunk stored in a segment, with its content in memory.
@@ -140,7 +123,6 @@ class StoredChunk:
         batch: Its messages over the uncompressed content; `channel` holds channel ids.
         seq: int64[n], arrival numbers.
         compressed_size: Bytes of compressed content.
-        fields: Of an expired chunk, see `ExpiredMessages`; None of others.
     """
 
     segment: int
@@ -153,4 +135,3 @@ class StoredChunk:
     batch: Batch
     seq: NDArray[np.int64]
     compressed_size: int
-    fields: Sequence[tuple[NDArray[np.intp], Any]] | None = None

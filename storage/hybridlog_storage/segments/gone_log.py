@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog_storage.manifest import File
-    from hybridlog_storage.messages import Buffer
-    from hybridlog_storage.segments.chunk import ExpiredMessages, StoredChunk
+    from hybridlog_storage.messages import Batch, Buffer
+    from hybridlog_storage.segments.chunk import StoredChunk
     from hybridlog_storage.segments.segment_reader import ChunkPlace, SegmentSummary
 
 _HEAD = struct.Struct("<4s8sIIQ")  # magics, bytes of the line, CRC-32 and bytes of all behind
@@ -40,8 +40,8 @@ _ADDED = {"expired": EXPIRED_IDS, "elsewhere": 2 * EXPIRED_IDS}
 class Rows(Protocol):
     """Finds what is left of chunks. The caller checks it."""
 
-    def left(self, log: int, chunk: int) -> ExpiredMessages:
-        """What is left of a chunk of a log.
+    def left(self, log: int, chunk: int) -> tuple[Batch, NDArray[np.int64]]:
+        """What is left of a chunk of a log, and the arrival numbers of its messages.
 
         Raises:
             SegmentError: It is missing or damaged.
@@ -162,8 +162,7 @@ class GoneLog(SegmentReader):
         try:
             if self._rows is None:
                 raise SegmentError("its rows are not at hand")
-            left = self._rows.left(self.number, place.number)
-            batch = left.batch
+            batch, seq = self._rows.left(self.number, place.number)
             times = (place.first, place.last)
             is_all = (
                 len(batch)
@@ -177,7 +176,7 @@ class GoneLog(SegmentReader):
                 f"Chunk {place.number} of log {self.number}, which is gone, is damaged: {error}"
             ) from error
         batch.channel = batch.channel + np.int32(self._added)
-        return place.stored(self.number, batch, left.seq, 0, left.fields)
+        return place.stored(self.number, batch, seq)
 
     def read_times(self, place: ChunkPlace) -> dict[int, NDArray[np.int64]]:
         """As of a log."""

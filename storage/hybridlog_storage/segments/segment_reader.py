@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import stat
 import struct
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -116,7 +116,6 @@ class ChunkPlace:
         batch: Batch,
         seq: NDArray[np.int64],
         compressed_size: int = 0,
-        fields: Sequence[tuple[NDArray[np.intp], Any]] | None = None,
     ) -> StoredChunk:
         """The chunk of a segment with its content; see `StoredChunk`."""
         return StoredChunk(
@@ -130,7 +129,6 @@ class ChunkPlace:
             batch=batch,
             seq=seq,
             compressed_size=compressed_size,
-            fields=fields,
         )
 
 
