@@ -48,6 +48,7 @@ from hybridlog_storage.manifest import (
     free_name,
     is_id,
     loss_of,
+    name_of,
 )
 from hybridlog_storage.messages import EXPIRED, NOT_COPIED, REDUCED, Channel, schema_hash
 from hybridlog_storage.segments.gone_log import GoneLog, open_log
@@ -954,7 +955,8 @@ def sealed_of(inventory: Inventory, number: int) -> Sealed:
 
 def free_name_in(catalog: Catalog, name: str, but: str = "") -> str:
     """A name that no recording of a store has, but for one, by its id; within `creating`."""
-    return free_name(text(name), {one.name for one in catalog.summaries() if one.id != but})
+    wanted = name_of(text(name))
+    return free_name(wanted, {known for known, one in catalog.names_like(wanted) if one != but})
 
 
 def text(name: str) -> str:

@@ -13,12 +13,15 @@ from hybridlog.index.connection import Connection
 from hybridlog.maintenance.opening import open_catalog
 from hybridlog.session import Session
 from hybridlog.shared import Shared
+from hybridlog.snapshot import UNFINISHED
+from hybridlog_storage.disk import files
 from hybridlog_storage.errors import DiskFullError, HybridlogError
 
 if TYPE_CHECKING:
     from hybridlog.maintenance.report import Progress
     from hybridlog.snapshot import Snapshot
     from hybridlog_storage.disk.directory import StoreDirectory
+    from hybridlog_storage.summary import RecordingSummary
 
 _LONG_LOOK_S = 0.05  # a look for new recordings that takes longer is not made all the time,
 _LOOK_SHARE = 0.1  # but for this share of it,
@@ -209,15 +212,21 @@ class OpenStore(Shared):
 
     # Closing.
 
-    def write_recordings_file(self) -> None:
-        """List the ended recordings for other readers of their tables, if that is possible."""
-        if self.directory.is_writable:
-            from hybridlog.columns.recordings_file import write_recordings_file
+    def _write_recordings_file(self) -> None:
+        """List the ended recordings for other readers of their tables."""
+        from hybridlog.columns.recordings_file import write_recordings_file
 
-            with suppress(OSError, HybridlogError):
-                present = self.now().snapshot().by_id.keys() & {*self.directory.ids()}
-                write_recordings_file(self.catalog, present)
-                self.catalog.has_changed = False
+        ended = self._ended_now()
+        write_recordings_file(self.catalog.recordings_file, ended)
+        if ended != self._ended_now():  # somebody has changed one meanwhile
+            files.unlink(self.catalog.recordings_file)
+
+    def _ended_now(self) -> list[RecordingSummary]:
+        """Summaries of all ended recordings; those that look different are read again."""
+        known = {one.id: one.look for one in self.now().snapshot().summaries}
+        looks = self.directory.looks(self.directory.ids())
+        self.catch_up(*(one for one, look in known.items() if looks.get(one) != look))
+        return [one for one in self.now().snapshot().summaries if one.status not in UNFINISHED]
 
     def close(self) -> None:
         """Close files and connections. May be called more than once."""
@@ -227,6 +236,8 @@ class OpenStore(Shared):
         self._drop_files()
         self.index.disconnect()
         is_missing = "tables" in vars(self) and not self.catalog.recordings_file.exists()
-        if self.catalog.has_changed or is_missing:
-            self.write_recordings_file()
+        is_written = self.directory.is_writable and not self.catalog.is_in_memory
+        if is_written and (self.catalog.has_changed or is_missing):
+            with suppress(OSError, HybridlogError):
+                self._write_recordings_file()
         self.catalog.close()

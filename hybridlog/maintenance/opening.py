@@ -175,7 +175,7 @@ class StoreFiles:
                 due.add(recording)
             else:
                 found[recording] = summary
-        whole = self._by_manifests({one: looks[one] for one in due})
+        whole = self._by_manifests({one: looks[one] for one in due}, known)
         for recording in sorted(due - whole.keys()):
             try:
                 summary = self._look_again(recording, mends=mends)
@@ -189,7 +189,9 @@ class StoreFiles:
                 found[recording] = summary
         return found | whole
 
-    def _by_manifests(self, looks: Mapping[str, str]) -> dict[str, RecordingSummary]:
+    def _by_manifests(
+        self, looks: Mapping[str, str], known: Mapping[str, RecordingSummary]
+    ) -> dict[str, RecordingSummary]:
         """Summaries of those of some recordings that are whole, by id; no log is opened."""
         found: dict[str, RecordingSummary] = {}
         topics: dict[str, Collection[TopicType]] = {}
@@ -200,7 +202,11 @@ class StoreFiles:
                 summary, topics[summary.topics] = made
                 found[summary.id] = summary
         if found:
-            self.catalog.put_summaries(found.values(), topics)
+            before = {
+                one: known[one]._replace(look="", indexed_by="") for one in found if one in known
+            }
+            is_change = any(before.get(one.id) != one._replace(look="") for one in found.values())
+            self.catalog.put_summaries(found.values(), topics, is_change=is_change)
         return found
 
     def _look_again(self, recording: str, *, mends: bool) -> RecordingSummary | None:

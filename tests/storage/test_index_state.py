@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from hybridlog_storage.catalog import ChannelStats, ChunkEntry, RecordingEntry, channel_entry
+from hybridlog_storage.catalog import ChannelStats, RecordingEntry, channel_entry
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.mongo.collection_names import CATALOG_PREFIX
 from hybridlog_storage.mongo.database import Database
@@ -59,25 +59,6 @@ def recording(of: str = ONE, topics: tuple[str, ...] = ("/ä b", "/b")) -> Recor
         spans=[(0, 5, 7), (1, 8, 9)],
         digests=dict(DIGESTS),
     )
-
-
-def chunk(segment: int, number: int, of: str = ONE) -> ChunkEntry:
-    told = ChannelStats(
-        messages=segment * 100 + number,
-        payload_bytes=7,
-        unreadable=1,
-        first=-5,
-        last=2**62,
-        first_stamp=3,
-        last_stamp=4,
-        stamped=2,
-        skew_sum=0.1,
-        skew_min=-3,
-        skew_max=9,
-        longest=2**62,
-    )
-    each = {3: told, 1: ChannelStats(messages=1)}
-    return ChunkEntry(of, segment, number, number * 1000, 90, 10, 1, 2, -5, 2**62, each)
 
 
 def document(of: str, at: int, segment: int, number: int) -> dict[str, object]:
