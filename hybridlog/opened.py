@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 
 from hybridlog.index.access import IndexAccess
 from hybridlog.index.connection import Connection
-from hybridlog.maintenance.opening import open_catalog
 from hybridlog.session import Session
 from hybridlog.shared import Shared
 from hybridlog.snapshot import UNFINISHED
@@ -23,9 +22,6 @@ if TYPE_CHECKING:
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.summary import RecordingSummary
 
-_LONG_LOOK_S = 0.05  # a look for new recordings that takes longer is not made all the time,
-_LOOK_SHARE = 0.1  # but for this share of it,
-_MAX_BETWEEN_LOOKS_S = 1.0  # and at least so often
 _LIST_EVERY_S = 1.0  # between two comparisons of ids: tools that copy may write manifests later
 
 
@@ -63,7 +59,6 @@ class OpenStore(Shared):
         self._changed = 0, False  # as of the latest state, see `StoreDirectory.changed`
         self._names: list[str] = []  # ids of recordings
         self._listed_at = 0.0  # when they were compared last, by `monotonic`
-        self._looks_at = 0.0  # when the next look for new recordings is due, by `monotonic`
         self._mending = threading.Lock()
 
     def now(self) -> Session:
@@ -76,7 +71,7 @@ class OpenStore(Shared):
         latest = self._latest
         if latest is None:
             return self._read()
-        if self._has_names_changed() and time.monotonic() >= self._looks_at:
+        if self._has_names_changed():
             self.catch_up()
             return self._latest or self._read()
         # What running recordings have flushed since is for this question to see.
@@ -86,7 +81,6 @@ class OpenStore(Shared):
         with self.following:  # or a thread might keep an older state than `_changed` says
             if self._latest is not None:
                 return self._latest
-            begun = time.monotonic()
             mends, self._is_opened = self._recovers and not self._is_opened, True
             self._changed = self.directory.changed()
             self._names = self.directory.ids()
@@ -95,15 +89,9 @@ class OpenStore(Shared):
             except DiskFullError as error:
                 # The store remains readable, and recordings can be removed.
                 self.repairs.disk_full = error
-                self.catalog.close()
-                self.catalog = open_catalog(self.directory, in_memory=True)
-                found = self._files.look_at_all(mends=mends)
-            self._latest = latest = Session(self, found)
-            ended = time.monotonic()
-            self._looks_at = ended
-            if ended - begun > _LONG_LOOK_S:  # in a store of thousands
-                self._looks_at += min((ended - begun) / _LOOK_SHARE, _MAX_BETWEEN_LOOKS_S)
-            return latest
+                found = self._files.look_at_all()
+            self._latest = Session(self, found)
+            return self._latest
 
     def _has_names_changed(self) -> bool:
         """True if recordings have come or gone since the latest state."""
@@ -167,10 +155,6 @@ class OpenStore(Shared):
         self.channels.clear()
         self.columns.clear()
         self._drop_files()
-
-    def note_changes(self, *recordings: str) -> None:
-        """See `IndexAccess.note_changes`."""
-        self.index.note_changes(*recordings)
 
     # Repairs.
 

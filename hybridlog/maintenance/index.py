@@ -430,18 +430,6 @@ def documents_in(entry: RecordingEntry) -> Counter[str]:
     return found
 
 
-def mirror(catalog: Catalog, database: Database, recording: str) -> None:
-    """Update the mirror of a recording after its manifest has changed.
-
-    Raises:
-        DatabaseError: MongoDB fails; the next connection repeats it.
-    """
-    state = IndexState(database)
-    known = catalog.recording(recording)
-    if known is not None:
-        state.show(known[1])
-
-
 def decode_again(
     directory: StoreDirectory,
     catalog: Catalog,
