@@ -48,6 +48,7 @@ from hybridlog_storage.manifest import (
     free_name,
     is_id,
     loss_of,
+    name_of,
 )
 from hybridlog_storage.messages import EXPIRED, NOT_COPIED, REDUCED, Channel, schema_hash
 from hybridlog_storage.segments.gone_log import GoneLog, open_log
@@ -101,14 +102,14 @@ class Misfit:
         file: Its name; empty for one that is missing.
         reason: Description of the problem.
         is_unlisted: Whether it is a whole segment of this recording that the manifest lacks.
-        belongs: Number under which the manifest lists this content; None if it does not.
+        own_name: Name that the manifest has for it, if it is another segment of this recording.
     """
 
     segment: int
     file: str
     reason: str
     is_unlisted: bool = False
-    belongs: int | None = None
+    own_name: str = ""
 
 
 @dataclass(slots=True)
@@ -159,6 +160,12 @@ class Inventory:
     def logs(self) -> Mapping[int, File]:
         """The segments that the manifest lists, by number."""
         return {} if self.manifest is None else self.manifest.logs
+
+    def cure(self, misfit: Misfit, otherwise: str) -> str:
+        """What to do about a misfit: rename it, unless the segment of that name is there."""
+        there = {self.listing.sealed[number] for number in self.summaries}
+        is_renamed = misfit.own_name and misfit.own_name not in there
+        return f"rename it to {misfit.own_name}" if is_renamed else otherwise
 
     def digest(self, number: int) -> str:
         """Digest of the file of a valid segment; one that is not listed is read for it.
@@ -266,8 +273,10 @@ def inventory_of(
         problem = _difference(found, summary, number, recording)
         if problem is not None:
             del found.summaries[number]
-            belongs = _belongs(listed, summary, name, recording)
-            found.misfits.append(Misfit(number, name, problem, belongs=belongs))
+            own = summary.recording.get("segment")
+            is_ours = summary.recording.get("id") == recording and own != number
+            own_name = listed[own].name if is_ours and own in listed else ""
+            found.misfits.append(Misfit(number, name, problem, own_name=own_name))
         elif manifest is not None and number not in listed:
             reason = "the manifest does not list it"
             found.misfits.append(Misfit(number, name, reason, is_unlisted=True))
@@ -343,17 +352,6 @@ def _parts(channels: Iterable[SealedChannel]) -> dict[int, truth.Part]:
     }
 
 
-def _belongs(
-    listed: Mapping[int, File], summary: SegmentSummary, name: str, recording: str
-) -> int | None:
-    """The number under which the manifest lists a segment that has another name."""
-    number = summary.recording.get("segment")
-    log = listed.get(number) if isinstance(number, int) else None
-    is_same = log is not None and (summary.size, _parts_of(summary)) == (log.bytes, log.parts)
-    is_ours = summary.recording.get("id") == recording
-    return log.number if log is not None and is_ours and is_same and log.name != name else None
-
-
 def read_summary(path: Path, number: int) -> SegmentSummary:
     """The summary of a sealed segment.
 
@@ -426,14 +424,22 @@ def describe(catalog: Catalog, inventory: Inventory, *, is_open: bool = False) -
         for channel_id, channel in sorted(channels.items())
     ]
     _fill_stats(entry, inventory, catalog)
+    return described_of(entry, inventory.listing.look, inventory.state, channels)
+
+
+def described_of(
+    entry: RecordingEntry, look: str, files: str, channels: Mapping[int, Channel] | None = None
+) -> Described:
+    """What the catalog takes of a recording.
+
+    Args:
+        entry: Its entry, without marks that somebody set.
+        look: State of its directory.
+        files: State of its files.
+        channels: By id; None if the catalog has their definitions.
+    """
     shown = with_marks(entry)
-    return Described(
-        entry,
-        summary_of(shown, inventory.listing.look),
-        topic_types(shown),
-        inventory.state,
-        channels,
-    )
+    return Described(entry, summary_of(shown, look), topic_types(shown), files, channels or {})
 
 
 def _ledger(end: Mapping[str, Any] | None) -> Iterable[Mapping[str, Any]]:
@@ -645,7 +651,6 @@ def lost_in_crash(manifest: Manifest, after: Sealed) -> list[truth.Loss]:
     """Rows of the loss ledger for content of a listed segment that a crash has taken."""
     before = manifest.logs[after.segment]
     left = {one.id: one.messages for one in after.channels}
-    reason = "a crash took what was written last"
     return [
         truth.Loss(
             Cause.SEGMENT.value,
@@ -653,7 +658,7 @@ def lost_in_crash(manifest: Manifest, after: Sealed) -> list[truth.Loss]:
             part.messages - left.get(number, 0),
             part.first,
             part.last,
-            reason,
+            "a crash took what was written last",
             before.name,
         )
         for number, part in before.parts.items()
@@ -740,18 +745,12 @@ def _losses_of_segment(inventory: Inventory, file: File) -> list[dict[str, Any]]
 
 def _losses_of_file(inventory: Inventory, file: File, reason: str) -> list[dict[str, Any]]:
     channels = inventory.manifest.channels if inventory.manifest is not None else {}
-    lost: list[dict[str, Any]] = [
-        {
-            "topic": channels[number].topic,
-            "messages": part.messages,
-            "first": part.first,
-            "last": part.last,
-        }
+    rows = [
+        _loss(file.name, reason, channels[number].topic, part, length=file.bytes)
         for number, part in file.parts.items()
         if part.messages
     ]
-    nothing = {"messages": 0, "topic": None, "first": None, "last": None}
-    return [_loss(file.name, reason, c, length=file.bytes) for c in lost or [nothing]]
+    return rows or [_loss(file.name, reason, "", truth.Part(0, 0), length=file.bytes)]
 
 
 def _losses_of_rows(inventory: Inventory) -> list[dict[str, Any]]:
@@ -774,39 +773,24 @@ def _losses_of_chunks(
         summary = inventory.summaries.get(segment)
         if summary is None or number >= len(summary.table.chunks):
             continue
-        chunk = summary.table.chunks[number]
-        bounds = summary.table.part_bounds()
+        chunk, bounds = summary.table.chunks[number], summary.table.part_bounds()
+        place = {name: int(chunk[name]) for name in ("offset", "length")}
         for part in summary.table.parts[bounds[number] : bounds[number + 1]]:
             channel = summary.channels.get(int(part["channel"]))
-            lost = {
-                "topic": channel.topic if channel is not None else None,
-                **{name: int(part[name]) for name in ("messages", "first", "last")},
-            }
-            place = {"offset": int(chunk["offset"]), "length": int(chunk["length"])}
-            rows.append(_loss(inventory.listing.sealed[segment], reason, lost, **place))
+            topic = channel.topic if channel is not None else ""
+            lost = truth.Part(int(part["messages"]), 0, int(part["first"]), int(part["last"]))
+            rows.append(_loss(inventory.listing.sealed[segment], reason, topic, lost, **place))
     return rows
 
 
 def _loss(
-    file: str,
-    reason: str,
-    channel: Mapping[str, Any],
-    *,
-    offset: int | None = None,
-    length: int | None = None,
+    file: str, reason: str, topic: str, lost: truth.Part, *, length: int, offset: int | None = None
 ) -> dict[str, Any]:
-    """A row of the loss ledger for messages of a channel that were stored in a file."""
-    return {
-        "cause": Cause.SEGMENT.value,
-        "file": file,
-        "offset": offset,
-        "length": length,
-        "reason": reason,
-        "count": channel["messages"],
-        "topic": channel["topic"],
-        "from": channel["first"],
-        "to": channel["last"],
-    }
+    """A row of the loss ledger for messages that were stored in a file."""
+    cause, count = Cause.SEGMENT.value, lost.messages
+    return loss_values(
+        truth.Loss(cause, topic, count, lost.first, lost.last, reason, file, offset, length)
+    )
 
 
 def _fill_stats(entry: RecordingEntry, inventory: Inventory, catalog: Catalog) -> None:
@@ -954,7 +938,8 @@ def sealed_of(inventory: Inventory, number: int) -> Sealed:
 
 def free_name_in(catalog: Catalog, name: str, but: str = "") -> str:
     """A name that no recording of a store has, but for one, by its id; within `creating`."""
-    return free_name(text(name), {one.name for one in catalog.summaries() if one.id != but})
+    wanted = name_of(text(name))
+    return free_name(wanted, {known for known, one in catalog.names_like(wanted) if one != but})
 
 
 def text(name: str) -> str:

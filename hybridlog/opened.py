@@ -10,19 +10,18 @@ from typing import TYPE_CHECKING
 
 from hybridlog.index.access import IndexAccess
 from hybridlog.index.connection import Connection
-from hybridlog.maintenance.opening import open_catalog
 from hybridlog.session import Session
 from hybridlog.shared import Shared
+from hybridlog.snapshot import UNFINISHED
+from hybridlog_storage.disk import files
 from hybridlog_storage.errors import DiskFullError, HybridlogError
 
 if TYPE_CHECKING:
     from hybridlog.maintenance.report import Progress
     from hybridlog.snapshot import Snapshot
     from hybridlog_storage.disk.directory import StoreDirectory
+    from hybridlog_storage.summary import RecordingSummary
 
-_LONG_LOOK_S = 0.05  # a look for new recordings that takes longer is not made all the time,
-_LOOK_SHARE = 0.1  # but for this share of it,
-_MAX_BETWEEN_LOOKS_S = 1.0  # and at least so often
 _LIST_EVERY_S = 1.0  # between two comparisons of ids: tools that copy may write manifests later
 
 
@@ -60,7 +59,6 @@ class OpenStore(Shared):
         self._changed = 0, False  # as of the latest state, see `StoreDirectory.changed`
         self._names: list[str] = []  # ids of recordings
         self._listed_at = 0.0  # when they were compared last, by `monotonic`
-        self._looks_at = 0.0  # when the next look for new recordings is due, by `monotonic`
         self._mending = threading.Lock()
 
     def now(self) -> Session:
@@ -73,7 +71,7 @@ class OpenStore(Shared):
         latest = self._latest
         if latest is None:
             return self._read()
-        if self._has_names_changed() and time.monotonic() >= self._looks_at:
+        if self._has_names_changed():
             self.catch_up()
             return self._latest or self._read()
         # What running recordings have flushed since is for this question to see.
@@ -83,7 +81,6 @@ class OpenStore(Shared):
         with self.following:  # or a thread might keep an older state than `_changed` says
             if self._latest is not None:
                 return self._latest
-            begun = time.monotonic()
             mends, self._is_opened = self._recovers and not self._is_opened, True
             self._changed = self.directory.changed()
             self._names = self.directory.ids()
@@ -92,15 +89,9 @@ class OpenStore(Shared):
             except DiskFullError as error:
                 # The store remains readable, and recordings can be removed.
                 self.repairs.disk_full = error
-                self.catalog.close()
-                self.catalog = open_catalog(self.directory, in_memory=True)
-                found = self._files.look_at_all(mends=mends)
-            self._latest = latest = Session(self, found)
-            ended = time.monotonic()
-            self._looks_at = ended
-            if ended - begun > _LONG_LOOK_S:  # in a store of thousands
-                self._looks_at += min((ended - begun) / _LOOK_SHARE, _MAX_BETWEEN_LOOKS_S)
-            return latest
+                found = self._files.look_at_all()
+            self._latest = Session(self, found)
+            return self._latest
 
     def _has_names_changed(self) -> bool:
         """True if recordings have come or gone since the latest state."""
@@ -165,10 +156,6 @@ class OpenStore(Shared):
         self.columns.clear()
         self._drop_files()
 
-    def note_changes(self, *recordings: str) -> None:
-        """See `IndexAccess.note_changes`."""
-        self.index.note_changes(*recordings)
-
     # Repairs.
 
     def mend(self, seconds: float = math.inf) -> None:
@@ -209,15 +196,21 @@ class OpenStore(Shared):
 
     # Closing.
 
-    def write_recordings_file(self) -> None:
-        """List the ended recordings for other readers of their tables, if that is possible."""
-        if self.directory.is_writable:
-            from hybridlog.columns.recordings_file import write_recordings_file
+    def _write_recordings_file(self) -> None:
+        """List the ended recordings for other readers of their tables."""
+        from hybridlog.columns.recordings_file import write_recordings_file
 
-            with suppress(OSError, HybridlogError):
-                present = self.now().snapshot().by_id.keys() & {*self.directory.ids()}
-                write_recordings_file(self.catalog, present)
-                self.catalog.has_changed = False
+        ended = self._ended_now()
+        write_recordings_file(self.catalog.recordings_file, ended)
+        if ended != self._ended_now():  # somebody has changed one meanwhile
+            files.unlink(self.catalog.recordings_file)
+
+    def _ended_now(self) -> list[RecordingSummary]:
+        """Summaries of all ended recordings; those that look different are read again."""
+        known = {one.id: one.look for one in self.now().snapshot().summaries}
+        looks = self.directory.looks(self.directory.ids())
+        self.catch_up(*(one for one, look in known.items() if looks.get(one) != look))
+        return [one for one in self.now().snapshot().summaries if one.status not in UNFINISHED]
 
     def close(self) -> None:
         """Close files and connections. May be called more than once."""
@@ -227,6 +220,8 @@ class OpenStore(Shared):
         self._drop_files()
         self.index.disconnect()
         is_missing = "tables" in vars(self) and not self.catalog.recordings_file.exists()
-        if self.catalog.has_changed or is_missing:
-            self.write_recordings_file()
+        is_written = self.directory.is_writable and not self.catalog.is_in_memory
+        if is_written and (self.catalog.has_changed or is_missing):
+            with suppress(OSError, HybridlogError):
+                self._write_recordings_file()
         self.catalog.close()

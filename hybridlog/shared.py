@@ -38,7 +38,6 @@ if TYPE_CHECKING:
     from hybridlog_storage.summary import RecordingSummary
 
 _MAX_OPEN_SEGMENTS = 256
-_TRIES = 5  # to find a recording, while it is renamed
 
 
 class Shared(ABC):
@@ -123,14 +122,6 @@ class Shared(ABC):
     def replace_latest(self, before: Snapshot, now: Any) -> None:
         """Let later questions begin with what one has seen, unless there is a newer state."""
 
-    @abstractmethod
-    def invalidate(self) -> None:
-        """Drop everything that was read, so that the next question reads the store again."""
-
-    @abstractmethod
-    def note_changes(self, *recordings: str) -> None:
-        """Note that the index may lack something, of some recordings for certain."""
-
     def _invalidate_recordings(self, recordings: Collection[str]) -> None:
         """Drop what was read of some recordings, by their ids."""
         for recording in recordings:
@@ -198,7 +189,7 @@ class Shared(ABC):
             return None  # another process has just removed it
         if entry is not None and is_new:
             # The index may have what the files had before.
-            self.note_changes(entry.id)
+            self.index.note_changes(entry.id)
         return entry
 
     def known_entry(self, recording: str) -> RecordingEntry | None:

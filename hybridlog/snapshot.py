@@ -140,11 +140,9 @@ class Snapshot:
         if before == places[::-1] and [one.id for one in changed] == [
             self.summaries[place].id for place in before
         ]:
-            stale = {"tags", "by_name"}  # each is where it was
-        elif not places and before[:1] == [len(self.summaries)]:  # all others are where they were
-            stale.discard("by_id")
-            last = enumerate((one.id for one in changed), len(self.summaries))
-            vars(found)["by_id"] = {**self.by_id, **{recording: n for n, recording in last}}
+            names = [self.summaries[place].name for place in before]
+            is_renamed = names != [one.name for one in changed]
+            stale = {"tags", "by_name"} if is_renamed else {"tags"}  # each is where it was
         if known.keys() != self._topics.keys():
             stale |= {"topics", "schemas"}
         for name in stale:

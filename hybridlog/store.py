@@ -40,7 +40,6 @@ from hybridlog.wording import listed
 from hybridlog_storage.catalog import Catalog, RecordingEntry
 from hybridlog_storage.disk.directory import StoreDirectory
 from hybridlog_storage.errors import (
-    ConnectionLostError,
     DatabaseError,
     HeldError,
     HybridlogError,
@@ -1104,8 +1103,7 @@ class Store:
         def how(now: Manifest) -> Manifest:
             return replace(now, pins=(*(one for one in now.pins if one.id != name), pin))
 
-        change(self.directory, self.catalog, entry, how)
-        shared.catch_up(entry.id)
+        change(shared, entry, how)
         return name
 
     def unpin(self, *names: str) -> None:
@@ -1125,8 +1123,7 @@ class Store:
             if name not in known:
                 raise UsageError(f"There is no pin {name!r}; `hybridlog keep --pins` lists them.")
         for entry in {known[name].id: known[name] for name in names}.values():
-            change(self.directory, self.catalog, entry, how)
-            shared.catch_up(entry.id)
+            change(shared, entry, how)
 
     def remove(self, recording: str) -> None:
         """Delete a recording.
@@ -1178,7 +1175,8 @@ class Store:
             raise UsageError(
                 'Tags are texts by keys, not empty and without NUL: tag={"place": "lab"}.'
             )
-        self._to_change().catch_up()
+        shared = self._to_change()
+        shared.catch_up()
         (entry,) = self.select([recording])
         gone = [untag] if isinstance(untag, str) else [*untag]
         for key in gone:
@@ -1192,20 +1190,7 @@ class Store:
             left = {key: value for key, value in now.tags.items() if key not in gone}
             return replace(now, tags={**left, **new}, notes=(*now.notes, *notes))
 
-        edit.change(self.directory, self.catalog, entry, change, name)
-        return self._mirrored(entry.id)
-
-    def _mirrored(self, recording: str) -> RecordingEntry:
-        """A recording whose manifest was changed, after its mirror in the index is."""
-        from hybridlog_storage.mongo.index_state import IndexState
-
-        self._to_change().catch_up(recording)
-        entry = self.entry(recording)
-        connected = self.shared.index.connected
-        if connected is not None and self.shared.index.connection.may_write:
-            with suppress(ConnectionLostError):  # the next connection mirrors it
-                IndexState(connected).show(entry)
-        return entry
+        return edit.change(shared, entry, change, name)
 
     def mark(
         self,
@@ -1234,13 +1219,13 @@ class Store:
         """
         from hybridlog.maintenance import edit
 
-        self._to_change().catch_up()
+        shared = self._to_change()
+        shared.catch_up()
         (entry,) = self.select([recording])
         time = edit.time_of_mark(entry, moment)
         last = None if until is None else edit.time_of_mark(entry, until)
         said = {text(key): text(value) for key, value in (tags or {}).items()}
-        edit.mark(self.directory, self.catalog, entry, time, text=text(note), tags=said, end=last)
-        return self._mirrored(entry.id)
+        return edit.mark(shared, entry, time, text=text(note), tags=said, end=last)
 
     def unmark(self, recording: str, note: str, moment: TimeLike | None = None) -> RecordingEntry:
         """Remove marks that somebody set; those that a recorder noted are messages, and stay.
@@ -1256,12 +1241,12 @@ class Store:
         """
         from hybridlog.maintenance import edit
 
-        self._to_change().catch_up()
+        shared = self._to_change()
+        shared.catch_up()
         (entry,) = self.select([recording])
         start, end = extent_of(entry)
         time = None if moment is None else parse_time(moment, start=start, end=end)
-        edit.unmark(self.directory, self.catalog, entry, time, text=text(note))
-        return self._mirrored(entry.id)
+        return edit.unmark(shared, entry, time, text=text(note))
 
     def copy(
         self,

@@ -662,7 +662,6 @@ class FormatReader:
         self.store = store
         settings = tomllib.loads((store / "hybridlog.toml").read_text())
         demand(settings["format"] == 4, "another format")
-        demand(not settings.get("requires"), "a feature that is unknown")
         self.store_id: str = settings["store_id"]
 
     def names(self) -> list[str]:

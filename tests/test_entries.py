@@ -288,7 +288,7 @@ def test_a_missing_segment(made: Made, number: int) -> None:
     made.segments[number].unlink()
     inventory = made.inventory()
     assert not inventory.is_proven
-    assert [(m.segment, m.file, m.belongs) for m in inventory.misfits] == [(number, "", None)]
+    assert [(m.segment, m.file, m.own_name) for m in inventory.misfits] == [(number, "", "")]
     assert "missing" in inventory.misfits[0].reason
     check(made.entry(), number)
 
@@ -300,7 +300,8 @@ def test_two_that_were_exchanged(made: Made, one: int, other: int) -> None:
     second.rename(first)
     (made.path / "x").rename(second)
     inventory = made.inventory()
-    assert [(m.segment, m.belongs) for m in inventory.misfits] == [(one, other), (other, one)]
+    own = [(one, f"{other:06d}.mcap"), (other, f"{one:06d}.mcap")]
+    assert [(m.segment, m.own_name) for m in inventory.misfits] == own
     assert all("of this recording" in m.reason for m in inventory.misfits)
     check(made.entry(), one, other)
 
@@ -309,14 +310,14 @@ def test_two_that_were_exchanged(made: Made, one: int, other: int) -> None:
 def test_one_that_lies_there_twice(made: Made, copied: int, over: int) -> None:
     shutil.copy(made.segments[copied], made.segments[over])
     inventory = made.inventory()
-    assert [(m.segment, m.belongs) for m in inventory.misfits] == [(over, copied)]
+    assert [(m.segment, m.own_name) for m in inventory.misfits] == [(over, f"{copied:06d}.mcap")]
     check(made.entry(), over)
 
 
 def test_one_that_lies_there_twice_under_a_number_of_its_own(made: Made) -> None:
     shutil.copy(made.segments[1], made.path / "000007.mcap")
     (misfit,) = made.inventory().misfits
-    assert (misfit.segment, misfit.file, misfit.belongs) == (7, "000007.mcap", 1)
+    assert (misfit.segment, misfit.file, misfit.own_name) == (7, "000007.mcap", "000001.mcap")
     assert not misfit.is_unlisted
     # Nothing is counted twice, and nothing is lost.
     check(made.entry())
@@ -328,7 +329,7 @@ def test_one_of_another_recording(made: Made, directory: StoreDirectory, number:
     shutil.copy(other.segments[number], made.segments[number])
     (misfit,) = made.inventory().misfits
     assert other.id in misfit.reason
-    assert (misfit.segment, misfit.belongs) == (number, None)
+    assert (misfit.segment, misfit.own_name) == (number, "")
     check(made.entry(), number)
 
 
@@ -470,7 +471,7 @@ def test_a_segment_that_the_manifest_does_not_list(made: Made) -> None:
     made.drop(1)
     inventory = made.inventory()
     (misfit,) = inventory.misfits
-    assert (misfit.segment, misfit.is_unlisted, misfit.belongs) == (1, True, None)
+    assert (misfit.segment, misfit.is_unlisted, misfit.own_name) == (1, True, "")
     assert inventory.lost == []
     # It answers, and is listed by the next one that may write.
     assert made.entry() == before

@@ -72,7 +72,7 @@ def test_nothing_is_said_to_have_crashed_on_a_full_disk(tmp_path: Path, calls: C
             recording.write(Channel("/a", "json", None, {}), b'{"n": 1}')
 
     def full(store: StoreFiles, **_: Any) -> None:
-        if not store.catalog.is_in_memory:
+        if store.report.disk_full is None:
             raise DiskFullError("No space left while writing the catalog.")
 
     calls(StoreFiles, "look_at_all", full)

@@ -537,18 +537,6 @@ def test_a_damaged_catalog_is_made_again(store: Path, way: str) -> None:
     assert run("verify", store=store).err == ""
 
 
-@pytest.mark.parametrize("way", OF_CATALOG)
-def test_a_catalog_damaged_while_the_store_is_open(store: Path, way: str) -> None:
-    with hl.open(store, mongo=NOWHERE) as opened:
-        imu = opened.topic(IMU)
-        want = imu.count(), imu.where(WHERE).count(), sum(1 for _ in imu)
-        OF_CATALOG[way](store / CATALOG)
-        assert (imu.count(), imu.where(WHERE).count(), sum(1 for _ in imu)) == want
-        opened.refresh()
-        assert len(opened.recordings()) == 2
-        assert (imu.count(), imu.where(WHERE).count(), sum(1 for _ in imu)) == want
-
-
 @pytest.mark.parametrize("way", ["removed", "cut", "garbled"])
 def test_damaged_tables_are_made_again(store: Path, way: str) -> None:
     question = ("fetch", "-t", IMU, "--where", WHERE, "--count", "-q")

@@ -18,7 +18,6 @@ from benchmarks.simulator.topics import RobotConfig
 from benchmarks.simulator.write import write_bag
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.data import DATA
-from tests.storage.chunk_entries import chunk_entries
 
 HERE = Path(__file__).parent / "second_opinion"
 SMALL = RobotConfig(image_size=(64, 48), cloud_columns=20, scan_beams=180)
@@ -144,7 +143,7 @@ def test_another_reader_refuses_what_was_altered(
     entry = next(r for r in store.recordings() if r.name == "none")
     _, path = store.directory.segments(entry.id)[0]
     data = bytearray(path.read_bytes())
-    data[chunk_entries(store.catalog, entry)[0].offset + 200] ^= 4
+    data[int(store.catalog.table(entry, 0).chunks["offset"][0]) + 200] ^= 4
     altered = tmp_path / "altered.mcap"
     altered.write_bytes(data)
     done = subprocess.run(

@@ -1,7 +1,7 @@
 """`tables/recordings.parquet`: the ended recordings of a store, beside their tables.
 
-It is made from the catalog when a store that has changed recordings is closed. The catalog
-removes it before it changes an ended recording, so it is right wherever it exists.
+It is made when a store that has changed recordings is closed. Who notes in the catalog that an
+ended recording has changed removes it, and it is left out if one changes while it is made.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ from hybridlog.snapshot import UNFINISHED
 from hybridlog_storage.disk import files
 
 if TYPE_CHECKING:
-    from hybridlog_storage.catalog import Catalog
+    from pathlib import Path
+
     from hybridlog_storage.summary import RecordingSummary
 
 TIME: Final = pa.timestamp("us", "UTC")
@@ -74,29 +75,28 @@ def times(first: int | None, last: int | None) -> dict[str, Any]:
     }
 
 
-def write_recordings_file(catalog: Catalog, present: set[str]) -> None:
-    """Write the file, with all ended recordings of the catalog, unless the catalog lacks some.
+def write_recordings_file(path: Path, summaries: Iterable[RecordingSummary]) -> None:
+    """Write the file.
+
+    Args:
+        path: Where it lies.
+        summaries: All recordings; those that have not ended are left out.
 
     Raises:
         OSError: It cannot be written.
-        StoreError: The catalog cannot be read or locked.
     """
-    with catalog.unchanged() as summaries:
-        if catalog.is_in_memory or not present <= {one.id for one in summaries}:
-            return
-        ended = [one for one in summaries if one.status not in UNFINISHED]
-        ended.sort(key=lambda one: (one.extent, one.id))
-        # In tables, `recording` is the id, which stays when a recording is renamed.
-        names = {"recording": "name", "id": "recording"}
-        table = recordings_table(ended)
-        sink = pa.BufferOutputStream()
-        pq.write_table(
-            table.rename_columns([names.get(name, name) for name in table.column_names]),
-            sink,
-            compression="zstd",
-            write_page_checksum=True,
-        )
-        path = catalog.recordings_file
-        with suppress(FileExistsError):
-            files.make_folder(path.parent)
-        files.write_file(path, sink.getvalue().to_pybytes(), sync=False)
+    ended = [one for one in summaries if one.status not in UNFINISHED]
+    ended.sort(key=lambda one: (one.extent, one.id))
+    # In tables, `recording` is the id, which stays when a recording is renamed.
+    names = {"recording": "name", "id": "recording"}
+    table = recordings_table(ended)
+    sink = pa.BufferOutputStream()
+    pq.write_table(
+        table.rename_columns([names.get(name, name) for name in table.column_names]),
+        sink,
+        compression="zstd",
+        write_page_checksum=True,
+    )
+    with suppress(FileExistsError):
+        files.make_folder(path.parent)
+    files.write_file(path, sink.getvalue().to_pybytes(), sync=False)

@@ -95,19 +95,7 @@ class ChunkIndexer:
             for number, of_chunk in found.by_chunk():
                 stats[number][channel_id] = of_chunk
         entries = [
-            ChunkEntry(
-                self.recording,
-                chunk.segment,
-                chunk.number,
-                chunk.offset,
-                chunk.length,
-                chunk.trailer,
-                chunk.crc,
-                chunk.trailer_crc,
-                int(chunk.batch.log_time.min()),
-                int(chunk.batch.log_time.max()),
-                of_chunk,
-            )
+            ChunkEntry(chunk.segment, chunk.number, of_chunk)
             for chunk, of_chunk in zip(chunks, stats, strict=True)
         ]
         return documents, entries

@@ -58,7 +58,7 @@ def bring_derived(source: Shared, target: RemoteDirectory, recordings: Collectio
                 cells.put_tables(recording, tables)
         if cells.save():
             return
-    cells.close(0)  # a manifest may have been made again
+    cells.close()  # a manifest may have been made again
 
 
 def free_name_there(directory: StoreDirectory, name: str, but: str) -> str:

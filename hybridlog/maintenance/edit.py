@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
 from typing import TYPE_CHECKING
 
-from hybridlog.entries import free_name_in, text
+from hybridlog.entries import free_name_in, text, with_said
 from hybridlog.maintenance import tables
 from hybridlog.query.times import TimeLike, format_time, parse_time
 from hybridlog.record.losses import extent_of
@@ -32,34 +32,33 @@ from hybridlog_storage.mongo.index_state import IndexState
 
 if TYPE_CHECKING:
     from hybridlog.opened import OpenStore
-    from hybridlog_storage.catalog import Catalog, RecordingEntry
+    from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.mongo.database import Database
 
 
 def change(
-    directory: StoreDirectory,
-    catalog: Catalog,
+    shared: OpenStore,
     entry: RecordingEntry,
     how: Callable[[Manifest], Manifest],
     name: str | None = None,
-) -> Manifest:
+) -> RecordingEntry:
     """Change the manifest of a recording, also of a running one, and give it another name.
 
     Args:
-        directory: The store.
-        catalog: Its catalog.
+        shared: The open store.
         entry: The recording.
         how: The change.
         name: The name; it gets a number if another recording has it. None to leave it.
 
     Returns:
-        The manifest with the change.
+        The recording with the change.
 
     Raises:
         StoreError: The manifest cannot be written.
         TopicError: The recording is gone.
     """
+    directory, catalog, index = shared.directory, shared.catalog, shared.index
     directory.check_changes()
     with ExitStack() as held:
         if name is not None:
@@ -75,7 +74,12 @@ def change(
             raise gone(entry.name) from error
         if name is not None:
             catalog.put_name(entry.id, made.name)  # before another recording gets it
-        return made
+    shared.catch_up(entry.id)
+    row = catalog.recording(entry.id)
+    if row is not None and index.connected is not None and index.connection.may_write:
+        with suppress(ConnectionLostError):  # the next connection mirrors it
+            IndexState(index.connected).show(with_said(row[1], made))
+    return shared.now().entry(entry.id)
 
 
 def time_of_mark(entry: RecordingEntry, moment: TimeLike) -> int:
@@ -103,20 +107,18 @@ def time_of_mark(entry: RecordingEntry, moment: TimeLike) -> int:
 
 
 def mark(
-    directory: StoreDirectory,
-    catalog: Catalog,
+    shared: OpenStore,
     entry: RecordingEntry,
     moment: int,
     *,
     text: str,
     tags: Mapping[str, str],
     end: int | None = None,
-) -> None:
-    """Set a mark in the manifest of a recording, also of a running one.
+) -> RecordingEntry:
+    """Set a mark in the manifest of a recording, also of a running one, and return it.
 
     Args:
-        directory: The store.
-        catalog: Its catalog.
+        shared: The open store.
         entry: The recording.
         moment: Log time of the mark, ns.
         text: Text of the mark.
@@ -133,9 +135,10 @@ def mark(
     if end is not None and end < moment:
         raise TimeError("A mark cannot end before it begins.")
     made = Mark(new_random(), moment, text, dict(tags), end)
-    now = change(directory, catalog, entry, lambda known: with_mark(known, made))
-    if all(one.id != made.id for one in now.marks):
+    now = change(shared, entry, lambda known: with_mark(known, made))
+    if all(one["id"] != made.id for one in now.marks):
         raise too_many_marks(entry.name)
+    return now
 
 
 def mark_now(
@@ -189,18 +192,12 @@ def too_many_marks(name: str) -> StoreError:
 
 
 def unmark(
-    directory: StoreDirectory,
-    catalog: Catalog,
-    entry: RecordingEntry,
-    moment: int | None,
-    *,
-    text: str,
-) -> None:
-    """Remove the marks of a text from the manifest.
+    shared: OpenStore, entry: RecordingEntry, moment: int | None, *, text: str
+) -> RecordingEntry:
+    """Remove the marks of a text from the manifest of a recording, and return it.
 
     Args:
-        directory: The store.
-        catalog: Its catalog.
+        shared: The open store.
         entry: The recording.
         moment: Log time of the mark, ns; None for any.
         text: Text of the mark.
@@ -221,46 +218,20 @@ def unmark(
             )
         return replace(now, marks=left)
 
-    change(directory, catalog, entry, how)
+    return change(shared, entry, how)
 
 
 def remove_if(
     shared: OpenStore, recording: str, check: Callable[[Manifest], None] = lambda _: None
 ) -> None:
-    """Delete a recording of an open store, by its id.
-
-    Args:
-        shared: The open store.
-        recording: The recording.
-        check: Called with the newest manifest; raises to keep the recording.
-    """
-    try:
-        entry = shared.now().entry(recording)
-        remove(shared.directory, shared.catalog, shared.index.writable_database, entry, check)
-    except ConnectionLostError:
-        shared.invalidate()
-        shared.index.connect()  # a new connection removes the rest
-    finally:
-        shared.catch_up()
-
-
-def remove(
-    directory: StoreDirectory,
-    catalog: Catalog,
-    database: Database | None,
-    entry: RecordingEntry,
-    check: Callable[[Manifest], None],
-) -> None:
-    """Delete a recording.
+    """Delete a recording of an open store.
 
     Its manifest says so first, then its files go, then the manifest; who may write finishes what
     was interrupted.
 
     Args:
-        directory: The store.
-        catalog: Its catalog.
-        database: The index; None if it is unavailable: the next connection clears it.
-        entry: The recording.
+        shared: The open store.
+        recording: The recording's id.
         check: Called with the newest manifest; raises to keep the recording.
 
     Raises:
@@ -268,16 +239,25 @@ def remove(
         TopicError: It is gone.
         DatabaseError: MongoDB fails; the files are gone, and the next connection clears it.
     """
-    with directory.writing(entry.id, entry.name, wait_s=LOCK_WAIT_S):
-        try:
-            directory.manifests.remove(entry.id, check)
-        except RecordingGoneError as error:
-            raise gone(entry.name) from error
-        catalog.remove(entry.id)
-        with suppress(OSError, StoreError):  # the next connection removes them
-            tables.remove(directory, entry.id, {c.type for c in entry.channels})
-        if database is not None:
-            _clear(database, entry)
+    directory = shared.directory
+    try:
+        entry = shared.now().entry(recording)
+        database = shared.index.writable_database
+        with directory.writing(entry.id, entry.name, wait_s=LOCK_WAIT_S):
+            try:
+                directory.manifests.remove(entry.id, check)
+            except RecordingGoneError as error:
+                raise gone(entry.name) from error
+            shared.catalog.remove(entry.id)
+            with suppress(OSError, StoreError):  # the next connection removes them
+                tables.remove(directory, entry.id, {c.type for c in entry.channels})
+            if database is not None:
+                _clear(database, entry)
+    except ConnectionLostError:
+        shared.invalidate()
+        shared.index.connect()  # a new connection removes the rest
+    finally:
+        shared.catch_up()
 
 
 def _clear(database: Database, entry: RecordingEntry) -> None:

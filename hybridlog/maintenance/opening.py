@@ -13,24 +13,22 @@ from collections.abc import Collection, Mapping
 from collections.abc import Set as AbstractSet
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from msgspec import to_builtins
 
 from hybridlog.entries import (
     NO_MANIFEST,
     describe_now,
+    described_of,
     ended,
     inventory_of,
     listed,
     lost_in_crash,
     state_of,
     summary_by,
-    summary_of,
     take_inventory,
-    topic_types,
     unlisted,
-    with_marks,
     with_said,
 )
 from hybridlog.snapshot import UNFINISHED, Snapshot
@@ -56,22 +54,16 @@ if TYPE_CHECKING:
 
 _LEFT_OVER = re.compile(r"\.[0-9.]+\.mcap\.([0-9a-f]{16}|rebuilt)")
 """Names of files that were being written, and were to get another name when they were whole."""
-_MOVING = re.compile(r"(?P<before>[0-9.]+\.mcap)\.moving-(?P<final>[0-9.]+\.mcap)")
 _RECOVERED_BYTES_PER_S = 200e6
 """Size of the open segments that are recovered in a second, about."""
 
 
-def open_catalog(directory: StoreDirectory, *, in_memory: bool = False) -> Catalog:
-    """Open the catalog of a store; in memory if the store cannot be written.
-
-    Args:
-        directory: The store.
-        in_memory: Use memory in any case, for a full disk.
-    """
+def open_catalog(directory: StoreDirectory) -> Catalog:
+    """Open the catalog of a store; in memory if the store cannot be written."""
     return Catalog(
         directory.path,
         directory.settings.store_id,
-        in_memory=in_memory or not directory.is_writable,
+        in_memory=not directory.is_writable,
         cells=directory.catalog_cells(),
     )
 
@@ -175,7 +167,7 @@ class StoreFiles:
                 due.add(recording)
             else:
                 found[recording] = summary
-        whole = self._by_manifests({one: looks[one] for one in due})
+        whole = self._by_manifests({one: looks[one] for one in due}, known)
         for recording in sorted(due - whole.keys()):
             try:
                 summary = self._look_again(recording, mends=mends)
@@ -189,7 +181,9 @@ class StoreFiles:
                 found[recording] = summary
         return found | whole
 
-    def _by_manifests(self, looks: Mapping[str, str]) -> dict[str, RecordingSummary]:
+    def _by_manifests(
+        self, looks: Mapping[str, str], known: Mapping[str, RecordingSummary]
+    ) -> dict[str, RecordingSummary]:
         """Summaries of those of some recordings that are whole, by id; no log is opened."""
         found: dict[str, RecordingSummary] = {}
         topics: dict[str, Collection[TopicType]] = {}
@@ -200,23 +194,31 @@ class StoreFiles:
                 summary, topics[summary.topics] = made
                 found[summary.id] = summary
         if found:
-            self.catalog.put_summaries(found.values(), topics)
+            before = {
+                one: known[one]._replace(look="", indexed_by="") for one in found if one in known
+            }
+            is_change = any(before.get(one.id) != one._replace(look="") for one in found.values())
+            self.catalog.put_summaries(found.values(), topics, is_change=is_change)
         return found
 
     def _look_again(self, recording: str, *, mends: bool) -> RecordingSummary | None:
         """The summary of a recording as its files are now; None if it is gone."""
         known = self._known(recording)
-        if known is not None:
-            found = known.described
-            if known.has_changed or found.entry.status not in UNFINISHED:
-                self.catalog.put(found, waits=False)
-            return found.summary
-        mends = mends and self._may_mend(recording)
-        described = (self._mended if mends else self._refresh)(recording)
-        return described.summary if described is not None else None
+        if known is None:
+            described = self._refresh(recording, mends=mends)
+            return described.summary if described is not None else None
+        found = described_of(*known)
+        is_noted = self.catalog.recording(recording) == (found.files, found.entry)
+        if found.entry.status not in UNFINISHED or not is_noted:
+            self.catalog.put(found, waits=False)
+        return found.summary
 
-    def _known(self, recording: str) -> _Known | None:
-        """A recording by its catalog row, if that still matches its files."""
+    def _known(self, recording: str) -> tuple[RecordingEntry, str, str] | None:
+        """A recording by its catalog row, with what people say of it by now.
+
+        Returns:
+            Its entry, its look and the state of its files; None if the row does not match them.
+        """
         directory, row = self.directory, self.catalog.recording(recording)
         if row is None:
             return None
@@ -226,17 +228,13 @@ class StoreFiles:
             manifest = directory.manifests.read(recording)
         except RecordingGoneError:
             return None
-        if files != state_of(listing, manifest) or not self._is_settled(entry, listing):
+        if files != state_of(listing, manifest):
             return None
-        now = with_said(entry, manifest)
-        return _Known(now, files, listing.look, now != entry)
-
-    def _is_settled(self, entry: RecordingEntry, listing: Listing) -> bool:
-        """False if a process that is gone has left something to mend."""
-        if listing.open or entry.status == "open" or _has_left_over(entry, listing):
-            holder = self.directory.holder(entry.id)
-            return holder is not None and (holder.is_recording or entry.status != "open")
-        return True
+        if _is_interrupted(manifest, listing):
+            holder = directory.holder(recording)
+            if holder is None or not (holder.is_recording or entry.status != "open"):
+                return None
+        return with_said(entry, manifest), listing.look, files
 
     def current_entry(self, summary: RecordingSummary) -> tuple[RecordingEntry | None, bool]:
         """The entry of a recording, compared with its files.
@@ -249,54 +247,38 @@ class StoreFiles:
         """
         known = self._known(summary.id)
         if known is not None:
-            if known.has_changed:
-                self.catalog.put(known.described, waits=False)
-            return known.entry, False
-        if not self.directory.has(summary.id):
-            return None, True
+            return known[0], False
         described = self._refresh(summary.id)
         return (described.entry if described is not None else None), True
 
-    def _refresh(self, recording: str) -> Described | None:
-        """Read what is whole of a recording, keep it in memory, and note what to mend.
+    def _refresh(self, recording: str, *, mends: bool = False) -> Described | None:
+        """Read what is whole of a recording, and put it into the catalog; None if it is gone.
 
-        None if the recording is gone.
+        What a crash has left is mended, or else noted.
         """
-        is_open = self.directory.is_recorded(recording)
-        if not is_open and self._may_mend(recording) and is_unfinished(self.directory, recording):
-            self.report.noted.add(recording)
-        return self._describe(recording, is_open=is_open)
-
-    def _may_mend(self, recording: str) -> bool:
-        if self.catalog.is_in_memory:
-            return False
-        return os.access(self.directory.recording(recording), os.W_OK)
-
-    def _describe(self, recording: str, *, is_open: bool) -> Described | None:
-        try:
-            described = describe_now(self.directory, self.catalog, recording, is_open=is_open)
-        except StoreError as error:
-            if isinstance(error, RecordingGoneError) or not self.directory.has(recording):
-                return None
-            raise
-        self.catalog.put(described, waits=False)
-        return described
-
-    def _mended(self, recording: str) -> Described | None:
-        """Recover a recording after a crash, and update its catalog row; None if it is gone."""
         directory, catalog = self.directory, self.catalog
+        can_write = not catalog.is_in_memory and os.access(directory.recording(recording), os.W_OK)
+        may_mend = can_write and self.report.disk_full is None
         try:
-            with directory.writing(recording):
-                if not recover(directory, recording, self.report):
-                    return None
-                described = describe_now(directory, catalog, recording)
-                catalog.put(described)
-                return described
-        except (HeldError, TopicError):
-            pass
+            if mends and may_mend:
+                with suppress(HeldError, TopicError), directory.writing(recording):
+                    if not recover(directory, recording, self.report):
+                        return None
+                    described = describe_now(directory, catalog, recording)
+                    catalog.put(described)
+                    return described
+            is_open = directory.is_recorded(recording)
+            if may_mend and not (mends or is_open) and is_unfinished(directory, recording):
+                self.report.noted.add(recording)
+            described = describe_now(directory, catalog, recording, is_open=is_open)
         except RecordingGoneError:
             return None
-        return self._describe(recording, is_open=directory.is_recorded(recording))
+        except StoreError:
+            if directory.has(recording):
+                raise
+            return None  # another process has just removed it
+        catalog.put(described, waits=False)
+        return described
 
     def mend(self, until: float) -> set[str]:
         """Recover the recordings that were noted, and update their catalog rows.
@@ -317,7 +299,7 @@ class StoreFiles:
             report.noted.discard(recording)
             report.unreadable.pop(recording, None)
             try:
-                described = self._mended(recording)
+                described = self._refresh(recording, mends=True)
             except DiskFullError:
                 raise
             except StoreError as error:
@@ -329,22 +311,6 @@ class StoreFiles:
         return mended
 
 
-class _Known(NamedTuple):
-    """A recording by its catalog row, with what people say of it by now."""
-
-    entry: RecordingEntry
-    files: str
-    look: str
-    has_changed: bool  # they say something else than the row
-
-    @property
-    def described(self) -> Described:
-        """For the catalog."""
-        shown = with_marks(self.entry)
-        summary, topics = summary_of(shown, self.look), topic_types(shown)
-        return Described(self.entry, summary, topics, self.files, {})
-
-
 def snapshot_of(catalog: Catalog, summaries: Collection[RecordingSummary]) -> Snapshot:
     """Some recordings with their topics.
 
@@ -353,13 +319,6 @@ def snapshot_of(catalog: Catalog, summaries: Collection[RecordingSummary]) -> Sn
     """
     hashes = {summary.topics for summary in summaries}
     return Snapshot(summaries, {digest: catalog.topics(digest) for digest in hashes})
-
-
-def _has_left_over(entry: RecordingEntry, listing: Listing) -> bool:
-    """True if files are left from an interrupted step."""
-    rows = {name for name, _, _ in entry.rows}
-    is_expiring = listing.rows.keys() - rows or {*map(str, listing.sealed)} & entry.files.keys()
-    return bool(is_expiring) or any(map(is_left_over, listing.others))
 
 
 def _lost(directory: StoreDirectory, name: str) -> str:
@@ -434,23 +393,25 @@ def is_unfinished(directory: StoreDirectory, recording: str) -> bool:
         listing = directory.listing(recording)
     except StoreError:
         return True
-    return bool(
-        not manifest.is_ended
-        or listing.open
-        or listing.left_over(manifest)
-        or listing.sealed.keys() - manifest.logs.keys()  # it may be whole, and not listed
-        or any(map(is_left_over, listing.others))
+    is_listed = listing.sealed.keys() <= manifest.logs.keys()
+    return not is_listed or _is_interrupted(manifest, listing)  # others may be whole
+
+
+def _is_interrupted(manifest: Manifest, listing: Listing) -> bool:
+    """True if a recording goes on, or a process has left something to mend."""
+    is_ended = manifest.is_ended and not listing.open
+    return (
+        not is_ended or bool(listing.left_over(manifest)) or any(map(is_left_over, listing.others))
     )
 
 
 def is_left_over(name: str) -> bool:
     """True if a file in a recording's directory is left from an interrupted step."""
-    return any(pattern.fullmatch(name) for pattern in (_LEFT_OVER, _MOVING))
+    return _LEFT_OVER.fullmatch(name) is not None
 
 
 def clear_away(directory: StoreDirectory, recording: str) -> None:
-    """Remove temporary files, and finish the renaming of segments."""
-    finish_moves(directory, recording)
+    """Remove temporary files."""
     path = directory.recording(recording)
     for name in directory.listing(recording).others:
         if _LEFT_OVER.fullmatch(name):
@@ -458,58 +419,6 @@ def clear_away(directory: StoreDirectory, recording: str) -> None:
                 files.unlink(path / name)
             except OSError as error:
                 raise durability.explain(error, path / name, "removing") from error
-
-
-def moving_name(name: str, final: str) -> str:
-    """Temporary name of a segment that is being renamed."""
-    return f"{name}.moving-{final}"
-
-
-def finish_moves(
-    directory: StoreDirectory, recording: str, *, replace: bool = False
-) -> list[tuple[str, str]]:
-    """Finish the renaming of segments.
-
-    Args:
-        directory: The store.
-        recording: The recording, locked by this process.
-        replace: Rename an existing file of that name to `.damaged`: the manifest does not list
-            it. Otherwise it stays, as it may be renamed itself.
-
-    Returns:
-        Old and new name of each.
-    """
-    path = directory.recording(recording)
-    done = []
-    try:
-        for name in directory.listing(recording).others:
-            moving = _MOVING.fullmatch(name)
-            if moving is None:
-                continue
-            final = path / moving["final"]
-            listing = directory.listing(recording)
-            if final.name in {*listing.sealed.values(), *listing.others}:
-                if not replace:
-                    continue
-                files.rename(
-                    final, path / _free_name(directory, recording, f"{final.name}.damaged")
-                )
-            files.rename(path / name, final)
-            done.append((moving["before"], final.name))
-        if done:
-            files.sync_folder(path)
-    except OSError as error:
-        raise durability.explain(error, path, "renaming segments of") from error
-    return done
-
-
-def _free_name(directory: StoreDirectory, recording: str, name: str) -> str:
-    """A free file name: this one, or one with a number before its suffix."""
-    taken = set(directory.listing(recording).others)
-    stem, _, last = name.rpartition(".")
-    return next(
-        n for n in (name, *(f"{stem}.{i}.{last}" for i in range(2, 1 << 20))) if n not in taken
-    )
 
 
 def recover_segments(

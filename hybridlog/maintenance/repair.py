@@ -18,10 +18,9 @@ from hybridlog.entries import (
 )
 from hybridlog.maintenance import tables
 from hybridlog.maintenance.index import StoreIndex
-from hybridlog.maintenance.opening import finish_moves, moving_name, recover_segments
+from hybridlog.maintenance.opening import recover_segments
 from hybridlog.maintenance.verify import RESTORE, damaged_files
 from hybridlog_storage.catalog import file_of
-from hybridlog_storage.disk import durability, files
 from hybridlog_storage.disk.directory import LOCK_WAIT_S
 from hybridlog_storage.errors import HeldError, ManifestError, SegmentError, StoreError, TopicError
 from hybridlog_storage.manifest import replace
@@ -102,8 +101,9 @@ def _repair_one(directory: StoreDirectory, catalog: Catalog, recording: str) -> 
     done += _put_segments_right(directory, recording)
     inventory = take_inventory(directory, recording)
     for misfit in inventory.misfits:
-        what = f"{misfit.reason}; restore it from a copy, if there is one"
+        cure = inventory.cure(misfit, "restore it from a copy, if there is one")
         place = misfit.file or f"segment {misfit.segment}"
+        what = f"{misfit.reason}; {cure}"
         done.append(Repaired(inventory.name, place, what, is_cured=False))
     return [*done, *_damage(directory.recording(recording), inventory)]
 
@@ -129,37 +129,20 @@ def _damage(path: Path, inventory: Inventory) -> Iterator[Repaired]:
 
 
 def _put_segments_right(directory: StoreDirectory, recording: str) -> list[Repaired]:
-    """Restore the names of segments and rebuild damaged summaries."""
+    """Rebuild damaged summaries."""
     path = directory.recording(recording)
     inventory = take_inventory(directory, recording)
-    done = [
+    return [
         Repaired(inventory.name, misfit.file, "its summary was rebuilt")
         for misfit in inventory.misfits
         if misfit.file and _rebuild(inventory, misfit, path)
-    ]
-    inventory = take_inventory(directory, recording)
-    moved = [m for m in inventory.misfits if m.belongs is not None]
-    wanted = {m.belongs for m in moved if m.belongs not in inventory.summaries}
-    try:
-        for misfit in moved:
-            if misfit.belongs is not None and misfit.belongs in wanted:
-                wanted.discard(misfit.belongs)
-                # Temporary names first, since two exchanged segments need each other's name. If
-                # this is interrupted, the temporary name tells the remaining step.
-                final = inventory.logs[misfit.belongs].name
-                files.rename(path / misfit.file, path / moving_name(misfit.file, final))
-    except OSError as error:
-        raise durability.explain(error, path, "renaming segments of") from error
-    return done + [
-        Repaired(inventory.name, before, f"is {now} again")
-        for before, now in finish_moves(directory, recording, replace=True)
     ]
 
 
 def _rebuild(inventory: Inventory, misfit: Misfit, path: Path) -> bool:
     """Rebuild a damaged summary, if the result has the digest in the manifest."""
     log = inventory.logs.get(misfit.segment)
-    if log is None or log.name != misfit.file or misfit.belongs is not None:
+    if log is None or log.name != misfit.file or misfit.own_name:
         return False
     return rebuild_summary(path / misfit.file, log.digest)
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from hybridlog.columns import rows_file
 from hybridlog.columns.recording_logs import RecordingRows, walk
-from hybridlog.entries import describe, steady_inventory, with_said
+from hybridlog.entries import describe, steady_inventory
 from hybridlog.maintenance import tables
 from hybridlog_storage.disk.directory import LOCK
 from hybridlog_storage.errors import ManifestError, SegmentError, StoreError
@@ -225,11 +225,6 @@ class _Check:
             return
         is_open = holder is not None and holder.is_recording
         entry = describe(self._catalog, inventory, is_open=is_open).entry
-        row = self._catalog.recording(entry.id)
-        # What is decoded of a recording in progress is noted behind its entry.
-        known = None if row is None or row[0] != inventory.state else row[1]
-        if not is_open and known and with_said(known, inventory.manifest) != entry:
-            self.found("catalog", "its entry differs from the files", _REPAIR)
         self._result.without_documents += entry.messages - entry.documents
         if entry.status == "open":
             return
@@ -252,13 +247,13 @@ class _Check:
     def _files(self, inventory: Inventory, *, is_held: bool) -> None:
         for misfit in inventory.misfits:
             place = misfit.file or f"segment {misfit.segment}"
-            cure = _REPAIR if misfit.file else _RESTORE_LOST
+            cure = inventory.cure(misfit, _REPAIR if misfit.file else _RESTORE_LOST)
             self.found(place, misfit.reason, RESTORE if is_rows(misfit.file) else cure)
         for name in inventory.listing.open.values():
             if not is_held:
                 self.found(name, "a crash has left it open", "open the store with write permission")
         for name in inventory.listing.others:
-            if name not in _KNOWN and not name.endswith(".damaged"):
+            if name not in _KNOWN:
                 self.found(name, "it is not a file of a recording", "move it out of the store")
 
     def _check_rows(self, inventory: Inventory) -> None:

@@ -12,12 +12,11 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Container, Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Collection, Container, Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
-from threading import RLock
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 from zlib import compress, decompressobj
 from zlib import error as ZlibError  # noqa: N812
@@ -36,7 +35,6 @@ from hybridlog_storage.ordering import run_starts
 from hybridlog_storage.segments.chunk_table import ChunkTable
 from hybridlog_storage.segments.gone_log import GoneLog, open_log
 from hybridlog_storage.segments.segment_file import sealed_name
-from hybridlog_storage.segments.segment_reader import ChunkPlace
 from hybridlog_storage.summary import (
     Int,
     RecordingSummary,
@@ -69,8 +67,9 @@ _RECORDINGS_FILE: Final = Path("tables/recordings.parquet")
 _BUSY_S: Final = 1.0
 _NOTING_S: Final = 0.1
 _MAX_TABLES: Final = 64 << 20  # bytes of chunk tables in memory
-_MAX_NOTED: Final = 1 << 17  # recordings with bounds of one kind, and bounds that wait for the end
+_MAX_NOTED: Final = 1 << 17  # recordings with bounds of one kind
 _MAX_KINDS: Final = 256  # of bounds
+_MAX_SOUGHT: Final = 200  # bytes of a name; of long ones, a number takes the place of the end
 _FEW: Final = 100  # cells that are read one by one
 _T = TypeVar("_T")
 Ends = tuple[float | None, float | None]
@@ -277,48 +276,11 @@ class RecordingEntry:
 
 @dataclass(frozen=True, slots=True)
 class ChunkEntry:
-    """One chunk: its position and its statistics by channel id.
+    """One chunk: numbers of its segment and of itself in it, and statistics by channel id."""
 
-    Attributes:
-        recording: Id of its recording.
-        segment: Number of its segment.
-        number: Its number in the segment, from 0.
-        offset: Byte of the chunk record in the file.
-        length: Bytes of the chunk record.
-        trailer: Bytes of message indexes and arrival numbers behind it.
-        crc: CRC-32 of the stored chunk record.
-        trailer_crc: CRC-32 of the trailer.
-        first: Least log time, ns.
-        last: Greatest log time, ns.
-        stats: By channel id.
-    """
-
-    recording: str
-    segment: Int
-    number: Int
-    offset: Int
-    length: Int
-    trailer: Int
-    crc: Int
-    trailer_crc: Int
-    first: Int
-    last: Int
+    segment: int
+    number: int
     stats: Mapping[int, ChannelStats]
-
-    @property
-    def place(self) -> ChunkPlace:
-        """Its position, as the segment reader expects it."""
-        return ChunkPlace(
-            offset=self.offset,
-            length=self.length,
-            trailer=self.trailer,
-            first=self.first,
-            last=self.last,
-            channels=tuple(self.stats),
-            number=self.number,
-            crc=self.crc,
-            trailer_crc=self.trailer_crc,
-        )
 
     @property
     def messages(self) -> int:
@@ -456,11 +418,8 @@ class Catalog:
         cells: Its cells, if they lie elsewhere.
 
     Attributes:
-        is_in_memory: True if it exists in the memory of this process only.
+        is_in_memory: True if what is put into it stays in the memory of this process.
         has_changed: True if an ended recording was changed by this process.
-
-    Raises:
-        StoreError: A symlink lies in the place of its file; so do all methods.
     """
 
     def __init__(
@@ -474,87 +433,39 @@ class Catalog:
         self.is_in_memory = in_memory or cells is not None
         self.has_changed = False
         self._store = store
-        self._lock = RLock()
-        self._cells = cells or Cells(
-            store / CATALOG,
-            store_id,
-            writes=not in_memory,
-            before_late=self._remove_recordings_file,
-        )
-        self._listed: tuple[tuple[int, ...], dict[str, RecordingSummary]] = (), {}
+        self._cells = cells or Cells(store / CATALOG, store_id, writes=not in_memory)
         self._topics: dict[str, tuple[TopicType, ...]] = {}
-        # Bounds by kind and content: as they were read, and those to be written.
-        self._bounds: dict[str, tuple[bytes, dict[str, Ends]]] = {}
-        self._noted: dict[str, dict[str, Ends]] = defaultdict(dict)
+        self._bounds: dict[str, dict[str, Ends]] = defaultdict(dict)  # to be written, by kind
         self._tables = Cache(_MAX_TABLES)
 
     @property
-    def path(self) -> Path:
-        """Its file."""
-        return self._store / CATALOG
-
-    @property
     def recordings_file(self) -> Path:
-        """The list of ended recordings for other readers; it is removed before they change."""
+        """The list of ended recordings for other readers; it is removed when they change."""
         return self._store / _RECORDINGS_FILE
 
     def close(self) -> None:
-        """Write what was noted or could not be written before, and close the file."""
-        with self._lock:
-            self._write_bounds()
-            self._tables.drop("table")
-            self._cells.close(_BUSY_S)
-
-    @contextmanager
-    def unchanged(self) -> Iterator[list[RecordingSummary]]:
-        """All summaries, while nobody changes them; none if that is not possible."""
-        with self._cells.alone(_BUSY_S) as is_alone:
-            yield self.summaries() if is_alone else []
+        """Write bounds that were noted, and close the file."""
+        if self._bounds:
+            self._cells.write(self._with_bounds, _NOTING_S)
+            self._bounds.clear()
+        self._tables.drop("table")
+        self._cells.close()
 
     # Changes.
 
-    def _write(
-        self,
-        *statements: Statement,
-        wait_s: float = _BUSY_S,
-        make: Callable[[], Iterable[Statement]] = tuple,
-        is_change: bool = False,
-        recordings: Collection[str] = (),
-    ) -> None:
-        """Write to the file; summaries of some recordings, by id, change.
+    def _remove_recordings_file(self) -> None:
+        """Remove the list of ended recordings, which is wrong now.
 
         Raises:
-            StoreError: The list of ended recordings, which is wrong now, cannot be removed.
+            StoreError: It cannot be removed.
         """
-
-        def changed() -> list[Statement]:
-            if is_change:
-                self._remove_recordings_file()
-            return [*statements, *make()]
-
-        with self._cells.lock:
-            before = self._cells.state()
+        if not self.is_in_memory:
             try:
-                self._cells.write(changed, wait_s)
+                files.unlink(self.recordings_file)
+            except FileNotFoundError:
+                pass
             except OSError as error:
                 raise durability.explain(error, self.recordings_file, "removing") from error
-            self._relist(before, recordings)
-
-    def _relist(self, before: tuple[int, ...], recordings: Collection[str]) -> None:
-        """Note in the list of summaries what this process alone has changed."""
-        state, listed = self._cells.state(), self._listed[1]
-        if self._listed[0] != before or state[:-1] != before[:-1] or len(recordings) > _FEW:
-            return
-        for recording in recordings:
-            listed.pop(recording, None)
-        listed.update((one.id, one) for one in self.summaries(recordings))
-        self._listed = state, listed
-
-    def _remove_recordings_file(self) -> None:
-        self.has_changed = True
-        if not self.is_in_memory:
-            with suppress(FileNotFoundError):
-                files.unlink(self.recordings_file)
 
     def put(self, described: Described, *, waits: bool = True) -> None:
         """Insert or replace a recording.
@@ -564,53 +475,52 @@ class Catalog:
             waits: False for a question, which does not wait for other processes.
         """
         entry, summary = described.entry, described.summary
-        topics = topics_to_json(described.topics)
-        self._invalidate(entry.id)
+        if entry.status != "open":
+            self.has_changed = True
+            self._remove_recordings_file()
+        self._tables.drop("table", entry.id)
         self._topics[summary.topics] = tuple(described.topics)
         schemas = {c.schema for c in described.channels.values() if c.schema is not None}
         known = {schema_hash(schema): schema for schema in schemas}
-        self._write(
-            *(
-                put(_SCHEMA, digest, _schema_body(schema))
-                for digest, schema in known.items()
-                if self._cells.read(_SCHEMA, digest) is None
-            ),
-            put(_TOPICS, summary.topics, topics.encode()),
-            put(_ENTRY, entry.id, _body([described.files, entry.to_document()])),
-            put(_SUMMARY, entry.id, _summary_body(summary)),
-            make=lambda: self._indexed_by([entry.id], ""),  # until it is compared with the index
-            wait_s=_BUSY_S if waits else _NOTING_S,
-            is_change=entry.status != "open",
-            recordings=[entry.id],
-        )
+
+        def statements() -> Iterator[Statement]:
+            for digest, schema in known.items():
+                if self._cells.read(_SCHEMA, digest) is None:
+                    yield put(_SCHEMA, digest, _schema_body(schema))
+            yield put(_TOPICS, summary.topics, topics_to_json(described.topics).encode())
+            yield put(_ENTRY, entry.id, _body([described.files, entry.to_document()]))
+            yield put(_SUMMARY, entry.id, _summary_body(summary))
+            index, _, damage = self._index(entry.id)
+            if index:  # until it is compared with the index
+                yield put(_INDEX, entry.id, _body(["", "", damage]))
+
+        self._cells.write(statements, _BUSY_S if waits else _NOTING_S)
 
     def put_summaries(
         self,
         summaries: Collection[RecordingSummary],
         topics: Mapping[str, Collection[TopicType]],
+        *,
+        is_change: bool,
     ) -> None:
         """Note summaries that manifests have made, at once; no question waits for it.
 
         Args:
             summaries: Of whole recordings.
             topics: Their topics and types, by hash.
+            is_change: Whether one differs, in more than its look, from what was known.
         """
+        if is_change:
+            self._remove_recordings_file()
         self._topics.update({digest: tuple(types) for digest, types in topics.items()})
-        recordings = [one.id for one in summaries]
-        known = {one.id: one._replace(look="", indexed_by="") for one in self.summaries(recordings)}
-        changed = [one.id for one in summaries if known.get(one.id) != one._replace(look="")]
 
         def statements() -> Iterator[Statement]:
             for digest, types in topics.items():
                 yield put(_TOPICS, digest, topics_to_json(types).encode())
             for one in summaries:
                 yield put(_SUMMARY, one.id, _summary_body(one))
-            yield from self._indexed_by(changed, "")
 
-        has_changed = self.has_changed  # the list is made again by who changes recordings
-        is_change = bool(changed)
-        self._write(make=statements, wait_s=_NOTING_S, is_change=is_change, recordings=recordings)
-        self.has_changed = has_changed
+        self._cells.write(statements, _NOTING_S)
 
     def put_name(self, recording: str, name: str) -> None:
         """Note the name of a recording; the rest is read again when it is looked at."""
@@ -619,32 +529,29 @@ class Catalog:
             for one in self.summaries([recording]):
                 yield put(_SUMMARY, recording, _summary_body(one._replace(name=name, look="")))
 
-        self._write(make=renamed, is_change=True, recordings=[recording])
+        self.has_changed = True
+        self._remove_recordings_file()
+        self._cells.write(renamed, _BUSY_S)
 
     def put_indexed(self, recordings: Collection[str], index: str) -> None:
-        """Note which index is complete for recordings.
+        """Note that an index is complete for recordings, as long as they look the same.
 
         Args:
             recordings: Their ids.
-            index: The id of the index; empty if none is.
+            index: The id of the index.
         """
-        self._write(
-            make=lambda: self._indexed_by(recordings, index),
-            wait_s=_NOTING_S,
-            recordings=recordings,
-        )
 
-    def _indexed_by(self, recordings: Collection[str], index: str) -> Iterator[Statement]:
-        known = self._bodies(_INDEX, recordings)
-        for recording in recordings if index else known:
-            before, damage = _indexed(known.get(recording))
-            if before != index:
-                yield put(_INDEX, recording, _body([index, damage]))
+        def statements() -> Iterator[Statement]:
+            for one in self.summaries(recordings):
+                if one.indexed_by != index:
+                    yield put(_INDEX, one.id, _body([index, one.look, self._index(one.id)[2]]))
+
+        self._cells.write(statements, _NOTING_S)
 
     def put_damage(self, recording: str, damage: Mapping[tuple[int, int], str]) -> None:
         """Store the unreadable chunks of a recording: reason by segment and number."""
         rows = [(*place, reason) for place, reason in sorted(damage.items())]
-        self._write(make=lambda: [put(_INDEX, recording, _body([self._index(recording)[0], rows]))])
+        self._cells.write(lambda: [put(_INDEX, recording, _body(["", "", rows]))], _BUSY_S)
 
     def put_stamps(
         self, recording: str, stamps: Iterable[tuple[int, str, NDArray[np.void]]]
@@ -656,61 +563,52 @@ class Catalog:
             stamps: Number and digest of a segment, and a row for each of the `parts` of its
                 chunk table.
         """
-        self._invalidate(recording)
-        self._write(
-            *(
-                put(
-                    _STAMPS,
-                    recording,
-                    b"%b %b" % (digest.encode(), compress(rows.tobytes(), 1)),
-                    number,
-                )
-                for number, digest, rows in stamps
-            )
-        )
+        self._tables.drop("table", recording)
+        cells = []
+        for number, digest, rows in stamps:
+            body = b"%b %b" % (digest.encode(), compress(rows.tobytes(), 1))
+            cells.append(put(_STAMPS, recording, body, number))
+        self._cells.write(lambda: cells, _BUSY_S)
 
     def remove(self, recording: str) -> None:
         """Remove a recording."""
-        self._invalidate(recording)
+        self.has_changed = True
+        self._remove_recordings_file()
+        self._tables.drop("table", recording)
         kinds = (_SUMMARY, _ENTRY, _INDEX, _STAMPS)
-        statements = (drop(kind, recording) for kind in kinds)
-        self._write(*statements, is_change=True, recordings=[recording])
+        self._cells.write(lambda: [drop(kind, recording) for kind in kinds], _BUSY_S)
 
     # Answers.
 
     def summaries(self, recordings: Collection[str] | None = None) -> list[RecordingSummary]:
         """Summaries of recordings by id, None for all; unordered, without damaged ones."""
-        if recordings is None:
-            with self._cells.lock:
-                state, (known, listed) = self._cells.state(), self._listed
-                if known != state:
-                    indexed = self._cells.beside(_INDEX, _SUMMARY)
-                    every = self._summaries(self._cells.each(_SUMMARY), indexed)
-                    listed = {one.id: one for one in every}
-                    self._listed = state, listed
-                return [*listed.values()]
-        return self._summaries(*(self._bodies(kind, recordings) for kind in (_SUMMARY, _INDEX)))
-
-    def _bodies(self, kind: str, recordings: Collection[str]) -> dict[str, bytes]:
-        """The cells of some recordings by id."""
-        if len(recordings) > _FEW:
-            every = self._cells.each(kind)
-            return {one: every[one] for one in recordings if one in every}
-        return {one: body for one in recordings if (body := self._cells.read(kind, one))}
-
-    def _summaries(
-        self, bodies: Mapping[str, bytes], indexed: Mapping[str, bytes]
-    ) -> list[RecordingSummary]:
+        indexed = self._bodies(_INDEX, recordings)
         found = []
-        for recording, body in bodies.items():
+        for recording, body in self._bodies(_SUMMARY, recordings).items():
             summary = _read(_SUMMARY_OF, body)
             if summary is None or summary.id != recording or self._set(summary.topics) is None:
                 continue
-            index = _read(_INDEX_OF, indexed.get(recording))
-            if index is not None and index[0]:
-                summary = summary._replace(indexed_by=index[0])
+            if recording in indexed:
+                index, look, _ = _indexed(indexed[recording])
+                if look == summary.look:
+                    summary = summary._replace(indexed_by=index)
             found.append(summary)
         return found
+
+    def names_like(self, name: str) -> set[tuple[str, str]]:
+        """Names and ids of recordings whose names begin like this one, if one is called so."""
+        quoted = encode(name)
+        if not self._cells.each(_SUMMARY, quoted):
+            return set()
+        bodies = self._cells.each(_SUMMARY, quoted[:_MAX_SOUGHT].removesuffix(b'"')).values()
+        return {(one.name, one.id) for body in bodies if (one := _read(_SUMMARY_OF, body))}
+
+    def _bodies(self, kind: str, recordings: Collection[str] | None) -> dict[str, bytes]:
+        """The cells of some recordings by id; None for all."""
+        if recordings is not None and len(recordings) <= _FEW:
+            return {one: body for one in recordings if (body := self._cells.read(kind, one))}
+        every = self._cells.each(kind)
+        return every if recordings is None else {o: every[o] for o in recordings if o in every}
 
     def topics(self, digest: str) -> tuple[TopicType, ...]:
         """A set of topics and their types, by its hash, which a summary has.
@@ -720,7 +618,7 @@ class Catalog:
         """
         found = self._set(digest)
         if found is None:
-            raise CatalogError(f"The catalog {self.path} has lost topics. Ask again.")
+            raise CatalogError(f"The catalog {self._store / CATALOG} has lost topics. Ask again.")
         return found
 
     def _set(self, digest: str) -> tuple[TopicType, ...] | None:
@@ -745,17 +643,17 @@ class Catalog:
                 return summary
         return None
 
-    def _index(self, recording: str) -> tuple[str, list[tuple[int, int, str]]]:
+    def _index(self, recording: str) -> _Indexed:
         return _indexed(self._cells.read(_INDEX, recording))
 
     def damaged(self, recordings: Collection[str]) -> set[str]:
         """Those of some recordings, by id, that are known to have unreadable chunks."""
         known = self._bodies(_INDEX, recordings)
-        return {recording for recording, body in known.items() if _indexed(body)[1]}
+        return {recording for recording, body in known.items() if _indexed(body)[2]}
 
     def damage(self, recording: str) -> dict[tuple[int, int], str]:
         """The unreadable chunks of a recording: reason by segment and number."""
-        return {(segment, chunk): reason for segment, chunk, reason in self._index(recording)[1]}
+        return {(segment, chunk): reason for segment, chunk, reason in self._index(recording)[2]}
 
     def stamps(
         self, entry: RecordingEntry, number: int, table: ChunkTable
@@ -775,11 +673,7 @@ class Catalog:
 
     def bounds(self, kind: str) -> dict[str, Ends]:
         """Known bounds of one kind, by content; see `note_bounds`."""
-        with self._lock:
-            body = self._cells.read(_BOUNDS, kind) or b""
-            if kind not in self._bounds or self._bounds[kind][0] != body:
-                self._bounds[kind] = body, _ends(body)
-            return self._bounds[kind][1] | self._noted.get(kind, {})
+        return {**_ends(self._cells.read(_BOUNDS, kind)), **self._bounds.get(kind, {})}
 
     def note_bounds(self, kind: str, entry: RecordingEntry, ends: Ends) -> None:
         """Note the bounds of numbers of a recording; they are written when this is closed.
@@ -789,24 +683,16 @@ class Catalog:
             entry: The recording; bounds hold for the content of its segments.
             ends: The bounds, without NaN.
         """
-        with self._lock:
-            if sum(map(len, self._noted.values())) >= _MAX_NOTED:
-                self._noted.clear()
-            self._noted[kind][content_of(entry)] = ends
+        if sum(map(len, self._bounds.values())) >= _MAX_NOTED:
+            self._bounds.clear()
+        self._bounds[kind][content_of(entry)] = ends
 
-    def _write_bounds(self) -> None:
-        noted, self._noted = self._noted, defaultdict(dict)
-
-        def merged() -> Iterator[Statement]:
-            held = {*self._cells.each(_BOUNDS)} - noted.keys()
-            for kind in [*held][_MAX_KINDS - len(noted) :]:
-                yield drop(_BOUNDS, kind)
-            for kind, own in noted.items():
-                found = _ends(self._cells.read(_BOUNDS, kind) or b"")
-                yield put(_BOUNDS, kind, _body(dict([*{**found, **own}.items()][-_MAX_NOTED:])))
-
-        if noted:
-            self._write(make=merged, wait_s=_NOTING_S)
+    def _with_bounds(self) -> Iterator[Statement]:
+        held = {*self._cells.each(_BOUNDS)} - self._bounds.keys()
+        for kind in [*held][max(_MAX_KINDS - len(self._bounds), 0) :]:
+            yield drop(_BOUNDS, kind)
+        for kind in [*self._bounds][-_MAX_KINDS:]:
+            yield put(_BOUNDS, kind, _body(dict([*self.bounds(kind).items()][-_MAX_NOTED:])))
 
     # Schemas.
 
@@ -880,14 +766,9 @@ class Catalog:
         silent = {c.id for c in entry.channels if not c.has_publish_time}
         return channel_totals(own, None if stamps is None else stamps[begin:end], silent)
 
-    def _invalidate(self, recording: str) -> None:
-        self._tables.drop("table", recording)
-
 
 def _summary_body(summary: RecordingSummary) -> bytes:
-    with suppress(UnicodeEncodeError):
-        return encode(summary[:-1])
-    return _body(summary[:-1])
+    return encode(summary[:-1])
 
 
 def _body(values: object) -> bytes:
@@ -898,7 +779,9 @@ def _body(values: object) -> bytes:
 _SUMMARY_OF: Final = Decoder(RecordingSummary)
 _TOPICS_OF: Final = Decoder(tuple[TopicType, ...])
 _ENTRY_OF: Final = Decoder(tuple[str, RecordingEntry])
-_INDEX_OF: Final = Decoder(tuple[str, list[tuple[Int, Int, str]]])
+_Indexed = tuple[str, str, list[tuple[Int, Int, str]]]
+"""An index that is complete for a recording, its look then, and its unreadable chunks."""
+_INDEX_OF: Final = Decoder(_Indexed)
 _NAMES_OF: Final = Decoder(tuple[str, str])
 
 
@@ -915,21 +798,21 @@ def _read(decoder: Decoder[_T], body: bytes | None) -> _T | None:
     return None
 
 
-def _indexed(body: bytes | None) -> tuple[str, list[tuple[int, int, str]]]:
-    """The index that is complete for a recording, and its unreadable chunks.
+def _indexed(body: bytes | None) -> _Indexed:
+    """What is known of the index of a recording.
 
-    They are one cell: of a list that is lost, no index is known to have all chunks.
+    It is one cell: of a list that is lost, no index is known to have all chunks.
     """
-    return _read(_INDEX_OF, body) or ("", [])
+    return _read(_INDEX_OF, body) or ("", "", [])
 
 
-def _ends(body: bytes) -> dict[str, Ends]:
+def _ends(body: bytes | None) -> dict[str, Ends]:
     """Bounds by content, without those that are none."""
     with suppress(TypeError, ValueError, RecursionError, AttributeError):
         # Numbers of any size stay exact, which `msgspec` makes floats.
         return {
             content: (low, high)
-            for content, (low, high) in json.loads(body).items()
+            for content, (low, high) in json.loads(body or b"{}").items()
             if {type(low), type(high)} <= {int, float} or low is high is None
         }
     return {}

@@ -31,8 +31,6 @@ EMBEDDED: Final = "embedded"
 """In place of a URI: the MongoDB that comes with hybridlog."""
 NONE: Final = "none"
 """In place of a URI: no MongoDB."""
-FEATURES: Final[frozenset[str]] = frozenset()
-"""Features that a store may require of its reader."""
 
 MIN_CACHE_MB: Final = 256
 """Smallest cache that MongoDB accepts, in MiB."""
@@ -58,8 +56,6 @@ class StoreSettings(Struct, frozen=True):
         store_id: Random id of the store.
         mongo: URI, without a password, of the MongoDB to use; `none` to use no MongoDB; None
             for the embedded one.
-        requires: Features that a reader must know to read the store.
-        optional: Features that a reader may ignore.
         arrays: Topics whose tables have arrays in full.
         cache_mb: Size of the embedded MongoDB's cache in MiB; None for the smallest one.
         retention: The table `[retention]`, as it stands there.
@@ -68,8 +64,6 @@ class StoreSettings(Struct, frozen=True):
 
     store_id: Annotated[str, Meta(min_length=1)]
     mongo: str | None = None
-    requires: tuple[str, ...] = ()
-    optional: tuple[str, ...] = ()
     arrays: tuple[str, ...] = ()
     cache_mb: int | None = None
     retention: dict[str, Any] = {}
@@ -80,8 +74,8 @@ def read_settings(path: Path) -> StoreSettings:
     """Read the settings of a store.
 
     Raises:
-        StoreError: It is not a store, has another format, or requires an unknown feature;
-            or the settings are damaged, or hold a password.
+        StoreError: It is not a store, or has another format; or the settings are damaged, or
+            hold a password.
     """
     file = path / NAME
     return _settings(path, file, _read(path, file))
@@ -108,13 +102,6 @@ def _settings(path: Path | str, file: Path, values: Mapping[str, object]) -> Sto
             checked_cache_mb(found.cache_mb, "cache_mb")
     except (ValidationError, UsageError) as error:
         raise StoreError(f"{file} is malformed: {error}") from error
-    unknown = [name for name in found.requires if name not in FEATURES]
-    if unknown:
-        names = ", ".join(repr(name[:80]) for name in unknown[:5])
-        raise StoreError(
-            f"The store {path} requires {names}, which this hybridlog does not know. Install a "
-            "newer hybridlog."
-        )
     return replace(found, mongo=_stored_uri(file, found.mongo))
 
 
@@ -140,8 +127,8 @@ def settings_text(settings: StoreSettings) -> bytes:
         lines.append(f"mongo = {_quoted(mongo)}")
     if settings.cache_mb is not None:
         lines.append(f"cache_mb = {settings.cache_mb}")
-    lists = {name: getattr(settings, name) for name in ("requires", "optional", "arrays")}
-    lines += [f"{name} = {_as_toml(names)}" for name, names in lists.items() if names]
+    if settings.arrays:
+        lines.append(f"arrays = {_as_toml(settings.arrays)}")
     for name, table in (("retention", settings.retention or None), ("remote", settings.remote)):
         if table is not None:
             lines.append(f"\n[{name}]")

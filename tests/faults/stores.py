@@ -20,7 +20,7 @@ from pymongo import MongoClient
 import hybridlog as hl
 from hybridlog.columns.folders import recordings_of
 from hybridlog.columns.layout import PARTS
-from hybridlog.entries import describe_now, state_now, take_inventory
+from hybridlog.entries import describe_now, state_now, take_inventory, with_said
 from hybridlog.maintenance.lease import place_of
 from hybridlog.record.losses import losses_of
 from hybridlog.record.marks import MARKS, MARKS_SEGMENT
@@ -382,10 +382,10 @@ def _check_catalog(store: hl.Store) -> None:
     _check(len(rows) == len(ids), f"{ids} are there, {len(rows)} in the catalog")
     for recording in ids:
         described = describe_now(store.directory, store.catalog, recording)
-        row = rows.get(described.entry.id)
-        _check(row is not None, f"{recording} is not in the catalog")
+        files, entry = rows[recording]
+        known = files, with_said(entry, store.directory.manifests.read(recording))
         _check(
-            row == (described.files, described.entry), f"the catalog's row of {recording} differs"
+            known == (described.files, described.entry), f"the catalog's row of {recording} differs"
         )
         known = next(one for one in store.catalog.summaries() if one.id == described.entry.id)
         same = known._replace(indexed_by="") == described.summary

@@ -8,9 +8,7 @@ from hybridlog_storage.catalog import Catalog, ChunkEntry, RecordingEntry
 def chunk_entries(catalog: Catalog, entry: RecordingEntry) -> list[ChunkEntry]:
     """All chunks of a recording."""
     return [
-        ChunkEntry(
-            entry.id, segment, number, *values[:-1], catalog.chunk_stats(entry, segment, number)
-        )
+        ChunkEntry(segment, number, catalog.chunk_stats(entry, segment, number))
         for segment, _, _ in entry.spans
-        for number, values in enumerate(catalog.table(entry, segment).chunks.tolist())
+        for number in range(len(catalog.table(entry, segment).chunks))
     ]

@@ -34,11 +34,10 @@ def write(store: Path, text: str | bytes) -> Path:
         StoreSettings("ab12", arrays=("/scan", "/points")),
         StoreSettings(
             "ab12",
-            requires=(),
             retention={"quota": "2GB", "topic": {"/c/**": "7d", "/b": "1h"}, "never-tag": ["a=b"]},
             remote={"segment-size": "64MiB"},
         ),
-        StoreSettings("ab12", optional=("colours", "Größe \U0001f600 \x7f\"'\\")),
+        StoreSettings("ab12", arrays=("Größe \U0001f600 \x7f\"'\\",)),
     ],
 )
 def test_what_is_written_is_read(tmp_path: Path, settings: StoreSettings) -> None:
@@ -73,10 +72,7 @@ def test_the_umask_says_who_may_read_it(tmp_path: Path, umask: int, mode: int) -
         (b"format = 4\nstore_id = 5", "store_id"),
         (b"format = 4\nstore_id = 'x'\nmongo = 1", "mongo"),
         (b"format = 4\nstore_id = 'x'\nmongo = 'nowhere'", "mongo"),
-        (b"format = 4\nstore_id = 'x'\nrequires = 'a'", "requires"),
-        (b"format = 4\nstore_id = 'x'\noptional = [1]", "optional"),
         (b"format = 4\nstore_id = 'x'\narrays = '/scan'", "arrays"),
-        (b"format = 4\nstore_id = 'x'\nrequires = ['payload tables']", "'payload tables'.*newer"),
         (b"format = 4\nstore_id = 'x'\nretention = 5", "retention"),
         (b"format = 4\nstore_id = 'x'\nremote = 'yes'", "remote"),
         (b"format = [", "damaged"),
@@ -90,9 +86,9 @@ def test_settings_that_are_none(tmp_path: Path, content: bytes, words: str) -> N
         read_settings(write(tmp_path, content))
 
 
-def test_only_what_is_required_has_to_be_known(tmp_path: Path) -> None:
-    write(tmp_path, GOOD + "colour = 'blue'\noptional = ['colours']\nrequires = []\n")
-    assert read_settings(tmp_path) == StoreSettings("x", optional=("colours",))
+def test_what_is_unknown_is_ignored(tmp_path: Path) -> None:
+    write(tmp_path, GOOD + "colour = 'blue'\n")
+    assert read_settings(tmp_path) == StoreSettings("x")
 
 
 def test_no_store(tmp_path: Path) -> None:

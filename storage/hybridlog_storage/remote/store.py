@@ -101,8 +101,9 @@ class CatalogCells(Cells):
                     os.close(handle)
                 content = zlib.decompressobj().decompress(packed, _MAX_CATALOG)
         with self.lock:
-            self._close()
-            self._db = self._in_memory(None, content)
+            super().close()
+            self._db = self.loaded(content)
+            self.changes += 1
             self.about, self.is_behind = about, False
 
     def save(self) -> bool:
@@ -121,7 +122,7 @@ class CatalogCells(Cells):
 
     def tables(self) -> dict[str, dict[str, Object]]:
         """The objects of tables by folder and name, without those that were lost."""
-        state = (*self.state(), len(self._bucket.lost))
+        state = self.changes, len(self._bucket.lost)
         if self._tables[0] != state:
             found: dict[str, dict[str, Object]] = {}
             for body in self.each(_TABLES).values():
@@ -137,10 +138,10 @@ class CatalogCells(Cells):
         before = _objects(self.read(_TABLES, recording) or b"")
         body = json.dumps([[one.name, one.size, one.version] for one in objects]).encode()
         cell = put(_TABLES, recording, body) if objects else drop(_TABLES, recording)
-        self.write(lambda: [cell], 0)
+        self.write(lambda: [cell])
         self._bucket.delete(sorted({one.name for one in before} - {one.name for one in objects}))
 
-    def close(self, wait_s: float) -> None:
+    def close(self) -> None:
         """Save what this process has changed. The cells stay: others here use them, too."""
         if self.has_changes:
             with suppress(BucketError):  # who opens the store reads a few manifests more
@@ -261,7 +262,7 @@ class SeenManifests(BucketManifests):
             if known is None or known[0].status == "removed":  # it was not created anew
                 self.objects.pop(recording, None)
                 self.number += 1
-                self._cells.write(lambda: [drop(_MANIFEST, recording)], 0)
+                self._cells.write(lambda: [drop(_MANIFEST, recording)])
 
     def _noted(self, recording: str, data: bytes, version: str) -> None:
         with self._lock:
@@ -269,7 +270,7 @@ class SeenManifests(BucketManifests):
             self.objects[recording] = Object(self.name_of(recording), len(data), version)
             self._known.pop(recording, None)
             cell = put(_MANIFEST, recording, version.encode() + b"\n" + data)
-            self._cells.write(lambda: [cell], 0)
+            self._cells.write(lambda: [cell])
 
 
 class BucketFiles:
