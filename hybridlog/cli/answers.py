@@ -18,8 +18,9 @@ import click
 
 from hybridlog.cli import output
 from hybridlog.cli.binder import PATH, option
-from hybridlog.cli.options import VERBOSE, AsJson, Forced, Topics
+from hybridlog.cli.options import AsJson, Forced, Topics
 from hybridlog.cli.progress import Bar, progress_bar
+from hybridlog.cli.render import ROWS_AT_ONCE, Column, print_table
 from hybridlog.cli.signals import if_stopped
 from hybridlog.formats import OUTPUTS, formats_of, is_directory, suffixes_of
 from hybridlog.formats.slices import IN_FORCE, Front, log_of, payload_bytes
@@ -200,41 +201,28 @@ class Listing(Tabular):
     form: str | None = format_option(_LISTING_FORMATS, "")
 
     def answer(
-        self,
-        rows: Iterable[Mapping[str, Any]],
-        columns: Sequence[output.Column],
-        cells: Callable[[Any], Sequence[str]],
-        spare: Sequence[str] = (),
-        titles: int = 0,
+        self, rows: Iterable[Mapping[str, Any]], columns: Sequence[Column], titles: int = 1
     ) -> None:
         """Print or write rows.
 
         Args:
             rows: The rows.
             columns: Of the table for people.
-            cells: Gives the cells of a row.
-            spare: Columns that may be left out, see `output.fitted`.
-            titles: Number of cells in the title of a block, see `output.print_rows`.
+            titles: See `print_table`.
         """
         to, limited = self.to, islice(rows, self.limit)
         if to.form != SCREEN:
             answer_tables(_tables_of(limited), lambda: None, to)
-        elif titles or spare:
-            shown = [cells(row) for row in limited]
-            if shown:
-                output.print_rows(columns, shown, titles, spare)
-        else:
-            first = list(islice(limited, 1))
-            if first:
-                output.print_table(columns, map(cells, chain(first, limited)))
+        elif first := list(islice(limited, 1)):
+            print_table(columns, chain(first, limited), titles=titles)
 
 
 def _tables_of(rows: Iterable[Mapping[str, Any]]) -> Iterator[pa.Table]:
     import pyarrow as pa
 
-    block = list(islice(rows, output.ROWS_AT_ONCE))
+    block = list(islice(rows, ROWS_AT_ONCE))
     yield pa.Table.from_pylist(block)
-    while block := list(islice(rows, output.ROWS_AT_ONCE)):
+    while block := list(islice(rows, ROWS_AT_ONCE)):
         yield pa.Table.from_pylist(block)
 
 
@@ -261,7 +249,8 @@ def answering(given: Topics) -> Iterator[Answering]:
         sys.stdout.flush()
         if not given.quiet:
             query = asked.query
-            print_cost(query.counters, time.monotonic() - started, count=True)
+            verbose = getattr(given, "verbose", False)
+            print_cost(query.counters, started, verbose=verbose, count=True)
             print_remarks(query, is_empty=asked.is_empty)
 
 
@@ -583,9 +572,7 @@ def _shown(found: int, limit: int | None, noun: str) -> int:
 
 
 def _print_rows(tables: Iterable[pa.Table], limit: int | None, topics: Sequence[str] = ()) -> int:
-    """Print rows for people to read: a table if the first of them fit, else a block for each.
-
-    Memory does not grow with the number of rows.
+    """Print rows for people to read.
 
     Args:
         tables: The rows.
@@ -595,55 +582,46 @@ def _print_rows(tables: Iterable[pa.Table], limit: int | None, topics: Sequence[
     Returns:
         Number of rows of the tables.
     """
-    from hybridlog.frames.cells import MAX_LINE, cells
+    from hybridlog.frames.cells import MAX_CELL, MAX_LINE, cells
     from hybridlog.schema.arrow_types import is_text
 
     most = SCREEN_ROWS if limit is None else limit
     read = 0
 
-    def rows() -> Iterator[tuple[tuple[list[str], list[int]], list[str]]]:
+    def rows() -> Iterator[tuple[list[tuple[str, bool]], list[str]]]:
         nonlocal read
         for table in tables:
             wanted = table.slice(0, max(most - read, 0))
             read += table.num_rows
-            texts = [n for n, column in enumerate(table.schema) if is_text(column.type)]
-            columns = table.column_names, texts
+            columns = [(each.name, is_text(each.type)) for each in table.schema]
             for row in cells(wanted, most=MAX_LINE):
                 yield columns, row
 
     # Headings are printed again only where the columns change.
-    for (names, texts), alike in groupby(rows(), itemgetter(0)):
-        lines = (row for _, row in alike)
-        first = list(islice(lines, output.ROWS_AT_ONCE))
-        short = partial(_shortened, texts=texts)
-        if output.fits(names, [*map(short, first)]):
-            output.print_table([(name, "left") for name in names], map(short, chain(first, lines)))
-            continue
-        begin = 2 if len(topics) > 1 else 1  # the first column is the time, the second the topic
-        for row in chain(first, lines):
-            title = "  ".join([*row[:begin], *(topics if len(topics) == 1 else ())])
-            # A column without a value is another topic's.
-            fields = zip(names[begin:], row[begin:], strict=True)
-            output.print_record(title, [(name, cell) for name, cell in fields if cell])
+    for columns, alike in groupby(rows(), itemgetter(0)):
+        print_table(
+            [
+                Column(name, n, "whole", cut=MAX_CELL if is_cut else 0)
+                for n, (name, is_cut) in enumerate(columns)
+            ],
+            map(itemgetter(1), alike),
+            # The first column is the time, the second the topic.
+            titles=2 if len(topics) > 1 else 1,
+            about=topics if len(topics) == 1 else (),
+        )
     return read
 
 
-def _shortened(row: list[str], texts: list[int]) -> list[str]:
-    """A row for a table: the texts in some columns are cut off."""
-    from hybridlog.frames.cells import MAX_CELL
-
-    return [output.cut(cell, MAX_CELL) if n in texts else cell for n, cell in enumerate(row)]
-
-
-def print_cost(counters: Counters, elapsed: float, *, count: bool) -> None:
+def print_cost(counters: Counters, started: float, *, verbose: bool, count: bool = False) -> None:
     """Print what an answer cost, with `--verbose`; without, the messages in front.
 
     Args:
         counters: Of the query.
-        elapsed: Seconds, including the opening of the store.
+        started: When the command began, see `time.monotonic`.
+        verbose: `--verbose` was given.
         count: The answer was a number, not messages.
     """
-    if not click.get_current_context().meta.get(VERBOSE):
+    if not verbose:
         if (counters.latched or counters.frames) and not count:
             output.note(latched(counters).removeprefix(" and "))
         return
@@ -659,8 +637,8 @@ def print_cost(counters: Counters, elapsed: float, *, count: bool) -> None:
         used.append(f"{output.size(counters.bytes_read)} read from disk{where}")
     if counters.documents_read:
         used.append(output.counted(counters.documents_read, "index document"))
-    time = f"{elapsed:.3f} s"
-    output.note(f"{', '.join(used)}, {time}" if used else f"answered in {time}")
+    took = f"{time.monotonic() - started:.3f} s"
+    output.note(f"{', '.join(used)}, {took}" if used else f"answered in {took}")
 
 
 def latched(counters: Counters) -> str:

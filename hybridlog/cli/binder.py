@@ -1,23 +1,26 @@
 """Binds a command to the dataclass of its options: each field is a parameter of the command.
 
 Options that several commands share are fields of a base class. Help shows those of a class
-before those of its bases.
+before those of its bases. Parameters say which others they need or exclude, by the names of the
+fields, and what is typed is checked before the command runs.
 """
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import field, fields
 from functools import wraps
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
 import click
+from click.core import ParameterSource
 
 from hybridlog.cli.hints import Command, Pair
+from hybridlog_storage.errors import UsageError
 
-_MAKE: Final = "hybridlog.parameter"
+_MAKE, _NEEDS, _EXCLUDES = "hybridlog.parameter", "hybridlog.needs", "hybridlog.excludes"
 _Kind = TypeVar("_Kind")
 PATH: Final = click.Path(readable=False, path_type=Path)
 """A path that click does not check: the library's errors name a cure and have exit codes."""
@@ -30,7 +33,9 @@ def option(
     *,
     name: str | None = None,
     short: str | None = None,
-    kind: type[click.Option] = click.Option,
+    needs: Sequence[str] = (),
+    excludes: Sequence[str] = (),
+    section: str = "",
     **settings: Any,
 ) -> Any:
     """A field that is an option; its type says how: `bool` has no value, a tuple is repeatable.
@@ -40,8 +45,11 @@ def option(
         metavar: What its value is called.
         name: Its long spelling; without, made from the name of the field.
         short: Its short spelling.
-        kind: Its class.
-        settings: Of the class.
+        needs: Parameters, one of which has to be given, too, of those that the command has;
+            `viewer=rerun` is one with a value.
+        excludes: Parameters that must not be given besides.
+        section: Of the help.
+        settings: Of `click.Option`.
     """
 
     def make(field: str, annotation: str) -> click.Parameter:
@@ -52,19 +60,28 @@ def option(
             settings["multiple"], words = True, f"{help} Repeatable."
         elif (of := annotation.removesuffix(" | None")) in _TYPES:
             settings.setdefault("type", _TYPES[of])
-        made = Pair if settings.get("nargs") == 2 else kind
+        kind: Any = Pair if settings.get("nargs") == 2 else click.Option
         spelled = [field, name or f"--{field.replace('_', '-')}", *([short] if short else [])]
-        return made(spelled, help=words, metavar=metavar, **settings)
+        made: click.Option = kind(spelled, help=words, metavar=metavar, **settings)
+        made.__dict__.update({"section": section} if section else {})
+        return made
 
-    return field(metadata={_MAKE: make})
+    return field(metadata={_MAKE: make, _NEEDS: needs, _EXCLUDES: excludes})
 
 
-def argument(help: str, metavar: str, **settings: Any) -> Any:  # noqa: A002
+def argument(
+    help: str,  # noqa: A002 - the word of click
+    metavar: str,
+    *,
+    excludes: Sequence[str] = (),
+    **settings: Any,
+) -> Any:
     """A field that is an argument; its type says how: a tuple takes any number of words.
 
     Args:
         help: What it is.
         metavar: What the usage line calls it.
+        excludes: As for `option`.
         settings: Of `click.Argument`.
     """
 
@@ -77,7 +94,7 @@ def argument(help: str, metavar: str, **settings: Any) -> Any:  # noqa: A002
         settings.setdefault("required", None if of == annotation else False)
         return click.Argument([field], help=help, metavar=metavar, **settings)
 
-    return field(metadata={_MAKE: make})
+    return field(metadata={_MAKE: make, _EXCLUDES: excludes})
 
 
 def parameters_of(kind: type) -> list[click.Parameter]:
@@ -92,6 +109,43 @@ def parameters_of(kind: type) -> list[click.Parameter]:
         for name, annotation in types.items()
         if (make := made.get(name)) is not None
     ]
+
+
+def check(kind: type, context: click.Context) -> None:
+    """Refuse parameters that lack another one, or do not go together.
+
+    Raises:
+        UsageError: They do.
+    """
+    parameters = {str(one.name): one for one in context.command.params}
+    given = {
+        name
+        for name in parameters
+        if context.get_parameter_source(name) is ParameterSource.COMMANDLINE
+        and context.params[name] not in (None, (), False)
+    }
+
+    def spelled(name: str) -> str:
+        name, _, value = name.partition("=")
+        one = parameters[name]
+        return value or (
+            one.opts[0] if isinstance(one, click.Option) else str(one.metavar).strip("[].")
+        )
+
+    def is_given(name: str) -> bool:
+        name, _, value = name.partition("=")
+        return context.params[name] == value if value else name in given
+
+    for one in (each for each in fields(kind) if each.name in given):
+        name = spelled(one.name)
+        needs = [n for n in one.metadata.get(_NEEDS, ()) if n.partition("=")[0] in parameters]
+        if needs and not any(map(is_given, needs)):
+            others = " or ".join(map(spelled, needs))
+            raise UsageError(f"{name} is for {others}: add that, or leave out {name}.")
+        for other in filter(given.__contains__, one.metadata.get(_EXCLUDES, ())):
+            raise UsageError(
+                f"{name} and {spelled(other)} exclude each other: leave out one of them."
+            )
 
 
 def command(
@@ -109,6 +163,7 @@ def command(
     def bound(function: Callable[..., Any]) -> click.Command:
         @wraps(function)
         def call(**values: Any) -> Any:
+            check(kind, click.get_current_context())
             return function(kind(**values))
 
         call.__click_params__ = parameters_of(kind)[::-1]  # type: ignore[attr-defined]

@@ -120,12 +120,17 @@ class _Mark(Running):
     at: str | None = option(
         "Mark a recording, also a running one, at this time, written as for --between.", "T"
     )
-    until: str | None = option("The mark lasts from --at to this time.", "T2")
+    until: str | None = option("The mark lasts from --at to this time.", "T2", needs=("at",))
     pin: tuple[str, str] | None = option(
-        "Mark and pin so much before and after the present moment.", "BEFORE AFTER", nargs=2
+        "Mark and pin so much before and after the present moment; `keep --pin` pins other times.",
+        "BEFORE AFTER",
+        nargs=2,
+        excludes=("at", "remove"),
     )
     remove: bool = option(
-        "Remove the marks with this text; with --at only what begins at this time."
+        "Remove the marks with this text; with --at only what begins at this time.",
+        needs=("recording",),
+        excludes=("tags", "until"),
     )
 
 
@@ -139,15 +144,9 @@ def mark_command(given: _Mark) -> None:
     tags, at = options.parse_tags(given.tags), given.at
     if not given.text.strip():
         raise UsageError("A mark needs a text: say what happened.")
-    if given.until is not None and at is None:
-        raise UsageError("--until ends a mark that begins at a time: add --at.")
-    if given.pin is not None and (at is not None or given.remove):
-        raise UsageError(
-            "--pin is for the present moment: `hybridlog keep --pin` pins other times."
-        )
+    if (given.remove or at is not None) and len(given.recording) != 1:
+        raise UsageError("A mark at a time needs one recording: name it with --recording.")
     if given.remove:
-        if len(given.recording) != 1 or tags or given.until is not None:
-            raise UsageError("--remove needs --recording, one, and takes --at besides.")
         with given.opened() as store:
             store.unmark(given.recording[0], given.text, at)
         return
@@ -157,12 +156,10 @@ def mark_command(given: _Mark) -> None:
         before, after = map(parse_duration, given.pin or ("0s", "0s"))
         around = None if given.pin is None else (before, after)
         marked = _mark_running(given.text, tags, around, given.recording, given.store)
-    elif len(given.recording) == 1:
+    else:
         (recording,) = given.recording
         with given.opened() as store:
             marked = iter([store.mark(recording, at, given.text, tags, until=given.until).name])
-    else:
-        raise UsageError("A mark at a time needs one recording: name it with --recording.")
     for name in marked:
         if not given.quiet:
             output.note(f"Marked in {name}.")

@@ -71,7 +71,6 @@ def export_command(given: _Given) -> None:
     if str(target) == "-":
         raise UsageError("export writes files; for a pipe: `hybridlog fetch '**' -F mcap -o -`.")
     form = given.form or _form(target)
-    given.check_form(form)
     front = Front(latched=not given.no_latched, original_times=given.original_times)
     settings = given.settings(form)
     if form in _LOGS and split is None:

@@ -16,6 +16,7 @@ from hybridlog.cli.binder import argument, command, option
 from hybridlog.cli.completion import complete_topic
 from hybridlog.cli.options import AsJson, Choosing, InStore, Quiet, cache_size
 from hybridlog.cli.progress import Stages, progress_bar
+from hybridlog.cli.render import Column, numbers, print_table
 from hybridlog.cli.signals import if_stopped
 from hybridlog.cli.watching import watch
 from hybridlog.wording import listed
@@ -92,20 +93,15 @@ def address(given: _Shared) -> None:
 
         places = [] if given.quiet and not given.as_json else contents(store.shared)
         recordings = len(store.session.snapshot())
+    names = ("topic", "collection", "documents")
+    topics = [dict(zip(names, place, strict=True)) for place in places]
     if given.as_json:
-        topics = [
-            {"topic": topic, "collection": collection, "documents": documents}
-            for topic, collection, documents in places
-        ]
         about = {"uri": found.uri, "database": found.database, "recordings": recordings}
         output.print_json({**about, "topics": topics})
         return
     output.say(found.uri)
     if not given.quiet:
-        output.print_table(
-            (("topic", "whole"), ("collection", "whole"), ("documents", "right")),
-            [(topic, collection, str(documents)) for topic, collection, documents in places],
-        )
+        print_table([Column("topic"), Column("collection"), *numbers("documents")], topics)
         output.say(f"database {found.database}, {output.counted(recordings, 'recording')}")
 
 
@@ -261,12 +257,9 @@ def _look(store: Store, given: _Shared) -> Iterator[StoreError]:
 
 
 def _print(found: list[FieldIndex], given: _Shared) -> None:
-    if given.as_json:
-        output.print_json([{"topic": one.topic, "fields": list(one.fields)} for one in found])
-    elif found:
-        output.print_table(
-            (("topic", "whole"), ("fields", "left")),
-            [(one.topic, " ".join(one.fields)) for one in found],
-        )
+    rows = [{"topic": one.topic, "fields": list(one.fields)} for one in found]
+    if rows or given.as_json:
+        columns = [Column("topic"), Column("fields", lambda row: " ".join(row["fields"]))]
+        given.show(rows, columns)
     elif not given.quiet:
         output.say("no index on a field")

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import click
 
@@ -25,40 +25,37 @@ LEROBOT: Final = "lerobot"
 _FPS: Final = 30
 
 
+def _option(help: str, metavar: str | None = None, **settings: Any) -> Any:  # noqa: A002
+    return option(help, metavar, needs=(f"form={LEROBOT}",), **settings)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Training:
     """Options of training sets."""
 
-    features: Path | None = option("Topics and fields, in YAML.", "FILE", name="--map")
-    propose_map: bool = option(
+    features: Path | None = _option("Topics and fields, in YAML.", "FILE", name="--map")
+    propose_map: bool = _option(
         "Write a map for the topics that are there to OUTPUT, and nothing else."
     )
-    fps: int | None = option(
+    fps: int | None = _option(
         f"Frames a second; without, {_FPS}.", "N", type=click.IntRange(1, 1000)
     )
-    episodes_by: str | None = option(
+    episodes_by: str | None = _option(
         "An episode for each `recording`, `mark`, or interval of a predicate.", "HOW"
     )
-    task: str | None = option("What the robot does, in words.", "TEXT")
-    task_topic: str | None = option(
+    task: str | None = _option("What the robot does, in words.", "TEXT")
+    task_topic: str | None = _option(
         "A topic of texts that say it, at the begin of each episode.",
         "TOPIC",
         shell_complete=complete_topic,
     )
-    vcodec: Literal["h264", "av1"] | None = option(
+    vcodec: Literal["h264", "av1"] | None = _option(
         "Without, h264.", type=click.Choice(["h264", "av1"])
     )
-    on_gap: Literal["refuse", "drop", "hold"] | None = option(
+    on_gap: Literal["refuse", "drop", "hold"] | None = _option(
         "Refuse an episode with a gap (the default), cut it there, or keep the last value.",
         type=click.Choice(["refuse", "drop", "hold"]),
     )
-
-    def check_form(self, form: str) -> None:
-        """Refuse these options with another format."""
-        used = sorted(one.name for one in fields(Training) if getattr(self, one.name))
-        if used and form != LEROBOT:
-            name = "--map" if used[0] == "features" else f"--{used[0].replace('_', '-')}"
-            raise UsageError(f"{name} is for lerobot, not for {form}.")
 
 
 def export_set(

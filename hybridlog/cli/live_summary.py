@@ -11,6 +11,7 @@ import click
 from hybridlog.cli import output
 from hybridlog.cli.app import DIFFERENT
 from hybridlog.cli.live_table import closing_rows
+from hybridlog.cli.render import print_fields
 from hybridlog.contract.judge import broken
 from hybridlog.query.answers.completeness import line_of
 from hybridlog.record.losses import Cause
@@ -77,7 +78,7 @@ class LiveSummary:
             rows = closing_rows(reports[0], state, self._unreached)
             if self._recorder.reason:
                 rows.append(("ended", self._recorder.reason))
-            output.print_table([("recording", "left"), (reports[0].entry.name, "left")], rows)
+            print_fields([("recording", reports[0].entry.name), *rows])
         else:
             output.note("Nothing was stored.")
 

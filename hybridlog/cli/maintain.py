@@ -15,7 +15,7 @@ from hybridlog.cli.binder import command, option
 from hybridlog.cli.options import AsJson, InStore, Named, Quiet, recordings_of
 from hybridlog.cli.progress import Stages, progress_bar
 from hybridlog.wording import listed
-from hybridlog_storage.errors import DatabaseError, TopicError, UsageError, WithoutMongoError
+from hybridlog_storage.errors import DatabaseError, TopicError, WithoutMongoError
 
 if TYPE_CHECKING:
     from hybridlog.maintenance.verify import Verification
@@ -26,9 +26,14 @@ if TYPE_CHECKING:
 @dataclass(frozen=True, kw_only=True)
 class _Verify(Named, InStore, AsJson, Quiet):
     repair: bool = option("Mend what can be mended without losing anything; list the rest.")
-    moved: bool = option("With --repair: the store was moved to here, take its index over.")
+    moved: bool = option(
+        "With --repair: the store was moved to here, take its index over.",
+        needs=("repair",),
+        excludes=("new_id",),
+    )
     new_id: bool = option(
-        "With --repair: the store is a copy, give it an id of its own, with the index at --mongo."
+        "With --repair: the store is a copy, give it an id of its own, with the index at --mongo.",
+        needs=("repair",),
     )
 
 
@@ -43,8 +48,6 @@ def verify_command(given: _Verify) -> None:
     if given.repair:
         _repair(given)
         return
-    if given.moved or given.new_id:
-        raise UsageError("--moved and --new-id are for --repair: give that, too.")
     started = time.monotonic()
     with given.opened(quiet=given.quiet) as store:
         chosen, unreadable = _chosen(given, store)
@@ -105,8 +108,6 @@ def _print(result: Verification, elapsed: float, *, quiet: bool) -> None:
 
 def _repair(given: _Verify) -> None:
     """Mend what can be mended, and list what is left."""
-    if given.moved and given.new_id:
-        raise UsageError("A store was moved or it is a copy: give --moved or --new-id, not both.")
     if given.new_id:
         from hybridlog.maintenance.lease import become_another
         from hybridlog.store import store_path

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import click
-from click.core import ParameterSource
 
 from hybridlog.cli.binder import argument, command
 from hybridlog.cli.hints import Command
-from hybridlog.cli.record_choices import LiveOption, RecordChoices, check_choices
+from hybridlog.cli.record_choices import RecordChoices, check_choices
 
 
 class _RecordCommand(Command):
@@ -58,7 +57,6 @@ def record_command(choices: RecordChoices) -> None:
     Ctrl-C. Lost messages are counted: see `hybridlog info --losses`. Options under
     "Live recording" are for this.
     """
-    choices = replace(choices, live_options=_live_options())
     check_choices(choices)
     if choices.is_live:
         from hybridlog.cli.record_live import record_live
@@ -72,17 +70,6 @@ def record_command(choices: RecordChoices) -> None:
         from hybridlog.cli.record_logs import record_logs
 
         record_logs(choices)
-
-
-def _live_options() -> tuple[str, ...]:
-    """The options for live recording that were given."""
-    context = click.get_current_context()
-    return tuple(
-        parameter.opts[0]
-        for parameter in context.command.params
-        if isinstance(parameter, LiveOption)
-        and context.get_parameter_source(str(parameter.name)) is ParameterSource.COMMANDLINE
-    )
 
 
 @dataclass(frozen=True, kw_only=True)

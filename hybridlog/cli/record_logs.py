@@ -17,6 +17,7 @@ from hybridlog.cli.ls import with_misfits
 from hybridlog.cli.options import parse_tags
 from hybridlog.cli.progress import progress_bar
 from hybridlog.cli.record_choices import RecordChoices, opened_to_record, segment_settings
+from hybridlog.cli.render import Column, bytes_of, numbers, print_fields, print_table
 from hybridlog.cli.signals import if_stopped
 from hybridlog.cli.watching import watch
 from hybridlog.query.answers.completeness import coverage
@@ -538,54 +539,39 @@ def _print_one(path: Path, report: RecordReport) -> None:
     left_behind = report.attachments_left_out
     attachments = f"{entry.attachments} ({left_behind} left out)" if left_behind else ""
     attachments = attachments or str(entry.attachments or "")
-    output.print_table(
-        [("recording", "left"), (entry.name, "left")],
+    print_fields(
         [
+            ("recording", entry.name),
             ("source", f"{path} ({entry.source['kind']})"),
-            ("topics", str(_topics(report))),
+            ("topics", _topics(report)),
             ("messages", f"{entry.messages}{left_out}"),
             *([("attachments", attachments)] if attachments else []),
             ("bytes in", output.size(taken)),
             ("bytes stored", output.size(entry.stored_bytes)),
             ("ratio", f"{_ratio(taken, entry.stored_bytes):.2f}"),
-            ("messages indexed", str(report.indexed)),
+            ("messages indexed", report.indexed),
             ("time", f"{report.elapsed_s:.2f} s ({rate:,.0f} messages/s)"),
-        ],
+        ]
     )
 
 
 def _print_several(reports: Sequence[RecordReport]) -> None:
-    figures = [
-        (
-            _topics(report),
-            report.entry.messages,
-            int(report.entry.source["bytes"]),
-            report.entry.stored_bytes,
-            report.indexed,
-            report.elapsed_s,
-        )
-        for report in reports
-    ]
+    rows = [_summary(Path(), report) for report in reports]
+    summed = ("messages", "bytes_in", "bytes_stored", "messages_indexed", "seconds")
+    total = {name: sum(row[name] for row in rows) for name in summed}
     topics = len({c.topic for report in reports for c in report.entry.channels})
-    total = (topics, *(sum(column) for column in [*zip(*figures, strict=True)][1:]))
-    names = [*(report.entry.name for report in reports), "total"]
-    rows = [
-        (
-            name,
-            str(topics),
-            str(messages),
-            output.size(taken),
-            output.size(stored),
-            f"{_ratio(taken, stored):.2f}",
-            str(indexed),
-            f"{elapsed_s:.2f} s",
-        )
-        for name, (topics, messages, taken, stored, indexed, elapsed_s) in zip(
-            names, [*figures, total], strict=True
-        )
-    ]
-    heads = ("topics", "messages", "bytes in", "stored", "ratio", "indexed", "time")
-    output.print_table([("recording", "left"), *((head, "right") for head in heads)], rows)
+    print_table(_COLUMNS, [*rows, {"recording": "total", "topics": topics, **total}])
+
+
+_COLUMNS = [
+    Column("recording"),
+    *numbers("topics", "messages"),
+    bytes_of("bytes in", "bytes_in", spare=1),
+    bytes_of("stored", "bytes_stored"),
+    Column("ratio", lambda row: f"{_ratio(row['bytes_in'], row['bytes_stored']):.2f}", "right"),
+    Column("indexed", "messages_indexed", "right"),
+    Column("time", lambda row: f"{row['seconds']:.2f} s", "right"),
+]
 
 
 def _problems(path: Path, report: RecordReport, *, quiet: bool) -> list[HybridlogError]:

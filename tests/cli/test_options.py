@@ -104,7 +104,7 @@ def test_ages_choose(tmp_path: Path) -> None:
     assert answer("fetch", "n", "--last", "30d", "--count", store=tmp_path / "s").out == "3\n"
     assert answer("stats", "n", "--last", "30d", "--json", store=tmp_path / "s").json[0]["max"] == 2
     for other in ("--between", "--during"):
-        assert "give one of them" in _error(
+        assert f"--last and {other} exclude each other" in _error(
             "fetch", "n", "--last", "30d", other, "start", "end", store=tmp_path / "s"
         )
 
