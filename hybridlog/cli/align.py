@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import click
 
-from hybridlog.cli.answers import Destination, Tabular, answer_tables, print_cost
+from hybridlog.cli.answers import Destination, Tabular, answer_tables, print_end
 from hybridlog.cli.binder import command, option
 from hybridlog.cli.completion import (
     complete_condition,
@@ -104,10 +103,8 @@ def align_command(given: _Given) -> None:
     with given.opened(snapshot=True) as store:
         show = _resample if given.base is None else _align
         counters, remarks = show(store, given, topics, to)
-        sys.stdout.flush()
-        if not given.quiet:
-            print_cost(counters, started, verbose=given.verbose)
-            notes(remarks)
+        print_end(given, counters, started)
+        notes([] if given.quiet else remarks)
 
 
 def _resample(

@@ -19,7 +19,7 @@ import click
 from hybridlog.cli import output
 from hybridlog.cli.binder import PATH, option
 from hybridlog.cli.options import AsJson, Forced, Topics
-from hybridlog.cli.progress import Bar, progress_bar
+from hybridlog.cli.progress import Bar
 from hybridlog.cli.render import ROWS_AT_ONCE, Column, print_table
 from hybridlog.cli.signals import if_stopped
 from hybridlog.formats import OUTPUTS, formats_of, is_directory, suffixes_of
@@ -123,6 +123,7 @@ def format_option(formats: Sequence[str], piped: str = " on a terminal, else jso
         name="--format",
         short="-F",
         type=click.Choice([SCREEN, *formats]),
+        excludes=("as_json",),
     )
 
 
@@ -158,7 +159,7 @@ class Tabular(Forced, AsJson):
         """Format and place of the answer.
 
         Raises:
-            UsageError: The file exists, or the format does not fit the place or `--json`.
+            UsageError: The file exists, or the format does not fit the place.
         """
         to = self.destination()
         to.check()
@@ -168,28 +169,32 @@ class Tabular(Forced, AsJson):
         """Format and place, which are yet to be checked.
 
         Raises:
-            UsageError: The format does not fit `--json`, or the name does not give it.
+            UsageError: The name does not give the format.
         """
-        if self.as_json and self.form not in {None, "json"}:
-            raise UsageError("--json is --format json: leave out one of them.")
         form, path = "json" if self.as_json else self.form, self.output
         if form is None and path is None:
             form = self.usual[not sys.stdout.isatty()]
         elif form is None and path is not None:
-            suffixes = suffixes_of(self.formats)
-            if path.suffix.lower() not in suffixes:
-                raise UsageError(
-                    f"The name {path} does not give the format: add --format, or end it in "
-                    f"{', '.join(suffixes)}."
-                )
-            form = suffixes[path.suffix.lower()]
+            form = form_of(path, self.formats)
+        quiet = getattr(self, "quiet", False)
         return Destination(
-            form=form or SCREEN,
-            path=path,
-            force=self.force,
-            limit=self.limit,
-            quiet=getattr(self, "quiet", False),
+            form=form or SCREEN, path=path, force=self.force, limit=self.limit, quiet=quiet
         )
+
+
+def form_of(path: Path, formats: Iterable[str]) -> str:
+    """The format that the name of an output gives.
+
+    Raises:
+        UsageError: It gives none.
+    """
+    suffixes = suffixes_of(formats)
+    if path.suffix.lower() not in suffixes:
+        raise UsageError(
+            f"The name {path} does not give the format: add --format, or end it in "
+            f"{', '.join(suffixes)}."
+        )
+    return suffixes[path.suffix.lower()]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -246,11 +251,9 @@ def answering(given: Topics) -> Iterator[Answering]:
     with given.opened(snapshot=True) as store:
         asked = Answering(store, given.query(store))
         yield asked
-        sys.stdout.flush()
+        query = asked.query
+        print_end(given, query.counters, started, count=True)
         if not given.quiet:
-            query = asked.query
-            verbose = getattr(given, "verbose", False)
-            print_cost(query.counters, started, verbose=verbose, count=True)
             print_remarks(query, is_empty=asked.is_empty)
 
 
@@ -324,7 +327,7 @@ def answer_tables(
     limited = tables if to.limit is None else _limited(tables, to.limit)
     limited = _checked(limited, completeness)
     quiet = to.quiet or to.path is None
-    with to.opened() as target, progress_bar(to.form, None, quiet=quiet) as bar:
+    with to.opened() as target, Bar(to.form, None, quiet=quiet) as bar:
         counted = _with_progress(limited, bar)
         columns = schema() if OUTPUTS[to.form].content == "table" else None
         OUTPUTS[to.form].write(_rows(counted, columns), target)
@@ -370,7 +373,7 @@ def write_answer(
         return 0
     to, counters = OUTPUTS[form], query.counters
     total = 0 if quiet else payload_bytes(query)
-    with progress_bar(form, total, quiet=quiet) as bar:
+    with Bar(form, total, quiet=quiet) as bar:
 
         def told(pieces: Iterable[_T]) -> Iterator[_T]:
             for piece in pieces:
@@ -574,11 +577,6 @@ def _shown(found: int, limit: int | None, noun: str) -> int:
 def _print_rows(tables: Iterable[pa.Table], limit: int | None, topics: Sequence[str] = ()) -> int:
     """Print rows for people to read.
 
-    Args:
-        tables: The rows.
-        limit: Number of rows to print; None for `SCREEN_ROWS`.
-        topics: Topics of messages, which are in the titles of blocks.
-
     Returns:
         Number of rows of the tables.
     """
@@ -612,23 +610,24 @@ def _print_rows(tables: Iterable[pa.Table], limit: int | None, topics: Sequence[
     return read
 
 
-def print_cost(counters: Counters, started: float, *, verbose: bool, count: bool = False) -> None:
+def print_end(given: Topics, counters: Counters, started: float, *, count: bool = False) -> None:
     """Print what an answer cost, with `--verbose`; without, the messages in front.
 
     Args:
+        given: The options.
         counters: Of the query.
         started: When the command began, see `time.monotonic`.
-        verbose: `--verbose` was given.
         count: The answer was a number, not messages.
     """
-    if not verbose:
-        if (counters.latched or counters.frames) and not count:
+    sys.stdout.flush()
+    if given.quiet or not given.verbose:
+        if (counters.latched or counters.frames) and not count and not given.quiet:
             output.note(latched(counters).removeprefix(" and "))
         return
     used = []
     if not count:
-        given = counters.messages - counters.reduced
-        used.append(f"{output.counted(given, 'message')}{latched(counters)}")
+        messages = counters.messages - counters.reduced
+        used.append(f"{output.counted(messages, 'message')}{latched(counters)}")
     if counters.payload_bytes:
         used.append(f"{output.size(counters.payload_bytes)} of payload")
     if counters.bytes_read:
@@ -650,13 +649,6 @@ def latched(counters: Counters) -> str:
         frames = output.counted(counters.frames, "frame")
         found += f" and {frames} of video in front, from the key frame on"
     return found
-
-
-def print_lost(query: Query, count: int) -> None:
-    """Print the limits of a count of messages, if any of the range are lost."""
-    found = query.completeness()
-    if found.has_losses:
-        output.note(found.describe(count, query.question.limit))
 
 
 def print_remarks(query: Query, *, is_empty: bool | None = None) -> None:

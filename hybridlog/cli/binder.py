@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Sequence
-from dataclasses import field, fields
+from dataclasses import dataclass, field, fields
 from functools import wraps
 from pathlib import Path
 from typing import Any, Final, TypeVar
@@ -18,13 +18,66 @@ import click
 from click.core import ParameterSource
 
 from hybridlog.cli.hints import Command, Pair
-from hybridlog_storage.errors import UsageError
+from hybridlog.wording import parse_size
+from hybridlog_storage.errors import HybridlogError, UsageError
 
 _MAKE, _NEEDS, _EXCLUDES = "hybridlog.parameter", "hybridlog.needs", "hybridlog.excludes"
 _Kind = TypeVar("_Kind")
 PATH: Final = click.Path(readable=False, path_type=Path)
 """A path that click does not check: the library's errors name a cure and have exit codes."""
 _TYPES: Final = {"int": int, "float": float, "Path": PATH}
+
+
+@dataclass(frozen=True)
+class Amount(click.ParamType[Any]):
+    """A number that is typed with a unit.
+
+    Attributes:
+        parse: Gives the number of a text.
+        least: The least number that is allowed, as typed.
+        most: The greatest one; None for any.
+    """
+
+    parse: Callable[[str], float]
+    least: str = "0"
+    most: str | None = None
+    name: str = "amount"  # for click
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The number.
+
+        Raises:
+            UsageError: The text is none, or it is out of range.
+        """
+        of = "" if param is None else param.opts[0]
+        try:
+            found = self.parse(value)
+        except HybridlogError as error:
+            raise UsageError(f"{of}: {error}") from error
+        if found < self.parse(self.least):
+            raise UsageError(f"{of} must be at least {self.least}, not {value}.")
+        if self.most is not None and found > self.parse(self.most):
+            raise UsageError(f"{of} must be at most {self.most}, not {value}.")
+        return found
+
+
+def parse_seconds(text: str) -> float:
+    """Seconds from `1m30s`.
+
+    Raises:
+        TimeError: The text is no duration.
+    """
+    from hybridlog.query.times import parse_duration
+
+    return parse_duration(text) / 1e9
+
+
+SIZE: Final = Amount(parse_size)
+"""Bytes."""
+SECONDS: Final = Amount(parse_seconds)
+"""Seconds."""
+SOME_SECONDS: Final = Amount(parse_seconds, "1ns")
+"""Seconds, more than none."""
 
 
 def option(
@@ -56,7 +109,7 @@ def option(
         words = help
         if annotation == "bool":
             settings["is_flag"] = True
-        elif annotation == "tuple[str, ...]":
+        elif annotation.startswith("tuple[") and annotation.endswith(", ...]"):
             settings["multiple"], words = True, f"{help} Repeatable."
         elif (of := annotation.removesuffix(" | None")) in _TYPES:
             settings.setdefault("type", _TYPES[of])

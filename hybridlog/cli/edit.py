@@ -15,6 +15,7 @@ import click
 from hybridlog.cli import options, output
 from hybridlog.cli.binder import argument, command, option
 from hybridlog.cli.completion import complete_recording
+from hybridlog.cli.ls import RECORDINGS
 from hybridlog.cli.options import (
     AsJson,
     Choosing,
@@ -26,6 +27,7 @@ from hybridlog.cli.options import (
     one_recording,
     recordings_of,
 )
+from hybridlog.cli.render import print_table
 from hybridlog.cli.signals import if_stopped
 from hybridlog.query.choice import Choice
 from hybridlog.wording import listed
@@ -84,12 +86,12 @@ def tag_command(given: _Tag) -> None:
             keys = given.remove if is_one else [key for key in given.remove if key in one.tags]
             changed = store.edit(one.id, tag=tags, untag=keys) if keys or tags else one
             found[one.name] = changed.tags
-    if given.as_json:
-        output.print_json(next(iter(found.values())) if is_one else found)
-    elif not given.quiet:
-        for name, own in found.items():
-            for key, value in sorted(own.items()):
-                output.say(f"{key}={value}" if is_one else f"{name}: {key}={value}")
+    lines = (
+        f"{'' if is_one else f'{name}: '}{key}={value}"
+        for name, own in found.items()
+        for key, value in sorted(own.items())
+    )
+    given.tell(next(iter(found.values())) if is_one else found, lines)
 
 
 def _named_or_chosen(store: Store, given: _Tag) -> tuple[Recordings, Sequence[str], bool]:
@@ -189,9 +191,6 @@ def _mark_running(
         yield mark_now(directory, recording, simulated or now, text, tags, around=around)
 
 
-_MAX_ROWS = 20
-
-
 @dataclass(frozen=True, kw_only=True)
 class _Remove(Named, InStore, Quiet):
     names: tuple[str, ...] = names_argument(  # type: ignore[misc]
@@ -225,29 +224,15 @@ def rm_command(given: _Remove) -> None:
 
 
 def _confirm(chosen: Sequence[RecordingSummary], pins: Sequence[str]) -> None:
-    """Ask for consent; several recordings are shown with what would be lost.
-
-    Args:
-        chosen: The recordings.
-        pins: Reasons of their pins.
-    """
+    """Ask for consent, with what would be lost."""
     why = f" ({listed([one for one in dict.fromkeys(pins) if one])})" if any(pins) else ""
     pinned = f" {output.counted(len(pins), 'pin')} would go, too{why}." if pins else ""
-    several = len(chosen) > 1
-    names = f"{len(chosen)} recordings ({listed(one.name for one in chosen)})"
-    names = names if several else chosen[0].name
+    names = chosen[0].name
+    if len(chosen) > 1:
+        names = f"{len(chosen)} recordings ({listed(one.name for one in chosen)})"
     if not sys.stdin.isatty():
         raise UsageError(f"Deleting {names} for good needs --yes.{pinned}")
-    if several:
-        for one in chosen[:_MAX_ROWS]:
-            span = "" if one.span is None else f"{output.short_time(one.span[0])}, "
-            output.note(
-                f"  {one.name}: {span}{output.counted(one.messages, 'message')}, "
-                f"{output.size(one.stored_bytes)}"
-            )
-        if len(chosen) > _MAX_ROWS:
-            output.note(f"  and {len(chosen) - _MAX_ROWS} more")
-        names = f"these {len(chosen)} recordings"
+    print_table(RECORDINGS, chosen)
     if pinned:
         output.note(pinned.strip())
     if not click.confirm(f"Delete {names} for good?", err=True):

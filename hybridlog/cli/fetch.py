@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -20,9 +19,7 @@ from hybridlog.cli.answers import (
     format_option,
     latched,
     output_option,
-    print_cost,
-    print_lost,
-    print_remarks,
+    print_end,
     write_following,
 )
 from hybridlog.cli.binder import command, option
@@ -35,7 +32,6 @@ from hybridlog_storage.errors import TopicError, UsageError
 from hybridlog_storage.stopping import at_safe_points
 
 if TYPE_CHECKING:
-    from hybridlog.query.counters import Counters
     from hybridlog.query.query import Query
     from hybridlog.store import Store
 
@@ -115,9 +111,8 @@ def fetch_command(choices: _Choices) -> None:
                 query = query.at_time(choices.at)
             except TopicError:
                 if not choices.quiet:
-                    print_remarks(query.between("start", choices.at), is_empty=False)
+                    output.notes(query.between("start", choices.at).remarks(is_empty=False))
                 raise
-        count = None
         if choices.strict:
             query.completeness().check(payloads=not choices.count)
         if choices.count:
@@ -125,6 +120,10 @@ def fetch_command(choices: _Choices) -> None:
             if choices.strict:
                 query.completeness().check()
             output.say(str(count))
+            _print_end(query, choices, started)
+            lost = query.completeness()
+            if lost.has_losses and not choices.quiet:
+                output.note(lost.describe(count, query.question.limit))
         else:
             front = Front(
                 # With --at, the answer is one message; a video needs those before it.
@@ -135,17 +134,20 @@ def fetch_command(choices: _Choices) -> None:
                 _write_pieces(query, choices, to, front)
                 return
             query = answer_query(query, to, front=front, strict=choices.strict)
-        sys.stdout.flush()
-        if not choices.quiet:
-            cost = _cost_of(query)
-            print_cost(cost, started, verbose=choices.verbose, count=choices.count)
-            given = cost.messages or cost.latched or cost.frames
-            if count is None and to.path is not None and not given:
-                what = " and ".join(f"'{one}'" for one in choices.where) or "the question"
-                output.note(f"Nothing matched {what}, so {to.path} is empty.")
-            print_remarks(query)
-            if count is not None:
-                print_lost(query, count)
+            _print_end(query, choices, started, to.path)
+
+
+def _print_end(query: Query, choices: _Choices, started: float, path: Path | None = None) -> None:
+    """Print the cost of an answer, with that of conditions on other topics, and what it lacks."""
+    cost = query.counters.copy()
+    for condition in query.conditions:
+        cost.add(condition.counters)
+    print_end(choices, cost, started, count=choices.count)
+    if not choices.quiet:
+        if path is not None and not (cost.messages or cost.latched or cost.frames):
+            what = " and ".join(f"'{one}'" for one in choices.where) or "the question"
+            output.note(f"Nothing matched {what}, so {path} is empty.")
+        output.notes(query.remarks())
 
 
 def _write_pieces(query: Query, choices: _Choices, to: Destination, front: Front) -> None:
@@ -175,14 +177,14 @@ def _follow(query: Query, choices: _Choices, form: str) -> None:
             write_following(following, form)
     except Stopped as error:
         stopped = error
+    print_end(choices, query.counters, started)
     if not choices.quiet:
-        print_cost(query.counters, started, verbose=choices.verbose)
         from hybridlog.cli.ls import status_text
         from hybridlog.query.query import Query
 
         asked = Query(query.session, following.question)
         asked.counters = query.counters
-        print_remarks(asked)
+        output.notes(asked.remarks())
         for one in asked.summaries():
             if one.status != "open":
                 output.note(f"{one.name} has ended: {status_text(one)}.")
@@ -257,11 +259,3 @@ def _check_near(choices: _Choices) -> None:
         raise UsageError(
             "--where with another topic needs a length of time: add --within, --before or --after."
         )
-
-
-def _cost_of(query: Query) -> Counters:
-    """The cost of an answer, with that of its conditions on other topics."""
-    cost = query.counters.copy()
-    for condition in query.conditions:
-        cost.add(condition.counters)
-    return cost

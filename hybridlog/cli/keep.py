@@ -12,7 +12,7 @@ from hybridlog.cli import output
 from hybridlog.cli.binder import command, option
 from hybridlog.cli.completion import complete_condition, complete_topic
 from hybridlog.cli.options import AsJson, Choosing, InStore, Quiet, query_of
-from hybridlog.cli.progress import Stages, progress_bar
+from hybridlog.cli.progress import Bar
 from hybridlog.cli.render import Column
 from hybridlog.cli.signals import if_stopped
 from hybridlog.wording import listed
@@ -20,7 +20,7 @@ from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
     from hybridlog.maintenance.keep import KeepReport
-    from hybridlog.maintenance.retention import Rules, Step
+    from hybridlog.maintenance.retention import Step
     from hybridlog.store import Store
 
 _MAX_PINS = 1000
@@ -80,10 +80,7 @@ def keep_command(given: _Given) -> None:
     with given.opened() as store:
         if given.pin:
             found = _pin(store, given)
-            if given.as_json:
-                output.print_json(found)
-            elif not given.quiet:
-                output.say(f"{output.counted(len(found), 'pin')}: {listed(found)}")
+            given.tell(found, [f"{output.counted(len(found), 'pin')}: {listed(found)}"])
         elif given.unpin:
             store.unpin(*given.unpin)
         elif given.pins:
@@ -218,26 +215,19 @@ def _keep(store: Store, rules: dict[str, Any], given: _Given) -> None:
     dry_run = given.dry_run
     with (
         if_stopped("What was not deleted is as it was; run it again."),
-        progress_bar("keep", 0, quiet=given.quiet or given.as_json) as bar,
+        Bar("keep", 0, quiet=given.quiet or given.as_json) as bar,
     ):
-        found = store.keep(wanted, dry_run=dry_run, progress=Stages(bar))
-    if given.as_json:
-        output.print_json({**asdict(found), "dry_run": dry_run})
-    elif not given.quiet:
-        for line in _lines(found, dry_run=dry_run):
-            output.say_folded(line)
-    for problem in (*found.problems, *found.plan.warnings, *_useless(store, Rules.of(wanted))):
-        output.note(problem)
+        found = store.keep(wanted, dry_run=dry_run, progress=bar.part)
+    given.tell({**asdict(found), "dry_run": dry_run}, _lines(found, dry_run=dry_run))
+    topics = store.topics()
+    useless = (
+        f"No topic matches {rule.pattern}, so its rule deletes nothing."
+        for rule in Rules.of(wanted).topics
+        if not any(map(rule.fits, topics))
+    )
+    output.notes((*found.problems, *found.plan.warnings, *useless))
     if found.problems or found.plan.is_short:
         raise click.exceptions.Exit(1)
-
-
-def _useless(store: Store, rules: Rules) -> Iterator[str]:
-    """Sentences about rules that fit no topic of the store."""
-    topics = store.topics() if rules.topics else []
-    for rule in rules.topics:
-        if not any(map(rule.fits, topics)):
-            yield f"No topic matches {rule.pattern}, so its rule deletes nothing."
 
 
 def _lines(found: KeepReport, *, dry_run: bool) -> Iterator[str]:

@@ -12,7 +12,7 @@ import click
 from hybridlog.cli import output
 from hybridlog.cli.binder import option
 from hybridlog.cli.completion import complete_topic
-from hybridlog.cli.progress import progress_bar
+from hybridlog.cli.progress import Bar
 from hybridlog.cli.signals import if_stopped
 from hybridlog_storage.errors import UsageError
 
@@ -78,7 +78,7 @@ def export_set(
         shutil.rmtree(target)
     done = 0
     again = "The same command goes on with the episodes that are not finished."
-    with if_stopped(lambda: again), progress_bar(target.name, None, quiet=quiet) as bar:
+    with if_stopped(lambda: again), Bar(target.name, None, quiet=quiet) as bar:
 
         def tell(name: str, frames: int) -> None:
             nonlocal done
@@ -126,28 +126,26 @@ def _write_map(text: str, target: Path, *, force: bool, quiet: bool) -> None:
 def _print_report(report: LerobotReport, fps: int | None, *, quiet: bool) -> None:
     counted = output.counted
     resumed = f", {report.resumed} of them from before" if report.resumed else ""
-    if not quiet:
-        output.note(
-            f"{report.path}: {counted(report.episodes, 'episode')}{resumed}, "
-            f"{counted(report.frames, 'frame')}, {output.size(report.bytes)}"
-        )
-        if fps is None:
-            output.note(f"Without --fps there are {_FPS} frames a second.")
-    if report.held:
-        output.note(
-            f"Values that are older than usual were kept for {counted(report.held, 'frame')}."
-        )
-    if report.dropped:
-        output.note(
-            f"{counted(report.dropped, 'frame')} left out, because a topic has a gap there."
-        )
-    if report.missing:
-        output.note(
-            f"{counted(report.missing, 'frame')} show an earlier picture: their own cannot be "
-            "shown, or has no payload."
-        )
-    if report.lost:
-        output.note(
+    about = (
+        f"{report.path}: {counted(report.episodes, 'episode')}{resumed}, "
+        f"{counted(report.frames, 'frame')}, {output.size(report.bytes)}"
+    )
+    held, dropped, missing = (
+        counted(number, "frame") for number in (report.held, report.dropped, report.missing)
+    )
+    notes = [
+        (not quiet, about),
+        (not quiet and fps is None, f"Without --fps there are {_FPS} frames a second."),
+        (report.held, f"Values that are older than usual were kept for {held}."),
+        (report.dropped, f"{dropped} left out, because a topic has a gap there."),
+        (
+            report.missing,
+            f"{missing} show an earlier picture: their own cannot be shown, or has no payload.",
+        ),
+        (
+            report.lost,
             f"{counted(report.lost, 'message')} of these topics are lost in the episodes; "
-            "meta/hybridlog.json says in which."
-        )
+            "meta/hybridlog.json says in which.",
+        ),
+    ]
+    output.notes(text for applies, text in notes if applies)

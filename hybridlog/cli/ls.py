@@ -30,7 +30,7 @@ def ls_command(given: _Given) -> None:
         recordings = given.recordings_in(store.snapshot()).summaries
     found = [*recordings]
     without = "" if store.repairs.unreadable else store.directory.when_empty
-    given.show(found, _COLUMNS, without, recording_dict, pages=True)
+    given.show(found, RECORDINGS, without, recording_dict, pages=True)
 
 
 def _note(entry: RecordingSummary) -> str:
@@ -47,7 +47,7 @@ def _duration(entry: RecordingSummary) -> str:
     return output.short_duration(entry.span[1] - entry.span[0]) if entry.span else "-"
 
 
-_COLUMNS = [
+RECORDINGS = [
     Column("recording", lambda one: one.name),
     Column("start", lambda one: output.short_time(one.span and one.span[0]), "whole"),
     Column("duration", _duration, "right"),
@@ -56,6 +56,7 @@ _COLUMNS = [
     Column("stored", lambda one: output.size(one.stored_bytes), "right", spare=2),
     Column("note", _note, cut=12),
 ]
+"""Columns of a list of recordings."""
 _STATUS = {
     "open": "being recorded",
     "damaged": "source damaged",

@@ -13,12 +13,13 @@ import click
 from hybridlog.cli import output
 from hybridlog.cli.binder import command, option
 from hybridlog.cli.options import AsJson, InStore, Named, Quiet, recordings_of
-from hybridlog.cli.progress import Stages, progress_bar
+from hybridlog.cli.progress import Bar
 from hybridlog.wording import listed
 from hybridlog_storage.errors import DatabaseError, TopicError, WithoutMongoError
 
 if TYPE_CHECKING:
-    from hybridlog.maintenance.verify import Verification
+    from hybridlog.maintenance.repair import Repaired
+    from hybridlog.maintenance.verify import Finding, Verification
     from hybridlog.store import Store
     from hybridlog_storage.summary import RecordingSummary
 
@@ -53,8 +54,8 @@ def verify_command(given: _Verify) -> None:
         chosen, unreadable = _chosen(given, store)
         total = sum(entry.stored_bytes for entry in chosen)
         names = None if given.choice.is_everything else [*(one.id for one in chosen), *unreadable]
-        with progress_bar("verify", total, quiet=given.quiet) as bar:
-            result = store.verify(names, Stages(bar))
+        with Bar("verify", total, quiet=given.quiet) as bar:
+            result = store.verify(names, bar.part)
         why = store.shared.index.unavailable
     elapsed = time.monotonic() - started
     if given.as_json:
@@ -90,8 +91,7 @@ def _chosen(given: _Verify, store: Store) -> tuple[Sequence[RecordingSummary], l
 
 def _print(result: Verification, elapsed: float, *, quiet: bool) -> None:
     for finding in result.findings:
-        of = f"{finding.recording}: " if finding.recording else ""
-        output.say(f"{of}{finding.place}: {finding.problem.removesuffix('.')}; {finding.cure}")
+        _say(finding, f"{finding.problem.removesuffix('.')}; {finding.cure}")
     if quiet:
         return
     verdict = "all is well" if result.index else "all is well in the files"
@@ -120,17 +120,18 @@ def _repair(given: _Verify) -> None:
             output.note("The index belongs to the store at this place now.")
         chosen, unreadable = _chosen(given, store)
         names = None if given.choice.is_everything else [*(one.id for one in chosen), *unreadable]
-        with progress_bar("repair", 0, quiet=given.quiet) as bar:
-            done = store.verify(names, Stages(bar), repair=True)
-    left = [one for one in done if not one.is_cured]
+        with Bar("repair", 0, quiet=given.quiet) as bar:
+            done = store.verify(names, bar.part, repair=True)
     if given.as_json:
         output.print_json([asdict(one) for one in done])
     else:
         for one in done:
-            result = "mended" if one.is_cured else "left"
-            of = f"{one.recording}: " if one.recording else ""
-            output.say(f"{of}{one.place}: {result}: {one.done}")
+            _say(one, f"{'mended' if one.is_cured else 'left'}: {one.done}")
         if not (done or given.moved or given.new_id or given.quiet):
             output.say("nothing to mend")
-    if left:
+    if not all(one.is_cured for one in done):
         raise click.exceptions.Exit(1)
+
+
+def _say(one: Finding | Repaired, what: str) -> None:
+    output.say(": ".join(filter(None, (one.recording, one.place, what))))

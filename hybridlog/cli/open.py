@@ -8,12 +8,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import click
 
 from hybridlog.cli import output
-from hybridlog.cli.answers import check_room, not_written, print_remarks, write_answer
+from hybridlog.cli.answers import check_room, not_written, write_answer
 from hybridlog.cli.binder import argument, command, option
 from hybridlog.cli.options import AsJson, Filtered, Forced, InStore, Place, Served, one_recording
 from hybridlog.cli.signals import ended_by_signal, if_stopped
@@ -93,25 +93,14 @@ def open_command(given: _Given) -> None:
     if given.path is not None:
         check_room(given.path, force=given.force)
     if given.viewer == _WEBSOCKET:
-        check_installed()
-        with given.opened(is_lasting=True) as store:
-            play(
-                given.query(store),
-                given.choice.name,
-                quiet=given.quiet,
-                port=_PORT if given.port is None else given.port,
-                speed=given.speed or 1.0,
-                loops=given.loop,
-                is_paused=given.paused,
-                origins=given.origins,
-            )
+        _play(given)
         return
     program = _find(given.viewer)
     with given.opened(snapshot=True) as store:
         query = given.query(store)
         path = _written(store, query, given)
         if not given.quiet:
-            print_remarks(query, is_empty=False)
+            output.notes(query.remarks(is_empty=False))
             output.note(f"{path}: {output.size(path.stat().st_size)}, opened with {program}")
     ended = subprocess.run(  # noqa: S603
         [program, *_VIEWERS[given.viewer].options, path.absolute()], check=False
@@ -156,42 +145,39 @@ def _find(viewer: str) -> str:
 _MAX_SHOWN = 5  # topics
 
 
-def check_installed() -> None:
-    """Refuse to play without the package for it.
+def _play(given: _Given) -> None:
+    """Play to viewers, until a signal ends it.
 
     Raises:
-        MissingDependencyError: It is missing.
+        MissingDependencyError: The package for it is missing.
     """
+    import asyncio
+
     try:
-        import hybridlog.view.playback.server  # noqa: F401
+        from hybridlog.view.playback.server import PlaybackOptions, PlaybackServer
     except ImportError as error:
         raise MissingDependencyError(
             "open websocket needs websockets: pip install 'hybridlog[foxglove]'"
         ) from error
-
-
-def play(query: Query, names: Sequence[str], *, quiet: bool, **how: Any) -> None:
-    """Play a query to viewers, until a signal ends it.
-
-    Args:
-        query: The messages.
-        names: Of the recordings, as typed.
-        quiet: Only print the address.
-        how: Of `PlaybackOptions`.
-    """
-    import asyncio
-
     from hybridlog.view.playback.played import PlayedLog
-    from hybridlog.view.playback.server import PlaybackOptions, PlaybackServer
 
-    log = PlayedLog(query)
-    name = " ".join(["hybridlog", *names])
-    server = PlaybackServer(log, name, PlaybackOptions(**how), output.note)
-    if not quiet:
-        print_remarks(query, is_empty=False)
-        print_unplayed(query)
-        _print_undefined(log)
-    asyncio.run(_until_signal(server, quiet=quiet))
+    options = PlaybackOptions(
+        port=_PORT if given.port is None else given.port,
+        speed=given.speed or 1.0,
+        loops=given.loop,
+        is_paused=given.paused,
+        origins=given.origins,
+    )
+    with given.opened(is_lasting=True) as store:
+        query = given.query(store)
+        log = PlayedLog(query)
+        name = " ".join(["hybridlog", *given.choice.name])
+        server = PlaybackServer(log, name, options, output.note)
+        if not given.quiet:
+            output.notes(query.remarks(is_empty=False))
+            print_unplayed(query)
+            _print_undefined(log)
+        asyncio.run(_until_signal(server, quiet=given.quiet))
 
 
 async def _until_signal(server: PlaybackServer, *, quiet: bool) -> None:
@@ -296,12 +282,7 @@ def view_command(given: _View) -> None:
 
 
 def _print_mcap(url: str, name: str) -> None:
-    """Print where other viewers find selections.
-
-    Args:
-        url: Address of all selections.
-        name: Name of a recording for the examples, as in a URL; empty without one.
-    """
+    """Print where other viewers find selections."""
     file = f"{url}slice.mcap?recording={name or 'RECORDING'}"
     output.note(f"MCAP file: {file}")
     output.note(f"In Foxglove: {_foxglove('remote-file', file)}")

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import click
 
 from hybridlog.cli import output
-from hybridlog.cli.binder import argument, option
+from hybridlog.cli.binder import Amount, argument, option
 from hybridlog.cli.completion import (
     complete_condition,
     complete_frame,
@@ -27,6 +27,7 @@ from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.render import Column, print_table
 from hybridlog.formats import formats_of
 from hybridlog.query.choice import Choice
+from hybridlog.wording import parse_size
 from hybridlog_storage.errors import TopicError, UsageError
 
 if TYPE_CHECKING:
@@ -92,6 +93,14 @@ class AsJson:
             print_table(columns, rows, **how)
         elif without and not getattr(self, "quiet", False):
             output.note(without)
+
+    def tell(self, value: object, lines: Iterable[str]) -> None:
+        """Print a result as JSON, or in lines unless `--quiet` is given."""
+        if self.as_json:
+            output.print_json(value)
+        elif not getattr(self, "quiet", False):
+            for line in lines:
+                output.say_folded(line)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -246,14 +255,16 @@ class Topics(Ranged):
     """Options of commands about messages of some topics.
 
     Attributes:
+        needs_topic: Without a topic, the question is refused: all would be too much.
         where: Predicates that all messages satisfy.
         strict: Incomplete answers are refused.
-        needs_topic: Without a topic, the question is refused: all would be too much.
+        verbose: The cost is told.
     """
 
     needs_topic: ClassVar[bool] = False
     where: ClassVar[tuple[str, ...]] = ()
     strict: ClassVar[bool] = False
+    verbose: ClassVar[bool] = False
     words: tuple[str, ...] = argument(
         "Topics, as for --topic.", "[TOPIC]...", shell_complete=complete_topic
     )
@@ -391,9 +402,10 @@ class Slices(Latched, Forced):
         "For rosbag2: the storage of the bag; without, mcap.",
         type=click.Choice(["mcap", "sqlite3"]),
     )
-    file_size: str | None = option(
+    file_size: int | None = option(
         "For rosbag2: begin a new file at so many bytes of payload, such as 500MB; without, 2GiB.",
         "SIZE",
+        type=Amount(parse_size, "1B"),
     )
 
     def settings(self, form: str) -> dict[str, Any]:
@@ -411,9 +423,7 @@ class Slices(Latched, Forced):
             return {}
         settings: dict[str, Any] = {"storage": self.storage or "mcap"}
         if self.file_size is not None:
-            settings["max_file"] = output.parse_size(self.file_size)
-            if not settings["max_file"]:
-                raise UsageError("--file-size must be more than 0.")
+            settings["max_file"] = self.file_size
         return settings
 
 

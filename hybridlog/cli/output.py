@@ -16,12 +16,12 @@ from hybridlog import wording
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from hybridlog.record.recorder import RecordReport
     from hybridlog_storage.catalog import ChannelEntry
 
 counted = wording.counted
 unfit = wording.unfit
 size = wording.size
-parse_size = wording.parse_size
 
 _MAX_LINE = 100  # characters of a note, an attachment and the like
 
@@ -108,6 +108,14 @@ def notes(lines: Iterable[str]) -> None:
 def stored(messages: int) -> str:
     """A number of stored messages: `1 message is stored`."""
     return f"{counted(messages, 'message')} {'is' if messages == 1 else 'are'} stored"
+
+
+def not_indexed(report: RecordReport) -> str:
+    """The sentence about messages that the index lacks, because it failed."""
+    return (
+        f"{report.failure} {stored(report.missed)} but not in the index; the next command that "
+        "opens the store catches up."
+    )
 
 
 def without_documents(messages: int) -> str:

@@ -48,7 +48,11 @@ class _Given(Asking, Forced):
         short="-o",
     )
     form: str | None = option(
-        "Without: by the suffix of -o.", name="--format", short="-F", type=click.Choice(_FORMATS)
+        "Without: by the suffix of -o.",
+        name="--format",
+        short="-F",
+        type=click.Choice(_FORMATS),
+        needs=("output",),
     )
     size: str | None = option(
         f"Pixels of the picture; without, {_WIDTH}x{_HEIGHT}, and as high again for each "
@@ -83,18 +87,15 @@ def plot_command(given: _Given) -> None:
 def _form(path: Path | None, form: str | None) -> str:
     """The format; empty for text."""
     if path is None:
-        if form is not None:
-            raise UsageError(f"{form} needs a name: -o FILE.{form}, or -o - for standard output.")
         return ""
     if str(path) == "-" and form is not None and sys.stdout.isatty():
         raise UsageError(f"{form} is no text for a terminal: name a file with -o.")
-    found = form or path.suffix.lower().removeprefix(".")
-    if found not in _FORMATS:
+    if form is None and path.suffix.lower()[1:] not in _FORMATS:
         raise UsageError(
             f"The name {path} does not give the format: add --format, or end it in "
             f"{', '.join(f'.{name}' for name in _FORMATS)}."
         )
-    return found
+    return form or path.suffix.lower()[1:]
 
 
 def _size(text: str) -> tuple[int, int]:

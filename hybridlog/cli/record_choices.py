@@ -8,8 +8,15 @@ from typing import TYPE_CHECKING, Any, Final, cast
 
 import click
 
-from hybridlog.cli import output
-from hybridlog.cli.binder import argument, option
+from hybridlog.cli.binder import (
+    SECONDS,
+    SIZE,
+    SOME_SECONDS,
+    Amount,
+    argument,
+    option,
+    parse_seconds,
+)
 from hybridlog.cli.completion import complete_topic
 from hybridlog.cli.options import (
     AsJson,
@@ -19,6 +26,7 @@ from hybridlog.cli.options import (
     Quiet,
     cache_size,
 )
+from hybridlog.wording import parse_size
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
@@ -31,7 +39,9 @@ DEFAULT_CHUNK: Final = 2 << 20
 """Bytes of a chunk."""
 
 
-_LIVE: Final = ("ros1", "master", "ros2", "foxglove", "replay")
+OF_ENVIRONMENT: Final = "ROS_MASTER_URI"
+"""The master of ROS 1 that is meant without a URI."""
+_LIVE: Final = ("ros1", "ros2", "foxglove", "replay")
 """Parameters that name a source of live messages."""
 _OF_LOGS: Final = ("between", "again", "watch", "no_latched", "original_times")
 
@@ -64,26 +74,30 @@ class RecordChoices(Between, Latched, InStore, AsJson, Quiet):
         "Ctrl-C.",
         excludes=("name",),
     )
-    settle: str = option(
+    settle: float = option(
         "With --watch: a file that does not say so is complete when unchanged for this time.",
         "TIME",
+        type=SECONDS,
         default="60s",
     )
-    chunk_size: str | None = option(
+    chunk_size: int | None = option(
         "Uncompressed size of a chunk, such as 512KiB; without, 2MiB, less where --budget is "
         "small.",
         "SIZE",
+        type=Amount(parse_size, "1KiB"),
     )
     compression: str = option(
         "Compression of chunks.", type=click.Choice(["zstd", "lz4", "none"]), default="zstd"
     )
     level: int = option("zstd level, 1 to 19.", "N", type=click.IntRange(1, 19), default=3)
-    ros1: bool = option(
+    ros1: str | None = option(
         "Record a running ROS 1 robot; the URI of a master may follow, else ROS_MASTER_URI "
         "names it.",
+        "[URI]",
+        is_flag=False,
+        flag_value=OF_ENVIRONMENT,
         excludes=_OF_LOGS,
     )
-    master: str | None = option("The ROS 1 master.", "URI", excludes=_OF_LOGS)
     ros2: bool = option("Record a running ROS 2 robot; needs rclpy.", excludes=_OF_LOGS)
     qos: Path | None = _live(
         "With --ros2: YAML file of QoS overrides, as for rosbag2.", "FILE", needs=("ros2",)
@@ -101,39 +115,63 @@ class RecordChoices(Between, Latched, InStore, AsJson, Quiet):
         default=1.0,
         needs=("replay",),
     )
-    duration: str | None = _live("Stop after this time, such as 10m.", "TIME")
+    duration: float | None = _live("Stop after this time, such as 10m.", "TIME", type=SOME_SECONDS)
     max_messages: int | None = _live(
         "Stop after this number of messages.", "N", type=click.IntRange(min=1)
     )
-    max_size: str | None = _live("Stop after this size of payloads, such as 10GB.", "SIZE")
-    split_size: str = _live("Start a new segment file after this size.", "SIZE", default="1GiB")
-    split_duration: str = _live("Start a new segment file after this time.", "TIME", default="10m")
+    max_size: int | None = _live(
+        "Stop after this size of payloads, such as 10GB.", "SIZE", type=Amount(parse_size, "1B")
+    )
+    split_size: int = _live(
+        "Start a new segment file after this size.",
+        "SIZE",
+        type=Amount(parse_size, "1MiB"),
+        default="1GiB",
+    )
+    split_duration: float = _live(
+        "Start a new segment file after this time.", "TIME", type=SOME_SECONDS, default="10m"
+    )
     use_sim_time: bool = _live("Log times are those of /clock, the time of a simulation.")
-    throttle: tuple[str, ...] = _live(
+    throttle: tuple[tuple[str, str], ...] = _live(
         "At most this rate of messages, such as /camera 5Hz.",
         "TOPIC RATE",
+        nargs=2,
         shell_complete=complete_topic,
     )
-    priority: tuple[str, ...] = _live(
+    priority: tuple[tuple[str, str], ...] = _live(
         "low, normal or high: when more arrives than can be written, payloads of the lowest "
         "priority are dropped first.",
         "TOPIC WORD",
+        nargs=2,
         shell_complete=complete_topic,
     )
-    budget: str | None = _live(
-        "Size of payloads in memory; without, a sixteenth of all memory.", "SIZE"
+    budget: int | None = _live(
+        "Size of payloads in memory; without, a sixteenth of all memory.",
+        "SIZE",
+        type=Amount(parse_size, "1MiB"),
     )
-    reserve: str = _live("Stop when the disk has less than this free.", "SIZE", default="1GB")
-    flush_interval: str = _live("The most that a killed recorder can lose.", "TIME", default="1s")
-    ring: str | None = _live("Keep only the last TIME, and what is pinned.", "TIME")
+    reserve: int = _live(
+        "Stop when the disk has less than this free.", "SIZE", type=SIZE, default="1GB"
+    )
+    flush_interval: float = _live(
+        "The most that a killed recorder can lose.",
+        "TIME",
+        type=Amount(parse_seconds, "1ns", "1h"),
+        default="1s",
+    )
+    ring: float | None = _live(
+        "Keep only the last TIME, and what is pinned.", "TIME", type=SOME_SECONDS
+    )
     trigger: tuple[str, ...] = _live(
         "Mark and pin what is around such a message: '/diagnostics: status[*].level >= 2'.",
         "TOPIC: PREDICATE",
     )
-    before: str | None = _live(
-        "Pin so much before a trigger or SIGUSR1; without, all that the ring has.", "TIME"
+    before: float | None = _live(
+        "Pin so much before a trigger or SIGUSR1; without, all that the ring has.",
+        "TIME",
+        type=SECONDS,
     )
-    after: str | None = _live("Pin so much after it.", "TIME")
+    after: float | None = _live("Pin so much after it.", "TIME", type=SECONDS)
     contract: Path | None = _live(
         "Tell and mark topics that are silent for longer than the rules in this file allow, "
         "and judge the recording at its end.",
@@ -145,12 +183,7 @@ class RecordChoices(Between, Latched, InStore, AsJson, Quiet):
     @property
     def is_live(self) -> bool:
         """True when a source of live messages is given."""
-        return self.is_ros1 or self.ros2 or self.foxglove is not None or self.replay is not None
-
-    @property
-    def is_ros1(self) -> bool:
-        """True when a ROS 1 robot is recorded."""
-        return self.ros1 or self.master is not None
+        return self.ros2 or (self.ros1, self.foxglove, self.replay) != (None, None, None)
 
 
 def check_choices(choices: RecordChoices) -> None:
@@ -159,15 +192,8 @@ def check_choices(choices: RecordChoices) -> None:
     Raises:
         UsageError: Neither a log nor a robot, or what is not fit for several logs.
     """
-    if choices.master is not None and not choices.master.strip():
-        raise UsageError("A ROS master's URI looks like http://host:11311; this one is empty.")
     if choices.paths and choices.is_live:
-        hint = ""
-        if choices.is_ros1 and choices.master is None:
-            hint = " A ROS master's URI looks like http://host:11311, and follows --ros1."
-        raise UsageError(
-            f"Give either logs to record or a robot (--ros1, --ros2, …), not both.{hint}"
-        )
+        raise UsageError("Give either logs to record or a robot (--ros1, --ros2, …), not both.")
     if not choices.paths and not choices.is_live:
         raise UsageError(
             "Nothing to record: give a log, or --ros1, --ros2, --foxglove URL or --replay FILE."
@@ -190,14 +216,12 @@ def segment_settings(choices: RecordChoices, chunk_size: int = DEFAULT_CHUNK) ->
         chunk_size: Bytes of a chunk if the user does not say.
 
     Raises:
-        UsageError: The chunk size is no size.
+        UsageError: Chunks would be too large.
     """
     from hybridlog_storage.segments.segment_writer import SegmentSettings
 
     return SegmentSettings(
-        chunk_size=chunk_size
-        if choices.chunk_size is None
-        else output.parse_size(choices.chunk_size),
+        chunk_size=choices.chunk_size or chunk_size,
         compression=cast(Any, choices.compression),
         level=choices.level,
     )

@@ -8,7 +8,8 @@ import json
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pyarrow as pa
@@ -16,8 +17,8 @@ import pyarrow.feather
 import pyarrow.parquet
 import pytest
 
-from hybridlog.cli.answers import print_cost
-from hybridlog.cli.options import Latched
+from hybridlog.cli.answers import print_end
+from hybridlog.cli.options import Latched, Topics
 from hybridlog.query.counters import Counters
 from hybridlog_storage.errors import UsageError
 from tests.independent import Seen, read_bag, read_mcap
@@ -364,7 +365,8 @@ def test_messages_that_do_not_fit_are_counted(store: Path, tmp_path: Path) -> No
 
 
 def test_the_closing_line_counts_what_is_given(capsys: pytest.CaptureFixture[str]) -> None:
-    print_cost(Counters(messages=251, reduced=12), 0.1, verbose=True)
+    given = SimpleNamespace(quiet=False, verbose=True)
+    print_end(cast("Topics", given), Counters(messages=251, reduced=12), 0.1)
     assert capsys.readouterr().err.startswith("239 messages, ")
 
 

@@ -14,7 +14,8 @@ from rosbags.rosbag2 import Writer as Rosbag2Writer
 
 import hybridlog as hl
 from hybridlog.cli.info import channel_note
-from hybridlog.cli.output import parse_size, quoted
+from hybridlog.cli.output import quoted
+from hybridlog.wording import parse_size
 from hybridlog_storage.messages import REDUCED, Channel, Schema
 from tests import places
 from tests.independent import read_bag
