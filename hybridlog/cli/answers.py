@@ -254,7 +254,7 @@ def answering(given: Topics) -> Iterator[Answering]:
         query = asked.query
         print_end(given, query.counters, started, count=True)
         if not given.quiet:
-            print_remarks(query, is_empty=asked.is_empty)
+            output.notes(query.remarks(is_empty=asked.is_empty))
 
 
 def answer_query(query: Query, to: Destination, *, front: Front, strict: bool = False) -> Query:
@@ -649,16 +649,6 @@ def latched(counters: Counters) -> str:
         frames = output.counted(counters.frames, "frame")
         found += f" and {frames} of video in front, from the key frame on"
     return found
-
-
-def print_remarks(query: Query, *, is_empty: bool | None = None) -> None:
-    """Print what is to be known about an answer, a line each.
-
-    Args:
-        query: The query that was answered.
-        is_empty: The answer was empty; None to tell by its counters.
-    """
-    output.notes(query.remarks(is_empty=is_empty))
 
 
 def check_room(path: Path, *, force: bool, is_directory: bool = False) -> None:
