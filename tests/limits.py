@@ -10,7 +10,7 @@ import pytest
 
 PLACES = {
     "align_piece_bytes": "hybridlog.across.align._PIECE_BYTES",
-    "printed_rows_at_once": "hybridlog.cli.output.ROWS_AT_ONCE",
+    "printed_rows_at_once": "hybridlog.cli.render.ROWS_AT_ONCE",
     "column_file_open_files": "hybridlog.columns.column_file._OPEN_FILES",
     "shared_file_rows": "hybridlog.columns.folders.MAX_SHARED_ROWS",
     "settled_ns": "hybridlog.columns.folders._STABLE_NS",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import click
 
-from hybridlog.cli.answers import Destination, Tabular, answer_tables, print_cost
+from hybridlog.cli.answers import Destination, Tabular, answer_tables, print_end
 from hybridlog.cli.binder import command, option
 from hybridlog.cli.completion import (
     complete_condition,
@@ -48,7 +47,9 @@ class _Given(Asking, Tabular):
         name="--to",
         shell_complete=complete_topic,
     )
-    step: str | None = option("Instead: rows at regular times, such as 100ms.", "DURATION")
+    step: str | None = option(
+        "Instead: rows at regular times, such as 100ms.", "DURATION", excludes=("base", "frame")
+    )
     how: str = option(
         "The last message not after the row, the nearest one, or between the last and the "
         "next. With --step also of the messages from a row to the next: their number, the first, "
@@ -63,6 +64,7 @@ class _Given(Asking, Tabular):
         "With --to: the time that is compared.",
         type=click.Choice(["log", "publish", "header"]),
         default="log",
+        needs=("base",),
     )
     where: tuple[str, ...] = option(  # type: ignore[misc]
         "Only messages of this topic that satisfy a predicate; with --step a predicate alone.",
@@ -73,6 +75,7 @@ class _Given(Asking, Tabular):
         "With --to: the topics beside it are of these recordings, whose time may overlap: a "
         "second robot or recorder. As for --recording; '*' for all.",
         "RECORDING",
+        needs=("base",),
         shell_complete=complete_recording,
     )
     fields: tuple[str, ...] = option(
@@ -93,25 +96,21 @@ def align_command(given: _Given) -> None:
     Columns are named by topic and field; `distance` is the time of a topic's message minus
     that of the row. What is not near enough is empty; lines on standard error say why.
     """
-    if (given.base is None) == (given.step is None):
+    if given.base is None and given.step is None:
         raise UsageError("Name the rows: --to TOPIC for its messages, or --step for times.")
     topics, to = given.topics, given.to
     started = time.monotonic()
     with given.opened(snapshot=True) as store:
         show = _resample if given.base is None else _align
         counters, remarks = show(store, given, topics, to)
-        sys.stdout.flush()
-        if not given.quiet:
-            print_cost(counters, time.monotonic() - started, count=False)
-            notes(remarks)
+        print_end(given, counters, started)
+        notes([] if given.quiet else remarks)
 
 
 def _resample(
     store: Store, given: _Given, topics: Sequence[str], to: Destination
 ) -> tuple[Counters, Sequence[str]]:
     """Answer with rows at regular times; gives the cost and what is to be known."""
-    if given.clock != "log" or given.beside or given.frame is not None:
-        raise UsageError("--clock, --beside and --in-frame are for --to, not for --step.")
     query = given.query(store)
     if given.fields:
         query = query.fields(*parse_fields(",".join(given.fields)))

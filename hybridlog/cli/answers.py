@@ -18,8 +18,9 @@ import click
 
 from hybridlog.cli import output
 from hybridlog.cli.binder import PATH, option
-from hybridlog.cli.options import VERBOSE, AsJson, Forced, Topics
-from hybridlog.cli.progress import Bar, progress_bar
+from hybridlog.cli.options import AsJson, Forced, Topics
+from hybridlog.cli.progress import Bar
+from hybridlog.cli.render import ROWS_AT_ONCE, Column, print_table
 from hybridlog.cli.signals import if_stopped
 from hybridlog.formats import OUTPUTS, formats_of, is_directory, suffixes_of
 from hybridlog.formats.answer import Answer
@@ -123,6 +124,7 @@ def format_option(formats: Sequence[str], piped: str = " on a terminal, else jso
         name="--format",
         short="-F",
         type=click.Choice([SCREEN, *formats]),
+        excludes=("as_json",),
     )
 
 
@@ -158,7 +160,7 @@ class Tabular(Forced, AsJson):
         """Format and place of the answer.
 
         Raises:
-            UsageError: The file exists, or the format does not fit the place or `--json`.
+            UsageError: The file exists, or the format does not fit the place.
         """
         to = self.destination()
         to.check()
@@ -168,28 +170,32 @@ class Tabular(Forced, AsJson):
         """Format and place, which are yet to be checked.
 
         Raises:
-            UsageError: The format does not fit `--json`, or the name does not give it.
+            UsageError: The name does not give the format.
         """
-        if self.as_json and self.form not in {None, "json"}:
-            raise UsageError("--json is --format json: leave out one of them.")
         form, path = "json" if self.as_json else self.form, self.output
         if form is None and path is None:
             form = self.usual[not sys.stdout.isatty()]
         elif form is None and path is not None:
-            suffixes = suffixes_of(self.formats)
-            if path.suffix.lower() not in suffixes:
-                raise UsageError(
-                    f"The name {path} does not give the format: add --format, or end it in "
-                    f"{', '.join(suffixes)}."
-                )
-            form = suffixes[path.suffix.lower()]
+            form = form_of(path, self.formats)
+        quiet = getattr(self, "quiet", False)
         return Destination(
-            form=form or SCREEN,
-            path=path,
-            force=self.force,
-            limit=self.limit,
-            quiet=getattr(self, "quiet", False),
+            form=form or SCREEN, path=path, force=self.force, limit=self.limit, quiet=quiet
         )
+
+
+def form_of(path: Path, formats: Iterable[str]) -> str:
+    """The format that the name of an output gives.
+
+    Raises:
+        UsageError: It gives none.
+    """
+    suffixes = suffixes_of(formats)
+    if path.suffix.lower() not in suffixes:
+        raise UsageError(
+            f"The name {path} does not give the format: add --format, or end it in "
+            f"{', '.join(suffixes)}."
+        )
+    return suffixes[path.suffix.lower()]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -201,41 +207,28 @@ class Listing(Tabular):
     form: str | None = format_option(_LISTING_FORMATS, "")
 
     def answer(
-        self,
-        rows: Iterable[Mapping[str, Any]],
-        columns: Sequence[output.Column],
-        cells: Callable[[Any], Sequence[str]],
-        spare: Sequence[str] = (),
-        titles: int = 0,
+        self, rows: Iterable[Mapping[str, Any]], columns: Sequence[Column], titles: int = 1
     ) -> None:
         """Print or write rows.
 
         Args:
             rows: The rows.
             columns: Of the table for people.
-            cells: Gives the cells of a row.
-            spare: Columns that may be left out, see `output.fitted`.
-            titles: Number of cells in the title of a block, see `output.print_rows`.
+            titles: See `print_table`.
         """
         to, limited = self.to, islice(rows, self.limit)
         if to.form != SCREEN:
             answer_tables(_tables_of(limited), lambda: None, to)
-        elif titles or spare:
-            shown = [cells(row) for row in limited]
-            if shown:
-                output.print_rows(columns, shown, titles, spare)
-        else:
-            first = list(islice(limited, 1))
-            if first:
-                output.print_table(columns, map(cells, chain(first, limited)))
+        elif first := list(islice(limited, 1)):
+            print_table(columns, chain(first, limited), titles=titles)
 
 
 def _tables_of(rows: Iterable[Mapping[str, Any]]) -> Iterator[pa.Table]:
     import pyarrow as pa
 
-    block = list(islice(rows, output.ROWS_AT_ONCE))
+    block = list(islice(rows, ROWS_AT_ONCE))
     yield pa.Table.from_pylist(block)
-    while block := list(islice(rows, output.ROWS_AT_ONCE)):
+    while block := list(islice(rows, ROWS_AT_ONCE)):
         yield pa.Table.from_pylist(block)
 
 
@@ -259,11 +252,10 @@ def answering(given: Topics) -> Iterator[Answering]:
     with given.opened(snapshot=True) as store:
         asked = Answering(store, given.query(store))
         yield asked
-        sys.stdout.flush()
+        query = asked.query
+        print_end(given, query.counters, started, count=True)
         if not given.quiet:
-            query = asked.query
-            print_cost(query.counters, time.monotonic() - started, count=True)
-            print_remarks(query, is_empty=asked.is_empty)
+            output.notes(query.remarks(is_empty=asked.is_empty))
 
 
 def answer_query(query: Query, to: Destination, *, front: Front, strict: bool = False) -> Query:
@@ -336,7 +328,7 @@ def answer_tables(
     limited = tables if to.limit is None else _limited(tables, to.limit)
     limited = _checked(limited, completeness)
     quiet = to.quiet or to.path is None
-    with to.opened() as target, progress_bar(to.form, None, quiet=quiet) as bar:
+    with to.opened() as target, Bar(to.form, None, quiet=quiet) as bar:
         counted = _with_progress(limited, bar)
         columns = schema() if OUTPUTS[to.form].content == "table" else None
         OUTPUTS[to.form].write(_rows(counted, columns), target)
@@ -382,7 +374,7 @@ def write_answer(
         return 0
     to, counters = OUTPUTS[form], query.counters
     total = 0 if quiet else payload_bytes(query)
-    with progress_bar(form, total, quiet=quiet) as bar:
+    with Bar(form, total, quiet=quiet) as bar:
 
         def told(pieces: Iterable[_T]) -> Iterator[_T]:
             for piece in pieces:
@@ -584,74 +576,59 @@ def _shown(found: int, limit: int | None, noun: str) -> int:
 
 
 def _print_rows(tables: Iterable[pa.Table], limit: int | None, topics: Sequence[str] = ()) -> int:
-    """Print rows for people to read: a table if the first of them fit, else a block for each.
-
-    Memory does not grow with the number of rows.
-
-    Args:
-        tables: The rows.
-        limit: Number of rows to print; None for `SCREEN_ROWS`.
-        topics: Topics of messages, which are in the titles of blocks.
+    """Print rows for people to read.
 
     Returns:
         Number of rows of the tables.
     """
-    from hybridlog.frames.cells import MAX_LINE, cells
+    from hybridlog.frames.cells import MAX_CELL, MAX_LINE, cells
     from hybridlog.schema.arrow_types import is_text
 
     most = SCREEN_ROWS if limit is None else limit
     read = 0
 
-    def rows() -> Iterator[tuple[tuple[list[str], list[int]], list[str]]]:
+    def rows() -> Iterator[tuple[list[tuple[str, bool]], list[str]]]:
         nonlocal read
         for table in tables:
             wanted = table.slice(0, max(most - read, 0))
             read += table.num_rows
-            texts = [n for n, column in enumerate(table.schema) if is_text(column.type)]
-            columns = table.column_names, texts
+            columns = [(each.name, is_text(each.type)) for each in table.schema]
             for row in cells(wanted, most=MAX_LINE):
                 yield columns, row
 
     # Headings are printed again only where the columns change.
-    for (names, texts), alike in groupby(rows(), itemgetter(0)):
-        lines = (row for _, row in alike)
-        first = list(islice(lines, output.ROWS_AT_ONCE))
-        short = partial(_shortened, texts=texts)
-        if output.fits(names, [*map(short, first)]):
-            output.print_table([(name, "left") for name in names], map(short, chain(first, lines)))
-            continue
-        begin = 2 if len(topics) > 1 else 1  # the first column is the time, the second the topic
-        for row in chain(first, lines):
-            title = "  ".join([*row[:begin], *(topics if len(topics) == 1 else ())])
-            # A column without a value is another topic's.
-            fields = zip(names[begin:], row[begin:], strict=True)
-            output.print_record(title, [(name, cell) for name, cell in fields if cell])
+    for columns, alike in groupby(rows(), itemgetter(0)):
+        print_table(
+            [
+                Column(name, n, "whole", cut=MAX_CELL if is_cut else 0)
+                for n, (name, is_cut) in enumerate(columns)
+            ],
+            map(itemgetter(1), alike),
+            # The first column is the time, the second the topic.
+            titles=2 if len(topics) > 1 else 1,
+            about=topics if len(topics) == 1 else (),
+        )
     return read
 
 
-def _shortened(row: list[str], texts: list[int]) -> list[str]:
-    """A row for a table: the texts in some columns are cut off."""
-    from hybridlog.frames.cells import MAX_CELL
-
-    return [output.cut(cell, MAX_CELL) if n in texts else cell for n, cell in enumerate(row)]
-
-
-def print_cost(counters: Counters, elapsed: float, *, count: bool) -> None:
+def print_end(given: Topics, counters: Counters, started: float, *, count: bool = False) -> None:
     """Print what an answer cost, with `--verbose`; without, the messages in front.
 
     Args:
+        given: The options.
         counters: Of the query.
-        elapsed: Seconds, including the opening of the store.
+        started: When the command began, see `time.monotonic`.
         count: The answer was a number, not messages.
     """
-    if not click.get_current_context().meta.get(VERBOSE):
-        if (counters.latched or counters.frames) and not count:
+    sys.stdout.flush()
+    if given.quiet or not given.verbose:
+        if (counters.latched or counters.frames) and not count and not given.quiet:
             output.note(latched(counters).removeprefix(" and "))
         return
     used = []
     if not count:
-        given = counters.messages - counters.reduced
-        used.append(f"{output.counted(given, 'message')}{latched(counters)}")
+        messages = counters.messages - counters.reduced
+        used.append(f"{output.counted(messages, 'message')}{latched(counters)}")
     if counters.payload_bytes:
         used.append(f"{output.size(counters.payload_bytes)} of payload")
     if counters.bytes_read:
@@ -660,8 +637,8 @@ def print_cost(counters: Counters, elapsed: float, *, count: bool) -> None:
         used.append(f"{output.size(counters.bytes_read)} read from disk{where}")
     if counters.documents_read:
         used.append(output.counted(counters.documents_read, "index document"))
-    time = f"{elapsed:.3f} s"
-    output.note(f"{', '.join(used)}, {time}" if used else f"answered in {time}")
+    took = f"{time.monotonic() - started:.3f} s"
+    output.note(f"{', '.join(used)}, {took}" if used else f"answered in {took}")
 
 
 def latched(counters: Counters) -> str:
@@ -673,23 +650,6 @@ def latched(counters: Counters) -> str:
         frames = output.counted(counters.frames, "frame")
         found += f" and {frames} of video in front, from the key frame on"
     return found
-
-
-def print_lost(query: Query, count: int) -> None:
-    """Print the limits of a count of messages, if any of the range are lost."""
-    found = query.completeness()
-    if found.has_losses:
-        output.note(found.describe(count, query.question.limit))
-
-
-def print_remarks(query: Query, *, is_empty: bool | None = None) -> None:
-    """Print what is to be known about an answer, a line each.
-
-    Args:
-        query: The query that was answered.
-        is_empty: The answer was empty; None to tell by its counters.
-    """
-    output.notes(query.remarks(is_empty=is_empty))
 
 
 def check_room(path: Path, *, force: bool, is_directory: bool = False) -> None:

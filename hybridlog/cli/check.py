@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -25,6 +25,7 @@ from hybridlog.cli.options import (
     one_recording,
     topics,
 )
+from hybridlog.cli.render import Column
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
@@ -39,12 +40,15 @@ class _Check(Strict, Topics, Verbose, Listing):
     contract: Path | None = option(
         "Judge recordings by the rules in this file; exit code 12 if one is broken.",
         "FILE",
+        excludes=("make", "words", "topic", "between"),
     )
     make: Path | None = option(
         "Write a contract that this good recording keeps, to be edited.", "FILE"
     )
     junit: Path | None = option(
-        "With --contract: also write the results in JUnit's XML, for CI.", "FILE"
+        "With --contract: also write the results in JUnit's XML, for CI.",
+        "FILE",
+        needs=("contract",),
     )
 
 
@@ -58,10 +62,6 @@ def check_command(given: _Check) -> None:
     from hybridlog.contract import Contract, contract_of
 
     contract, make = given.contract, given.make
-    if sum(map(bool, (contract, make))) > 1 or (given.junit and not contract):
-        raise UsageError("--contract and --make exclude each other; --junit is for --contract.")
-    if contract and (given.topics or given.between):
-        raise UsageError("A contract is about whole recordings: leave out topics and --between.")
     for path in filter(None, (make, given.junit)):
         check_room(path, force=given.force)
     if contract is not None:
@@ -79,23 +79,42 @@ def check_command(given: _Check) -> None:
                 raise UsageError("A contract is made from one good recording: name it with -r.")
             _write(make, contract_of(found))
             return
-        columns: list[output.Column] = [
-            ("recording", "left"),
-            ("topic", "left"),
-            *((name, "right") for name in ("messages", "Hz", "jitter", "longest gap", "from")),
-            *((name, "right") for name in ("late", "early", "lost")),
-        ]
         is_one = len({one.recording for one in found}) == 1
         # Losses are left out only where there are none; a late start may be why a topic is bad.
-        no_losses = () if any(one.lost != 0 for one in found) else ("lost",)
-        given.answer(
-            map(asdict, found),
-            columns[1:] if is_one else columns,
-            lambda row: _cells(row)[is_one:],
-            ("from", "jitter", "Hz", *no_losses, "early", "late"),
-        )
+        has_losses = any(one.lost != 0 for one in found)
+        columns = [
+            *([] if is_one else [Column("recording")]),
+            Column("topic"),
+            Column("messages", side="right"),
+            Column("Hz", lambda row: row["rate_hz"] and f"{row['rate_hz']:.2f}", "right", spare=3),
+            Column("jitter", lambda row: _duration(row["jitter_ns"]), "right", spare=2),
+            Column("longest gap", lambda row: _duration(row["gap_ns"]), "right"),
+            Column("from", _gap_begin, "right", spare=1),
+            Column("late", lambda row: _edge(row, "late_ns"), "right", spare=6),
+            Column("early", lambda row: _edge(row, "early_ns"), "right", spare=5),
+            Column(
+                "lost",
+                lambda row: "?" if row["lost"] is None else row["lost"],
+                "right",
+                spare=0 if has_losses else 4,
+            ),
+        ]
+        given.answer(map(asdict, found), columns)
         if not found and not given.quiet:
             output.note("No topic.")
+
+
+def _duration(ns: float | None) -> str:
+    return "" if ns is None else output.short_duration(round(ns))
+
+
+def _edge(row: Mapping[str, Any], name: str) -> str:
+    return "" if row["is_latched"] else _duration(row[name])
+
+
+def _gap_begin(row: Mapping[str, Any]) -> str:
+    begin = row["gap_begin_ns"]
+    return "" if begin is None else f"+{(begin - row['begin_ns']) / 1e9:.3f}s"
 
 
 def _show_verdict(results: Sequence[Result], recordings: int, given: _Check) -> None:
@@ -105,11 +124,7 @@ def _show_verdict(results: Sequence[Result], recordings: int, given: _Check) -> 
         _write(given.junit, junit_of(results))
     bad = broken(results)
     names = ("recording", "topic", "rule", "wanted", "found")
-    given.answer(
-        map(asdict, results if given.as_json else bad),
-        [(name, "left") for name in names],
-        lambda row: [row[name] for name in names],
-    )
+    given.answer(map(asdict, results if given.as_json else bad), [*map(Column, names)])
     sys.stdout.flush()
     if not given.quiet:
         output.note(_verdict(results, f" in {output.counted(recordings, 'recording')}"))
@@ -131,25 +146,6 @@ def _write(path: Path, text: str) -> None:
     sink = Sink(path)
     sink.write(text.encode())
     sink.commit()
-
-
-def _cells(row: Mapping[str, Any]) -> list[str]:
-    def duration(name: str) -> str:
-        ns = row[name]
-        return "" if ns is None else output.short_duration(round(ns))
-
-    begin, rate = row["gap_begin_ns"], row["rate_hz"]
-    return [
-        row["recording"],
-        row["topic"],
-        str(row["messages"]),
-        "" if rate is None else f"{rate:.2f}",
-        duration("jitter_ns"),
-        duration("gap_ns"),
-        "" if begin is None else f"+{(begin - row['begin_ns']) / 1e9:.3f}s",
-        *(("", "") if row["is_latched"] else (duration("late_ns"), duration("early_ns"))),
-        "?" if row["lost"] is None else str(row["lost"]),
-    ]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -191,13 +187,8 @@ def diff_command(given: _Diff) -> None:
             for name in (given.a, given.b)
             if rules is not None
         ]
-    names = ("topic", "what", "a", "b")
-    given.answer(
-        map(asdict, found),
-        [(name, "left") for name in names],
-        _cells_of_difference,
-        titles=2,
-    )
+    columns = [Column("topic"), Column("what"), Column("a", _side("a")), Column("b", _side("b"))]
+    given.answer(map(asdict, found), columns, titles=2)
     sys.stdout.flush()
     if not (given.quiet or given.as_json):
         output.notes(verdicts)
@@ -211,9 +202,11 @@ def diff_command(given: _Diff) -> None:
         raise click.exceptions.Exit(DIFFERENT)
 
 
-def _cells_of_difference(row: Mapping[str, Any]) -> list[str]:
-    """In words where only one recording has something."""
-    sides = [row["a"], row["b"]]
-    if row["what"] in {"times", "topic"}:
-        sides = [told and f"only {name}: {told}" for name, told in zip("ab", sides, strict=True)]
-    return [row["topic"], row["what"], *sides]
+def _side(name: str) -> Callable[[Mapping[str, Any]], str]:
+    """Gives what a recording has, in words where only it has something."""
+
+    def told(row: Mapping[str, Any]) -> str:
+        is_alone = row[name] and row["what"] in {"times", "topic"}
+        return f"only {name}: {row[name]}" if is_alone else str(row[name])
+
+    return told

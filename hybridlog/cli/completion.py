@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator
-from contextlib import closing, contextmanager
-from functools import partial
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import closing
+from functools import partial, wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -22,6 +23,8 @@ if TYPE_CHECKING:
     from hybridlog.session import Session
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.summary import RecordingSummary
+
+    _Complete = Callable[[click.Context, click.Parameter, str], list[str]]
 
 VARIABLE: Final = "_HYBRIDLOG_COMPLETE"
 """Environment variable in which a shell asks for completions."""
@@ -40,59 +43,70 @@ _STARTUP: Final = {
 """Startup file of a shell and the line in it that loads the script; fish needs none."""
 
 
-def complete_recording(context: click.Context, _: click.Parameter, incomplete: str) -> list[str]:
-    """Names of recordings that begin with what was typed."""
-    with _nothing_on_error(), _opened(context) as session:
-        names = (one.name for one in session.look().summaries)
+def _of_store(complete: Callable[[Session, click.Context, str], Iterable[str]]) -> _Complete:
+    """A function for click, of one that gives candidates from the opened store.
+
+    The store has what is flushed of running recordings; nothing is repaired for it. Errors are
+    swallowed: a shell that completes a line cannot show them.
+    """
+
+    @wraps(complete)
+    def found(context: click.Context, _: click.Parameter, incomplete: str) -> list[str]:
+        try:
+            directory = _store(context)
+            from hybridlog.store import Store
+
+            with closing(Store(directory, mongo="none", recover=False).shared) as shared:
+                names = [*complete(shared.now(), context, incomplete)]
+        except (HybridlogError, OSError):
+            return []
         return [name for name in names if name.startswith(incomplete)]
-    return []
+
+    return found
 
 
-def complete_tag(context: click.Context, _: click.Parameter, incomplete: str) -> list[str]:
+@_of_store
+def complete_recording(session: Session, _: click.Context, __: str) -> Iterable[str]:
+    """Names of recordings that begin with what was typed."""
+    return (one.name for one in session.look().summaries)
+
+
+@_of_store
+def complete_tag(session: Session, _: click.Context, incomplete: str) -> Iterable[str]:
     """Tags of recordings: keys, and values after the equals sign."""
-    with _nothing_on_error(), _opened(context) as session:
-        tags = session.look().tags
-        if "=" in incomplete:
-            key = incomplete.partition("=")[0]
-            offered = [f"{key}={value}" for value in tags.get(key, ())]
-        else:
-            offered = list(tags)
-        return sorted(tag for tag in offered if tag.startswith(incomplete))
-    return []
+    tags = session.look().tags
+    key, sign, _value = incomplete.partition("=")
+    return sorted(f"{key}={value}" for value in tags.get(key, ())) if sign else sorted(tags)
 
 
-def complete_type(context: click.Context, _: click.Parameter, incomplete: str) -> list[str]:
+@_of_store
+def complete_type(session: Session, _: click.Context, incomplete: str) -> Iterable[str]:
     """Types of messages, whole or by the name behind the package."""
-    with _nothing_on_error(), _opened(context) as session:
-        names = {*session.type_names().values()}
-        names |= {name.rpartition("/")[2] for name in names if incomplete}
-        return sorted(name for name in names if name.startswith(incomplete))
-    return []
+    names = {*session.type_names().values()}
+    return sorted(names | {name.rpartition("/")[2] for name in names if incomplete})
 
 
 def complete_running(context: click.Context, _: click.Parameter, incomplete: str) -> list[str]:
     """Names of running recorders that begin with what was typed."""
     from hybridlog.live.state import running
 
-    with _nothing_on_error():
-        return [name for name in running(_store(context)).values() if name.startswith(incomplete)]
-    return []
+    try:
+        names = running(_store(context)).values()
+    except (HybridlogError, OSError):
+        return []
+    return [name for name in names if name.startswith(incomplete)]
 
 
-def complete_topic(context: click.Context, _: click.Parameter, incomplete: str) -> list[str]:
+@_of_store
+def complete_topic(session: Session, context: click.Context, incomplete: str) -> Iterable[str]:
     """Topics that begin with what was typed; without a slash, short names as well.
 
     A short name is offered when it stands for one topic only. With `--recording`, the
     topics of those recordings are offered.
     """
-    with _nothing_on_error(), _opened(context) as session:
-        chosen, topics_of = _chosen(context, session), session.look().topics_of
-        topics = {topic for one in chosen for topic in topics_of(one)}
-        found = {topic for topic in topics if topic.startswith(incomplete)}
-        if incomplete and not incomplete.startswith("/"):
-            found.update(n for n in _short_names(topics) if n.startswith(incomplete))
-        return sorted(found)
-    return []
+    topics_of = session.look().topics_of
+    topics = {topic for one in _chosen(context, session) for topic in topics_of(one)}
+    return sorted({*topics, *(_short_names(topics) if incomplete else ())})
 
 
 def complete_condition(
@@ -108,11 +122,16 @@ complete_field: Final = partial(complete_condition, space="")
 """The same for a field, which follows without a space."""
 
 
-def complete_path(context: click.Context, _: click.Parameter, incomplete: str) -> list[str]:
+@_of_store
+def complete_path(session: Session, context: click.Context, incomplete: str) -> Iterable[str]:
     """Fields of a topic, for the last name in a list or a predicate.
 
     The topic is that before a colon; without, those of the command.
     """
+    from hybridlog.frames.names import SUMMARIES, is_summary
+    from hybridlog.query.question import field_types
+    from hybridlog.query.topics import resolve
+
     last = re.findall(r"[\w.]*$", incomplete)[0]
     before = incomplete.removesuffix(last)
     named = re.match(r"([^\s:]+):", before)
@@ -125,37 +144,30 @@ def complete_path(context: click.Context, _: click.Parameter, incomplete: str) -
         given += context.params.get("topic") or ()
         if not context.resilient_parsing:  # what is completed was taken for a topic
             given = [topic for topic in given if topic != incomplete]
-    with _nothing_on_error(), _opened(context) as session:
-        from hybridlog.frames.names import SUMMARIES, is_summary
-        from hybridlog.query.question import field_types
-        from hybridlog.query.topics import resolve
-
-        chosen = [session.entry_of(one) for one in _chosen(context, session)]
-        topics = resolve(given, {one.topic for entry in chosen for one in entry.channels})
-        channels = (one for entry in chosen for one in session.channels_of(entry, topics))
-        known = field_types(tuple(channels)) or {}
-        array = last.rpartition(".")[0]
-        summaries = (f"{array}.{name}" for name in SUMMARIES)
-        names = [*known, *(name for name in summaries if is_summary(name, known))]
-        return [f"{before}{name}" for name in names if name.startswith(last)]
-    return []
+    chosen = [session.entry_of(one) for one in _chosen(context, session)]
+    topics = resolve(given, {one.topic for entry in chosen for one in entry.channels})
+    channels = (one for entry in chosen for one in session.channels_of(entry, topics))
+    known = field_types(tuple(channels)) or {}
+    array = last.rpartition(".")[0]
+    summaries = (f"{array}.{name}" for name in SUMMARIES)
+    names = [*known, *(name for name in summaries if is_summary(name, known))]
+    return [f"{before}{name}" for name in names]
 
 
-def complete_frame(context: click.Context, _: click.Parameter, incomplete: str) -> list[str]:
+@_of_store
+def complete_frame(session: Session, context: click.Context, _: str) -> Iterable[str]:
     """Coordinate frames in the first transforms of the chosen recordings, or all."""
-    with _nothing_on_error(), _opened(context) as session:
-        from hybridlog.query.query import Query
-        from hybridlog.query.question import Question
-        from hybridlog.tf import frames_named, is_of_transforms
+    from hybridlog.query.query import Query
+    from hybridlog.query.question import Question
+    from hybridlog.tf import frames_named, is_of_transforms
 
-        found: set[str] = set()
-        for one in _chosen(context, session):
-            for channel in session.entry_of(one).channels:
-                if is_of_transforms(channel.type):
-                    asked = Question((channel.topic,), (one.id,), limit=_TRANSFORMS)
-                    found.update(*(frames_named(each.fields) for each in Query(session, asked)))
-        return sorted(name for name in found if name.startswith(incomplete))
-    return []
+    found: set[str] = set()
+    for one in _chosen(context, session):
+        for channel in session.entry_of(one).channels:
+            if is_of_transforms(channel.type):
+                asked = Question((channel.topic,), (one.id,), limit=_TRANSFORMS)
+                found.update(*(frames_named(each.fields) for each in Query(session, asked)))
+    return sorted(found)
 
 
 def _store(context: click.Context) -> StoreDirectory:
@@ -171,16 +183,6 @@ def _store(context: click.Context) -> StoreDirectory:
     return directory_of(path)
 
 
-@contextmanager
-def _opened(context: click.Context) -> Iterator[Session]:
-    """The store, with what is flushed of running recordings; nothing is repaired for it."""
-    directory = _store(context)
-    from hybridlog.store import Store
-
-    with closing(Store(directory, mongo="none", recover=False).shared) as shared:
-        yield shared.now()
-
-
 def _chosen(context: click.Context, session: Session) -> list[RecordingSummary]:
     """The recordings of `--recording` or all, one for each set of topics and types."""
     from hybridlog.query.choosing import placed
@@ -194,22 +196,12 @@ def _chosen(context: click.Context, session: Session) -> list[RecordingSummary]:
 
 def _short_names(topics: set[str]) -> Iterator[str]:
     """Short names that stand for one topic only: `scan` for `/robot/scan`."""
-    owners: dict[str, int] = {}
-    for topic in topics:
-        parts = topic.strip("/").split("/")
-        for start in range(len(parts)):
-            name = "/".join(parts[start:])
-            owners[name] = owners.get(name, 0) + 1
+    owners = Counter(
+        "/".join(parts[start:])
+        for parts in (topic.strip("/").split("/") for topic in topics)
+        for start in range(len(parts))
+    )
     yield from (name for name, count in owners.items() if count == 1)
-
-
-@contextmanager
-def _nothing_on_error() -> Iterator[None]:
-    """Swallow errors: a shell that completes a line cannot show them."""
-    try:
-        yield
-    except (HybridlogError, OSError):
-        return
 
 
 def show_completion(context: click.Context) -> str:

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
-from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from hybridlog.cli import options, output
-from hybridlog.cli.binder import argument, command, option
+from hybridlog.cli.binder import Amount, argument, command, option
 from hybridlog.cli.options import AsJson, Choosing, InStore, Quiet
-from hybridlog.cli.progress import LateBar
+from hybridlog.cli.progress import Bar
 from hybridlog.cli.signals import if_stopped
 from hybridlog.cli.watching import watch
 from hybridlog.wording import parse_size
@@ -25,6 +24,10 @@ if TYPE_CHECKING:
     from hybridlog.store import Store
 
 _RUNNING: Final = frozenset({"open", "unfinished"})
+
+
+def _parse_rate(text: str) -> int:
+    return parse_size(text.removesuffix("/s"))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +43,9 @@ class _Copy(Choosing, InStore, AsJson, Quiet):
     then_expire: bool = option(
         "Delete payloads here once their copy is proved there; pinned ones stay."
     )
-    limit_rate: str | None = option("Bytes a second at most, such as 5MB/s.", "RATE")
+    limit_rate: float | None = option(
+        "Bytes a second at most, such as 5MB/s.", "RATE", type=Amount(_parse_rate, "1B/s")
+    )
     check: bool = option("Read copies that are there already, too, and mend them.")
     watch: bool = option("Go on with what ends later, until Ctrl-C.")
     ssh: str | None = option(
@@ -65,8 +70,9 @@ def copy_command(given: _Copy) -> None:
         given = _from_elsewhere(given, given.source)
     if given.to is None:
         raise UsageError("Name the place to copy to, or with --from STORE the one to copy from.")
-    rate = _rate(given.limit_rate)
-    how = CopyOptions(given.only_fields, given.then_expire, rate, given.ssh, given.check)
+    how = CopyOptions(
+        given.only_fields, given.then_expire, given.limit_rate, given.ssh, given.check
+    )
     with (
         given.opened(is_lasting=given.watch) as store,
         if_stopped("What arrived stays there: run the command again."),
@@ -106,8 +112,8 @@ def _copied(
     assert given.to is not None
     report = CopyReport()
     try:
-        with closing(LateBar("copy", quiet=given.quiet or given.as_json)) as bar:
-            store.copy(given.to, chosen, how, bar, report)
+        with Bar("copy", quiet=given.quiet or given.as_json) as bar:
+            store.copy(given.to, chosen, how, bar.part, report)
     except BaseException:
         if report != CopyReport():
             _print(report, given, is_short=is_short)
@@ -140,13 +146,7 @@ def _print(
     *,
     is_short: bool = False,
 ) -> None:
-    """Print what was copied.
-
-    Args:
-        report: The result.
-        given: The options.
-        is_short: Leave out what is there already; JSON is one line.
-    """
+    """Print what was copied."""
     there = "there" if given.source is None else "here"
     if given.as_json:
         (output.print_json_line if is_short else output.print_json)(asdict(report))
@@ -171,15 +171,3 @@ def _check(report: CopyReport) -> None:
     if left:
         sys.stdout.flush()
         raise StoreError(" ".join(left))
-
-
-def _rate(text: str | None) -> float | None:
-    """Bytes a second.
-
-    Raises:
-        UsageError: The text is no rate, or it is 0.
-    """
-    rate = None if text is None else parse_size(text.removesuffix("/s"))
-    if rate == 0:
-        raise UsageError("--limit-rate must be more than 0.")
-    return rate

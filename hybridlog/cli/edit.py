@@ -15,6 +15,7 @@ import click
 from hybridlog.cli import options, output
 from hybridlog.cli.binder import argument, command, option
 from hybridlog.cli.completion import complete_recording
+from hybridlog.cli.ls import RECORDINGS
 from hybridlog.cli.options import (
     AsJson,
     Choosing,
@@ -26,6 +27,7 @@ from hybridlog.cli.options import (
     one_recording,
     recordings_of,
 )
+from hybridlog.cli.render import print_table
 from hybridlog.cli.signals import if_stopped
 from hybridlog.query.choice import Choice
 from hybridlog.wording import listed
@@ -84,12 +86,12 @@ def tag_command(given: _Tag) -> None:
             keys = given.remove if is_one else [key for key in given.remove if key in one.tags]
             changed = store.edit(one.id, tag=tags, untag=keys) if keys or tags else one
             found[one.name] = changed.tags
-    if given.as_json:
-        output.print_json(next(iter(found.values())) if is_one else found)
-    elif not given.quiet:
-        for name, own in found.items():
-            for key, value in sorted(own.items()):
-                output.say(f"{key}={value}" if is_one else f"{name}: {key}={value}")
+    lines = (
+        f"{'' if is_one else f'{name}: '}{key}={value}"
+        for name, own in found.items()
+        for key, value in sorted(own.items())
+    )
+    given.tell(next(iter(found.values())) if is_one else found, lines)
 
 
 def _named_or_chosen(store: Store, given: _Tag) -> tuple[Recordings, Sequence[str], bool]:
@@ -120,12 +122,17 @@ class _Mark(Running):
     at: str | None = option(
         "Mark a recording, also a running one, at this time, written as for --between.", "T"
     )
-    until: str | None = option("The mark lasts from --at to this time.", "T2")
+    until: str | None = option("The mark lasts from --at to this time.", "T2", needs=("at",))
     pin: tuple[str, str] | None = option(
-        "Mark and pin so much before and after the present moment.", "BEFORE AFTER", nargs=2
+        "Mark and pin so much before and after the present moment; `keep --pin` pins other times.",
+        "BEFORE AFTER",
+        nargs=2,
+        excludes=("at", "remove"),
     )
     remove: bool = option(
-        "Remove the marks with this text; with --at only what begins at this time."
+        "Remove the marks with this text; with --at only what begins at this time.",
+        needs=("recording",),
+        excludes=("tags", "until"),
     )
 
 
@@ -139,15 +146,9 @@ def mark_command(given: _Mark) -> None:
     tags, at = options.parse_tags(given.tags), given.at
     if not given.text.strip():
         raise UsageError("A mark needs a text: say what happened.")
-    if given.until is not None and at is None:
-        raise UsageError("--until ends a mark that begins at a time: add --at.")
-    if given.pin is not None and (at is not None or given.remove):
-        raise UsageError(
-            "--pin is for the present moment: `hybridlog keep --pin` pins other times."
-        )
+    if (given.remove or at is not None) and len(given.recording) != 1:
+        raise UsageError("A mark at a time needs one recording: name it with --recording.")
     if given.remove:
-        if len(given.recording) != 1 or tags or given.until is not None:
-            raise UsageError("--remove needs --recording, one, and takes --at besides.")
         with given.opened() as store:
             store.unmark(given.recording[0], given.text, at)
         return
@@ -157,12 +158,10 @@ def mark_command(given: _Mark) -> None:
         before, after = map(parse_duration, given.pin or ("0s", "0s"))
         around = None if given.pin is None else (before, after)
         marked = _mark_running(given.text, tags, around, given.recording, given.store)
-    elif len(given.recording) == 1:
+    else:
         (recording,) = given.recording
         with given.opened() as store:
             marked = iter([store.mark(recording, at, given.text, tags, until=given.until).name])
-    else:
-        raise UsageError("A mark at a time needs one recording: name it with --recording.")
     for name in marked:
         if not given.quiet:
             output.note(f"Marked in {name}.")
@@ -190,9 +189,6 @@ def _mark_running(
         if simulated == 0:
             raise UsageError(f"There is no time of {CLOCK} yet: mark again when it has come.")
         yield mark_now(directory, recording, simulated or now, text, tags, around=around)
-
-
-_MAX_ROWS = 20
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -228,29 +224,15 @@ def rm_command(given: _Remove) -> None:
 
 
 def _confirm(chosen: Sequence[RecordingSummary], pins: Sequence[str]) -> None:
-    """Ask for consent; several recordings are shown with what would be lost.
-
-    Args:
-        chosen: The recordings.
-        pins: Reasons of their pins.
-    """
+    """Ask for consent, with what would be lost."""
     why = f" ({listed([one for one in dict.fromkeys(pins) if one])})" if any(pins) else ""
     pinned = f" {output.counted(len(pins), 'pin')} would go, too{why}." if pins else ""
-    several = len(chosen) > 1
-    names = f"{len(chosen)} recordings ({listed(one.name for one in chosen)})"
-    names = names if several else chosen[0].name
+    names = chosen[0].name
+    if len(chosen) > 1:
+        names = f"{len(chosen)} recordings ({listed(one.name for one in chosen)})"
     if not sys.stdin.isatty():
         raise UsageError(f"Deleting {names} for good needs --yes.{pinned}")
-    if several:
-        for one in chosen[:_MAX_ROWS]:
-            span = "" if one.span is None else f"{output.short_time(one.span[0])}, "
-            output.note(
-                f"  {one.name}: {span}{output.counted(one.messages, 'message')}, "
-                f"{output.size(one.stored_bytes)}"
-            )
-        if len(chosen) > _MAX_ROWS:
-            output.note(f"  and {len(chosen) - _MAX_ROWS} more")
-        names = f"these {len(chosen)} recordings"
+    print_table(RECORDINGS, chosen)
     if pinned:
         output.note(pinned.strip())
     if not click.confirm(f"Delete {names} for good?", err=True):

@@ -15,9 +15,9 @@ from hybridlog.cli import output
 from hybridlog.cli.answers import (
     Destination,
     check_room,
+    form_of,
     latched,
     not_written,
-    print_remarks,
     write_answer,
 )
 from hybridlog.cli.binder import argument, command, option
@@ -70,8 +70,7 @@ def export_command(given: _Given) -> None:
     target, force, quiet, split = given.target, given.force, given.quiet, given.split
     if str(target) == "-":
         raise UsageError("export writes files; for a pipe: `hybridlog fetch '**' -F mcap -o -`.")
-    form = given.form or _form(target)
-    given.check_form(form)
+    form = given.form or form_of(target, _LOGS)
     front = Front(latched=not given.no_latched, original_times=given.original_times)
     settings = given.settings(form)
     if form in _LOGS and split is None:
@@ -103,17 +102,7 @@ def export_command(given: _Given) -> None:
             else:
                 _write_directory(one, to, path, front)
             if not quiet:
-                print_remarks(one, is_empty=None if form in _LOGS else False)
-
-
-def _form(target: Path) -> str:
-    suffixes = suffixes_of(_LOGS)
-    if target.suffix.lower() not in suffixes:
-        raise UsageError(
-            f"{target} does not give the format: end it in {' or '.join(suffixes)}, or name a "
-            "directory for tables and add --format parquet or csv."
-        )
-    return suffixes[target.suffix.lower()]
+                output.notes(one.remarks(is_empty=None if form in _LOGS else False))
 
 
 def _write_file(query: Query, to: Destination, path: Path, front: Front, extras: Extras) -> None:

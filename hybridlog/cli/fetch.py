@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -20,9 +19,7 @@ from hybridlog.cli.answers import (
     format_option,
     latched,
     output_option,
-    print_cost,
-    print_lost,
-    print_remarks,
+    print_end,
     write_following,
 )
 from hybridlog.cli.binder import command, option
@@ -35,7 +32,6 @@ from hybridlog_storage.errors import TopicError, UsageError
 from hybridlog_storage.stopping import at_safe_points
 
 if TYPE_CHECKING:
-    from hybridlog.query.counters import Counters
     from hybridlog.query.query import Query
     from hybridlog.store import Store
 
@@ -55,12 +51,17 @@ class _Choices(Asking, Tabular, Slices):
     clock: str = option(
         "The clock of --between.", type=click.Choice(["log", "publish", "header"]), default="log"
     )
-    at: str | None = option("Only the message that was current at this time.", "T")
+    at: str | None = option(
+        "Only the message that was current at this time.",
+        "T",
+        excludes=("between", "last", "limit", "every", "reverse", "clock", "follow"),
+    )
     every: int = option("Only every n-th message.", "N", type=click.IntRange(min=1), default=1)
     reverse: bool = option("Latest first.")
     follow: bool = option(
         "Of running recordings: print messages as they come, from now on or from the "
-        "beginning of --between, until the recordings end or Ctrl-C."
+        "beginning of --between, until the recordings end or Ctrl-C.",
+        excludes=("as_json", "output", "reverse", "count", "strict", "frame"),
     )
     fields: str | None = option(
         "Only these fields, with commas between them.", "A,B.C", shell_complete=complete_path
@@ -70,16 +71,21 @@ class _Choices(Asking, Tabular, Slices):
         "Greatest distance in time of messages of other topics in --where "
         "'/odom: twist.twist.linear.x > 0.5'.",
         "DURATION",
+        needs=("where",),
+        excludes=("before", "after"),
     )
     before: str | None = option(
         "With such a --where, in place of --within: from this long before each match on, "
         "such as 5min.",
         "DURATION",
+        needs=("where",),
     )
     after: str | None = option(
-        "With such a --where, in place of --within: until this long after each match.", "DURATION"
+        "With such a --where, in place of --within: until this long after each match.",
+        "DURATION",
+        needs=("where",),
     )
-    count: bool = option("Only print how many.")
+    count: bool = option("Only print how many.", excludes=("output", "form", "split"))
     form: str | None = format_option(_FORMATS)
     output: Path | None = output_option(
         "Write to this file (raw: a directory; png and jpg: a directory, or one picture)"
@@ -105,9 +111,8 @@ def fetch_command(choices: _Choices) -> None:
                 query = query.at_time(choices.at)
             except TopicError:
                 if not choices.quiet:
-                    print_remarks(query.between("start", choices.at), is_empty=False)
+                    output.notes(query.between("start", choices.at).remarks(is_empty=False))
                 raise
-        count = None
         if choices.strict:
             query.completeness().check(payloads=not choices.count)
         if choices.count:
@@ -115,6 +120,10 @@ def fetch_command(choices: _Choices) -> None:
             if choices.strict:
                 query.completeness().check()
             output.say(str(count))
+            _print_end(query, choices, started)
+            lost = query.completeness()
+            if lost.has_losses and not choices.quiet:
+                output.note(lost.describe(count, query.question.limit))
         else:
             front = Front(
                 # With --at, the answer is one message; a video needs those before it.
@@ -125,17 +134,20 @@ def fetch_command(choices: _Choices) -> None:
                 _write_pieces(query, choices, to, front)
                 return
             query = answer_query(query, to, front=front, strict=choices.strict)
-        sys.stdout.flush()
-        if not choices.quiet:
-            cost = _cost_of(query)
-            print_cost(cost, time.monotonic() - started, count=choices.count)
-            given = cost.messages or cost.latched or cost.frames
-            if count is None and to.path is not None and not given:
-                what = " and ".join(f"'{one}'" for one in choices.where) or "the question"
-                output.note(f"Nothing matched {what}, so {to.path} is empty.")
-            print_remarks(query)
-            if count is not None:
-                print_lost(query, count)
+            _print_end(query, choices, started, to.path)
+
+
+def _print_end(query: Query, choices: _Choices, started: float, path: Path | None = None) -> None:
+    """Print the cost of an answer, with that of conditions on other topics, and what it lacks."""
+    cost = query.counters.copy()
+    for condition in query.conditions:
+        cost.add(condition.counters)
+    print_end(choices, cost, started, count=choices.count)
+    if not choices.quiet:
+        if path is not None and not (cost.messages or cost.latched or cost.frames):
+            what = " and ".join(f"'{one}'" for one in choices.where) or "the question"
+            output.note(f"Nothing matched {what}, so {path} is empty.")
+        output.notes(query.remarks())
 
 
 def _write_pieces(query: Query, choices: _Choices, to: Destination, front: Front) -> None:
@@ -165,14 +177,14 @@ def _follow(query: Query, choices: _Choices, form: str) -> None:
             write_following(following, form)
     except Stopped as error:
         stopped = error
+    print_end(choices, query.counters, started)
     if not choices.quiet:
-        print_cost(query.counters, time.monotonic() - started, count=False)
         from hybridlog.cli.ls import status_text
         from hybridlog.query.query import Query
 
         asked = Query(query.session, following.question)
         asked.counters = query.counters
-        print_remarks(asked)
+        output.notes(asked.remarks())
         for one in asked.summaries():
             if one.status != "open":
                 output.note(f"{one.name} has ended: {status_text(one)}.")
@@ -205,68 +217,17 @@ def _destination(choices: _Choices) -> Destination:
     """Format and place of the answer; refuses what makes no sense before a store is opened."""
     assert choices.topics
     _check_near(choices)
-    _check_together(choices)
     to = choices.destination()
     form = to.form
     to = replace(to, settings=choices.settings(form))
     as_it_came = form in OUTPUTS and OUTPUTS[form].content in {"log", "pictures", "video"}
     if choices.frame is not None and (as_it_came or form == "raw"):
         raise UsageError(f"{form} has messages as they came: --in-frame is for tables and ply.")
-    if choices.split is not None and to.path is None:
-        raise UsageError("--split-by writes files: name them with -o.")
-    if not choices.count and choices.split is None:
+    if choices.follow and not (form in OUTPUTS and OUTPUTS[form].is_text and form != "json"):
+        raise UsageError(f"--follow prints lines, such as jsonl or csv: {form} has an end.")
+    if not choices.count and (choices.split is None or form == SCREEN):
         to.check()
     return to
-
-
-def _check_together(choices: _Choices) -> None:
-    """Refuse options that make no sense together."""
-    with_others = any(map(_names_topics, choices.where)), "--where with other topics"
-    alone: dict[str, list[tuple[bool, str]]] = {}
-    if choices.split is not None:
-        alone["--split-by writes files"] = [
-            (choices.count, "--count"),
-            (choices.at is not None, "--at"),
-            (choices.follow, "--follow"),
-            (choices.reverse, "--reverse"),
-            (choices.form == "table", "--format table"),
-        ]
-    if choices.count:
-        alone["--count prints a number"] = [
-            (choices.output is not None, "--output"),
-            (choices.form is not None, "--format"),
-        ]
-    if choices.at is not None:
-        alone["--at gives one message, by log time"] = [
-            (choices.between is not None, "--between"),
-            (choices.last is not None, "--last"),
-            (choices.limit is not None, "--limit"),
-            (choices.every > 1, "--every"),
-            (choices.reverse, "--reverse"),
-            (choices.clock != "log", "--clock"),
-            with_others,
-        ]
-    if choices.follow:
-        alone["--follow prints messages as they come, in lines (jsonl, csv)"] = [
-            (choices.as_json, "--json"),
-            (not _is_lines(choices.form), f"--format {choices.form}"),
-            (choices.output is not None, "--output"),
-            (choices.reverse, "--reverse"),
-            (choices.count, "--count"),
-            (choices.at is not None, "--at"),
-            (choices.strict, "--strict"),
-            (choices.frame is not None, "--in-frame"),
-            with_others,
-        ]
-    for reason, others in alone.items():
-        for given, name in others:
-            if given:
-                raise UsageError(f"{reason}: leave out {name}.")
-
-
-def _is_lines(form: str | None) -> bool:
-    """True for text without an end, which a list in JSON has."""
-    return form is None or (form in OUTPUTS and OUTPUTS[form].is_text and form != "json")
 
 
 def _near(choices: _Choices) -> str | tuple[str, str] | None:
@@ -284,11 +245,11 @@ def _names_topics(predicate: str) -> bool:
 
 
 def _check_near(choices: _Choices) -> None:
-    around = choices.before is not None or choices.after is not None
-    if around and choices.within is not None:
-        raise UsageError("--within is before and after: leave out --before and --after.")
-    near = around or choices.within is not None
+    """Refuse a distance without other topics, and other topics without one or with one message."""
+    near = (choices.within, choices.before, choices.after) != (None, None, None)
     asks = any(map(_names_topics, choices.where))
+    if asks and (choices.at is not None or choices.follow):
+        raise UsageError("--at and --follow have no messages of other topics: leave out --where.")
     if near and not asks:
         raise UsageError(
             "--within, --before and --after are about messages of other topics: add --where "
@@ -298,11 +259,3 @@ def _check_near(choices: _Choices) -> None:
         raise UsageError(
             "--where with another topic needs a length of time: add --within, --before or --after."
         )
-
-
-def _cost_of(query: Query) -> Counters:
-    """The cost of an answer, with that of its conditions on other topics."""
-    cost = query.counters.copy()
-    for condition in query.conditions:
-        cost.add(condition.counters)
-    return cost

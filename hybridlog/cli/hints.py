@@ -143,9 +143,10 @@ class Pair(click.Option):
 
     def type_cast_value(self, ctx: click.Context, value: Any) -> Any:
         """Refuse an option as a value."""
-        for place, one in enumerate(value or ()):
-            if isinstance(one, str) and one[:1] == "-" and not one[1:2].isdigit():
-                first = value[0] if place else "start"
-                name = self.opts[0]
-                raise click.UsageError(f"{name} takes two times: {name} {first} end", ctx)
+        for pair in filter(None, (value or ()) if self.multiple else (value,)):
+            for place, one in enumerate(pair):
+                if isinstance(one, str) and one[:1] == "-" and not one[1:2].isdigit():
+                    name, words = self.opts[0], str(self.metavar).split()
+                    shown = " ".join([name, *pair[:place], *words[place:]])
+                    raise click.UsageError(f"{name} takes two values: {shown}", ctx)
         return super().type_cast_value(ctx, value)

@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING
 import click
 
 from hybridlog.cli import output
-from hybridlog.cli.binder import argument, command, option
+from hybridlog.cli.binder import SOME_SECONDS, argument, command, option
 from hybridlog.cli.completion import complete_topic
 from hybridlog.cli.options import AsJson, Choosing, InStore, Quiet, cache_size
-from hybridlog.cli.progress import Stages, progress_bar
+from hybridlog.cli.progress import Bar
+from hybridlog.cli.render import Column, numbers, print_table
 from hybridlog.cli.signals import if_stopped
 from hybridlog.cli.watching import watch
 from hybridlog.wording import listed
@@ -92,20 +93,15 @@ def address(given: _Shared) -> None:
 
         places = [] if given.quiet and not given.as_json else contents(store.shared)
         recordings = len(store.session.snapshot())
+    names = ("topic", "collection", "documents")
+    topics = [dict(zip(names, place, strict=True)) for place in places]
     if given.as_json:
-        topics = [
-            {"topic": topic, "collection": collection, "documents": documents}
-            for topic, collection, documents in places
-        ]
         about = {"uri": found.uri, "database": found.database, "recordings": recordings}
         output.print_json({**about, "topics": topics})
         return
     output.say(found.uri)
     if not given.quiet:
-        output.print_table(
-            (("topic", "whole"), ("collection", "whole"), ("documents", "right")),
-            [(topic, collection, str(documents)) for topic, collection, documents in places],
-        )
+        print_table([Column("topic"), Column("collection"), *numbers("documents")], topics)
         output.say(f"database {found.database}, {output.counted(recordings, 'recording')}")
 
 
@@ -130,9 +126,9 @@ def rebuild(given: _Rebuild) -> None:
                 "Finished recordings stay indexed; the next command that needs the index "
                 "finishes the recording at which it stopped."
             ),
-            progress_bar("index rebuild", total, quiet=given.quiet) as bar,
+            Bar("index rebuild", total, quiet=given.quiet) as bar,
         ):
-            done = store.index.rebuild(None if given.choice.is_everything else chosen, Stages(bar))
+            done = store.index.rebuild(None if given.choice.is_everything else chosen, bar.part)
     left = [entry.name for entry in chosen.summaries if entry.id not in {r.id for r in done}]
     for name in left:
         output.note(f"Recording {name} is in use, and was left as it is.")
@@ -145,22 +141,18 @@ def rebuild(given: _Rebuild) -> None:
     messages = sum(r.documents for r in done)
     without = sum(r.messages - len(r.marks) for r in done) - messages
     elapsed = time.monotonic() - started
-    if given.as_json:
-        output.print_json(
-            {
-                "recordings": len(done),
-                "messages": messages,
-                "messages_without_documents": without,
-                "left": left,
-                "seconds": round(elapsed, 3),
-            }
-        )
-    elif not given.quiet:
-        output.say(
-            f"{output.counted(len(done), 'recording')}, "
-            f"{output.counted(messages, 'message')} indexed in {elapsed:.2f} s"
-            f"{output.without_documents(without)}"
-        )
+    about = {
+        "recordings": len(done),
+        "messages": messages,
+        "messages_without_documents": without,
+        "left": left,
+        "seconds": round(elapsed, 3),
+    }
+    line = (
+        f"{output.counted(len(done), 'recording')}, {output.counted(messages, 'message')} indexed "
+        f"in {elapsed:.2f} s{output.without_documents(without)}"
+    )
+    given.tell(about, [line])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -184,9 +176,9 @@ def arrays(given: _Arrays) -> None:
     with (
         given.opened(quiet=given.quiet) as store,
         if_stopped("The setting is made; run it again for the tables that are left."),
-        progress_bar("index arrays", 0, quiet=given.quiet) as bar,
+        Bar("index arrays", 0, quiet=given.quiet) as bar,
     ):
-        found = store.index.arrays(*given.topic, off=given.off, progress=Stages(bar))
+        found = store.index.arrays(*given.topic, off=given.off, progress=bar.part)
         known = {*store.all_topics().topics} if store.recordings() else set()
     if given.as_json:
         output.print_json([asdict(one) for one in found])
@@ -218,8 +210,8 @@ def _told(one: ArraysOfTopic, *, is_known: bool, off: bool) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class _Watch(_Shared):
-    every: str = option(
-        "Time between two looks at the store.", "DURATION", default="2s", show_default=True
+    every: float = option(
+        "Time between two looks at the store.", "DURATION", type=SOME_SECONDS, default="2s"
     )
 
 
@@ -230,14 +222,9 @@ def watch_command(given: _Watch) -> None:
     For a server into whose store robots copy. While MongoDB is unavailable, it tries again.
     Several may watch one store.
     """
-    from hybridlog.query.times import parse_duration
-
-    pause_s = parse_duration(given.every) / 1e9
-    if pause_s <= 0:
-        raise UsageError(f"--every {given.every} is no time to wait. Give a duration such as 2s.")
     with given.opened(needs_database=True, quiet=given.quiet, is_lasting=True) as store:
         look = partial(_look, store, given)
-        watch(store.directory.path, look, pause_s=pause_s, quiet=given.quiet)
+        watch(store.directory.path, look, pause_s=given.every, quiet=given.quiet)
 
 
 def _look(store: Store, given: _Shared) -> Iterator[StoreError]:
@@ -261,12 +248,9 @@ def _look(store: Store, given: _Shared) -> Iterator[StoreError]:
 
 
 def _print(found: list[FieldIndex], given: _Shared) -> None:
-    if given.as_json:
-        output.print_json([{"topic": one.topic, "fields": list(one.fields)} for one in found])
-    elif found:
-        output.print_table(
-            (("topic", "whole"), ("fields", "left")),
-            [(one.topic, " ".join(one.fields)) for one in found],
-        )
+    rows = [{"topic": one.topic, "fields": list(one.fields)} for one in found]
+    if rows or given.as_json:
+        columns = [Column("topic"), Column("fields", lambda row: " ".join(row["fields"]))]
+        given.show(rows, columns)
     elif not given.quiet:
         output.say("no index on a field")

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from operator import itemgetter
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Any
@@ -31,6 +32,7 @@ from hybridlog.cli.options import (
     names_argument,
     query_of,
 )
+from hybridlog.cli.render import Column, numbers, print_fields, print_table
 from hybridlog.query.answers.completeness import coverage, line_of
 from hybridlog.query.choice import Choice
 from hybridlog.query.topics import resolve
@@ -40,15 +42,15 @@ from hybridlog_storage.errors import SegmentError, SourceError, StoreError, Usag
 
 if TYPE_CHECKING:
     from hybridlog.attachments import StoredAttachment, StoredMetadata
-    from hybridlog.drawing.density import Density
     from hybridlog.query.answers.video import VideoSummary
     from hybridlog.store import Store
-    from hybridlog_storage.catalog import ChannelEntry, ChannelStats, RecordingEntry
+    from hybridlog_storage.catalog import ChannelStats, RecordingEntry
 
 
 _MAX_DRAWN = 20  # recordings with sparklines; for more, reading their chunk tables takes long
 _DRAWN_TIMES = 1 << 18  # see `density`: little is read for a sparkline
-_LETTERS = 40  # of the coverage bar and of the longest sparkline
+_LETTERS = 40  # of the coverage bar
+_DRAWN = 20  # letters of a sparkline
 _OVER_TIME = "over time"
 
 
@@ -62,24 +64,32 @@ class _Given(Choosing, InStore, AsJson, Forced):
         "of this topic."
     )
     tables: bool = option(
-        "With --topic, instead: its Parquet files and SQL for DuckDB, and what is missing of them."
+        "With --topic, instead: its Parquet files and SQL for DuckDB, and what is missing of them.",
+        needs=("topic",),
+        excludes=("losses",),
     )
-    losses: bool = option("Instead: what is missing, from when to when, and why.")
+    losses: bool = option(
+        "Instead: what is missing, from when to when, and why.",
+        excludes=("sizes", "attachments", "attachment"),
+    )
     sizes: str | None = option(
         "Instead: the bytes of each recording, each topic, or each topic of each recording "
         "in segments, tables and MongoDB. Shares of what topics have in common are estimates.",
         type=click.Choice(["recording", "topic", "both"]),
+        excludes=("topic", "attachments", "attachment"),
     )
-    attachments: bool = option("Instead: the attachments of the logs.")
+    attachments: bool = option("Instead: the attachments of the logs.", excludes=("topic",))
     attachment: str | None = option(
         "Instead: the content of this attachment, or with -o those that fit a glob such as "
         "'*.yaml'.",
         "NAME",
+        excludes=("topic",),
     )
     output: Path | None = option(
         "Write the attachment to this file; several attachments into this directory.",
         "FILE|DIR",
         short="-o",
+        needs=("attachments", "attachment"),
     )
 
 
@@ -89,7 +99,6 @@ def info_command(given: _Given) -> None:
 
     Options show one thing instead: the definition of a topic, losses, sizes, attachments.
     """
-    _check(given)
     if len(given.names) == 1 and _is_segment(given.names[0]):
         show_segment(Path(given.names[0]), as_json=given.as_json)
         return
@@ -104,46 +113,26 @@ def info_command(given: _Given) -> None:
         raise
 
 
-def _check(given: _Given) -> None:
-    """Refuse options that do not go together."""
-    has_attachments = given.attachments or given.attachment is not None
-    parts = {
-        "--topic": bool(given.topic) and not given.losses,
-        "--losses": given.losses,
-        "--sizes": given.sizes is not None,
-        "--attachments": has_attachments,
-    }
-    asked = [name for name, wanted in parts.items() if wanted]
-    if len(asked) > 1:
-        raise UsageError(f"{' and '.join(asked)} exclude each other: give one of them.")
-    if given.tables and (len(given.topic) != 1 or given.losses):
-        raise UsageError("--tables is about one topic: add --topic TOPIC.")
-    if given.output is not None and not has_attachments:
-        raise UsageError("--output is for --attachments and --attachment.")
-
-
 def _show_part(store: Store, given: _Given) -> bool:
     """Show what options ask for instead of everything; returns whether they do."""
-    as_json = given.as_json
     if given.losses:
         if given.topic:
             resolve(given.topic, store.topics())  # refuses a name that fits no topic
-        show_losses([*given.recordings_in(store)], given.topic, as_json=as_json)
+        show_losses([*given.recordings_in(store)], given.topic, given)
     elif given.topic:
         query = query_of(store, given.topic, given.choice)
-        if given.tables:
-            if len(query.topics) > 1:
-                named = listed(query.topics)
-                raise UsageError(f"--tables is about one topic: name one of {named}.")
-            show_tables(store, query, as_json=as_json)
-            return True
-        show_topics(store, query, given.topic, as_json=as_json)
+        if not given.tables:
+            show_topics(store, query, given.topic, as_json=given.as_json)
+        elif len(query.topics) > 1:
+            raise UsageError(f"--tables is about one topic: name one of {listed(query.topics)}.")
+        else:
+            show_tables(store, query, as_json=given.as_json)
     elif given.sizes is not None:
         sizes = store.sizes(given.recordings_in(store))
-        show_sizes(sizes, given.sizes, as_json=as_json, without=store.session.when_empty)
+        show_sizes(sizes, given.sizes, given, store.session.when_empty)
     elif given.attachments or given.attachment is not None:
         found = [one for entry in given.recordings_in(store) for one in store.attachments(entry)]
-        show_attachments(found, given.attachment, given.output, force=given.force, as_json=as_json)
+        show_attachments(found, given.attachment, given.output, given, force=given.force)
     else:
         return False
     return True
@@ -153,43 +142,22 @@ def _show(store: Store, given: _Given) -> None:
     from hybridlog.query.choosing import is_one
 
     choice = given.choice
-    chosen = [with_misfits(store, entry) for entry in given.recordings_in(store)]
-    extras = {entry.id: _extras(store, entry) for entry in chosen}
-    videos = {entry.id: _videos(store, entry) for entry in chosen[:_MAX_DRAWN]}
+    entries = [with_misfits(store, entry) for entry in given.recordings_in(store)]
+    found = [
+        _as_dict(store, entry, _videos(store, entry) if number < _MAX_DRAWN else {})
+        for number, entry in enumerate(entries)
+    ]
     if given.as_json:
-        full = [_as_dict(entry, *extras[entry.id], videos.get(entry.id, {})) for entry in chosen]
         is_single = choice == Choice.of(choice.name[:1]) and is_one(store.session, choice.name)
-        output.print_json(full[0] if is_single else full)
+        output.print_json(found[0] if is_single else found)
         return
-    drawn = {}
-    if sys.stdout.isatty() and len(chosen) <= _MAX_DRAWN:
-        drawn = {entry.id: _densities(store, entry) for entry in chosen}
-    if not chosen:
+    if not entries:
         output.note(store.session.when_empty)
-    for number, entry in enumerate(chosen):
+    for number, (entry, about) in enumerate(zip(entries, found, strict=True)):
         if number:
             output.say()
-        _print_recording(
-            entry,
-            store.shared.index.connection.place,
-            *extras[entry.id],
-            videos=videos.get(entry.id, {}),
-            drawn=drawn.get(entry.id),
-        )
-
-
-def _extras(
-    store: Store, entry: RecordingEntry
-) -> tuple[list[StoredAttachment], list[StoredMetadata], str]:
-    """Attachments and metadata records of a recording that can be read, and its completeness."""
-    attachments: list[StoredAttachment] = []
-    metadata: list[StoredMetadata] = []
-    try:
-        attachments = store.attachments(entry)
-        metadata = store.metadata(entry)
-    except SegmentError as error:
-        output.note(f"{entry.name}: {error}")
-    return attachments, metadata, coverage(entry, losses_of(entry))
+        drawn = sys.stdout.isatty() and len(entries) <= _MAX_DRAWN
+        _print_recording(entry, about, store, _sparklines(store, entry) if drawn else {})
 
 
 def _is_segment(what: str) -> bool:
@@ -217,20 +185,24 @@ def _videos(store: Store, entry: RecordingEntry) -> dict[str, VideoSummary]:
 
 
 def _as_dict(
-    entry: RecordingEntry,
-    attachments: list[StoredAttachment],
-    metadata: list[StoredMetadata],
-    complete: str,
-    videos: Mapping[str, VideoSummary],
+    store: Store, entry: RecordingEntry, videos: Mapping[str, VideoSummary]
 ) -> dict[str, Any]:
     from hybridlog.entries import summary_of
+    from hybridlog.query.periods import mean_rate
     from hybridlog.schema.states import shown_channels
 
+    attachments: list[StoredAttachment] = []
+    metadata: list[StoredMetadata] = []
+    try:
+        attachments, metadata = store.attachments(entry), store.metadata(entry)
+    except SegmentError as error:
+        output.note(f"{entry.name}: {error}")
+    losses = losses_of(entry)
     return {
         **recording_dict(summary_of(entry)),
         "chunks": entry.chunks,
-        "coverage": complete,
-        "losses": losses_of(entry),
+        "coverage": coverage(entry, losses),
+        "losses": losses,
         "marks": entry.marks,
         "pins": entry.pins,
         "attachments": [attachment_as_dict(each) for each in attachments],
@@ -242,7 +214,7 @@ def _as_dict(
                 "message_encoding": c.message_encoding,
                 "messages": c.stats.messages,
                 "payload_bytes": c.stats.payload_bytes,
-                "rate_hz": _rate(c),
+                "rate_hz": mean_rate(c.stats.messages, c.stats.first or 0, c.stats.last or 0),
                 "first_ns": c.stats.first,
                 "last_ns": c.stats.last,
                 "skew_ns": _skew(c.stats),
@@ -258,14 +230,6 @@ def _as_dict(
     }
 
 
-def _rate(channel: ChannelEntry) -> float | None:
-    """Mean rate in Hz."""
-    from hybridlog.query.periods import mean_rate
-
-    stats = channel.stats
-    return mean_rate(stats.messages, stats.first or 0, stats.last or 0)
-
-
 def _skew(stats: ChannelStats) -> dict[str, float | int | None] | None:
     """Log time minus header stamp, ns; None if no stamp was set."""
     if stats.mean_skew is None:
@@ -274,96 +238,51 @@ def _skew(stats: ChannelStats) -> dict[str, float | int | None] | None:
 
 
 def _print_recording(
-    entry: RecordingEntry,
-    index: str | None,
-    attachments: list[StoredAttachment],
-    metadata: list[StoredMetadata],
-    complete: str,
-    *,
-    videos: Mapping[str, VideoSummary],
-    drawn: Density | None,
+    entry: RecordingEntry, about: dict[str, Any], store: Store, drawn: Mapping[str, str]
 ) -> None:
     from hybridlog.entries import summary_of
-    from hybridlog.query.times import format_duration, format_time
 
-    span = entry.span
-    losses = losses_of(entry)
-    source = entry.source
-    summary = summary_of(entry)
-    status = status_text(summary)
+    status = status_text(summary_of(entry))
     if entry.status == "open":
         status += f"; `hybridlog top {quote(entry.name)}` shows it"
     held = (
         f"{output.size(entry.stored_bytes)} in {output.counted(entry.segments, 'segment')}, "
         f"{output.counted(entry.chunks, 'chunk')}"
     )
-    rows = [
+    pins = [f"{pin['id']}: {', '.join(pin_cells(pin))}" for pin in entry.pins]
+    contents = [f"{one['name']} ({_content(one)})" for one in about["attachments"]]
+    records = [f"{one['name']} ({', '.join(one['values'])})" for one in about["metadata_records"]]
+    fields = [
+        ("recording", entry.name),
         ("id", entry.id),
         ("status", status),
-        ("source", _source(source)),
-        ("start", format_time(span[0]) if span else "-"),
-        ("last", format_time(span[1]) if span else "-"),
-        ("duration", format_duration(span[1] - span[0]) if span else "-"),
-        ("messages", str(entry.messages)),
+        ("source", _source(entry.source)),
+        *_span(about["start_ns"], about["last_ns"]),
+        ("messages", entry.messages),
         ("stored", held),
-        *_coverage(entry, complete),
-        *(("", line_of(loss)) for loss in losses),
+        *_coverage(entry, about["coverage"]),
+        *(("", line_of(loss)) for loss in about["losses"]),
         *(("tag", f"{key}={value}") for key, value in sorted(entry.tags.items())),
         *(("note", note["text"]) for note in entry.notes),
-        *_cut("pin", [f"{pin['id']}: {', '.join(pin_cells(pin))}" for pin in entry.pins]),
-        *_cut("attachment", [f"{a.name} ({_content(a)})" for a in attachments]),
-        *_cut("metadata", [f"{m.name} ({', '.join(m.values)})" for m in metadata]),
-        ("index", index),
+        *_cut("pin", pins),
+        *_cut("attachment", contents),
+        *_cut("metadata", records),
+        ("index", store.shared.index.connection.place),
     ]
-    output.print_table([("recording", "left"), (entry.name, "left")], rows)
-    if not entry.channels:
-        return
-    output.say()
-    columns: Sequence[output.Column] = [
-        ("topic", "left"),
-        ("type", "left"),
-        ("messages", "right"),
-        ("Hz", "right"),
-        ("payload", "right"),
-        ("log - header", "right"),
-        ("note", "left"),
-    ]
-    from hybridlog.schema.states import shown_channels
-
-    channels = sorted(shown_channels(entry.channels), key=lambda c: c.topic)
-    cells = _with_short_types(
-        columns,
-        [_channel_row(c, is_decoded=entry.is_decoded, video=videos.get(c.topic)) for c in channels],
-    )
-    if output.is_narrow():
-        columns, cells = output.fitted(columns, cells, ("payload",))
-    if drawn is not None:
-        headings = [name for name, _ in columns]
-        # Names of types are cut short if that makes room for lines.
-        for shown in (cells, _short_types(cells)):
-            # The heading has taken its share of the room.
-            room = output.room([*headings, _OVER_TIME], shown)
-            lines = _sparklines(drawn, room + len(_OVER_TIME) if room >= 0 else 0)
-            if lines:
-                cells = [
-                    [*row[:-1], lines.get(channel.topic, ""), row[-1]]
-                    for channel, row in zip(channels, shown, strict=True)
-                ]
-                columns = [*columns[:-1], (_OVER_TIME, "whole"), columns[-1]]
-                break
-    output.print_table(*output.fitted(columns, cells, ("log - header",)))
+    print_fields(fields)
+    if about["channels"]:
+        output.say()
+        over_time = Column(_OVER_TIME, lambda c: drawn.get(c["topic"]), "whole", spare=1)
+        columns = [*_CHANNELS[:-1], *([over_time] if drawn else []), _CHANNELS[-1]]
+        print_table(columns, sorted(about["channels"], key=itemgetter("topic")))
 
 
-_Rows = Sequence[Sequence[str]]
+def _span(first: int | None, last: int | None) -> list[tuple[str, str]]:
+    from hybridlog.query.times import format_duration
 
-
-def _with_short_types(columns: Sequence[output.Column], rows: _Rows) -> _Rows:
-    """Rows of a topic and its type, short where the terminal has no room for the package."""
-    return rows if output.fits([name for name, _ in columns], rows) else _short_types(rows)
-
-
-def _short_types(rows: _Rows) -> _Rows:
-    return [[topic, kind.rpartition("/")[2], *others] for topic, kind, *others in rows]
+    length = "-" if first is None or last is None else format_duration(last - first)
+    times = [output.time_text(first), output.time_text(last), length]
+    return [*zip(("start", "last", "duration"), times, strict=True)]
 
 
 def _coverage(entry: RecordingEntry, words: str) -> list[tuple[str, str]]:
@@ -377,100 +296,92 @@ def _coverage(entry: RecordingEntry, words: str) -> list[tuple[str, str]]:
     return [("coverage", bar(lost_parts(entry, extent_of(entry), _LETTERS))), ("", words)]
 
 
-def _densities(store: Store, entry: RecordingEntry) -> Density | None:
-    """Messages of each topic over time; None for a recording without any, or a damaged one."""
+def _sparklines(store: Store, entry: RecordingEntry) -> dict[str, str]:
+    """Messages of each topic over time; none without any, or if they cannot be read."""
+    from hybridlog.cli.sparkline import densities
     from hybridlog.drawing.density import density
     from hybridlog.record.losses import extent_of
 
     begin, end = extent_of(entry)
     if begin == end:
-        return None
+        return {}
     try:
-        return density(store.session, entry, (begin, end), _LETTERS, max_times=_DRAWN_TIMES)
+        found = density(store.session, entry, (begin, end), _DRAWN, max_times=_DRAWN_TIMES)
     except SegmentError as error:
         output.note(f"{entry.name}: {error}")
-        return None
+        return {}
+    return dict(zip(found.topics, map(densities, found.counts), strict=True))
 
 
-def _sparklines(drawn: Density, room: int) -> dict[str, str]:
-    """A line for each topic, as long as there is room for, by topic; none without room."""
-    from hybridlog.cli.sparkline import densities
-
-    for step in (1, 2, 4):
-        if _LETTERS // step <= room:
-            counts = drawn.counts.reshape(len(drawn.topics), -1, step).sum(axis=2)
-            return dict(zip(drawn.topics, map(densities, counts), strict=True))
-    return {}
-
-
-def _content(attachment: StoredAttachment) -> str:
-    size = output.size(attachment.size)
-    return f"{attachment.media_type}, {size}" if attachment.media_type else size
+def _content(attachment: Mapping[str, Any]) -> str:
+    size = output.size(attachment["bytes"])
+    return f"{attachment['media_type']}, {size}" if attachment["media_type"] else size
 
 
 def _cut(name: str, lines: list[str]) -> list[tuple[str, str]]:
-    """Rows of a table; the last one counts the lines that are left out."""
+    """Fields of a record; the last one counts the lines that are left out."""
     rows = [(name, output.cut(line)) for line in lines[:MAX_LISTED]]
     more = len(lines) - len(rows)
     return [*rows, (name, f"and {more} more")] if more else rows
 
 
-def _channel_row(
-    channel: ChannelEntry,
-    *,
-    is_decoded: bool,
-    video: VideoSummary | None,
-) -> list[str]:
+def _kind(channel: Mapping[str, Any]) -> str:
+    from hybridlog.schema.states import encoding_of
+
+    return channel["type"] or encoding_of(channel["message_encoding"], channel["metadata"])
+
+
+def _skew_text(channel: Mapping[str, Any]) -> str:
+    if channel["skew_ns"] is not None:
+        return output.short_duration(round(channel["skew_ns"]["mean"]))
+    if channel["unset_stamps"]:
+        return "not set"
+    return "?" if channel["unset_stamps"] is None else "-"
+
+
+def channel_note(channel: Mapping[str, Any]) -> str:
+    """What is special about the messages of a topic."""
     from hybridlog.query.latching import depth_of
-    from hybridlog.schema.states import State, encoding_of, state_of
+    from hybridlog.schema.states import State, state_of
     from hybridlog_storage.messages import SUPPLIED, Channel
 
-    stats = channel.stats
-    rate = _rate(channel)
-    notes = []
-    if channel.unindexed is not None:
-        notes.append(f"not indexed: {channel.unindexed}")
-    if SUPPLIED in channel.metadata:
-        notes.append(f"definition of {channel.metadata[SUPPLIED]}")
-    if stats.unreadable:
-        notes.append(f"{stats.unreadable} unreadable")
-    if stats.surplus:
-        notes.append(f"{stats.surplus} with bytes left over")
-    state = state_of(channel.message_encoding)
-    if state is not State.WHOLE:
-        why = {State.EXPIRED: ", expired", State.NOT_COPIED: ", not copied yet"}
-        notes.append(f"fields only{why.get(state, '')}")
-    if depth_of(Channel(channel.topic, channel.message_encoding, None, channel.metadata)):
-        notes.append("latched")
-    if video is not None and video.frames:
-        notes.append(_video_text(video, stats.messages))
-    skew = "-" if is_decoded else "?"
-    if stats.mean_skew is not None:
-        skew = output.short_duration(round(stats.mean_skew))
-        if stats.unset:
-            notes.append(f"{output.counted(stats.unset, 'stamp')} not set")
-    elif stats.unset:
-        skew = "not set"
-    encoding = encoding_of(channel.message_encoding, channel.metadata)
-    return [
-        channel.topic,
-        channel.type or encoding,
-        str(stats.messages),
-        f"{rate:.2f}" if rate is not None else "-",
-        output.size(stats.payload_bytes),
-        skew,
-        "; ".join(notes),
-    ]
+    encoding, metadata = channel["message_encoding"], channel["metadata"]
+    state, video = state_of(encoding), channel["video"]
+    why = {State.EXPIRED: ", expired", State.NOT_COPIED: ", not copied yet"}.get(state, "")
+    unset = channel["skew_ns"] is not None and channel["unset_stamps"]
+    notes = {
+        f"not indexed: {channel['not_indexed']}": channel["not_indexed"] is not None,
+        f"definition of {metadata.get(SUPPLIED)}": SUPPLIED in metadata,
+        f"{channel['unreadable']} unreadable": channel["unreadable"],
+        f"{channel['surplus']} with bytes left over": channel["surplus"],
+        f"fields only{why}": state is not State.WHOLE,
+        "latched": depth_of(Channel(channel["topic"], encoding, None, metadata)),
+        _video_text(video, channel["messages"]): video and video["frames"],
+        f"{output.counted(unset or 0, 'stamp')} not set": unset,
+    }
+    return "; ".join(text for text, applies in notes.items() if applies)
 
 
-def _video_text(video: VideoSummary, messages: int) -> str:
-    frames = "" if video.frames >= messages else f" in the first {video.frames}"
-    keys = output.counted(video.key_frames, "key frame")
-    text = f"{', '.join(video.formats)}, {keys}{frames}" if video.formats else ""
-    if video.unreadable:
-        text = f"{text}; " if text else ""
-        text += f"{output.counted(video.unreadable, 'frame')} of no known video{frames}"
-    return text
+def _video_text(video: Mapping[str, Any] | None, messages: int) -> str:
+    if video is None:
+        return ""
+    frames = "" if video["frames"] >= messages else f" in the first {video['frames']}"
+    keys = output.counted(video["key_frames"], "key frame")
+    parts = [f"{', '.join(video['formats'])}, {keys}{frames}"] if video["formats"] else []
+    if video["unreadable"]:
+        parts.append(f"{output.counted(video['unreadable'], 'frame')} of no known video{frames}")
+    return "; ".join(parts)
+
+
+_CHANNELS = [
+    Column("topic"),
+    Column("type", _kind, short=lambda channel: _kind(channel).rpartition("/")[2]),
+    Column("messages", side="right"),
+    Column("Hz", lambda c: "-" if c["rate_hz"] is None else f"{c['rate_hz']:.2f}", "right"),
+    Column("payload", lambda c: output.size(c["payload_bytes"]), "right", spare=2),
+    Column("log - header", _skew_text, "right", spare=3),
+    Column("note", channel_note),
+]
 
 
 def _source(source: Mapping[str, Any]) -> str:
@@ -530,26 +441,20 @@ def show_segment(path: Path, *, as_json: bool) -> None:
             }
         )
         return
-    from hybridlog.query.times import format_time
-
-    output.print_table(
-        [("segment", "left"), (str(path), "left")],
-        [
-            ("recording", str(summary.recording.get("name"))),
-            ("id", str(summary.recording.get("id"))),
-            ("start", format_time(first) if first is not None else "-"),
-            ("last", format_time(last) if last is not None else "-"),
-            ("bytes", output.size(bytes_all)),
-            ("chunks", str(len(chunks))),
-            ("messages", str(sum(summary.counts.values()))),
-        ],
-    )
+    fields: list[tuple[str, object]] = [
+        ("segment", path),
+        ("recording", summary.recording.get("name")),
+        ("id", summary.recording.get("id")),
+        ("start", output.time_text(first)),
+        ("last", output.time_text(last)),
+        ("bytes", output.size(bytes_all)),
+        ("chunks", len(chunks)),
+        ("messages", sum(summary.counts.values())),
+    ]
+    print_fields(fields)
     output.say()
-    columns: Sequence[output.Column] = [
-        ("topic", "left"), ("type", "left"), ("messages", "right"), ("chunks", "right")
-    ]  # fmt: skip
-    rows = [["" if c[n] is None else str(c[n]) for n, _ in columns] for c in channels]
-    output.print_table(columns, _with_short_types(columns, rows))
+    kind = Column("type", short=lambda channel: (channel["type"] or "").rpartition("/")[2])
+    print_table([Column("topic"), kind, *numbers("messages", "chunks")], channels)
 
 
 def _refuse_log(path: Path) -> None:

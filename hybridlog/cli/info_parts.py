@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict
 from fnmatch import fnmatchcase
 from functools import partial
@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 from hybridlog.cli import output
 from hybridlog.cli.answers import check_room, not_written
+from hybridlog.cli.options import AsJson
+from hybridlog.cli.render import Column, bytes_of, print_table
 from hybridlog.cli.signals import if_stopped
 from hybridlog.record.losses import losses_of
 from hybridlog.wording import listed
@@ -76,13 +78,9 @@ def _print_topic(item: dict[str, Any]) -> None:
         output.say()
         if item["observed"]:
             output.say("No definition fixes the fields. The first messages have these:")
-        output.print_table(
-            [("field", "left"), ("type", "left"), ("asked as", "left")],
-            [
-                (f["path"], f["type"], f["path"] if item["observed"] else _asked_as(f))
-                for f in item["fields"]
-            ],
-        )
+        asked = "path" if item["observed"] else _asked_as
+        columns = [Column("field", "path"), Column("type"), Column("asked as", asked)]
+        print_table(columns, item["fields"])
     output.say()
 
 
@@ -121,13 +119,13 @@ def _asked_as(field: dict[str, Any]) -> str:
     return path
 
 
-def show_losses(entries: Sequence[RecordingEntry], topics: Sequence[str], *, as_json: bool) -> None:
+def show_losses(entries: Sequence[RecordingEntry], topics: Sequence[str], given: AsJson) -> None:
     """Print what is missing, from when to when, and why.
 
     Args:
         entries: The recordings.
         topics: Only of these, as patterns; empty for all.
-        as_json: Print JSON.
+        given: How to print.
     """
     from hybridlog.query.topics import matcher
 
@@ -138,10 +136,8 @@ def show_losses(entries: Sequence[RecordingEntry], topics: Sequence[str], *, as_
         for loss in losses_of(entry)
         if fits is None or (loss.get("topic") is not None and fits(loss["topic"]))
     ]
-    if as_json:
-        output.print_json(rows)
-    elif rows:
-        _print_losses(rows, entries)
+    if rows or given.as_json:
+        given.show(rows, _LOSSES[len(entries) == 1 :])
     else:
         named = output.counted(len(entries), "recording")
         output.say(f"Nothing is missing from {named}, as far as the ledger knows.")
@@ -153,59 +149,47 @@ def show_losses(entries: Sequence[RecordingEntry], topics: Sequence[str], *, as_
             )
 
 
-def _print_losses(rows: Sequence[dict[str, Any]], entries: Sequence[RecordingEntry]) -> None:
-    several = len(entries) > 1
-    columns: list[output.Column] = [
-        ("topic", "left"),
-        ("cause", "left"),
-        ("messages", "right"),
-        ("from", "whole"),
-        ("for", "right"),
-        ("detail", "left"),
-    ]
-    if several:
-        columns.insert(0, ("recording", "left"))
-    output.print_table(
-        columns,
-        [([row["recording"]] if several else []) + _loss_cells(row) for row in rows],
-    )
+def _lasted(loss: Mapping[str, Any]) -> str:
+    begin, end = loss.get("from"), loss.get("to")
+    return "" if begin is None or end is None else output.short_duration(end - begin)
 
 
-def _loss_cells(row: dict[str, Any]) -> list[str]:
-    begin, end = row.get("from"), row.get("to")
-    file = f"{row['file']}: " if row.get("file") else ""
-    return [
-        row.get("topic") or "any",
-        row["cause"],
-        "unknown" if row["count"] is None else str(row["count"]),
-        "" if begin is None else output.short_time(begin),
-        "" if begin is None or end is None else output.short_duration(end - begin),
-        f"{file}{row.get('reason') or ''}",
-    ]
+def _detail(loss: Mapping[str, Any]) -> str:
+    return ": ".join(filter(None, (loss.get("file"), loss.get("reason"))))
 
 
-def show_sizes(sizes: Sizes, by: str, *, as_json: bool, without: str) -> None:
+_LOSSES = [
+    Column("recording"),
+    Column("topic", lambda loss: loss.get("topic") or "any"),
+    Column("cause"),
+    Column("messages", lambda loss: "unknown" if loss["count"] is None else loss["count"], "right"),
+    Column("from", lambda loss: output.short_time(loss.get("from")), "whole"),
+    Column("for", _lasted, "right"),
+    Column("detail", _detail),
+]
+
+
+def show_sizes(sizes: Sizes, by: str, given: AsJson, without: str) -> None:
     """Print the bytes of recordings, topics, or topics of each recording.
 
     Args:
         sizes: The sizes.
         by: `recording`, `topic` or `both`.
-        as_json: Print JSON.
+        given: How to print.
         without: What to say without any.
     """
-    rows = sizes.rows
+    found = sizes.rows
     if by != "both":
-        rows = sizes.by_recording() if by == "recording" else sizes.by_topic()
-    if as_json:
-        each = [_size_as_dict(row) for row in rows]
-        output.print_json({"rows": each, "total": _size_as_dict(sizes.total)})
-    elif rows:
-        _print_sizes(rows, sizes.total, recordings=by != "topic", topics=by != "recording")
-    else:
-        output.note(without)
-
-
-_NO_TOPIC = "(no topic)"
+        found = sizes.by_recording() if by == "recording" else sizes.by_topic()
+    rows, total = [_size_as_dict(row) for row in found], _size_as_dict(sizes.total)
+    if given.as_json:
+        output.print_json({"rows": rows, "total": total})
+        return
+    names = [Column("recording"), Column("topic", lambda row: row.get("topic", "(no topic)"))]
+    names = [one for one in names if by in {one.name, "both"}]
+    last = total | {one.name: "" for one in names[1:]} | {names[0].name: "total"}
+    columns = [column for column in _SIZES if column.name != "fields" or total["column_bytes"]]
+    given.show([*rows, last] if rows else [], [*names, *columns], without)
 
 
 def _size_as_dict(row: Size) -> dict[str, Any]:
@@ -216,49 +200,24 @@ def _size_as_dict(row: Size) -> dict[str, Any]:
     }
 
 
-def _print_sizes(rows: Sequence[Size], total: Size, *, recordings: bool, topics: bool) -> None:
-    """Print rows and their sum.
-
-    Args:
-        rows: The rows.
-        total: The sum.
-        recordings: Whether the rows are of single recordings.
-        topics: Whether the rows are of single topics.
-    """
-    columns: list[output.Column] = [("recording", "left")] if recordings else []
-    if topics:
-        columns.append(("topic", "left"))
-    has_columns = bool(total.column_bytes)
-    columns_too = ("fields",) if has_columns else ()
-    headings = ("messages", "payload", "segments", *columns_too, "tables", "MongoDB", "total")
-    names: list[output.Column] = [(heading, "right") for heading in headings]
-    if output.is_narrow():
-        del names[:2]
-    cells = []
-    for row in (*rows, total):
-        is_total = row is total
-        named = [("total" if is_total else row.recording)] if recordings else []
-        if topics:
-            name = row.topic or _NO_TOPIC
-            named.append(name if not is_total else "" if recordings else "total")
-        cells.append([*named, *_size_cells(row, has_columns=has_columns)[-len(names) :]])
-    output.print_table([*columns, *names], cells)
-
-
-def _size_cells(row: Size, *, has_columns: bool) -> list[str]:
-    index = "-" if row.index_bytes is None else output.size(row.index_bytes)
-    columns = [row.column_bytes] if has_columns else []
-    sizes = [row.payload_bytes, row.segment_bytes, *columns, row.table_bytes]
-    return [str(row.messages), *map(output.size, sizes), index, output.size(row.total_bytes)]
+_SIZES = [
+    Column("messages", side="right", spare=1),
+    bytes_of("payload", "payload_bytes", spare=2),
+    bytes_of("segments", "segment_bytes"),
+    bytes_of("fields", "column_bytes"),
+    bytes_of("tables", "table_bytes"),
+    bytes_of("MongoDB", "index_bytes"),
+    bytes_of("total", "total_bytes"),
+]
 
 
 def show_attachments(
     found: list[StoredAttachment],
     name: str | None,
     target: Path | None,
+    given: AsJson,
     *,
     force: bool,
-    as_json: bool,
 ) -> None:
     """List attachments, print the content of one, or write some into files.
 
@@ -266,12 +225,12 @@ def show_attachments(
         found: Those of the chosen recordings.
         name: Only this one, or those that fit a glob.
         target: The file, or the directory for several.
+        given: How to list them.
         force: Overwrite files.
-        as_json: Print JSON.
     """
     found = _chosen(found, name)
-    if target is None and (name is None or as_json):
-        _list_attachments(found, as_json=as_json)
+    if target is None and (name is None or given.as_json):
+        given.show(list(map(attachment_as_dict, found)), _ATTACHMENTS, "There are no attachments.")
     elif target is None:
         _print_content(found)
     elif name is None or len(found) > 1 or target.is_dir():
@@ -304,27 +263,12 @@ def attachment_as_dict(attachment: StoredAttachment) -> dict[str, Any]:
     }
 
 
-def _list_attachments(found: list[StoredAttachment], *, as_json: bool) -> None:
-    from hybridlog.query.times import format_time
-
-    if as_json:
-        output.print_json([attachment_as_dict(each) for each in found])
-        return
-    if not found:
-        output.note("There are no attachments.")
-        return
-    output.print_table(
-        [("attachment", "left"), ("media type", "left"), ("size", "right"), ("log time", "left")],
-        [
-            (
-                each.name,
-                each.media_type,
-                output.size(each.size),
-                format_time(each.log_time_ns) if each.log_time_ns else "-",
-            )
-            for each in found
-        ],
-    )
+_ATTACHMENTS = [
+    Column("attachment", "name"),
+    Column("media type", "media_type"),
+    bytes_of("size", "bytes"),
+    Column("log time", lambda row: output.time_text(row["log_time_ns"] or None)),
+]
 
 
 def _print_content(found: list[StoredAttachment]) -> None:

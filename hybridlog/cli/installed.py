@@ -15,6 +15,7 @@ from urllib.request import url2pathname
 
 from hybridlog import __version__
 from hybridlog.cli import output
+from hybridlog.cli.render import Column, print_table
 from hybridlog_storage.errors import MissingDependencyError
 
 NEEDED_FOR: Final = {
@@ -45,15 +46,15 @@ def print_installed() -> None:
     own = (f"{name} {version}" for name, version in packages() if version)
     output.say_folded(f"Packages: {', '.join(own)}")
     output.say()
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for extra, purpose in NEEDED_FOR.items():
         found = list(packages(extra))
         has = ", ".join(f"{name} {version}" for name, version in found if version)
         is_there = all(version for _, version in found)
         cure = "" if is_there else from_here(f"pip install 'hybridlog[{extra}]'")
         rows.append((extra, purpose, cure or has))
-    columns = ("extra", "needed for", "installed, or the cure")
-    output.print_table([(heading, "left") for heading in columns], rows)
+    headings = ("extra", "needed for", "installed, or the cure")
+    print_table([Column(heading, n) for n, heading in enumerate(headings)], rows)
 
 
 def packages(extra: str | None = None) -> Iterator[tuple[str, str | None]]:

@@ -12,17 +12,19 @@ from hybridlog.cli import output
 from hybridlog.cli.binder import command, option
 from hybridlog.cli.completion import complete_condition, complete_topic
 from hybridlog.cli.options import AsJson, Choosing, InStore, Quiet, query_of
-from hybridlog.cli.progress import Stages, progress_bar
+from hybridlog.cli.progress import Bar
+from hybridlog.cli.render import Column
 from hybridlog.cli.signals import if_stopped
 from hybridlog.wording import listed
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
     from hybridlog.maintenance.keep import KeepReport
-    from hybridlog.maintenance.retention import Rules, Step
+    from hybridlog.maintenance.retention import Step
     from hybridlog.store import Store
 
 _MAX_PINS = 1000
+_RULES = ("quota", "min_free", "max_age", "never_tag", "fields_age", "save", "dry_run")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,19 +47,24 @@ class _Given(Choosing, InStore, AsJson, Quiet):
     )
     save: bool = option("Write these rules into the store, for recorders too.")
     dry_run: bool = option("Only say what would go.")
-    pin: bool = option("Pin recordings, or a time of them: it never goes.")
-    at: str | None = option("With --pin: the time around T, see --before and --after.", "T")
+    pin: bool = option(
+        "Pin recordings, or a time of them: it never goes.", excludes=("unpin", "pins", *_RULES)
+    )
+    at: str | None = option(
+        "With --pin: the time around T, see --before and --after.", "T", needs=("pin",)
+    )
     when: tuple[str, ...] = option(
         "With --pin: whenever this held, such as 'scan: ranges.min < 0.5', or around "
         "messages of a topic alone, or of marks.",
         "TOPIC: PREDICATE",
         shell_complete=complete_condition,
+        needs=("pin",),
     )
     before: str = option("With --pin: so much before it, too.", "TIME", default="0s")
     after: str = option("With --pin: so much after it, too.", "TIME", default="0s")
-    reason: str = option("With --pin: why.", "TEXT", default="")
-    unpin: tuple[str, ...] = option("Remove a pin.", "PIN")
-    pins: bool = option("List the pins.")
+    reason: str = option("With --pin: why.", "TEXT", default="", needs=("pin",))
+    unpin: tuple[str, ...] = option("Remove a pin.", "PIN", excludes=("pins", "topic", *_RULES))
+    pins: bool = option("List the pins.", excludes=("topic", *_RULES))
 
 
 @command(_Given)
@@ -73,10 +80,7 @@ def keep_command(given: _Given) -> None:
     with given.opened() as store:
         if given.pin:
             found = _pin(store, given)
-            if given.as_json:
-                output.print_json(found)
-            elif not given.quiet:
-                output.say(f"{output.counted(len(found), 'pin')}: {listed(found)}")
+            given.tell(found, [f"{output.counted(len(found), 'pin')}: {listed(found)}"])
         elif given.unpin:
             store.unpin(*given.unpin)
         elif given.pins:
@@ -107,14 +111,9 @@ def _check(given: _Given, rules: dict[str, Any]) -> None:
         UsageError: They do not.
     """
     is_all = given.choice.is_everything
-    pinning = sum(map(bool, (given.pin, given.pins, given.unpin)))
-    if pinning > 1 or (pinning and (rules or given.save or given.dry_run)):
-        raise UsageError("Give --pin, --unpin, --pins or rules, one of them at a time.")
-    if not given.pin and (given.at or given.when or given.reason):
-        raise UsageError("--at, --when and --reason are for --pin.")
     if given.pin and is_all:
         raise UsageError("Choose the recordings to pin: -r 'monday*', --tag robot=7, -r '*'.")
-    if not pinning and not is_all:
+    if not (given.pin or given.pins or given.unpin or is_all):
         raise UsageError("Rules are for the whole store; --never-tag leaves recordings out.")
     if given.save and not rules:
         raise UsageError("--save needs rules: --quota 200GB.")
@@ -176,21 +175,28 @@ def _are_marks(store: Store, topics: Sequence[str]) -> bool:
 def _show_pins(store: Store, given: _Given) -> None:
     chosen = given.recordings_in(store)
     rows = [{"recording": entry.name, **pin} for entry in chosen for pin in entry.pins]
-    if given.as_json:
-        output.print_json(rows)
-    elif rows:
-        cells = [[row["id"], row["recording"], *pin_cells(row)] for row in rows]
-        names = ("pin", "recording", "from", "to", "topics", "reason")
-        output.print_table([(name, "left") for name in names], cells)
+    given.show(rows, [Column("pin", "id"), Column("recording"), *_PIN])
+
+
+def _time(key: str) -> Column:
+    return Column(
+        key,
+        lambda pin: output.time_text(pin[key]),
+        short=lambda pin: output.short_time(pin[key]),
+    )
+
+
+_PIN = [
+    _time("from"),
+    _time("to"),
+    Column("topics", lambda pin: "all" if pin["topics"] is None else listed(pin["topics"])),
+    Column("reason"),
+]
 
 
 def pin_cells(pin: dict[str, Any]) -> list[str]:
-    """From, to, topics and reason of a pin; where there is little room, times to the second."""
-    from hybridlog.query.times import format_time
-
-    shown = output.short_time if output.is_narrow() else format_time
-    times = ["-" if pin[key] is None else shown(pin[key]) for key in ("from", "to")]
-    return [*times, "all" if pin["topics"] is None else listed(pin["topics"]), pin["reason"]]
+    """From, to, topics and reason of a pin."""
+    return [column.cell(pin) for column in _PIN]
 
 
 def _keep(store: Store, rules: dict[str, Any], given: _Given) -> None:
@@ -209,26 +215,19 @@ def _keep(store: Store, rules: dict[str, Any], given: _Given) -> None:
     dry_run = given.dry_run
     with (
         if_stopped("What was not deleted is as it was; run it again."),
-        progress_bar("keep", 0, quiet=given.quiet or given.as_json) as bar,
+        Bar("keep", 0, quiet=given.quiet or given.as_json) as bar,
     ):
-        found = store.keep(wanted, dry_run=dry_run, progress=Stages(bar))
-    if given.as_json:
-        output.print_json({**asdict(found), "dry_run": dry_run})
-    elif not given.quiet:
-        for line in _lines(found, dry_run=dry_run):
-            output.say_folded(line)
-    for problem in (*found.problems, *found.plan.warnings, *_useless(store, Rules.of(wanted))):
-        output.note(problem)
+        found = store.keep(wanted, dry_run=dry_run, progress=bar.part)
+    given.tell({**asdict(found), "dry_run": dry_run}, _lines(found, dry_run=dry_run))
+    topics = store.topics()
+    useless = (
+        f"No topic matches {rule.pattern}, so its rule deletes nothing."
+        for rule in Rules.of(wanted).topics
+        if not any(map(rule.fits, topics))
+    )
+    output.notes((*found.problems, *found.plan.warnings, *useless))
     if found.problems or found.plan.is_short:
         raise click.exceptions.Exit(1)
-
-
-def _useless(store: Store, rules: Rules) -> Iterator[str]:
-    """Sentences about rules that fit no topic of the store."""
-    topics = store.topics() if rules.topics else []
-    for rule in rules.topics:
-        if not any(map(rule.fits, topics)):
-            yield f"No topic matches {rule.pattern}, so its rule deletes nothing."
 
 
 def _lines(found: KeepReport, *, dry_run: bool) -> Iterator[str]:

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import click
 
 from hybridlog.cli import output
 from hybridlog.cli.binder import option
 from hybridlog.cli.completion import complete_topic
-from hybridlog.cli.progress import progress_bar
+from hybridlog.cli.progress import Bar
 from hybridlog.cli.signals import if_stopped
 from hybridlog_storage.errors import UsageError
 
@@ -25,40 +25,37 @@ LEROBOT: Final = "lerobot"
 _FPS: Final = 30
 
 
+def _option(help: str, metavar: str | None = None, **settings: Any) -> Any:  # noqa: A002
+    return option(help, metavar, needs=(f"form={LEROBOT}",), **settings)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Training:
     """Options of training sets."""
 
-    features: Path | None = option("Topics and fields, in YAML.", "FILE", name="--map")
-    propose_map: bool = option(
+    features: Path | None = _option("Topics and fields, in YAML.", "FILE", name="--map")
+    propose_map: bool = _option(
         "Write a map for the topics that are there to OUTPUT, and nothing else."
     )
-    fps: int | None = option(
+    fps: int | None = _option(
         f"Frames a second; without, {_FPS}.", "N", type=click.IntRange(1, 1000)
     )
-    episodes_by: str | None = option(
+    episodes_by: str | None = _option(
         "An episode for each `recording`, `mark`, or interval of a predicate.", "HOW"
     )
-    task: str | None = option("What the robot does, in words.", "TEXT")
-    task_topic: str | None = option(
+    task: str | None = _option("What the robot does, in words.", "TEXT")
+    task_topic: str | None = _option(
         "A topic of texts that say it, at the begin of each episode.",
         "TOPIC",
         shell_complete=complete_topic,
     )
-    vcodec: Literal["h264", "av1"] | None = option(
+    vcodec: Literal["h264", "av1"] | None = _option(
         "Without, h264.", type=click.Choice(["h264", "av1"])
     )
-    on_gap: Literal["refuse", "drop", "hold"] | None = option(
+    on_gap: Literal["refuse", "drop", "hold"] | None = _option(
         "Refuse an episode with a gap (the default), cut it there, or keep the last value.",
         type=click.Choice(["refuse", "drop", "hold"]),
     )
-
-    def check_form(self, form: str) -> None:
-        """Refuse these options with another format."""
-        used = sorted(one.name for one in fields(Training) if getattr(self, one.name))
-        if used and form != LEROBOT:
-            name = "--map" if used[0] == "features" else f"--{used[0].replace('_', '-')}"
-            raise UsageError(f"{name} is for lerobot, not for {form}.")
 
 
 def export_set(
@@ -81,7 +78,7 @@ def export_set(
         shutil.rmtree(target)
     done = 0
     again = "The same command goes on with the episodes that are not finished."
-    with if_stopped(lambda: again), progress_bar(target.name, None, quiet=quiet) as bar:
+    with if_stopped(lambda: again), Bar(target.name, None, quiet=quiet) as bar:
 
         def tell(name: str, frames: int) -> None:
             nonlocal done
@@ -129,28 +126,26 @@ def _write_map(text: str, target: Path, *, force: bool, quiet: bool) -> None:
 def _print_report(report: LerobotReport, fps: int | None, *, quiet: bool) -> None:
     counted = output.counted
     resumed = f", {report.resumed} of them from before" if report.resumed else ""
-    if not quiet:
-        output.note(
-            f"{report.path}: {counted(report.episodes, 'episode')}{resumed}, "
-            f"{counted(report.frames, 'frame')}, {output.size(report.bytes)}"
-        )
-        if fps is None:
-            output.note(f"Without --fps there are {_FPS} frames a second.")
-    if report.held:
-        output.note(
-            f"Values that are older than usual were kept for {counted(report.held, 'frame')}."
-        )
-    if report.dropped:
-        output.note(
-            f"{counted(report.dropped, 'frame')} left out, because a topic has a gap there."
-        )
-    if report.missing:
-        output.note(
-            f"{counted(report.missing, 'frame')} show an earlier picture: their own cannot be "
-            "shown, or has no payload."
-        )
-    if report.lost:
-        output.note(
+    about = (
+        f"{report.path}: {counted(report.episodes, 'episode')}{resumed}, "
+        f"{counted(report.frames, 'frame')}, {output.size(report.bytes)}"
+    )
+    held, dropped, missing = (
+        counted(number, "frame") for number in (report.held, report.dropped, report.missing)
+    )
+    notes = [
+        (not quiet, about),
+        (not quiet and fps is None, f"Without --fps there are {_FPS} frames a second."),
+        (report.held, f"Values that are older than usual were kept for {held}."),
+        (report.dropped, f"{dropped} left out, because a topic has a gap there."),
+        (
+            report.missing,
+            f"{missing} show an earlier picture: their own cannot be shown, or has no payload.",
+        ),
+        (
+            report.lost,
             f"{counted(report.lost, 'message')} of these topics are lost in the episodes; "
-            "meta/hybridlog.json says in which."
-        )
+            "meta/hybridlog.json says in which.",
+        ),
+    ]
+    output.notes(text for applies, text in notes if applies)

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import io
 import textwrap
 from collections.abc import Mapping, Sequence
-from itertools import takewhile
 from typing import TYPE_CHECKING, Any, Self
 
 from hybridlog.cli import output
@@ -30,8 +28,6 @@ _SLOW = 0.8  # of the expected rate: below it the rate is shown as a warning
 class LiveTable:
     """The table; a context manager that removes it at the end.
 
-    Of a table of the same size only what has changed is drawn: the line may be slow.
-
     Args:
         error: Draw it on standard error, else on standard output.
     """
@@ -42,8 +38,6 @@ class LiveTable:
         self._live = Live(
             console=output.console(error=error), auto_refresh=False, transient=True, screen=False
         )
-        self._lines: list[str] = []
-        self._width = 0
 
     def __enter__(self) -> Self:
         """Begin to draw."""
@@ -64,40 +58,9 @@ class LiveTable:
 
     def show(self, state: RecorderState, below: Sequence[str] = ()) -> None:
         """Draw a state, with lines below it."""
-        from rich.console import Console
-
-        console = self._live.console
-        width, before = console.width, self._lines
-        found = drawn(state, width=width, height=console.height - 1, below=below)
-        text = io.StringIO()
-        system: Any = console.color_system
-        Console(file=text, force_terminal=True, color_system=system, width=width).print(found)
-        self._lines = [line.rstrip() for line in text.getvalue().splitlines()]
-        self._live.update(found)  # what others print is above it
-        if len(before) != len(self._lines) or width != self._width:
-            self._live.refresh()
-        else:
-            console.file.write(changes(before, self._lines))
-            console.file.flush()
-        self._width = width
-
-
-def changes(before: Sequence[str], after: Sequence[str]) -> str:
-    """The text that turns lines of a terminal into others, for a cursor on the last of them.
-
-    Args:
-        before: The lines on the terminal.
-        after: As many others.
-    """
-    text = ""
-    for up, (old, new) in enumerate(zip(reversed(before), reversed(after), strict=True)):
-        if old == new:
-            continue
-        pairs = zip(old, new, strict=False)
-        kept = len([*takewhile(lambda pair: pair[0] == pair[1] and " " <= pair[0] <= "~", pairs)])
-        text += (f"\x1b[{up}A" if up else "") + "\r" + (f"\x1b[{kept}C" if kept else "")
-        text += f"{new[kept:]}\x1b[K" + (f"\x1b[{up}B" if up else "")
-    return text
+        size = self._live.console.size
+        found = drawn(state, width=size.width, height=size.height - 1, below=below)
+        self._live.update(found, refresh=True)
 
 
 def drawn(

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from hybridlog.cli import output
 from hybridlog.cli.binder import command
 from hybridlog.cli.options import AsJson, Choosing, InStore
+from hybridlog.cli.render import Column
 
 if TYPE_CHECKING:
     from hybridlog.store import Store
@@ -28,62 +28,35 @@ def ls_command(given: _Given) -> None:
         if store.directory.look_closely():
             store.refresh()
         recordings = given.recordings_in(store.snapshot()).summaries
-    if given.as_json:
-        output.print_json([recording_dict(entry) for entry in recordings])
-    elif recordings:
-        _print(recordings)
-    elif not store.repairs.unreadable:
-        output.note(store.directory.when_empty)
+    found = [*recordings]
+    without = "" if store.repairs.unreadable else store.directory.when_empty
+    given.show(found, RECORDINGS, without, recording_dict, pages=True)
 
 
-def _print(recordings: Sequence[RecordingSummary]) -> None:
-    narrow = output.is_narrow()
-    columns: list[output.Column] = [
-        ("recording", "left"),
-        ("start", "whole"),
-        ("duration", "right"),
-        ("topics", "right"),
-        ("messages", "right"),
-        ("stored", "right"),
-        ("note", "left"),
-    ]
-    rows = [_row(entry, narrow=narrow) for entry in recordings]
-    output.print_pages(*_with_short_notes(*output.fitted(columns, rows, ("topics", "stored"))))
-
-
-def _with_short_notes(
-    columns: Sequence[output.Column], rows: Sequence[Sequence[str]]
-) -> tuple[Sequence[output.Column], Sequence[Sequence[str]]]:
-    """The same table, where notes are cut short if the terminal has no room for them."""
-    headings = [heading for heading, _ in columns]
-    if output.fits(headings, rows):
-        return columns, rows
-    room = output.room(headings, [row[:-1] for row in rows]) + len(headings[-1])
-    return columns, [[*row[:-1], output.cut(row[-1], max(room, _LEAST_NOTE))] for row in rows]
-
-
-def _row(entry: RecordingSummary, *, narrow: bool) -> list[str]:
-    span = entry.span
+def _note(entry: RecordingSummary) -> str:
     notes = [] if entry.status == "complete" else [status_text(entry)]
     for number, what in ((entry.expired, "deleted"), (entry.not_copied, "not copied yet")):
         if number:
-            notes.append(f"{number if narrow else output.counted(number, 'payload')} {what}")
+            notes.append(f"{output.counted(number, 'payload')} {what}")
     notes.extend(f"{key}={value}" for key, value in sorted(entry.tags.items()))
-    if not narrow:
-        notes.extend(output.cut(note["text"]) for note in entry.notes)
-    start = output.short_time(span[0], minutes=narrow) if span else "-"
-    return [
-        entry.name,
-        start,
-        output.short_duration(span[1] - span[0]) if span else "-",
-        str(entry.topic_count),
-        str(entry.messages),
-        output.size(entry.stored_bytes),
-        ", ".join(notes),
-    ]
+    notes.extend(output.cut(note["text"]) for note in entry.notes)
+    return ", ".join(notes)
 
 
-_LEAST_NOTE = 12
+def _duration(entry: RecordingSummary) -> str:
+    return output.short_duration(entry.span[1] - entry.span[0]) if entry.span else "-"
+
+
+RECORDINGS = [
+    Column("recording", lambda one: one.name),
+    Column("start", lambda one: output.short_time(one.span and one.span[0]), "whole"),
+    Column("duration", _duration, "right"),
+    Column("topics", lambda one: one.topic_count, "right", spare=1),
+    Column("messages", lambda one: one.messages, "right"),
+    Column("stored", lambda one: output.size(one.stored_bytes), "right", spare=2),
+    Column("note", _note, cut=12),
+]
+"""Columns of a list of recordings."""
 _STATUS = {
     "open": "being recorded",
     "damaged": "source damaged",

@@ -13,12 +13,13 @@ import click
 from hybridlog.cli import output
 from hybridlog.cli.binder import command, option
 from hybridlog.cli.options import AsJson, InStore, Named, Quiet, recordings_of
-from hybridlog.cli.progress import Stages, progress_bar
+from hybridlog.cli.progress import Bar
 from hybridlog.wording import listed
-from hybridlog_storage.errors import DatabaseError, TopicError, UsageError, WithoutMongoError
+from hybridlog_storage.errors import DatabaseError, TopicError, WithoutMongoError
 
 if TYPE_CHECKING:
-    from hybridlog.maintenance.verify import Verification
+    from hybridlog.maintenance.repair import Repaired
+    from hybridlog.maintenance.verify import Finding, Verification
     from hybridlog.store import Store
     from hybridlog_storage.summary import RecordingSummary
 
@@ -26,9 +27,14 @@ if TYPE_CHECKING:
 @dataclass(frozen=True, kw_only=True)
 class _Verify(Named, InStore, AsJson, Quiet):
     repair: bool = option("Mend what can be mended without losing anything; list the rest.")
-    moved: bool = option("With --repair: the store was moved to here, take its index over.")
+    moved: bool = option(
+        "With --repair: the store was moved to here, take its index over.",
+        needs=("repair",),
+        excludes=("new_id",),
+    )
     new_id: bool = option(
-        "With --repair: the store is a copy, give it an id of its own, with the index at --mongo."
+        "With --repair: the store is a copy, give it an id of its own, with the index at --mongo.",
+        needs=("repair",),
     )
 
 
@@ -43,15 +49,13 @@ def verify_command(given: _Verify) -> None:
     if given.repair:
         _repair(given)
         return
-    if given.moved or given.new_id:
-        raise UsageError("--moved and --new-id are for --repair: give that, too.")
     started = time.monotonic()
     with given.opened(quiet=given.quiet) as store:
         chosen, unreadable = _chosen(given, store)
         total = sum(entry.stored_bytes for entry in chosen)
         names = None if given.choice.is_everything else [*(one.id for one in chosen), *unreadable]
-        with progress_bar("verify", total, quiet=given.quiet) as bar:
-            result = store.verify(names, Stages(bar))
+        with Bar("verify", total, quiet=given.quiet) as bar:
+            result = store.verify(names, bar.part)
         why = store.shared.index.unavailable
     elapsed = time.monotonic() - started
     if given.as_json:
@@ -87,8 +91,7 @@ def _chosen(given: _Verify, store: Store) -> tuple[Sequence[RecordingSummary], l
 
 def _print(result: Verification, elapsed: float, *, quiet: bool) -> None:
     for finding in result.findings:
-        of = f"{finding.recording}: " if finding.recording else ""
-        output.say(f"{of}{finding.place}: {finding.problem.removesuffix('.')}; {finding.cure}")
+        _say(finding, f"{finding.problem.removesuffix('.')}; {finding.cure}")
     if quiet:
         return
     verdict = "all is well" if result.index else "all is well in the files"
@@ -105,8 +108,6 @@ def _print(result: Verification, elapsed: float, *, quiet: bool) -> None:
 
 def _repair(given: _Verify) -> None:
     """Mend what can be mended, and list what is left."""
-    if given.moved and given.new_id:
-        raise UsageError("A store was moved or it is a copy: give --moved or --new-id, not both.")
     if given.new_id:
         from hybridlog.maintenance.lease import become_another
         from hybridlog.store import store_path
@@ -119,17 +120,18 @@ def _repair(given: _Verify) -> None:
             output.note("The index belongs to the store at this place now.")
         chosen, unreadable = _chosen(given, store)
         names = None if given.choice.is_everything else [*(one.id for one in chosen), *unreadable]
-        with progress_bar("repair", 0, quiet=given.quiet) as bar:
-            done = store.verify(names, Stages(bar), repair=True)
-    left = [one for one in done if not one.is_cured]
+        with Bar("repair", 0, quiet=given.quiet) as bar:
+            done = store.verify(names, bar.part, repair=True)
     if given.as_json:
         output.print_json([asdict(one) for one in done])
     else:
         for one in done:
-            result = "mended" if one.is_cured else "left"
-            of = f"{one.recording}: " if one.recording else ""
-            output.say(f"{of}{one.place}: {result}: {one.done}")
+            _say(one, f"{'mended' if one.is_cured else 'left'}: {one.done}")
         if not (done or given.moved or given.new_id or given.quiet):
             output.say("nothing to mend")
-    if left:
+    if not all(one.is_cured for one in done):
         raise click.exceptions.Exit(1)
+
+
+def _say(one: Finding | Repaired, what: str) -> None:
+    output.say(": ".join(filter(None, (one.recording, one.place, what))))

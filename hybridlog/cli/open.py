@@ -8,18 +8,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import click
 
 from hybridlog.cli import output
-from hybridlog.cli.answers import check_room, not_written, print_remarks, write_answer
+from hybridlog.cli.answers import check_room, not_written, write_answer
 from hybridlog.cli.binder import argument, command, option
 from hybridlog.cli.options import AsJson, Filtered, Forced, InStore, Place, Served, one_recording
 from hybridlog.cli.signals import ended_by_signal, if_stopped
 from hybridlog.formats.slices import SliceCache
 from hybridlog.wording import listed
-from hybridlog_storage.errors import HybridlogError, MissingDependencyError, UsageError
+from hybridlog_storage.errors import HybridlogError, MissingDependencyError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from hybridlog.view.playback.server import PlaybackServer
 
 _WEBSOCKET: Final = "websocket"
+_PLAYED: Final = (f"viewer={_WEBSOCKET}",)
 _PORT: Final = 8765
 _PLAY: Final = "`hybridlog open websocket` plays to the one in the browser"
 
@@ -69,14 +70,16 @@ class _Given(Filtered, Forced, Served):
         "FILE",
         name="--output",
         short="-o",
+        needs=("viewer=foxglove", "viewer=lichtblick", "viewer=rerun"),
     )
     speed: float | None = option(
         "With websocket: times as fast as recorded, 0.01 to 100; viewers can change it.",
         "N",
         type=click.FloatRange(0.01, 100),
+        needs=_PLAYED,
     )
-    loop: bool = option("With websocket: begin again at the end.")
-    paused: bool = option("With websocket: wait until a viewer plays.")
+    loop: bool = option("With websocket: begin again at the end.", needs=_PLAYED)
+    paused: bool = option("With websocket: wait until a viewer plays.", needs=_PLAYED)
 
 
 @command(_Given)
@@ -87,51 +90,23 @@ def open_command(given: _Given) -> None:
     ends when the program does. `open websocket` plays recordings over a WebSocket, also to
     viewers in the browser: they play, pause, seek and change the speed. Ctrl-C ends it.
     """
-    _check(given)
+    if given.path is not None:
+        check_room(given.path, force=given.force)
     if given.viewer == _WEBSOCKET:
-        check_installed()
-        with given.opened(is_lasting=True) as store:
-            play(
-                given.query(store),
-                given.choice.name,
-                quiet=given.quiet,
-                port=_PORT if given.port is None else given.port,
-                speed=given.speed or 1.0,
-                loops=given.loop,
-                is_paused=given.paused,
-                origins=given.origins,
-            )
+        _play(given)
         return
     program = _find(given.viewer)
     with given.opened(snapshot=True) as store:
         query = given.query(store)
         path = _written(store, query, given)
         if not given.quiet:
-            print_remarks(query, is_empty=False)
+            output.notes(query.remarks(is_empty=False))
             output.note(f"{path}: {output.size(path.stat().st_size)}, opened with {program}")
     ended = subprocess.run(  # noqa: S603
         [program, *_VIEWERS[given.viewer].options, path.absolute()], check=False
     )
     if ended.returncode:
         raise HybridlogError(f"{program} ended with exit code {ended.returncode}.")
-
-
-def _check(given: _Given) -> None:
-    """Refuse options of the other way to show a slice.
-
-    Raises:
-        UsageError: There are some, or the output exists.
-    """
-    if given.viewer == _WEBSOCKET:
-        if given.path is not None:
-            raise UsageError("--output is the file for a viewer; websocket writes none.")
-        return
-    if given.port is not None or given.speed or given.loop or given.paused or given.origins:
-        raise UsageError(
-            "--port, --speed, --loop, --paused and --allow-origin are for `open websocket`."
-        )
-    if given.path is not None:
-        check_room(given.path, force=given.force)
 
 
 def _written(store: Store, query: Query, given: _Given) -> Path:
@@ -172,42 +147,39 @@ def _find(viewer: str) -> str:
 _MAX_SHOWN = 5  # topics
 
 
-def check_installed() -> None:
-    """Refuse to play without the package for it.
+def _play(given: _Given) -> None:
+    """Play to viewers, until a signal ends it.
 
     Raises:
-        MissingDependencyError: It is missing.
+        MissingDependencyError: The package for it is missing.
     """
+    import asyncio
+
     try:
-        import hybridlog.view.playback.server  # noqa: F401
+        from hybridlog.view.playback.server import PlaybackOptions, PlaybackServer
     except ImportError as error:
         raise MissingDependencyError(
             "open websocket needs websockets: pip install 'hybridlog[foxglove]'"
         ) from error
-
-
-def play(query: Query, names: Sequence[str], *, quiet: bool, **how: Any) -> None:
-    """Play a query to viewers, until a signal ends it.
-
-    Args:
-        query: The messages.
-        names: Of the recordings, as typed.
-        quiet: Only print the address.
-        how: Of `PlaybackOptions`.
-    """
-    import asyncio
-
     from hybridlog.view.playback.played import PlayedLog
-    from hybridlog.view.playback.server import PlaybackOptions, PlaybackServer
 
-    log = PlayedLog(query)
-    name = " ".join(["hybridlog", *names])
-    server = PlaybackServer(log, name, PlaybackOptions(**how), output.note)
-    if not quiet:
-        print_remarks(query, is_empty=False)
-        print_unplayed(query)
-        _print_undefined(log)
-    asyncio.run(_until_signal(server, quiet=quiet))
+    options = PlaybackOptions(
+        port=_PORT if given.port is None else given.port,
+        speed=given.speed or 1.0,
+        loops=given.loop,
+        is_paused=given.paused,
+        origins=given.origins,
+    )
+    with given.opened(is_lasting=True) as store:
+        query = given.query(store)
+        log = PlayedLog(query)
+        name = " ".join(["hybridlog", *given.choice.name])
+        server = PlaybackServer(log, name, options, output.note)
+        if not given.quiet:
+            output.notes(query.remarks(is_empty=False))
+            print_unplayed(query)
+            _print_undefined(log)
+        asyncio.run(_until_signal(server, quiet=given.quiet))
 
 
 async def _until_signal(server: PlaybackServer, *, quiet: bool) -> None:
@@ -221,16 +193,21 @@ async def _until_signal(server: PlaybackServer, *, quiet: bool) -> None:
 
 
 def _print_address(port: int, *, quiet: bool) -> None:
-    from urllib.parse import quote
-
     address = f"ws://127.0.0.1:{port}"
     output.say(address)
     sys.stdout.flush()
     if not quiet:
-        url = f"https://app.foxglove.dev/?ds=foxglove-websocket&ds.url={quote(address, safe='')}"
+        url = _foxglove("foxglove-websocket", address)
         output.note(f"In Foxglove or Lichtblick: Open connection, Foxglove WebSocket, {address}")
         output.note(f"In a browser: {url}")
         output.note("Ctrl-C ends it.")
+
+
+def _foxglove(source: str, url: str) -> str:
+    """The address at which Foxglove opens a source."""
+    from urllib.parse import quote
+
+    return f"https://app.foxglove.dev/?ds={source}&ds.url={quote(url, safe='')}"
 
 
 def print_unplayed(query: Query) -> None:
@@ -283,8 +260,6 @@ def view_command(given: _View) -> None:
         raise MissingDependencyError(
             "The view needs starlette and uvicorn: pip install 'hybridlog[view]'"
         ) from error
-    if given.origins and not given.mcap:
-        raise UsageError("--allow-origin is about --mcap: add that.")
     with given.opened(is_lasting=True) as store:
         server = ViewServer(store, given.port or 0, viewers=given.mcap, origins=given.origins)
         url = server.url
@@ -309,18 +284,10 @@ def view_command(given: _View) -> None:
 
 
 def _print_mcap(url: str, name: str) -> None:
-    """Print where other viewers find selections.
-
-    Args:
-        url: Address of all selections.
-        name: Name of a recording for the examples, as in a URL; empty without one.
-    """
-    from urllib.parse import quote
-
+    """Print where other viewers find selections."""
     file = f"{url}slice.mcap?recording={name or 'RECORDING'}"
-    foxglove = f"https://app.foxglove.dev/?ds=remote-file&ds.url={quote(file, safe='')}"
     output.note(f"MCAP file: {file}")
-    output.note(f"In Foxglove: {foxglove}")
+    output.note(f"In Foxglove: {_foxglove('remote-file', file)}")
     output.note(f"For a remote data loader: {url}manifest")
 
 

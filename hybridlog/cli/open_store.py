@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 import click
 
 from hybridlog.cli.output import counted, note
-from hybridlog.cli.progress import LateBar
+from hybridlog.cli.progress import Bar
 from hybridlog_storage.errors import StoreError, WithoutMongoError
 
 if TYPE_CHECKING:
@@ -65,24 +65,22 @@ def opened_store(
     if len(near) == 1 and _reads():
         path = near[0]
         note(f"Store: {path}, the only one below this folder.")
-    bar = LateBar("indexing", quiet=quiet)
     try:
-        store = open_store(
-            path,
-            mongo=mongo,
-            create=create,
-            require_database=needs_database,
-            progress=bar,
-            cache_mb=cache_mb,
-            recover=recover,
-        )
+        with Bar("indexing", quiet=quiet) as bar:
+            store = open_store(
+                path,
+                mongo=mongo,
+                create=create,
+                require_database=needs_database,
+                progress=bar.part,
+                cache_mb=cache_mb,
+                recover=recover,
+            )
     except StoreError as error:
         if near and path is None:
             named = " or ".join(f"--store {quote(str(one))}" for one in near[:_MAX_LISTED])
             error.add_note(f"Below this folder: {named}.")
         raise
-    finally:
-        bar.close()
     during = mended_meanwhile(store) if is_lasting and recover else nullcontext()
     with store, during:
         doing = "so the files answer"
@@ -145,12 +143,7 @@ def _print_unreadable(store: Store, told: Collection[str]) -> None:
 
 
 def _print_rebuilt(store: Store, doing: str) -> None:
-    """Report what was made again since the last report, and why MongoDB is unavailable.
-
-    Args:
-        store: The store.
-        doing: The consequence; empty if that was said before.
-    """
+    """Report what was made again since the last report, and why MongoDB is unavailable."""
     repairs = store.repairs
     if repairs.tables:
         note(f"{counted(len(repairs.tables), 'table')} made again: missing or damaged.")

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Final
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import click
 
 from hybridlog.cli import output
-from hybridlog.cli.binder import argument, option
+from hybridlog.cli.binder import Amount, argument, option
 from hybridlog.cli.completion import (
     complete_condition,
     complete_frame,
@@ -24,8 +24,10 @@ from hybridlog.cli.completion import (
     complete_type,
 )
 from hybridlog.cli.open_store import opened_store
+from hybridlog.cli.render import Column, print_table
 from hybridlog.formats import formats_of
 from hybridlog.query.choice import Choice
+from hybridlog.wording import parse_size
 from hybridlog_storage.errors import TopicError, UsageError
 
 if TYPE_CHECKING:
@@ -33,9 +35,6 @@ if TYPE_CHECKING:
     from hybridlog.query.times import TimeLike
     from hybridlog.recordings import Recordings
     from hybridlog.store import Store
-
-VERBOSE: Final = f"{__name__}.verbose"
-"""Key in `click.Context.meta`: True with `--verbose`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,6 +69,38 @@ class AsJson:
     """The option of commands that print JSON."""
 
     as_json: bool = option("Print JSON, for scripts.", name="--json")
+
+    def show(
+        self,
+        rows: Sequence[Any],
+        columns: Sequence[Column],
+        without: str = "",
+        plain: Callable[[Any], object] = lambda row: row,
+        **how: Any,
+    ) -> None:
+        """Print rows.
+
+        Args:
+            rows: The rows.
+            columns: Of the table.
+            without: What to say without any row.
+            plain: Gives a row as JSON.
+            how: Of `print_table`.
+        """
+        if self.as_json:
+            output.print_json([plain(row) for row in rows])
+        elif rows:
+            print_table(columns, rows, **how)
+        elif without and not getattr(self, "quiet", False):
+            output.note(without)
+
+    def tell(self, value: object, lines: Iterable[str]) -> None:
+        """Print a result as JSON, or in lines unless `--quiet` is given."""
+        if self.as_json:
+            output.print_json(value)
+        elif not getattr(self, "quiet", False):
+            for line in lines:
+                output.say_folded(line)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,7 +157,9 @@ class Choosing:
         nargs=2,
     )
     last: str | None = option(
-        "Only from so long ago until now, such as 30d: recordings, and their messages.", "DURATION"
+        "Only from so long ago until now, such as 30d: recordings, and their messages.",
+        "DURATION",
+        excludes=("between", "during"),
     )
     older_than: str | None = option(
         "Only recordings whose last message is at least this old, such as 30d.", "DURATION"
@@ -140,16 +173,8 @@ class Choosing:
 
     @property
     def choice(self) -> Choice:
-        """The conditions for recordings.
-
-        Raises:
-            UsageError: `--last` and `--during` are given.
-        """
-        during: Any = self.during
-        if self.last is not None:
-            if during is not None:
-                raise UsageError("--last is a range of time, as --during: give one of them.")
-            during = self.since, None
+        """The conditions for recordings."""
+        during: Any = self.during if self.last is None else (self.since, None)
         return Choice.of(
             (*self.names, *self.recording),
             tag=self.tag,
@@ -221,16 +246,8 @@ class Ranged(Between, Choosing, InStore, Quiet):
 
     @property
     def span(self) -> tuple[TimeLike, TimeLike | None] | None:
-        """The range of `--between` or `--last`; None for all times.
-
-        Raises:
-            UsageError: Both are given.
-        """
-        if self.between is None:
-            return None if self.last is None else (self.since, None)
-        if self.last is not None:
-            raise UsageError("--last is a range of time, as --between: give one of them.")
-        return self.between
+        """The range of `--between` or `--last`; None for all times."""
+        return self.between if self.last is None else (self.since, None)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -238,14 +255,16 @@ class Topics(Ranged):
     """Options of commands about messages of some topics.
 
     Attributes:
+        needs_topic: Without a topic, the question is refused: all would be too much.
         where: Predicates that all messages satisfy.
         strict: Incomplete answers are refused.
-        needs_topic: Without a topic, the question is refused: all would be too much.
+        verbose: The cost is told.
     """
 
     needs_topic: ClassVar[bool] = False
     where: ClassVar[tuple[str, ...]] = ()
     strict: ClassVar[bool] = False
+    verbose: ClassVar[bool] = False
     words: tuple[str, ...] = argument(
         "Topics, as for --topic.", "[TOPIC]...", shell_complete=complete_topic
     )
@@ -296,16 +315,11 @@ class Filtered(Strict, Topics):
     )
 
 
-def _note_verbose(context: click.Context, _: click.Parameter, wanted: bool) -> bool:  # noqa: FBT001
-    context.meta[VERBOSE] = wanted
-    return wanted
-
-
 @dataclass(frozen=True, kw_only=True)
 class Verbose:
     """The option of commands that can tell the cost of an answer."""
 
-    verbose: bool = option("Say what the answer has cost.", short="-v", callback=_note_verbose)
+    verbose: bool = option("Say what the answer has cost.", short="-v")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -322,12 +336,14 @@ class Served:
         "for viewers that connect.",
         "N",
         type=click.IntRange(0, 65535),
+        needs=("viewer=websocket",),
     )
     origins: tuple[str, ...] = option(
         "Let web pages of this origin read what is served, such as https://viewer.example; "
         "Foxglove's may.",
         "URL",
         name="--allow-origin",
+        needs=("viewer=websocket", "mcap"),
     )
 
 
@@ -351,19 +367,16 @@ class Latched:
         "With --between: leave out the latched messages and frames of video from before it."
     )
     original_times: bool = option(
-        "Latched messages and frames from before the time range keep their log time."
+        "Latched messages and frames from before the time range keep their log time.",
+        excludes=("no_latched",),
     )
 
     def check_latched(self, form: str | None) -> None:
         """Refuse what has no effect in a format; None for a recording.
 
         Raises:
-            UsageError: The options contradict each other, or the format has no such messages.
+            UsageError: The format has no such messages.
         """
-        if self.no_latched and self.original_times:
-            raise UsageError(
-                "--no-latched leaves no messages for --original-times: give one of them."
-            )
         logs = formats_of("log")
         if self.original_times and form not in {None, *logs}:
             raise UsageError(
@@ -381,15 +394,18 @@ class Slices(Latched, Forced):
         "holds: 'odom: twist.twist.linear.x > 0.1'. Their names follow that of the output.",
         "HOW",
         name="--split-by",
+        needs=("output", "target"),
+        excludes=("at", "follow", "reverse"),
     )
     tags: str | None = option("Tags of the recordings as columns, with commas between them.", "A,B")
     storage: str | None = option(
         "For rosbag2: the storage of the bag; without, mcap.",
         type=click.Choice(["mcap", "sqlite3"]),
     )
-    file_size: str | None = option(
+    file_size: int | None = option(
         "For rosbag2: begin a new file at so many bytes of payload, such as 500MB; without, 2GiB.",
         "SIZE",
+        type=Amount(parse_size, "1B"),
     )
 
     def settings(self, form: str) -> dict[str, Any]:
@@ -407,9 +423,7 @@ class Slices(Latched, Forced):
             return {}
         settings: dict[str, Any] = {"storage": self.storage or "mcap"}
         if self.file_size is not None:
-            settings["max_file"] = output.parse_size(self.file_size)
-            if not settings["max_file"]:
-                raise UsageError("--file-size must be more than 0.")
+            settings["max_file"] = self.file_size
         return settings
 
 

@@ -16,6 +16,7 @@ from hybridlog.cli.answers import answering, check_room, not_written
 from hybridlog.cli.binder import command, option
 from hybridlog.cli.completion import complete_path
 from hybridlog.cli.options import Asking, Forced, parse_fields
+from hybridlog.cli.render import Column, print_table, room
 from hybridlog.cli.signals import if_stopped
 from hybridlog_storage.errors import UsageError
 
@@ -47,7 +48,11 @@ class _Given(Asking, Forced):
         short="-o",
     )
     form: str | None = option(
-        "Without: by the suffix of -o.", name="--format", short="-F", type=click.Choice(_FORMATS)
+        "Without: by the suffix of -o.",
+        name="--format",
+        short="-F",
+        type=click.Choice(_FORMATS),
+        needs=("output",),
     )
     size: str | None = option(
         f"Pixels of the picture; without, {_WIDTH}x{_HEIGHT}, and as high again for each "
@@ -82,18 +87,15 @@ def plot_command(given: _Given) -> None:
 def _form(path: Path | None, form: str | None) -> str:
     """The format; empty for text."""
     if path is None:
-        if form is not None:
-            raise UsageError(f"{form} needs a name: -o FILE.{form}, or -o - for standard output.")
         return ""
     if str(path) == "-" and form is not None and sys.stdout.isatty():
         raise UsageError(f"{form} is no text for a terminal: name a file with -o.")
-    found = form or path.suffix.lower().removeprefix(".")
-    if found not in _FORMATS:
+    if form is None and path.suffix.lower()[1:] not in _FORMATS:
         raise UsageError(
             f"The name {path} does not give the format: add --format, or end it in "
             f"{', '.join(f'.{name}' for name in _FORMATS)}."
         )
-    return found
+    return form or path.suffix.lower()[1:]
 
 
 def _size(text: str) -> tuple[int, int]:
@@ -120,26 +122,22 @@ def _print(found: Sequence[Line]) -> None:
     """A row for each line: its least and greatest value, and a sparkline."""
     from hybridlog.cli.sparkline import sparkline
 
-    shared = [
-        ("topic", [line.topic for line in found]),
-        ("recording", [line.recording for line in found]),
-    ]
-    beside = [(name, cells) for name, cells in shared if len(set(cells)) > 1]
     if not any(len(line.series.times) for line in found):
         output.note("No message.")
         return
-    columns: list[output.Column] = [(name, "left") for name, _ in beside]
-    columns += [("field", "left"), ("least", "right"), ("greatest", "right"), ("", "whole")]
-    rows = [
-        [*(cells[number] for _, cells in beside), line.series.field, *_ends(line.series)]
-        for number, line in enumerate(found)
+    shared = [
+        Column("topic", lambda line: line.topic),
+        Column("recording", lambda line: line.recording),
     ]
-    width = _LETTERS
-    if sys.stdout.isatty():
-        width = max(_LETTERS // 4, output.room([name for name, _ in columns], rows))
-    for row, line in zip(rows, found, strict=True):
-        row.append(sparkline(line.series.by_column(width)))
-    output.print_table(columns, rows)
+    columns = [
+        *(one for one in shared if len(set(map(one.cell, found))) > 1),
+        Column("field", lambda line: line.series.field),
+        Column("least", lambda line: _ends(line.series)[0], "right"),
+        Column("greatest", lambda line: _ends(line.series)[1], "right"),
+    ]
+    width = max(_LETTERS // 4, room(columns, found)) if sys.stdout.isatty() else _LETTERS
+    drawn = Column("", lambda line: sparkline(line.series.by_column(width)), "whole")
+    print_table([*columns, drawn], found)
 
 
 def _ends(series: Series) -> tuple[str, str]:

@@ -2,50 +2,14 @@
 
 from __future__ import annotations
 
-import os
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
-import click
-from click.core import ParameterSource
-
 from hybridlog.cli.binder import argument, command
-from hybridlog.cli.hints import Command
-from hybridlog.cli.record_choices import LiveOption, RecordChoices, check_choices
+from hybridlog.cli.record_choices import RecordChoices, check_choices
 
 
-class _RecordCommand(Command):
-    """`record`, with two spellings of options that click does not know."""
-
-    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Read `--ros1 URI` as `--ros1 --master URI`, and `--throttle A B` as `A=B`."""
-        written: list[str] = []
-        rest = list(args)
-        while rest:
-            word = rest.pop(0)
-            before = written[-1] if written else ""
-            if word.startswith("--ros1="):
-                written += ["--master", word.removeprefix("--ros1=")]
-            elif before == "--ros1" and _is_value(word) and not _is_file(word):
-                written += ["--master", word]
-            elif before in {"--throttle", "--priority"} and "=" not in word:
-                # The next option is no value, even where a value was forgotten.
-                has_value = bool(rest) and _is_value(rest[0])
-                written.append(f"{word}={rest.pop(0)}" if has_value else word)
-            else:
-                written.append(word)
-        return super().parse_args(ctx, written)
-
-
-def _is_value(word: str) -> bool:
-    return not word.startswith("-")
-
-
-def _is_file(word: str) -> bool:
-    return os.path.exists(word)  # noqa: PTH110 - a word that is too long for a path is no error
-
-
-@command(RecordChoices, cls=_RecordCommand)
+@command(RecordChoices)
 def record_command(choices: RecordChoices) -> None:
     """Record logs, or a running robot, into the store.
 
@@ -58,7 +22,6 @@ def record_command(choices: RecordChoices) -> None:
     Ctrl-C. Lost messages are counted: see `hybridlog info --losses`. Options under
     "Live recording" are for this.
     """
-    choices = replace(choices, live_options=_live_options())
     check_choices(choices)
     if choices.is_live:
         from hybridlog.cli.record_live import record_live
@@ -72,17 +35,6 @@ def record_command(choices: RecordChoices) -> None:
         from hybridlog.cli.record_logs import record_logs
 
         record_logs(choices)
-
-
-def _live_options() -> tuple[str, ...]:
-    """The options for live recording that were given."""
-    context = click.get_current_context()
-    return tuple(
-        parameter.opts[0]
-        for parameter in context.command.params
-        if isinstance(parameter, LiveOption)
-        and context.get_parameter_source(str(parameter.name)) is ParameterSource.COMMANDLINE
-    )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,7 +10,6 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
-from types import FrameType
 from typing import TYPE_CHECKING
 
 from hybridlog.cli import output
@@ -19,7 +18,8 @@ from hybridlog.cli.live_summary import LiveSummary
 from hybridlog.cli.live_table import LiveTable, in_short, summary
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.record_choices import opened_to_record
-from hybridlog.cli.signals import SIGNALS, restore_echo, write_note
+from hybridlog.cli.signals import handled, restore_echo, write_note
+from hybridlog.contract.judge import broken
 from hybridlog_storage.errors import HybridlogError
 from hybridlog_storage.stopping import Flag
 
@@ -75,11 +75,10 @@ def _record(choices: RecordChoices) -> None:
                     reports = recorder.stop()
             while recovery.is_alive() and not stop.wait(_RECOVERY_POLL_S):
                 pass
-        ending = LiveSummary(reports, recorder, sources, options)
-        if options.contract is not None:
-            ids = [report.entry.id for report in reports]
-            results = [one for each in ids for one in store.judge(options.contract, each)]
-            ending.add_verdict(results)
+        rules, results = options.contract, []
+        if rules is not None:
+            results = [one for each in reports for one in store.judge(rules, each.entry.id)]
+        ending = LiveSummary(reports, recorder, recorder.look(), sources, options, broken(results))
         ending.print_and_exit(as_json=choices.as_json, quiet=quiet)
 
 
@@ -102,13 +101,12 @@ def _begin_recovery(choices: RecordChoices, store: Store) -> threading.Thread:
 
 
 def _watch(recorder: Recorder, stop: Flag, display: _Display) -> RecorderState:
-    state = recorder.look()
-    display.state(state)
-    while not stop.is_set and not recorder.wait(0):
-        stop.wait(_STATE_S)
+    while True:
         state = recorder.look()
         display.state(state)
-    return state
+        if stop.is_set or recorder.wait(0):
+            return state
+        stop.wait(_STATE_S)
 
 
 @contextmanager
@@ -133,10 +131,9 @@ def _stop_flag() -> Iterator[Flag]:
 
     Flushed chunks stay, and the next command on the store seals them.
     """
-    before = {number: signal.getsignal(number) for number in SIGNALS}
     with Flag() as stopped:
 
-        def stop(number: int, _frame: FrameType | None) -> None:
+        def stop(number: int) -> None:
             if stopped.is_set:
                 write_note(
                     "\nhybridlog: stopped. Flushed chunks stay; the next command seals them."
@@ -145,32 +142,18 @@ def _stop_flag() -> Iterator[Flag]:
                 os._exit(128 + number)
             stopped.set()
 
-        for number, handler in before.items():
-            if handler is not signal.SIG_IGN:
-                signal.signal(number, stop)
-        try:
+        with handled(stop):
             yield stopped
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
 
 
-@contextmanager
-def _pinned_by_signal(recorder: Recorder) -> Iterator[None]:
+def _pinned_by_signal(recorder: Recorder) -> AbstractContextManager[object]:
     """SIGUSR1 marks and pins what is around it."""
-    if not hasattr(signal, "SIGUSR1"):
-        yield
-        return
 
-    def fire(number: int, _frame: FrameType | None) -> None:
+    def fire(_: int) -> None:
         # Not in the handler: the code it interrupts may hold the locks.
         threading.Thread(target=recorder.fire, args=("SIGUSR1",), daemon=True).start()
 
-    before = signal.signal(signal.SIGUSR1, fire)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGUSR1, before)
+    return handled(fire, [signal.SIGUSR1] if hasattr(signal, "SIGUSR1") else [])
 
 
 class _Display:

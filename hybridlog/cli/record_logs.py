@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -15,8 +16,9 @@ from hybridlog.arrays import is_video_type
 from hybridlog.cli import output
 from hybridlog.cli.ls import with_misfits
 from hybridlog.cli.options import parse_tags
-from hybridlog.cli.progress import progress_bar
+from hybridlog.cli.progress import Bar
 from hybridlog.cli.record_choices import RecordChoices, opened_to_record, segment_settings
+from hybridlog.cli.render import Column, bytes_of, numbers, print_fields, print_table
 from hybridlog.cli.signals import if_stopped
 from hybridlog.cli.watching import watch
 from hybridlog.query.answers.completeness import coverage
@@ -33,7 +35,6 @@ from hybridlog_storage.errors import (
 from hybridlog_storage.stopping import anywhere, at_safe_points, safe_point
 
 if TYPE_CHECKING:
-    from hybridlog.cli.progress import Bar
     from hybridlog.formats.find import Found, Watch
     from hybridlog.formats.log_set import LogSet
     from hybridlog.formats.reading import Source
@@ -51,23 +52,22 @@ def record_logs(choices: RecordChoices) -> None:
     if choices.name is not None and len(logs) > 1:
         raise UsageError(f"--name names one recording; there are {len(logs)} logs.")
     # Wrong options are found before a store is made.
-    recorder = LogRecorder(choices)
+    recorder = LogRecorder(choices, Results(choices, logs, is_search=walked is not None))
     check_new_store(choices, logs)
     done = recorder.results
-    done.expect(logs, is_search=walked is not None)
-    if walked is not None:
-        done.add_walk(walked)
-    total = sum(log.size for log in logs)
+    for problem in walked.problems if walked is not None else ():
+        done.fail(None, problem)
+    total, before = sum(log.size for log in logs), 0
     try:
         with (
             if_stopped(done.on_stop),
             opened_to_record(choices) as store,
             at_safe_points(),
-            progress_bar(_what(logs), total, quiet=choices.quiet) as bar,
+            Bar(_what(logs), total, quiet=choices.quiet) as bar,
         ):
-            before = 0
             for log in logs:
                 safe_point()
+                # A single one needs no name beside the bar.
                 name = f"{log.path.name}: " if len(logs) > 1 else ""
                 recorder.record(store, log, partial(_shown, bar, before, name))
                 before += log.size
@@ -79,16 +79,13 @@ def record_logs(choices: RecordChoices) -> None:
 def record_watched(choices: RecordChoices) -> None:
     """Record what lies in directories, and what comes into them, until a signal ends it."""
     from hybridlog.formats.find import Watch
-    from hybridlog.query.times import parse_duration
 
-    settle_s = parse_duration(choices.settle) / 1e9
-    recorder = LogRecorder(choices)
+    done = Results(choices, (), is_search=True)
+    recorder = LogRecorder(choices, done)
     check_new_store(choices, [])
-    watches = [Watch(path, settle_s) for path in choices.paths]
+    watches = [Watch(path, choices.settle) for path in choices.paths]
     for one in watches:
         one.check()
-    done = recorder.results
-    done.report_each()
     try:
         with if_stopped(done.on_stop), opened_to_record(choices) as store:
             look = partial(_look, recorder, store, watches, set[Path]())
@@ -109,14 +106,7 @@ def record_watched(choices: RecordChoices) -> None:
 def _look(
     recorder: LogRecorder, store: Store, watches: Sequence[Watch], met: set[Path]
 ) -> Iterator[SourceError]:
-    """Record logs that have become complete; yields what cannot be read.
-
-    Args:
-        recorder: Records them.
-        store: The store.
-        watches: The directories.
-        met: Stores in them that were named; changed.
-    """
+    """Record logs that have become complete; yields what cannot be read."""
     for one in watches:
         try:
             found = one.look()
@@ -151,14 +141,13 @@ def _find(choices: RecordChoices) -> tuple[list[LogSet], Found | None]:
         )
     for path in choices.paths:
         found = find_logs(path) if path.is_dir() else Found()
+        print_stores(found.stores)
         is_one = len(found.logs) == 1 and path in {found.logs[0].path, found.logs[0].path.parent}
         if is_one or not found.logs:
             logs.append(LogSet.at(path))
-            print_stores(found.stores)
             continue
         walked = walked or Found()
         logs += found.logs
-        walked.stores += found.stores
         walked.problems += found.problems
     return logs, walked
 
@@ -183,7 +172,6 @@ def _what(logs: Sequence[LogSet]) -> str:
 
 
 def _shown(bar: Bar, before: int, name: str, read: int, messages: int) -> None:
-    """Show the progress of a log after others; a single one needs no name beside the bar."""
     bar(before + read, f"{name}{output.counted(messages, 'message')}")
 
 
@@ -197,8 +185,8 @@ class LogRecorder:
         UsageError: An option is wrong.
     """
 
-    def __init__(self, choices: RecordChoices) -> None:
-        self.results = Results(choices)
+    def __init__(self, choices: RecordChoices, results: Results) -> None:
+        self.results = results
         self._choices = choices
         self._settings = segment_settings(choices)
         self._tags = parse_tags(choices.set_tag)
@@ -348,16 +336,16 @@ def _matchers(choices: RecordChoices) -> tuple[TopicMatcher | None, TopicMatcher
 class Results:
     """Results of logs, for the table at the end and the exit code.
 
-    Attributes:
+    Args:
+        choices: The options.
+        logs: The logs to record; without any, each is reported at once, as there is no end.
         is_search: Whether logs are looked for in directories, so that known ones are no error.
     """
 
-    def __init__(self, choices: RecordChoices) -> None:
+    def __init__(self, choices: RecordChoices, logs: Sequence[LogSet], *, is_search: bool) -> None:
         self._choices = choices
-        self._logs: Sequence[LogSet] = ()
-        self._unfinished: list[Path] = []
-        self.is_search = False
-        self._reports_each = False
+        self._logs, self.is_search = logs, is_search
+        self._unfinished = [log.path for log in logs]
         self._current: Path | None = None
         self._recorded = self._known = self._failed = 0
         self._exit_code = 0
@@ -365,26 +353,6 @@ class Results:
         self._reports: list[tuple[Path, RecordReport]] = []
         self._summaries: list[dict[str, Any]] = []
         self._messages: list[str] = []
-
-    def expect(self, logs: Sequence[LogSet], *, is_search: bool) -> None:
-        """Set the logs to record.
-
-        Args:
-            logs: The logs.
-            is_search: Whether they were found in directories.
-        """
-        self._logs, self.is_search = logs, is_search
-        self._unfinished = [log.path for log in logs]
-
-    def report_each(self) -> None:
-        """Print a line for each log when it is recorded; there is no end to the search."""
-        self.is_search = self._reports_each = True
-
-    def add_walk(self, found: Found) -> None:
-        """Report what was met in directories besides logs."""
-        print_stores(found.stores)
-        for problem in found.problems:
-            self.fail(None, problem)
 
     def begin(self, path: Path) -> None:
         """The log at a path is recorded now."""
@@ -402,7 +370,7 @@ class Results:
         for error in _problems(path, report, quiet=self._choices.quiet):
             self._exit_code = self._exit_code or error.exit_code
         self._summarise(_summary(path, report))
-        if not self._reports_each:
+        if self._logs:
             self._reports.append((path, report))
         elif not self._choices.as_json and not self._choices.quiet:
             entry = report.entry
@@ -443,7 +411,7 @@ class Results:
         self._summarise({**about, "error": str(error), "exit_code": error.exit_code})
 
     def _summarise(self, summary: dict[str, Any]) -> None:
-        if not self._reports_each:
+        if self._logs:
             self._summaries.append(summary)
         elif self._choices.as_json:
             output.print_json_line(summary)
@@ -461,26 +429,22 @@ class Results:
         return " ".join(parts)
 
     def show(self) -> None:
-        """Print the table of the finished recordings, and what became of the others."""
-        if self._choices.as_json:
-            if self._summaries:
-                one = len(self._choices.paths) == 1 and not self.is_search
-                output.print_json(self._summaries[0] if one else self._summaries)
-        elif not self._choices.quiet and self._reports:
-            if len(self._reports) == 1:
-                _print_one(*self._reports[0])
-            else:
-                _print_several([report for _, report in self._reports])
-        if self.is_search:
-            self._sum_up()
-
-    def _sum_up(self) -> None:
-        """Print how many logs were recorded, were there, and could not be read."""
+        """Print the finished recordings, and what became of the others."""
+        choices = self._choices
+        if choices.as_json and self._summaries:
+            one = len(choices.paths) == 1 and not self.is_search
+            output.print_json(self._summaries[0] if one else self._summaries)
+        elif len(self._reports) == 1 and not choices.as_json and not choices.quiet:
+            _print_one(*self._reports[0])
+        elif self._reports and not choices.as_json and not choices.quiet:
+            _print_several([report for _, report in self._reports])
+        if not self.is_search:
+            return
         for message in self._messages:
             output.note(f"not recorded: {message}")
         if self._failed > len(self._messages):
             output.note(f"and {self._failed - len(self._messages)} more")
-        if not self._choices.quiet:
+        if not choices.quiet:
             output.note(
                 f"{output.counted(self._recorded, 'log')} recorded, {self._known} in the store "
                 f"already, {self._failed} not recorded."
@@ -499,7 +463,7 @@ def _summary(path: Path, report: RecordReport) -> dict[str, Any]:
         "recording": entry.name,
         "id": entry.id,
         "status": entry.status,
-        "topics": _topics(report),
+        "topics": len({c.topic for c in entry.channels}),
         "messages": entry.messages,
         "messages_indexed": report.indexed,
         "messages_unreadable": sum(c.stats.unreadable for c in entry.channels),
@@ -511,86 +475,66 @@ def _summary(path: Path, report: RecordReport) -> dict[str, Any]:
         "messages_latched": report.latched,
         "bytes_in": entry.source["bytes"],
         "bytes_stored": entry.stored_bytes,
-        "ratio": round(_ratio(entry.source["bytes"], entry.stored_bytes), 3),
+        "ratio": round(entry.source["bytes"] / (entry.stored_bytes or math.inf), 3),
         "seconds": round(report.elapsed_s, 3),
         "damage": [{**asdict(d), "file": str(d.file)} for d in report.damage],
         "not_indexed": {c.topic: c.unindexed for c in entry.channels if c.unindexed is not None},
     }
 
 
-def _topics(report: RecordReport) -> int:
-    return len({c.topic for c in report.entry.channels})
-
-
-def _ratio(taken: int, stored: int) -> float:
-    return taken / stored if stored else 0.0
+def _ratio(row: Mapping[str, Any]) -> str:
+    return f"{row['bytes_in'] / (row['bytes_stored'] or math.inf):.2f}"
 
 
 def _print_one(path: Path, report: RecordReport) -> None:
-    entry = report.entry
-    taken = int(entry.source["bytes"])
+    entry, row = report.entry, _summary(path, report)
     rate = entry.messages / report.elapsed_s if report.elapsed_s else 0.0
-    left_out = f" ({report.skipped} left out)" if report.skipped else ""
+    messages, attachments = str(entry.messages), str(entry.attachments or "")
+    if report.skipped:
+        messages += f" ({report.skipped} left out)"
     if report.latched:
         videos = any(is_video_type(one.type) for one in entry.channels)
         what = "latched or frames of video" if videos else "latched"
-        left_out += f"; {report.latched} of them {what}, from before the time range"
-    left_behind = report.attachments_left_out
-    attachments = f"{entry.attachments} ({left_behind} left out)" if left_behind else ""
-    attachments = attachments or str(entry.attachments or "")
-    output.print_table(
-        [("recording", "left"), (entry.name, "left")],
+        messages += f"; {report.latched} of them {what}, from before the time range"
+    if report.attachments_left_out:
+        attachments = f"{entry.attachments} ({report.attachments_left_out} left out)"
+    print_fields(
         [
+            ("recording", entry.name),
             ("source", f"{path} ({entry.source['kind']})"),
-            ("topics", str(_topics(report))),
-            ("messages", f"{entry.messages}{left_out}"),
+            ("topics", row["topics"]),
+            ("messages", messages),
             *([("attachments", attachments)] if attachments else []),
-            ("bytes in", output.size(taken)),
+            ("bytes in", output.size(row["bytes_in"])),
             ("bytes stored", output.size(entry.stored_bytes)),
-            ("ratio", f"{_ratio(taken, entry.stored_bytes):.2f}"),
-            ("messages indexed", str(report.indexed)),
+            ("ratio", _ratio(row)),
+            ("messages indexed", report.indexed),
             ("time", f"{report.elapsed_s:.2f} s ({rate:,.0f} messages/s)"),
-        ],
+        ]
     )
 
 
 def _print_several(reports: Sequence[RecordReport]) -> None:
-    figures = [
-        (
-            _topics(report),
-            report.entry.messages,
-            int(report.entry.source["bytes"]),
-            report.entry.stored_bytes,
-            report.indexed,
-            report.elapsed_s,
-        )
-        for report in reports
-    ]
+    rows = [_summary(Path(), report) for report in reports]
+    summed = ("messages", "bytes_in", "bytes_stored", "messages_indexed", "seconds")
+    total = {name: sum(row[name] for row in rows) for name in summed}
     topics = len({c.topic for report in reports for c in report.entry.channels})
-    total = (topics, *(sum(column) for column in [*zip(*figures, strict=True)][1:]))
-    names = [*(report.entry.name for report in reports), "total"]
-    rows = [
-        (
-            name,
-            str(topics),
-            str(messages),
-            output.size(taken),
-            output.size(stored),
-            f"{_ratio(taken, stored):.2f}",
-            str(indexed),
-            f"{elapsed_s:.2f} s",
-        )
-        for name, (topics, messages, taken, stored, indexed, elapsed_s) in zip(
-            names, [*figures, total], strict=True
-        )
-    ]
-    heads = ("topics", "messages", "bytes in", "stored", "ratio", "indexed", "time")
-    output.print_table([("recording", "left"), *((head, "right") for head in heads)], rows)
+    print_table(_COLUMNS, [*rows, {"recording": "total", "topics": topics, **total}])
 
 
-def _problems(path: Path, report: RecordReport, *, quiet: bool) -> list[HybridlogError]:
-    """Print problems; returns an error for each that sets the exit code."""
-    problems: list[HybridlogError] = []
+_COLUMNS = [
+    Column("recording"),
+    *numbers("topics", "messages"),
+    bytes_of("bytes in", "bytes_in", spare=1),
+    bytes_of("stored", "bytes_stored"),
+    Column("ratio", _ratio, "right"),
+    Column("indexed", "messages_indexed", "right"),
+    Column("time", lambda row: f"{row['seconds']:.2f} s", "right"),
+]
+
+
+def _problems(path: Path, report: RecordReport, *, quiet: bool) -> Iterator[HybridlogError]:
+    """Print problems; gives an error for each that sets the exit code."""
     for channel in report.entry.channels:
         if channel.is_indexed and channel.reason is not None and not quiet:
             output.note(f"{channel.topic}: not indexed beyond time: {channel.reason}")
@@ -605,24 +549,19 @@ def _problems(path: Path, report: RecordReport, *, quiet: bool) -> list[Hybridlo
             "the time range did not fit in memory."
         )
     if not quiet:
-        for line in (*output.surpluses(report.entry.channels), *report.remarks):
-            output.note(line)
+        output.notes((*output.surpluses(report.entry.channels), *report.remarks))
     for damage in report.damage:
         place = "" if damage.offset is None else f" at byte {damage.offset}"
         count = damage.messages_lost
         lost = f"; {output.counted(count, 'message')} lost" if count else ""
         output.note(f"{damage.file}{place}: {damage.reason}{lost}")
     if report.failure is not None:
-        output.note(
-            f"hybridlog: {report.failure} {output.stored(report.missed)} "
-            "but not in the index; the next command that opens the store catches up."
-        )
-        problems.append(DatabaseError(str(report.failure)))
+        output.note(f"hybridlog: {output.not_indexed(report)}")
+        yield DatabaseError(str(report.failure))
     if report.damage:
-        losses = losses_of(report.entry)
+        entry = report.entry
         output.note(
-            f"{path} is damaged: {output.stored(report.entry.messages)}; "
-            f"{coverage(report.entry, losses)}."
+            f"{path} is damaged: {output.stored(entry.messages)}; "
+            f"{coverage(entry, losses_of(entry))}."
         )
-        problems.append(SourceDamagedError(str(path)))
-    return problems
+        yield SourceDamagedError(str(path))

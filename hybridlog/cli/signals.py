@@ -12,7 +12,7 @@ import contextlib
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from types import FrameType
 from typing import Any, Final, NoReturn
@@ -93,29 +93,39 @@ def install() -> None:
 
 
 @contextlib.contextmanager
+def handled(
+    handler: Callable[[int], object], numbers: Sequence[int] = SIGNALS
+) -> Iterator[Callable[[], None]]:
+    """Handle signals that are not ignored, in a block; gives what ends that before."""
+    before = {number: signal.getsignal(number) for number in numbers}
+
+    def restore() -> None:
+        for number, old in before.items():
+            signal.signal(number, old)
+
+    for number, old in before.items():
+        if old is not signal.SIG_IGN:
+            signal.signal(number, lambda number, _: handler(number))
+    try:
+        yield restore
+    finally:
+        restore()
+
+
+@contextlib.contextmanager
 def ended_by_signal(end: Callable[[], object]) -> Iterator[None]:
     """Let the first signal end a server, with exit code 0; a second one ends the process.
 
     Args:
         end: Ends the server soon.
     """
-    before = {number: signal.getsignal(number) for number in SIGNALS}
 
-    def restore() -> None:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-    def stop(_number: int, _frame: FrameType | None) -> None:
+    def stop(_: int) -> None:
         restore()
         end()
 
-    for number, handler in before.items():
-        if handler is not signal.SIG_IGN:
-            signal.signal(number, stop)
-    try:
+    with handled(stop) as restore:
         yield
-    finally:
-        restore()
 
 
 def undo_unfinished() -> None:

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NoReturn, Self
 
 from hybridlog.cli.answers import Tabular, answer_sql
-from hybridlog.cli.binder import argument, command, option
+from hybridlog.cli.binder import SECONDS, SIZE, argument, command, option
 from hybridlog.cli.options import Ranged, Strict
-from hybridlog.cli.output import note, notes, parse_size, say
+from hybridlog.cli.output import note, notes, say
 from hybridlog.cli.signals import if_stopped
 from hybridlog_storage.errors import HybridlogError
 from hybridlog_storage.stopping import at_safe_points, postpone
@@ -27,12 +27,13 @@ class _Given(Strict, Ranged, Tabular):
     query: str | None = argument(
         "A query; without, a prompt on a terminal, else standard input.", "[QUERY]"
     )
-    memory: str | None = option(
+    memory: int | None = option(
         "Memory that the query may use, such as 4GiB; without, 1 GiB. hybridlog takes at "
         "most 512 MiB more for itself.",
         "SIZE",
+        type=SIZE,
     )
-    timeout: str | None = option("Stop a query that takes longer.", "DURATION")
+    timeout: float | None = option("Stop a query that takes longer.", "DURATION", type=SECONDS)
 
 
 @command(_Given)
@@ -44,24 +45,21 @@ def sql_command(given: _Given) -> None:
     and views and marks only the time of --between or --last. Needs no MongoDB.
     """
     from hybridlog.query.question import Question
-    from hybridlog.query.times import parse_duration
     from hybridlog.sql.duck import limited_memory
 
     to, query = given.to, given.query
-    most = None if given.memory is None else parse_size(given.memory)
-    seconds = None if given.timeout is None else parse_duration(given.timeout) / 1e9
     is_prompt = query is None and sys.stdin.isatty()
     if query is None and not is_prompt:
         query = sys.stdin.read()
     with given.opened(is_lasting=is_prompt, snapshot=not is_prompt) as store:
         ids = None if given.choice.is_everything else given.recordings_in(store).ids
-        connection = store.sql_engine.connect(most, scope=Question((), ids, given.span))
+        connection = store.sql_engine.connect(given.memory, scope=Question((), ids, given.span))
 
         def run(text: str) -> None:
             with limited_memory(connection.memory):
                 if given.strict:
                     connection.check(text)
-                answer = connection.query(text, timeout=seconds)
+                answer = connection.query(text, timeout=given.timeout)
                 answer_sql(answer, to)
             sys.stdout.flush()
             if not given.quiet:

@@ -2,29 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 from hybridlog.cli import output
 from hybridlog.cli.answers import Listing, answering
 from hybridlog.cli.binder import command, option
 from hybridlog.cli.completion import complete_path
 from hybridlog.cli.options import Asking, parse_fields
-from hybridlog_storage.errors import UsageError
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
+from hybridlog.cli.render import Column, times
 
 _NAMES = ("count", "nan", "infinite", "min", "max", "mean", "std")
-_RATE_COLUMNS: Sequence[output.Column] = [
-    ("topic", "left"),
-    ("begin", "whole"),
-    ("end", "whole"),
-    ("recording", "left"),
-    ("messages", "right"),
-    ("Hz", "right"),
-]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,8 +23,10 @@ class _Given(Asking, Listing):
         "A,B.C",
         shell_complete=complete_path,
     )
-    rate: bool = option("Instead: how many messages came in a second.")
-    window: str | None = option("With --rate: a row for each so long, such as 1s.", "DURATION")
+    rate: bool = option("Instead: how many messages came in a second.", excludes=("fields",))
+    window: str | None = option(
+        "With --rate: a row for each so long, such as 1s.", "DURATION", needs=("rate",)
+    )
 
     @property
     def needs_topic(self) -> bool:  # type: ignore[override]
@@ -49,59 +40,45 @@ def stats_command(given: _Given) -> None:
 
     Also their standard deviation, and how many values are NaN.
     """
-    if given.rate and given.fields is not None:
-        raise UsageError("--rate counts messages, which have no --fields: leave one out.")
-    if given.window is not None and not given.rate:
-        raise UsageError("--window is for --rate.")
     with answering(given) as asked:
         if given.rate:
             asked.is_empty = False
             rates = asked.query.rate(given.window)
-            if given.strict:
-                asked.query.completeness().check()
-            times = [rates[name].cast("int64").to_pylist() for name in ("begin", "end")]
+            spans = [rates[name].cast("int64").to_pylist() for name in ("begin", "end")]
             rows = rates.drop_columns(["begin", "end"]).to_pylist()
-            given.answer(
-                (
-                    {"begin_ns": begin, "end_ns": end, **row}
-                    for begin, end, row in zip(*times, rows, strict=True)
-                ),
-                _RATE_COLUMNS,
-                _cells_of_rate,
-                spare=[
-                    *(["recording"] if len({row["recording"] for row in rows}) == 1 else []),
-                    *(["end"] if given.window is not None else ["end", "begin"]),
-                ],
-                titles=2,
-            )
-            return
-        found = asked.query.stats(*([] if given.fields is None else parse_fields(given.fields)))
+            found: list[dict[str, Any]] = [
+                {"begin_ns": begin, "end_ns": end, **row}
+                for begin, end, row in zip(*spans, rows, strict=True)
+            ]
+            columns = _of_rates(found, given.window)
+        else:
+            stats = asked.query.stats(*([] if given.fields is None else parse_fields(given.fields)))
+            found = [asdict(row) for row in stats]
+            if not found and not given.as_json:
+                output.note("No field is a number.")
+            columns = _of_fields(found)
         if given.strict:
             asked.query.completeness().check()
-        if not found and not given.as_json:
-            output.note("No field is a number.")
-        several = len({row.topic for row in found}) > 1
-        columns: list[output.Column] = [("field", "left"), *((name, "right") for name in _NAMES)]
-        if several:
-            columns.insert(0, ("topic", "left"))
-
-        def cells(row: Mapping[str, Any]) -> list[str]:
-            own = [row["topic"]] if several else []
-            return [*own, row["field"], *(_number(row[name]) for name in _NAMES)]
-
-        # How many are no numbers is left out only where there are none.
-        spare = [n for n in ("nan", "infinite") if not any(getattr(row, n) for row in found)]
-        titles = len(columns) - len(_NAMES)
-        given.answer(map(asdict, found), columns, cells, [*spare, "std"], titles)
+        given.answer(found, columns, titles=2 - (columns[0].name == "field"))
 
 
-def _cells_of_rate(row: Mapping[str, Any]) -> list[str]:
-    rate = "" if row["rate"] is None else f"{row['rate']:.2f}"
-    times = output.begin_and_end(row["begin_ns"], row["end_ns"])
-    return [row["topic"], *times, row["recording"], str(row["messages"]), rate]
+def _of_rates(rows: Sequence[Mapping[str, Any]], window: str | None) -> list[Column]:
+    begin, end = times()
+    is_one = len({row["recording"] for row in rows}) == 1
+    return [
+        Column("topic"),
+        replace(begin, spare=0 if window else 3),
+        replace(end, spare=2),
+        Column("recording", spare=int(is_one)),
+        Column("messages", side="right"),
+        Column("Hz", lambda row: row["rate"] and f"{row['rate']:.2f}", "right"),
+    ]
 
 
-def _number(value: float | None) -> str:
-    if value is None:
-        return ""
-    return str(value) if isinstance(value, int) else f"{value:.6g}"
+def _of_fields(rows: Sequence[Mapping[str, Any]]) -> list[Column]:
+    several = len({row["topic"] for row in rows}) > 1
+    # How many are no numbers is left out only where there are none.
+    spare = {name: 1 for name in ("nan", "infinite") if not any(row[name] for row in rows)}
+    spare["std"] = 2
+    shown = [Column(name, side="right", spare=spare.get(name, 0)) for name in _NAMES]
+    return [*([Column("topic")] if several else []), Column("field"), *shown]

@@ -10,7 +10,8 @@ from hybridlog.cli.answers import SCREEN, Destination, Tabular, answer_tables
 from hybridlog.cli.binder import argument, command, option
 from hybridlog.cli.completion import complete_frame
 from hybridlog.cli.options import Strict, Topics, Verbose, topics
-from hybridlog.cli.output import notes, print_table, short_duration
+from hybridlog.cli.output import notes, short_duration
+from hybridlog.cli.render import Column, numbers, print_table
 from hybridlog.wording import counted, listed
 from hybridlog_storage.errors import IncompleteError, UsageError
 
@@ -35,8 +36,12 @@ class _Given(Strict, Topics, Tabular, Verbose):
         "[SOURCE]",
         shell_complete=complete_frame,
     )
-    at: tuple[str, ...] = option("At this time.", "TIME")
-    step: str | None = option("At regular times, such as 100ms.", "DURATION")
+    at: tuple[str, ...] = option(
+        "At this time.", "TIME", needs=("target",), excludes=("step", "topic", "between")
+    )
+    step: str | None = option(
+        "At regular times, such as 100ms.", "DURATION", needs=("target",), excludes=("topic",)
+    )
     topic: tuple[str, ...] = topics(
         "At the header stamps of this topic, or the log times of one without."
     )
@@ -57,9 +62,7 @@ def tf_command(given: _Given) -> None:
     """
     target, source, topic = given.target, given.source, given.topic
     between = given.span if given.step or topic else given.between
-    if sum(map(bool, (given.at, given.step, topic))) > 1:
-        raise UsageError("--at, --step and --topic exclude each other.")
-    if target is None and (given.at or given.step or topic or between):
+    if target is None and (topic or between):
         raise UsageError("Times are those of a transform: name its TARGET and SOURCE frames.")
     from hybridlog.tf.reader import frames_and_stamps
 
@@ -128,27 +131,17 @@ def _show_tree(tree: FrameTree, to: Destination, *, quiet: bool) -> None:
     if to.form != SCREEN:
         answer_tables([tree.to_arrow()], lambda: None, to)
         return
+    names = ("transforms", "Hz", "longest gap", "from")
     rows = []
     for name, depth in tree.walk():
-        cells = ["", "", "", ""]
+        row: dict[str, object] = {**dict.fromkeys(names), "frame": "  " * depth + name}
         if (frame := tree.frames.get(name)) is not None:
-            rate, gap = frame.rate_hz, frame.longest_gap()
-            cells = [
-                "static" if frame.is_static else str(len(frame.stamps)),
-                "" if rate is None else f"{rate:.2f}",
-                "" if gap is None else short_duration(gap[1] - gap[0]),
-                "" if gap is None else f"{(gap[0] - tree.span[0]) / 1e9:+.3f}s",
-            ]
-        rows.append(["  " * depth + name, *cells])
-    print_table(
-        [
-            ("frame", "left"),
-            ("transforms", "right"),
-            ("Hz", "right"),
-            ("longest gap", "right"),
-            ("from", "right"),
-        ],
-        rows,
-    )
+            row["transforms"] = "static" if frame.is_static else len(frame.stamps)
+            row["Hz"] = None if frame.rate_hz is None else f"{frame.rate_hz:.2f}"
+            if (gap := frame.longest_gap()) is not None:
+                row["longest gap"] = short_duration(gap[1] - gap[0])
+                row["from"] = f"{(gap[0] - tree.span[0]) / 1e9:+.3f}s"
+        rows.append(row)
+    print_table([Column("frame", side="whole"), *numbers(*names)], rows)
     if not quiet:
         notes([*tree.problems(), *tree.remarks])

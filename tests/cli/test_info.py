@@ -13,9 +13,9 @@ from mcap.writer import Writer
 from rosbags.rosbag2 import Writer as Rosbag2Writer
 
 import hybridlog as hl
-from hybridlog.cli.info import _channel_row
-from hybridlog.cli.output import parse_size, quoted
-from hybridlog_storage.catalog import ChannelEntry
+from hybridlog.cli.info import channel_note
+from hybridlog.cli.output import quoted
+from hybridlog.wording import parse_size
 from hybridlog_storage.messages import REDUCED, Channel, Schema
 from tests import places
 from tests.independent import read_bag
@@ -221,9 +221,11 @@ def test_control_characters_are_shown_not_obeyed(store: Path) -> None:
 
 
 def test_notes_of_a_channel() -> None:
+    lacks = ("not_indexed", "unreadable", "surplus", "skew_ns", "unset_stamps", "video")
+
     def notes(encoding: str, **metadata: str) -> str:
-        entry = ChannelEntry(1, "/a", encoding, None, "T", metadata, False, None)
-        return _channel_row(entry, is_decoded=True, video=None)[-1]
+        about = {"topic": "/a", "message_encoding": encoding, "metadata": metadata, "messages": 1}
+        return channel_note({**dict.fromkeys(lacks), **about})
 
     assert notes("cdr", offered_qos_profiles="- durability: 1\n  depth: 1") == "latched"
     assert notes("cdr", offered_qos_profiles="- durability: 2") == ""

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from hybridlog.cli import output
+from hybridlog.cli.render import Column, print_table
 from hybridlog.formats.answer import Answer
 from hybridlog.formats.jsonl import write_json
 from tests.independent import Seen, read_bag
@@ -63,7 +63,7 @@ def test_long_answers_are_printed_some_rows_at_a_time(
             printed.append(capsys.readouterr().out)
             yield [str(10**n), "x" * (5 - n)]
 
-    output.print_table([("number", "right"), ("text", "left")], rows())
+    print_table([Column("number", 0, "right"), Column("text", 1)], rows())
     printed.append(capsys.readouterr().out)
     assert [bool(text) for text in printed] == [False, False, True, False, True, True]
     assert "".join(printed).splitlines() == [
@@ -74,7 +74,7 @@ def test_long_answers_are_printed_some_rows_at_a_time(
         "  1000  xx",
         " 10000  x",
     ]
-    output.print_table([("none", "left")], [])
+    print_table([Column("none")], [])
     assert capsys.readouterr().out == "none\n"
     for values in ([], [{"a": "1\n2", "b": [1, {"c": None}]}, {}], [3]):
         target = io.BytesIO()
@@ -105,7 +105,7 @@ def test_fetch_near_events(store: Path, seen: list[Seen]) -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("fetch", "-t", "odom", "--before", "5s"), "add --where 'TOPIC: PREDICATE'"),
+        (("fetch", "-t", "odom", "--before", "5s"), "--before is for --where: add that"),
         (("fetch", "-t", "odom", "--where", "rosout: level > 1"), "--before or --after"),
         (("fetch", "-t", "odom", "--where", "rosout: levl > 1", "--after", "1s"), "levl"),
         (("fetch", "-t", "odom", "--where", "rosout: level > 1", "--after", "x"), "duration"),
@@ -113,8 +113,14 @@ def test_fetch_near_events(store: Path, seen: list[Seen]) -> None:
             ("fetch", "-t", "odom", "--where", "rosout: level > 1", "--after", "1s", "--at", "0"),
             "leave out --where",
         ),
-        (("fetch", "-t", "odom", "--count", "-o", "x.csv"), "leave out --output"),
-        (("fetch", "-t", "odom", "--count", "-F", "csv"), "leave out --format"),
+        (
+            ("fetch", "-t", "odom", "--count", "-o", "x.csv"),
+            "--count and --output exclude each other",
+        ),
+        (
+            ("fetch", "-t", "odom", "--count", "-F", "csv"),
+            "--count and --format exclude each other",
+        ),
         (("intervals", "-t", "/camera/*/image_raw"), "one topic"),
         (("intervals", *GRIPPER, "--where", "position ="), "value"),
         (("intervals", *GRIPPER, "--at-least", "soon"), "not a duration"),

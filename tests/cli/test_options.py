@@ -67,7 +67,8 @@ def test_rows_have_all_forms(words: tuple[str, ...], store: Path, tmp_path: Path
     assert len(lines) == 1
     assert _set(json.loads(lines[0])) == _set(rows[0])
     assert len(answer(*words, "-n", "1", "--json", store=store, code=code).json) == 1
-    assert "--json is --format json" in _error(*words, "--json", "-F", "csv", store=store)
+    both = _error(*words, "--json", "-F", "csv", store=store)
+    assert "--format and --json exclude each other" in both
     # Rows without a place are not offered the formats of places.
     assert "tum" not in answer(words[0], "--help", store=store).out
     assert "does not give the format" in _error(*words, "-o", tmp_path / "a.tum", store=store)
@@ -104,7 +105,7 @@ def test_ages_choose(tmp_path: Path) -> None:
     assert answer("fetch", "n", "--last", "30d", "--count", store=tmp_path / "s").out == "3\n"
     assert answer("stats", "n", "--last", "30d", "--json", store=tmp_path / "s").json[0]["max"] == 2
     for other in ("--between", "--during"):
-        assert "give one of them" in _error(
+        assert f"--last and {other} exclude each other" in _error(
             "fetch", "n", "--last", "30d", other, "start", "end", store=tmp_path / "s"
         )
 

@@ -176,7 +176,7 @@ def test_what_cannot_be_indexed_is_said(logs: Path, tmp_path: Path) -> None:
     ("options", "words"),
     [
         (("--chunk-size", "big"), "no size"),
-        (("--chunk-size", "1"), "chunk size"),
+        (("--chunk-size", "1"), "must be at least 1KiB"),
         (("--set-tag", "a"), "KEY=VALUE"),
         (("--topic", r"re:(a)\1"), "refused"),
         (("--between", "x", "y"), "not a time"),

@@ -265,9 +265,9 @@ def test_paths_are_checked_by_the_library() -> None:
         ("keep --pin robot", "Did you mean -r robot?"),
         ("tf -r robot battery odom", "There is no frame 'battery'; there are map, odom"),
         ("tf -r robot battery odom", "\nDid you mean -t battery?\n"),
-        ("fetch -t scan --between +10s --count", ": --between takes two times: --between +10s end"),
-        ("fetch scan --between +1s --where n>1", ": --between takes two times: --between +1s end"),
-        ("ls --during +1s -r robot", ": --during takes two times: --during +1s end"),
+        ("fetch -t scan --between +10s --count", ": --between takes two values: --between +10s T1"),
+        ("fetch scan --between +1s --where n>1", ": --between takes two values: --between +1s T1"),
+        ("ls --during +1s -r robot", ": --during takes two values: --during +1s T1"),
     ],
 )
 def test_a_slip_gets_a_hint(words: str, hint: str, store: Path) -> None:

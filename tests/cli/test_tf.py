@@ -60,7 +60,7 @@ def test_times_without_a_transform(store: Path) -> None:
         (("odom", "base_link", "--at", "+99s"), "There is no transform from base_link to odom"),
         (("odom", "wheel"), "There is no frame 'wheel'; there are map, odom"),
         (("odom",), "name TARGET and SOURCE"),
-        (("--at", "+1s"), "name its TARGET and SOURCE"),
+        (("--at", "+1s"), "--at is for TARGET"),
         (("odom", "base_link", "--at", "+1s", "--step", "1s"), "exclude each other"),
         (("odom", "base_link", "--step", "1ns"), "more than 10,000,000 times"),
         (("odom", "base_link", "--step", "0s"), "more than 10,000,000 times"),

@@ -1,0 +1,219 @@
+"""Lays rows out for people: a table that fits the terminal, else a block for each row."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import textwrap
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import chain, islice, zip_longest
+from typing import Any, Literal
+
+from hybridlog.cli.output import cut, printable, say, screen_width, size, time_text, wrapped
+
+ROWS_AT_ONCE = 10_000
+"""Rows of a table that are laid out together."""
+_MIN_ROOM = 20  # characters of a folded value
+
+Get = str | int | Callable[[Any], object]
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """A column of a table.
+
+    Attributes:
+        name: Its heading.
+        get: Key or function that gives the value of a row; empty for the name as the key.
+        side: Numbers stand on the right. Cells on the left may be folded between words, `whole`
+            ones are not.
+        short: Gives a shorter value, for a table that does not fit.
+        cut: Cells may be cut off to so many characters; 0 for no.
+        spare: The least is left out first where there is no room; 0 never.
+    """
+
+    name: str
+    get: Get = ""
+    side: Literal["left", "right", "whole"] = "left"
+    short: Get | None = None
+    cut: int = 0
+    spare: int = 0
+
+    def cell(self, row: Any, *, short: bool = False) -> str:
+        """The text for a row."""
+        get = self.get if self.short is None or not short else self.short
+        value = get(row) if callable(get) else row[self.name if get == "" else get]
+        if isinstance(value, float):
+            value = f"{value:.6g}"
+        return "" if value is None else printable(str(value))
+
+    def folded(self, cell: str, width: int) -> list[str]:
+        """The lines of a cell."""
+        return [cut(cell, width)] if self.cut or self.side != "left" else wrapped(cell, width)
+
+
+def numbers(*names: str) -> list[Column]:
+    """Columns of numbers whose headings are the keys."""
+    return [Column(name, side="right") for name in names]
+
+
+def bytes_of(name: str, key: str, spare: int = 0) -> Column:
+    """A column of sizes; `-` for one that is not known."""
+
+    def shown(row: Mapping[str, Any]) -> str:
+        return "-" if row[key] is None else size(row[key])
+
+    return Column(name, shown, "right", spare=spare)
+
+
+@dataclass(slots=True)
+class _Shape:
+    """The columns of a table that are shown, and their widths."""
+
+    columns: Sequence[Column]
+    widths: list[int]
+    short: bool
+    folds: bool = False
+
+    def cells(self, rows: Iterable[Any]) -> list[list[str]]:
+        """The cells of rows; columns become as wide as they are."""
+        found = [[one.cell(row, short=self.short) for one in self.columns] for row in rows]
+        if not self.folds:
+            self.widths = [
+                max(width, *map(len, cells))
+                for width, cells in zip(self.widths, zip(*found, strict=True), strict=False)
+            ] or self.widths
+        return found
+
+    def lines(self, row: Sequence[str]) -> Iterator[str]:
+        parts = [[cell] for cell in row]
+        if self.folds:
+            parts = [*map(Column.folded, self.columns, row, self.widths)]
+        for cells in zip_longest(*parts, fillvalue=""):
+            aligned = (
+                f"{cell:{'>' if one.side == 'right' else '<'}{width}}"
+                for cell, one, width in zip(cells, self.columns, self.widths, strict=True)
+            )
+            yield "  ".join(aligned).rstrip()
+
+    def room(self) -> int:
+        """Columns of the terminal that the table leaves; files and pipes have room for all."""
+        taken = sum(self.widths) + 2 * (len(self.widths) - 1)
+        return screen_width() - taken if sys.stdout.isatty() else 0
+
+    def narrow(self, rows: Sequence[Sequence[str]]) -> bool:
+        """Fold and cut cells until the table fits; False if a word would be broken."""
+        least = list(self.widths)
+        for n, one in enumerate(self.columns):
+            words = [word for row in rows for word in (one.name, *row[n].split())]
+            if one.cut:
+                least[n] = min(least[n], max(len(one.name), one.cut))
+            elif one.side == "left":
+                least[n] = max(map(len, words), default=0)
+        self.folds = True
+        for _ in range(-self.room()):
+            place = max(
+                range(len(least)), key=lambda n: (self.widths[n] > least[n], self.widths[n])
+            )
+            if self.widths[place] <= least[place]:
+                return False
+            self.widths[place] -= 1
+        return True
+
+
+def _shape(columns: Sequence[Column], block: Sequence[Any]) -> _Shape | None:
+    """What fits the terminal; None if nothing does."""
+    spare = sorted((one for one in columns if one.spare), key=lambda one: one.spare)
+    for without in range(len(spare) + 1):
+        left = [one for one in columns if one not in spare[:without]]
+        for short in (False, True):
+            found = _Shape(left, [len(one.name) for one in left], short)
+            cells = found.cells(block)
+            if found.room() >= 0:
+                return found
+        if found.narrow(cells):
+            return found
+    return None
+
+
+def print_table(
+    columns: Sequence[Column],
+    rows: Iterable[Any],
+    *,
+    titles: int = 1,
+    about: Sequence[str] = (),
+    pages: bool = False,
+) -> None:
+    """Print rows under headings; on a terminal that has no room for them, a block for each row.
+
+    A long table is printed some rows at a time: memory does not grow with it. Columns become
+    wider where later rows need it.
+
+    Args:
+        columns: The columns.
+        rows: What their functions take.
+        titles: Number of columns that are the title of a block.
+        about: Further words of each title.
+        pages: Use the pager on a terminal that has too few lines.
+    """
+    source = iter(rows)
+    block = [*islice(source, ROWS_AT_ONCE)]
+    shape = _shape(columns, block)
+    if shape is None:
+        for row in chain(block, source):
+            named = [(one.name, one.cell(row)) for one in columns]
+            say("  ".join([*(cell for _, cell in named[:titles]), *about]))
+            print_fields([pair for pair in named[titles:] if pair[1]], indent=2)
+            say()
+        return
+    lines = _lines(shape, block, source)
+    if pages and sys.stdout.isatty() and len(block) >= shutil.get_terminal_size().lines:
+        import click
+
+        click.echo_via_pager(f"{line}\n" for line in lines)
+        return
+    for line in lines:
+        print(line)  # noqa: T201
+
+
+def _lines(shape: _Shape, block: list[Any], source: Iterator[Any]) -> Iterator[str]:
+    cells = [[one.name for one in shape.columns], *shape.cells(block)]
+    while cells:
+        yield from chain.from_iterable(map(shape.lines, cells))
+        cells = shape.cells(islice(source, ROWS_AT_ONCE))
+
+
+def room(columns: Sequence[Column], rows: Sequence[Any]) -> int:
+    """Columns of the terminal that a table leaves to one more."""
+    shape = _Shape(columns, [len(one.name) for one in columns], short=False)
+    shape.cells(rows)
+    return shape.room() - 2
+
+
+def print_fields(fields: Sequence[tuple[str, object]], indent: int = 0) -> None:
+    """Print a line for each name and value, folded on a terminal."""
+    width = max((len(name) for name, _ in fields), default=0)
+    room = max(screen_width() - width - 2 - indent, _MIN_ROOM)
+    for name, value in fields:
+        lines = [printable(str(value))]
+        if sys.stdout.isatty():
+            lines = textwrap.wrap(lines[0], room, break_on_hyphens=False)
+        for heading, line in zip_longest([printable(name)], lines, fillvalue=""):
+            say(f"{' ' * indent}{heading:<{width}}  {line}".rstrip())
+
+
+def times() -> list[Column]:
+    """Columns of `begin_ns` and `end_ns`; the short end has no day if it is that of the begin."""
+
+    def end(row: Mapping[str, int]) -> str:
+        begin, last = (time_text(row[name], 10**6) for name in ("begin_ns", "end_ns"))
+        return last.partition("T")[2] if begin[:10] == last[:10] else last
+
+    begin = Column(
+        "begin",
+        lambda row: time_text(row["begin_ns"]),
+        "whole",
+        lambda row: time_text(row["begin_ns"], 10**6),
+    )
+    return [begin, Column("end", lambda row: time_text(row["end_ns"]), "whole", end)]
