@@ -69,8 +69,8 @@ def extended(tmp_path_factory: pytest.TempPathFactory) -> Path:
             path.unlink()
         touched[name] = touched.get(name, 0) + 1
         path.write_text(text, "utf-8")
-    # A writer, a reader and the tables of both; a type of number; an engine and its table.
-    assert len(touched) == 6
+    # A writer, a reader and the tables of both; a type of number.
+    assert len(touched) == 4
     return folder
 
 
