@@ -63,11 +63,8 @@ def bring_derived(source: Shared, target: RemoteDirectory, recordings: Collectio
 
 def free_name_there(directory: StoreDirectory, name: str, but: str) -> str:
     """A name that no recording of a store has, by their manifests, but for one, by its id."""
-    names = set()
-    for one in set(directory.ids()) - {but}:
-        with suppress(StoreError):
-            names.add(directory.manifests.read(one).name)
-    return free_name(text(name), names)
+    others = directory.manifests.each({*directory.ids()} - {but})
+    return free_name(text(name), {one.name for one in others})
 
 
 def _describe(

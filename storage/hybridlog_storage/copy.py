@@ -122,11 +122,12 @@ class _Copy:
     def known(self) -> Copied | None:
         """What a copy gives that has nothing to do, without a lock; None if it has."""
         here, target, there = self._here, self._target, None
+        if self._must_prove:
+            return None
         with suppress(ManifestError):  # it may be made again
             there = target.manifests.find(here.id)
         check_origin(here, there)
-        is_done = there is not None and there.status != "unproven" and not self._wanted(there)
-        if there is None or self._must_prove or not is_done:
+        if there is None or there.status == "unproven" or self._wanted(there):
             return None
         if target.mends:
             sizes = target.sizes(here.id)

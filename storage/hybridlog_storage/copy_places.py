@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, ClassVar, Final
 
 from hybridlog_storage.disk import durability, files
 from hybridlog_storage.disk.directory import (
-    LOCK,
     LOCK_WAIT_S,
     StoreDirectory,
 )
@@ -251,7 +250,12 @@ class Directory(Source):
         directory, path = StoreDirectory(self._path), self._path / RECORDINGS / recording
         with ExitStack() as held:
             while True:
-                self._make_folders(path / LOCK)
+                try:
+                    files.make_folders(path)
+                    files.sync_folder(self._path)
+                    files.sync_folder(path.parent)
+                except OSError as error:
+                    raise durability.explain(error, path, "copying into") from error
                 with suppress(TopicError):  # it was removed meanwhile
                     held.enter_context(directory.writing(recording, wait_s=LOCK_WAIT_S))
                     break
@@ -277,7 +281,6 @@ class Directory(Source):
     def send(self, sent: Sending) -> None:
         """As of `Place`; goes on behind the last byte that is there."""
         final, part = self._path / sent.name, self._path / sent.part
-        self._make_folders(final)
         try:
             fd = files.open_file(part, os.O_RDWR | os.O_CREAT)
             try:
@@ -303,16 +306,6 @@ class Directory(Source):
         durability.sync_file(fd)
         return digest_of(read(fd, 0, sent.size)) == sent.digest
 
-    def _make_folders(self, path: Path) -> None:
-        """Make the folders of a file, on the disk; none may be a link."""
-        try:
-            for folder in reversed([*path.relative_to(self._path).parents][:-1]):
-                with suppress(FileExistsError):
-                    files.make_folder(self._path / folder)
-                files.sync_folder(self._path / folder.parent)
-        except OSError as error:
-            raise durability.explain(error, path, "copying into") from error
-
     def drop(self, name: str) -> None:
         """As of `Place`."""
         with suppress(OSError):
@@ -335,19 +328,12 @@ class Directory(Source):
 
     def pieces(self, name: str, at: int, size: int) -> Iterator[bytes]:
         """As of `Source`."""
-        with self._opened(name, size) as fd:
-            pieces = read(fd, at, size)
-            while piece := readable(pieces, f"{self.address}/{name}"):
-                yield piece
+        with self.opened(name, size) as fd:
+            yield from read(fd, at, size)
 
     @contextmanager
     def opened(self, name: str, size: int) -> Iterator[int]:
-        """As of `Source`."""
-        with self._opened(name, size) as fd:
-            yield fd
-
-    @contextmanager
-    def _opened(self, name: str, size: int) -> Iterator[int]:
+        """As of `Source`; what cannot be read of it is refused, too."""
         path = self._path / name
         with ExitStack() as stack:
             try:
@@ -355,11 +341,13 @@ class Directory(Source):
                     stack.enter_context(files.folder(self._path / folder))  # none may be a link
                 fd = stack.enter_context(_file(path))
                 found = os.fstat(fd).st_size
+                if found != size:
+                    raise RefusedError(
+                        f"{path} is damaged: it has {found} bytes instead of {size}."
+                    )
+                yield fd
             except OSError as error:
                 raise RefusedError(f"{path} cannot be copied: {error.strerror}.") from error
-            if found != size:
-                raise RefusedError(f"{path} is damaged: it has {found} bytes instead of {size}.")
-            yield fd
 
     @contextmanager
     def marked(self) -> Iterator[str]:
@@ -447,18 +435,6 @@ def _file(path: Path) -> Iterator[int]:
         yield fd
     finally:
         os.close(fd)
-
-
-def readable(pieces: Iterator[bytes], name: str) -> bytes:
-    """The next bytes of a file that is copied; none at its end.
-
-    Raises:
-        RefusedError: It cannot be read.
-    """
-    try:
-        return next(pieces, b"")
-    except OSError as error:
-        raise RefusedError(f"{name} cannot be copied: {error.strerror}.") from error
 
 
 def read(fd: int, at: int, end: int) -> Iterator[bytes]:

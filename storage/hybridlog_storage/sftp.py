@@ -33,16 +33,13 @@ from hybridlog_storage.copy_places import (
     Place,
     RefusedError,
     read,
-    readable,
 )
 from hybridlog_storage.disk.directory import LOCK, LOCK_WAIT_S
 from hybridlog_storage.errors import (
     HeldError,
     HybridlogError,
-    ManifestError,
     ObjectChangedError,
     RecordingExistsError,
-    RecordingGoneError,
     StoreError,
     UsageError,
 )
@@ -204,11 +201,7 @@ class Server(Place):
             whole = f"find {MANIFESTS} -name '[!.]*.json'"  # others were left by a cut
             _, said = self.shell(f"{whole} -exec grep -hao '{pattern}' {{}} + || true")
             return {json.loads(f"{row}}}")["name"] for row in said.splitlines()}
-        found = set()
-        for recording in self.manifests.ids():
-            with suppress(RecordingGoneError, ManifestError):
-                found.add(self.manifests.read(recording).name)
-        return found
+        return {one.name for one in self.manifests.each(self.manifests.ids())}
 
     def put_beside(self, content: bytes, folder: str) -> str:
         """Write a small file under a hidden name of its own."""
@@ -253,7 +246,7 @@ class Server(Place):
         """As of `Place`; goes on at the last byte that is there."""
         name, part = sent.name, sent.part
         with sent.source.opened(name, sent.size) as fd:
-            sha256, digest = _digests(fd, name)
+            sha256, digest = _digests(fd)
             if digest != sent.digest:
                 raise sent.damaged()
             there = self._found.pop(part, 0)
@@ -290,7 +283,7 @@ class Server(Place):
         sha256 = ""
         if self.has_shell:
             with suppress(RefusedError), sent.source.opened(sent.name, sent.size) as fd:
-                found, digest = _digests(fd, sent.name)
+                found, digest = _digests(fd)
                 sha256 = found if digest == sent.digest else ""
         return self._is(sent.name, sha256, sent)
 
@@ -302,7 +295,7 @@ class Server(Place):
             if sha256 or code:
                 return code == 0 and said.split()[:1] == [sha256]
         with suppress(FileNotFoundError), self._got(name, sent.size) as got, got.open("rb") as file:
-            return _digests(file.fileno(), name)[1] == sent.digest
+            return _digests(file.fileno())[1] == sent.digest
         return False
 
     def sftp(
@@ -575,10 +568,10 @@ def _position(process: int, fd: int) -> int:
     return found
 
 
-def _digests(fd: int, name: str) -> tuple[str, str]:
+def _digests(fd: int) -> tuple[str, str]:
     """SHA-256, which servers can work out, and the digest of an open file."""
-    sha256, digest, pieces = hashlib.sha256(), hasher(), read(fd, 0, os.fstat(fd).st_size)
-    while piece := readable(pieces, name):
+    sha256, digest = hashlib.sha256(), hasher()
+    for piece in read(fd, 0, os.fstat(fd).st_size):
         safe_point()
         sha256.update(piece)
         digest.update(piece)

@@ -70,14 +70,6 @@ def test_spoiled_requests_are_repeated(address: str, proxy: Proxy, first: int) -
     assert bucket.read_whole("a/1", 1 << 20)[1] == DATA[1:]
 
 
-def test_a_server_without_conditions_is_refused(address: str, proxy: Proxy) -> None:
-    proxy.without_conditions = True
-    bucket = Bucket(address)
-    with pytest.raises(BucketError, match="ignores conditions"):
-        bucket.create("a", b"1")
-    assert [o.name for o in bucket.objects()] == []
-
-
 def test_addresses_and_refusals(proxy: Proxy, limit: Limit) -> None:
     for wrong in ("s3://", "http://lab/store", "/a"):
         with pytest.raises(UsageError):

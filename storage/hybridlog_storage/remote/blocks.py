@@ -18,7 +18,7 @@ from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Final
+from typing import Final, Self
 
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk.files import user_directory
@@ -40,32 +40,28 @@ _MARK: Final = struct.Struct("<II")
 class CachedFile(int):
     """A handle of the cached file of an object, which fetches what is read."""
 
-    blocks: Blocks
+    _cache: BlockCache
+    _bucket: Bucket
+    _about: Object
+    _lock: threading.Lock
+    _proved: set[int]
 
-    def fetch(self, ranges: Iterable[tuple[int, int]]) -> None:
-        """Make ranges of bytes readable; see `Blocks.fetch`."""
-        self.blocks.fetch(self, ranges)
+    def __new__(cls, fd: int, cache: BlockCache, bucket: Bucket, about: Object) -> Self:
+        """A handle that takes over an open file."""
+        made = super().__new__(cls, fd)
+        made._cache, made._bucket, made._about = cache, bucket, about
+        made._lock, made._proved = threading.Lock(), set()
+        return made
 
     def identity(self) -> tuple[int, ...]:
         """A value that no other object has, nor this one after a change."""
-        return inode_of(self.blocks.about), self.blocks.about.size
+        return inode_of(self._about), self._about.size
 
     def again(self) -> CachedFile:
         """Another handle of the same file."""
-        return _handle(os.dup(self), self.blocks)
+        return CachedFile(os.dup(self), self._cache, self._bucket, self._about)
 
-
-class Blocks:
-    """The blocks in an open file."""
-
-    def __init__(self, cache: BlockCache, bucket: Bucket, about: Object) -> None:
-        self.about = about
-        self._cache = cache
-        self._bucket = bucket
-        self._lock = threading.Lock()
-        self._proved: set[int] = set()
-
-    def fetch(self, fd: int, ranges: Iterable[tuple[int, int]]) -> None:
+    def fetch(self, ranges: Iterable[tuple[int, int]]) -> None:
         """Fetch the missing blocks of some ranges of bytes.
 
         Raises:
@@ -73,7 +69,7 @@ class Blocks:
             BucketError: The server does not answer.
             ResourceError: The cache cannot be written.
         """
-        size = self.about.size
+        size = self._about.size
         wanted: set[int] = set()
         for begin, end in ranges:
             first, last = begin, min(end, size)
@@ -84,24 +80,24 @@ class Blocks:
         with self._lock:
             wanted -= self._proved
             if wanted:
-                self._fetch(fd, sorted(wanted))
+                self._fetch(sorted(wanted))
 
-    def _fetch(self, fd: int, wanted: list[int]) -> None:
+    def _fetch(self, wanted: list[int]) -> None:
         with self._cache.writing():
-            sums = _opened(self._cache.paths(self._bucket, self.about)[1])
+            sums = _opened(self._cache.paths(self._bucket, self._about)[1])
         try:
             with self._cache.writing():
-                missing = [number for number in wanted if not self._is_there(fd, sums, number)]
+                missing = [number for number in wanted if not self._is_there(sums, number)]
             with ThreadPoolExecutor(_PARALLEL) as pool:
-                for _ in pool.map(lambda piece: self._bring(fd, sums, *piece), _pieces(missing)):
+                for _ in pool.map(lambda piece: self._bring(sums, *piece), _pieces(missing)):
                     pass
             self._proved.update(wanted)
         finally:
             os.close(sums)
 
-    def _bring(self, fd: int, sums: int, first: int, last: int) -> None:
+    def _bring(self, sums: int, first: int, last: int) -> None:
         """Fetch blocks, the last one with them."""
-        about, bucket = self.about, self._bucket
+        about, bucket = self._about, self._bucket
         begin, end = first * BLOCK, min((last + 1) * BLOCK, about.size)
         try:
             data = memoryview(bucket.read(about.name, begin, end, about.size))
@@ -114,15 +110,15 @@ class Blocks:
         with self._cache.writing():
             done = 0
             while done < len(data):
-                done += os.pwrite(fd, data[done:], begin + done)
+                done += os.pwrite(self, data[done:], begin + done)
             os.pwrite(sums, marks, first * _MARK.size)
         self._cache.added(len(data))
 
-    def _is_there(self, fd: int, sums: int, number: int) -> bool:
+    def _is_there(self, sums: int, number: int) -> bool:
         mark = os.pread(sums, _MARK.size, number * _MARK.size)
         if len(mark) < _MARK.size or mark == bytes(_MARK.size):
             return False
-        return mark == _MARK.pack(1, crc32(os.pread(fd, BLOCK, number * BLOCK)))
+        return mark == _MARK.pack(1, crc32(os.pread(self, BLOCK, number * BLOCK)))
 
 
 class BlockCache:
@@ -157,7 +153,7 @@ class BlockCache:
             except BaseException:
                 os.close(fd)
                 raise
-            return _handle(fd, Blocks(self, bucket, about))
+            return CachedFile(fd, self, bucket, about)
 
     def paths(self, bucket: Bucket, about: Object) -> tuple[Path, Path]:
         """The files with the blocks of an object, and with their checksums."""
@@ -212,12 +208,6 @@ def inode_of(about: Object) -> int:
 
 def _opened(path: Path) -> int:
     return os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
-
-
-def _handle(fd: int, blocks: Blocks) -> CachedFile:
-    handle = CachedFile(fd)
-    handle.blocks = blocks
-    return handle
 
 
 def _pieces(numbers: Iterable[int]) -> list[tuple[int, int]]:

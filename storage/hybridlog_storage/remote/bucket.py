@@ -225,15 +225,8 @@ class Bucket:
         if size <= PART_BYTES:
             return Object(name, size, self._put(name, b"".join(pieces), "overwrite"))
         with self._explained(name):
-            try:
-                with obstore.open_writer(
-                    self._writing, name, buffer_size=_PART, max_concurrency=4
-                ) as writer:
-                    for piece in pieces:
-                        writer.write(bytes(piece))
-            except OSError as error:  # of the writer, which has others than the library
-                raise BucketError(self._problem(name, _reason(error))) from error
-            return _object(obstore.head(self._reading, name), name)
+            made = obstore.put(self._writing, name, pieces, chunk_size=_PART, max_concurrency=4)
+            return Object(name, size, _version(made))
 
     def delete(self, names: Sequence[str]) -> None:
         """Delete objects; those that do not exist are left out.

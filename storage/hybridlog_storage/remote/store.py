@@ -12,9 +12,7 @@ is derived may be missing:
 from __future__ import annotations
 
 import errno
-import json
 import os
-import re
 import secrets
 import stat
 import tempfile
@@ -25,8 +23,9 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar, Final
+from typing import Annotated, Any, ClassVar, Final
 
+from msgspec import Meta, MsgspecError, json
 from msgspec.structs import replace
 
 from hybridlog_storage import manifest as truth
@@ -65,7 +64,12 @@ _TABLES: Final = "tables"
 """Kinds of cells, by recording: its manifest with its version, and the objects of its tables."""
 _FEW: Final = 4  # manifests that are read one by one, even if there is a newer catalog
 _MAX_CATALOG: Final = 1 << 30  # bytes, packed and unpacked
-_TABLE: Final = re.compile(rf"{TABLES}/[^/\x00]{{1,255}}/[^/\x00]{{1,255}}")
+_PART: Final = r"(?!\.\.?(?:/|$))[^/\x00]{1,255}"
+_Row = tuple[
+    Annotated[str, Meta(pattern=f"^{TABLES}/{_PART}/{_PART}$")],
+    Annotated[int, Meta(ge=0, lt=1 << 50)],
+    str,
+]
 _FOLDER: Final = stat.S_IFDIR | 0o555
 _FILE: Final = stat.S_IFREG | 0o444
 
@@ -133,7 +137,7 @@ class CatalogCells(Cells):
     def put_tables(self, recording: str, objects: Collection[Object] = ()) -> None:
         """List the tables of a recording; those that were listed before are deleted."""
         before = _objects(self.read(_TABLES, recording) or b"")
-        body = json.dumps([[one.name, one.size, one.version] for one in objects]).encode()
+        body = json.encode([(one.name, one.size, one.version) for one in objects])
         cell = put(_TABLES, recording, body) if objects else drop(_TABLES, recording)
         self.write(lambda: [cell], 0)
         self._bucket.delete(sorted({one.name for one in before} - {one.name for one in objects}))
@@ -405,10 +409,7 @@ class RemoteDirectory(StoreDirectory):
         """The address by which another process opens it."""
         return self.bucket.address
 
-    @property
-    def place(self) -> str:
-        """Its address."""
-        return self.bucket.address
+    place = address
 
     @property
     def when_empty(self) -> str:
@@ -514,13 +515,9 @@ class RemoteDirectory(StoreDirectory):
 
     def listed_bytes(self) -> int:
         """Bytes of all files that manifests list, and of tables."""
-        found = sum(o.size for own in self.source.cells.tables().values() for o in own.values())
-        for one in self.ids():
-            with suppress(StoreError):
-                found += sum(
-                    o.size for o in self.source.files_of(self.manifests.read(one)).values()
-                )
-        return found
+        tables = sum(o.size for own in self.source.cells.tables().values() for o in own.values())
+        manifests = self.manifests.each(self.ids())
+        return tables + sum(one.bytes for now in manifests for one in listed_files(now))
 
     @contextmanager
     def retaining(self) -> Iterator[bool]:
@@ -602,14 +599,10 @@ def _brought(
 
 
 def _objects(body: bytes) -> list[Object]:
-    """Objects of tables, of which nothing is believed that does not fit."""
-    found = []
-    with suppress(ValueError, TypeError, RecursionError):
-        for name, size, version in json.loads(body):
-            is_sound = type(size) is int and 0 <= size < 1 << 50 and isinstance(version, str)
-            if is_sound and _TABLE.fullmatch(name) and ".." not in name.split("/"):
-                found.append(Object(name, size, version))
-    return found
+    """Objects of tables; none of a list that does not fit."""
+    with suppress(MsgspecError):
+        return [Object(*row) for row in json.decode(body, type=list[_Row])]
+    return []
 
 
 def _version(about: Object | None) -> str:
