@@ -1276,7 +1276,7 @@ class Store:
             StoreError: The place is not reached, or cannot be written.
             DiskFullError: It has no room; what arrived stays.
         """
-        from hybridlog.maintenance.copying import CopyOptions, CopyReport, run
+        from hybridlog.maintenance.copying import Copying, CopyOptions, CopyReport
 
         wanted, found = options or CopyOptions(), report or CopyReport()
         if wanted.only_fields and wanted.then_expire:
@@ -1290,15 +1290,7 @@ class Store:
             def expire(recording: str, digests: Mapping[int, str]) -> None:
                 self._expire(recording, digests, target.place.address, found, progress)
 
-            run(
-                self.directory,
-                target,
-                chosen,
-                wanted,
-                expire=expire,
-                progress=progress,
-                report=found,
-            )
+            Copying(self.directory, target, wanted, found, expire, progress).run(chosen)
         return found
 
     def _expire(

@@ -20,8 +20,7 @@ from mcap.writer import Writer
 import hybridlog as hl
 from hybridlog.columns.folders import files_of
 from hybridlog.index.access import IndexAccess
-from hybridlog.maintenance import copying
-from hybridlog.maintenance.copying import CopyReport
+from hybridlog.maintenance.copying import Copying
 from hybridlog.maintenance.lease import become_another
 from hybridlog.query.intervals import Intervals
 from hybridlog_storage.catalog import CATALOG
@@ -584,17 +583,14 @@ def test_a_copy_of_a_recording_that_is_removed_is_whole_or_refused(
         shutil.copytree(base, place)
         exchange = Exchange(places.root(place) / one, step, after=bool(step % 2))
         with hl.open(target, mongo=NOWHERE, create=True) as store:
-            run = copying.run
+            run = Copying.run
 
-            def armed(
-                *args: Any, run: Any = run, exchange: Exchange = exchange, **options: Any
-            ) -> CopyReport:
+            def armed(*args: Any, run: Any = run, exchange: Exchange = exchange) -> None:
                 patch.setattr(files, "folder", exchange.folder)  # it is chosen
-                report: CopyReport = run(*args, **options)
-                return report
+                run(*args)
 
             with monkeypatch.context() as patch:
-                patch.setattr(copying, "run", armed)
+                patch.setattr(Copying, "run", armed)
                 done = bring(store, place, [one])
                 if done.refused:
                     done = bring(store, base, [one])

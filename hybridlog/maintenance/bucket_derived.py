@@ -13,12 +13,13 @@ from hybridlog.columns.layout import SHARED, SUFFIX, TABLES
 from hybridlog.entries import describe, take_inventory, text
 from hybridlog.maintenance.opening import open_catalog
 from hybridlog.snapshot import UNFINISHED
+from hybridlog_storage.copy_places import read
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import CatalogError, StoreError, unreadable
 from hybridlog_storage.manifest import free_name
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator
+    from collections.abc import Collection
 
     from hybridlog.shared import Shared
     from hybridlog_storage.catalog import Catalog, RecordingEntry
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
     from hybridlog_storage.remote.bucket import Object
     from hybridlog_storage.remote.store import RemoteDirectory
 
-_PIECE: Final = 1 << 20
 _TRIES: Final = 10  # while others write the catalog, too
 
 
@@ -63,11 +63,8 @@ def bring_derived(source: Shared, target: RemoteDirectory, recordings: Collectio
 
 def free_name_there(directory: StoreDirectory, name: str, but: str) -> str:
     """A name that no recording of a store has, by their manifests, but for one, by its id."""
-    names = set()
-    for one in set(directory.ids()) - {but}:
-        with suppress(StoreError):
-            names.add(directory.manifests.read(one).name)
-    return free_name(text(name), names)
+    others = directory.manifests.each({*directory.ids()} - {but})
+    return free_name(text(name), {one.name for one in others})
 
 
 def _describe(
@@ -99,15 +96,10 @@ def _bring_tables(source: Shared, target: RemoteDirectory, entry: RecordingEntry
                 raise unreadable(error, path) from error
             try:
                 size = os.fstat(fd).st_size
-                found.append(target.bucket.put(name, size, _pieces(fd, size)))
+                found.append(target.bucket.put(name, size, read(fd, 0, size)))
             finally:
                 os.close(fd)
     return found
-
-
-def _pieces(fd: int, size: int) -> Iterator[bytes]:
-    for at in range(0, size, _PIECE):
-        yield files.pread(fd, min(_PIECE, size - at), at)
 
 
 def _tables(source: Shared, entry: RecordingEntry, root: Path) -> list[Path]:

@@ -6,9 +6,10 @@ What a copy is, and what it proves, is in `hybridlog_storage.copy`.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -97,117 +98,80 @@ class Target:
     arrived: list[str] = field(default_factory=list)
 
 
-def run(
-    source: StoreDirectory,
-    target: Target,
-    chosen: Iterable[RecordingSummary],
-    options: CopyOptions,
-    *,
-    expire: Callable[[str, Mapping[int, str]], None] = lambda *_: None,
-    progress: Progress | None = None,
-    report: CopyReport | None = None,
-) -> CopyReport:
-    """Copy recordings of a store.
+@dataclass
+class Copying:
+    """Copies recordings of a store.
 
     Args:
-        source: The store to read.
+        directory: The store to read.
         target: Where they go.
-        chosen: Recordings of `source`.
         options: How they are copied.
+        report: Takes the result, as it grows.
         expire: With `then_expire`, called with the id of each recording and the digests of logs
             whose copies were proved just now, by number.
         progress: Called with the bytes copied and checked, of all that are to be copied.
-        report: Takes the result, as it grows.
-
-    Raises:
-        UsageError: The place is this very store.
-        StoreError: The place cannot be written or reached; what was copied stays there.
-        DiskFullError: No room; the copy can be run again.
     """
-    found = report or CopyReport()
-    work = _Copying(source, target, options, found, expire=expire, progress=progress)
-    return work.run([*chosen])
 
+    directory: StoreDirectory
+    target: Target
+    options: CopyOptions
+    report: CopyReport
+    expire: Callable[[str, Mapping[int, str]], None]
+    progress: Progress | None
 
-class _Copying:
-    """The steps of a copy."""
+    def run(self, chosen: Sequence[RecordingSummary]) -> None:
+        """Copy some recordings.
 
-    def __init__(
-        self,
-        source: StoreDirectory,
-        target: Target,
-        options: CopyOptions,
-        report: CopyReport,
-        *,
-        expire: Callable[[str, Mapping[int, str]], None],
-        progress: Progress | None,
-    ) -> None:
-        self._directory = source
-        self._source: Source = Directory(source.path)
-        if source.is_remote:
-            self._source = BucketStore(Bucket(source.place))
-        self._target = target
-        self._place = target.place
-        self._options = options
-        self._expire = expire
-        self._progress = progress
-        self._report = report
-        self._done = self._left = 0  # bytes of recordings before, and after this one
-
-    def run(self, chosen: list[RecordingSummary]) -> CopyReport:
+        Raises:
+            UsageError: The place is this very store.
+            StoreError: The place cannot be written or reached; what was copied stays there.
+            DiskFullError: No room; the copy can be run again.
+        """
+        self._place, self._source = self.target.place, self._source_of(self.directory)
         if self._is_same():
             raise UsageError(f"{self._place.address} is this very store: there is nothing to copy.")
-        there = {*self._place.manifests.ids()}
-        wanted = [one for one in chosen if one.id not in there or not self._is_known(one)]
-        self._left = sum(one.stored_bytes for one in wanted)
-        for one in wanted:
+        self._done = 0  # bytes of recordings before, and after this one
+        self._left = sum(one.stored_bytes for one in chosen)
+        for one in chosen:
             self._left -= one.stored_bytes
             self._copy(one)
-        return self._report
+
+    @staticmethod
+    def _source_of(directory: StoreDirectory) -> Source:
+        if directory.is_remote:
+            return BucketStore(Bucket(directory.place))
+        return Directory(directory.path)
 
     def _is_same(self) -> bool:
         """True if the place is the source: it sees a file that was made here this moment.
 
         Paths do not tell, nor does the id of a store, which its backups have, too.
         """
-        if not isinstance(self._source, Directory) or not self._directory.is_writable:
+        if not isinstance(self._source, Directory) or not self.directory.is_writable:
             return False  # nothing of it can be deleted
         try:
             with self._source.marked() as mark:
                 return self._place.sees(mark)
         except StoreError:
-            if self._options.then_expire:
+            if self.options.then_expire:
                 raise
             return False  # a full disk can be copied from
 
-    def _is_known(self, one: RecordingSummary) -> bool:
-        """Note a recording if the place has all that would be copied."""
-        try:
-            found = copy.known(self._source, self._place, one.id, self._how(one))
-        except RecordingGoneError:
-            return False
-        if found is not None:
-            self._note(one, found)
-        return found is not None
-
     def _how(self, one: RecordingSummary) -> copy.How:
-        options = self._options
+        options = self.options
 
         def progress(done: int, total: int) -> None:
-            if self._progress is not None:
-                self._progress(one.name, self._done + done, self._done + total + self._left)
-
-        def proved(digests: Mapping[int, str]) -> None:
-            self._let_go(one, digests)
+            if self.progress is not None:
+                self.progress(one.name, self._done + done, self._done + total + self._left)
 
         return copy.How(
             self._without_payloads if options.only_fields else None,
             options.check,
             options.limit_rate,
-            self._target.named,
-            self._target.made,
+            self.target.named,
+            self.target.made,
             progress,
-            proved if options.then_expire else None,
+            partial(self._let_go, one) if options.then_expire else None,
         )
 
     @contextmanager
@@ -218,9 +182,9 @@ class _Copying:
         with tempfile.TemporaryDirectory(prefix="hybridlog-") as place:
             into = Path(place) / RECORDINGS / now.id
             files.make_folders(into)
-            path, numbers = self._directory.recording(now.id), [log.number for log in logs]
+            path, numbers = self.directory.recording(now.id), [log.number for log in logs]
             try:
-                made = without_payloads(path, now, numbers, into, self._directory.address)
+                made = without_payloads(path, now, numbers, into, self.directory.address)
             except DiskFullError:
                 raise
             except StoreError as error:  # it is damaged, or has changed meanwhile
@@ -228,7 +192,7 @@ class _Copying:
             yield made, Directory(Path(place))
 
     def _copy(self, one: RecordingSummary) -> None:
-        report, name = self._report, f"Recording {one.name!r} of {self._directory.place}"
+        report, name = self.report, f"Recording {one.name!r} of {self.directory.place}"
         try:
             if one.status == "open":
                 raise RefusedError(f"{name} is being written. Copy it when it has ended.")
@@ -247,7 +211,7 @@ class _Copying:
             report.refused[one.name] = str(gone(one.name))
 
     def _note(self, one: RecordingSummary, copied: copy.Copied) -> None:
-        report, name = self._report, copied.manifest.name
+        report, name = self.report, copied.manifest.name
         self._done += copied.bytes
         report.bytes_copied += copied.sent_bytes
         if copied.lost:
@@ -257,7 +221,7 @@ class _Copying:
                 "store may have them."
             )
         if copied.sent or copied.is_new:
-            self._target.arrived.append(one.id)
+            self.target.arrived.append(one.id)
             report.copied.append(name)
         elif not copied.lost:
             report.known.append(name)
@@ -269,9 +233,9 @@ class _Copying:
         logs = self._source.manifests.read(one.id).logs
         left = len({n for n, log in logs.items() if log.is_here} - digests.keys())
         if left:
-            self._report.problems.append(
+            self.report.problems.append(
                 f"Payloads of {counted(left, 'segment')} of {one.name} stay: their copies in "
                 f"{self._place.address} have lost some."
             )
         if digests:
-            self._expire(one.id, digests)
+            self.expire(one.id, digests)

@@ -7,7 +7,7 @@ the status; what people said of the recording there stays (`merging`).
 from __future__ import annotations
 
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
@@ -96,26 +96,13 @@ def copy(source: Source, target: Place, recording: str, how: How | None = None) 
     """
     for attempt in range(_TRIES):
         here = source.manifests.read(recording)
+        work = _Copy(source, target, here, how or How())
         try:
-            return _Copy(source, target, here, how or How()).run()
+            return work.known() or work.run()
         except RefusedError:  # a file that has expired meanwhile is no damage
             if attempt + 1 == _TRIES or source.manifests.read(recording) == here:
                 raise
     raise AssertionError
-
-
-def known(source: Source, target: Place, recording: str, how: How) -> Copied | None:
-    """What a copy would give, if it has nothing to do; None if it has.
-
-    Raises:
-        HybridlogError: A store does not answer.
-    """
-    here = source.manifests.read(recording)
-    try:
-        there = target.manifests.find(recording)
-        return None if there is None else _Copy(source, target, here, how).known(there)
-    except (ManifestError, RefusedError):
-        return None
 
 
 class _Copy:
@@ -132,14 +119,18 @@ class _Copy:
         self._new: set[str] = set()  # paths of files that the manifest there did not list
         self._proved: dict[str, str] = {}  # digests by path
 
-    def known(self, there: Manifest) -> Copied | None:
-        """As of the function."""
-        here = self._here
-        check_origin(here, there)
-        if self._must_prove or there.status == "unproven" or self._wanted(there):
+    def known(self) -> Copied | None:
+        """What a copy gives that has nothing to do, without a lock; None if it has."""
+        here, target, there = self._here, self._target, None
+        if self._must_prove:
             return None
-        if self._target.mends:
-            sizes = self._target.sizes(here.id)
+        with suppress(ManifestError):  # it may be made again
+            there = target.manifests.find(here.id)
+        check_origin(here, there)
+        if there is None or there.status == "unproven" or self._wanted(there):
+            return None
+        if target.mends:
+            sizes = target.sizes(here.id)
             if any(sizes.get(one.path) != one.bytes for one in listed_files(there)):
                 return None
         return Copied(there, lacking=_lacking(here, there))

@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, ClassVar, Final
 
 from hybridlog_storage.disk import durability, files
 from hybridlog_storage.disk.directory import (
-    LOCK,
     LOCK_WAIT_S,
     StoreDirectory,
 )
@@ -31,7 +30,6 @@ from hybridlog_storage.errors import (
 )
 from hybridlog_storage.manifest import hasher
 from hybridlog_storage.manifests import BucketManifests, DiskManifests
-from hybridlog_storage.remote.bucket import digest_like
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -80,8 +78,8 @@ class Sending:
     file: str
     size: int
     digest: str
-    count: Callable[[int, bool], None]
-    limit_rate: float | None
+    count: Callable[[int, bool], None] = lambda *_: None
+    limit_rate: float | None = None
 
     @property
     def name(self) -> str:
@@ -125,6 +123,16 @@ class Sending:
         if found.hexdigest() != self.digest:
             raise self.damaged()
         yield last
+
+    def begins(self, there: int) -> list[int]:
+        """Where to begin, one after the other: behind what is there, whose end may be torn."""
+        return [there, 0] if 0 < there <= self.size else [0]
+
+    def not_arrived(self, place: Place) -> RefusedError:
+        """The error for one that has another digest there, because it has one here, or not."""
+        if digest_of(self.again()) != self.digest:
+            return self.damaged()
+        return RefusedError(f"{place.address}/{self.name} did not arrive as it was sent.")
 
     def damaged(self) -> RefusedError:
         """The error for one whose bytes have another digest than the manifest states."""
@@ -196,13 +204,13 @@ class Source(Place):
     """A store that recordings are copied from, too."""
 
     @abstractmethod
-    def pieces(self, name: str, at: int, size: int | None) -> Iterator[bytes]:
+    def pieces(self, name: str, at: int, size: int) -> Iterator[bytes]:
         """Bytes of a file.
 
         Args:
             name: Its path below the store.
             at: The first one.
-            size: The bytes that it must have, if they are known.
+            size: The bytes that it must have.
 
         Raises:
             RefusedError: It is missing, or has another size.
@@ -242,7 +250,12 @@ class Directory(Source):
         directory, path = StoreDirectory(self._path), self._path / RECORDINGS / recording
         with ExitStack() as held:
             while True:
-                self._make_folders(path / LOCK)
+                try:
+                    files.make_folders(path)
+                    files.sync_folder(self._path)
+                    files.sync_folder(path.parent)
+                except OSError as error:
+                    raise durability.explain(error, path, "copying into") from error
                 with suppress(TopicError):  # it was removed meanwhile
                     held.enter_context(directory.writing(recording, wait_s=LOCK_WAIT_S))
                     break
@@ -268,31 +281,30 @@ class Directory(Source):
     def send(self, sent: Sending) -> None:
         """As of `Place`; goes on behind the last byte that is there."""
         final, part = self._path / sent.name, self._path / sent.part
-        self._make_folders(final)
         try:
             fd = files.open_file(part, os.O_RDWR | os.O_CREAT)
             try:
-                if not _fill(fd, sent):
+                about = os.fstat(fd)
+                if not stat.S_ISREG(about.st_mode):
+                    raise OSError(0, "it is not an ordinary file")
+                if not any(self._grown(fd, at, sent) for at in sent.begins(about.st_size)):
                     files.system.truncate(fd, 0)
-                    raise sent.damaged()
-                durability.sync_file(fd)
-                if digest_of(read(fd, 0, sent.size)) != sent.digest:
-                    raise RefusedError(f"{final} did not arrive as it was sent. Copy again.")
+                    raise sent.not_arrived(self)
             finally:
                 os.close(fd)
             durability.publish(part, final)
         except OSError as error:
             raise durability.explain(error, final, "copying into") from error
 
-    def _make_folders(self, path: Path) -> None:
-        """Make the folders of a file, on the disk; none may be a link."""
-        try:
-            for folder in reversed([*path.relative_to(self._path).parents][:-1]):
-                with suppress(FileExistsError):
-                    files.make_folder(self._path / folder)
-                files.sync_folder(self._path / folder.parent)
-        except OSError as error:
-            raise durability.explain(error, path, "copying into") from error
+    def _grown(self, fd: int, at: int, sent: Sending) -> bool:
+        """Write a file from a byte on; True if it is on the disk, with its digest."""
+        files.system.truncate(fd, at)
+        sent.count(at, False)
+        os.lseek(fd, at, os.SEEK_SET)
+        for piece in sent.pieces(at):
+            durability.write_all(fd, [piece])
+        durability.sync_file(fd)
+        return digest_of(read(fd, 0, sent.size)) == sent.digest
 
     def drop(self, name: str) -> None:
         """As of `Place`."""
@@ -314,21 +326,14 @@ class Directory(Source):
             raise unreadable(error, path) from error
         return True
 
-    def pieces(self, name: str, at: int, size: int | None) -> Iterator[bytes]:
+    def pieces(self, name: str, at: int, size: int) -> Iterator[bytes]:
         """As of `Source`."""
-        with self._opened(name, size) as fd:
-            pieces = read(fd, at, os.fstat(fd).st_size)
-            while piece := readable(pieces, f"{self.address}/{name}"):
-                yield piece
+        with self.opened(name, size) as fd:
+            yield from read(fd, at, size)
 
     @contextmanager
     def opened(self, name: str, size: int) -> Iterator[int]:
-        """As of `Source`."""
-        with self._opened(name, size) as fd:
-            yield fd
-
-    @contextmanager
-    def _opened(self, name: str, size: int | None) -> Iterator[int]:
+        """As of `Source`; what cannot be read of it is refused, too."""
         path = self._path / name
         with ExitStack() as stack:
             try:
@@ -336,11 +341,13 @@ class Directory(Source):
                     stack.enter_context(files.folder(self._path / folder))  # none may be a link
                 fd = stack.enter_context(_file(path))
                 found = os.fstat(fd).st_size
+                if found != size:
+                    raise RefusedError(
+                        f"{path} is damaged: it has {found} bytes instead of {size}."
+                    )
+                yield fd
             except OSError as error:
                 raise RefusedError(f"{path} cannot be copied: {error.strerror}.") from error
-            if size is not None and found != size:
-                raise RefusedError(f"{path} is damaged: it has {found} bytes instead of {size}.")
-            yield fd
 
     @contextmanager
     def marked(self) -> Iterator[str]:
@@ -391,7 +398,7 @@ class BucketStore(Source):
         """As of `Place`; from its first byte on."""
         self._found[sent.name] = self._bucket.put(sent.name, sent.size, sent.checked())
         if not self.is_whole(sent):
-            raise RefusedError(f"{self.address}/{sent.name} did not arrive as it was sent.")
+            raise sent.not_arrived(self)
 
     def drop(self, name: str) -> None:
         """As of `Place`."""
@@ -399,51 +406,23 @@ class BucketStore(Source):
 
     def is_whole(self, sent: Sending, *, reads: bool = False) -> bool:
         """As of `Place`: by the checksum of the server, or it is read."""
-        about = self._found[sent.name]
-        self._bucket.check_conditions()  # tells whether the server has checksums
-        try:
-            with suppress(RefusedError):  # what is damaged here may be whole there
-                found = "" if reads else self._bucket.digest(about)
-                if found and found == digest_like(found, sent.again()):
-                    return True
-            return digest_of(self._bucket.pieces(about)) == sent.digest
-        except (FileNotFoundError, ObjectChangedError):
-            return False
+        with suppress(RefusedError):  # what is damaged here may be whole there
+            if not reads and self._found[sent.name].has_md5_of(sent.again()):
+                return True
+        with suppress(RefusedError):
+            return digest_of(self.pieces(sent.name, 0, sent.size)) == sent.digest
+        return False
 
-    def pieces(self, name: str, at: int, size: int | None) -> Iterator[bytes]:
+    def pieces(self, name: str, at: int, size: int) -> Iterator[bytes]:
         """As of `Source`."""
-        about = self._found.get(name) or self._bucket.head(name)
         where = f"{self.address}/{name}"
-        if about is None:
-            raise RefusedError(f"{where} cannot be copied: there is no such object.")
-        if size is not None and about.size != size:
-            raise RefusedError(f"{where} is damaged: it has {about.size} bytes instead of {size}.")
-        for begin in range(at, about.size, _FETCHED):
-            part = begin, min(begin + _FETCHED, about.size)
+        for begin in range(at, size, _FETCHED):
             try:
-                yield self._bucket.read(name, [part], about.version)[0]
-            except (FileNotFoundError, ObjectChangedError) as error:
-                raise RefusedError(f"{where} has changed meanwhile. Copy again.") from error
-
-
-def _fill(fd: int, sent: Sending) -> bool:
-    """Write a file behind what is there of it, or else anew; True if it has the digest."""
-    about, size = os.fstat(fd), sent.size
-    if not stat.S_ISREG(about.st_mode):
-        raise OSError(0, "it is not an ordinary file")
-    begins = [about.st_size, 0] if 0 < about.st_size <= size else [0]  # the end may be torn
-    return any(digest_of(_written(fd, sent, at)) == sent.digest for at in begins)
-
-
-def _written(fd: int, sent: Sending, at: int) -> Iterator[bytes]:
-    """The bytes of a file, as they are written; of the first ones, what is there."""
-    files.system.truncate(fd, at)
-    sent.count(at, False)
-    yield from read(fd, 0, at)
-    os.lseek(fd, at, os.SEEK_SET)
-    for piece in sent.pieces(at):
-        durability.write_all(fd, [piece])
-        yield piece
+                yield self._bucket.read(name, begin, min(begin + _FETCHED, size), size)
+            except FileNotFoundError as error:
+                raise RefusedError(f"{where} cannot be copied: {error.strerror}.") from error
+            except ObjectChangedError as error:
+                raise RefusedError(f"{where} is damaged: it has not {size} bytes.") from error
 
 
 @contextmanager
@@ -458,20 +437,8 @@ def _file(path: Path) -> Iterator[int]:
         os.close(fd)
 
 
-def readable(pieces: Iterator[bytes], name: str) -> bytes:
-    """The next bytes of a file that is copied; none at its end.
-
-    Raises:
-        RefusedError: It cannot be read.
-    """
-    try:
-        return next(pieces, b"")
-    except OSError as error:
-        raise RefusedError(f"{name} cannot be copied: {error.strerror}.") from error
-
-
 def read(fd: int, at: int, end: int) -> Iterator[bytes]:
     """Bytes of an open file, a megabyte at a time."""
-    while at < end and (piece := os.pread(fd, min(_PIECE, end - at), at)):
+    while at < end and (piece := files.pread(fd, min(_PIECE, end - at), at)):
         yield piece
         at += len(piece)

@@ -43,7 +43,6 @@ from hybridlog_storage.manifest import MAX_BYTES, Manifest, decode, encode, is_i
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
-    from contextlib import AbstractContextManager
     from pathlib import Path
 
     from hybridlog_storage.remote.bucket import Bucket
@@ -158,14 +157,15 @@ class Manifests(ABC):
         with self.creating() as create:
             create(manifest)
 
-    @abstractmethod
-    def creating(self) -> AbstractContextManager[Callable[[Manifest], None]]:
+    @contextmanager
+    def creating(self) -> Iterator[Callable[[Manifest], None]]:
         """Create manifests; on a disk nobody else can create one meanwhile.
 
         Raises:
             RecordingExistsError: The recording exists.
             HybridlogError: It cannot be written.
         """
+        yield self._create
 
     def restore(self, recording: str, make: Callable[[Manifest | None], Manifest]) -> Manifest:
         """Make a manifest again that is lost or damaged.
@@ -258,16 +258,21 @@ class Manifests(ABC):
         """The bytes of a manifest and their version. Raises FileNotFoundError."""
 
     @abstractmethod
-    def _alone(self, recording: str) -> AbstractContextManager[None]:
+    def _create(self, manifest: Manifest) -> None:
+        """Write the manifest of a new recording."""
+
+    @contextmanager
+    def _alone(self, recording: str) -> Iterator[None]:
         """Keep others, where there are locks, from replacing a manifest."""
+        yield
 
     @abstractmethod
     def _replace(self, recording: str, data: bytes, version: str) -> None:
         """Replace a manifest. Raises ObjectChangedError if it has another version by now."""
 
-    @abstractmethod
     def old(self, recording: str) -> Manifest | None:
         """The manifest before the last change; None if there is none to read."""
+        return None
 
     @abstractmethod
     def _drop(self, recording: str) -> None:
@@ -557,11 +562,6 @@ class BucketManifests(Manifests):
     def _noted(self, recording: str, data: bytes, version: str) -> None:
         """Called with each manifest that was read or written, and its version."""
 
-    @contextmanager
-    def creating(self) -> Iterator[Callable[[Manifest], None]]:
-        """Create manifests; others may create some meanwhile, but not the same."""
-        yield self._create
-
     def _create(self, manifest: Manifest) -> None:
         data = encode(manifest)
         try:
@@ -575,16 +575,8 @@ class BucketManifests(Manifests):
         self._noted(recording, data, about.version)
         return data, about.version
 
-    @contextmanager
-    def _alone(self, recording: str) -> Iterator[None]:
-        yield
-
     def _replace(self, recording: str, data: bytes, version: str) -> None:
         self._noted(recording, data, self._bucket.replace(self.name_of(recording), data, version))
-
-    def old(self, recording: str) -> Manifest | None:
-        """As of `Manifests`."""
-        return None
 
     def _drop(self, recording: str) -> None:
         self._bucket.delete([self.name_of(recording)])

@@ -21,8 +21,8 @@ import shlex
 import subprocess
 import tempfile
 import time
-from contextlib import ExitStack, contextmanager, nullcontext, suppress
-from pathlib import Path, PurePosixPath
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
 from typing import IO, TYPE_CHECKING, Final, Self
 from urllib.parse import unquote, urlsplit
 
@@ -33,21 +33,18 @@ from hybridlog_storage.copy_places import (
     Place,
     RefusedError,
     read,
-    readable,
 )
 from hybridlog_storage.disk.directory import LOCK, LOCK_WAIT_S
 from hybridlog_storage.errors import (
     HeldError,
     HybridlogError,
-    ManifestError,
     ObjectChangedError,
     RecordingExistsError,
-    RecordingGoneError,
     StoreError,
     UsageError,
 )
 from hybridlog_storage.manifest import MAX_BYTES, Manifest, encode, hasher, is_id
-from hybridlog_storage.manifests import MANIFEST_LOCK, WAIT_S, Manifests
+from hybridlog_storage.manifests import MANIFEST_LOCK, MANIFEST_OLD, WAIT_S, Manifests
 from hybridlog_storage.settings import MAX_SETTINGS, StoreSettings, settings_of, settings_text
 from hybridlog_storage.settings import NAME as SETTINGS
 from hybridlog_storage.stopping import pause, safe_point
@@ -204,11 +201,7 @@ class Server(Place):
             whole = f"find {MANIFESTS} -name '[!.]*.json'"  # others were left by a cut
             _, said = self.shell(f"{whole} -exec grep -hao '{pattern}' {{}} + || true")
             return {json.loads(f"{row}}}")["name"] for row in said.splitlines()}
-        found = set()
-        for recording in self.manifests.ids():
-            with suppress(RecordingGoneError, ManifestError):
-                found.add(self.manifests.read(recording).name)
-        return found
+        return {one.name for one in self.manifests.each(self.manifests.ids())}
 
     def put_beside(self, content: bytes, folder: str) -> str:
         """Write a small file under a hidden name of its own."""
@@ -230,7 +223,7 @@ class Server(Place):
 
     def fetched(self, name: str, most: int) -> bytes | None:
         """A file, and at most one byte more than it may have; None if there is none."""
-        with self._got(name, most, may_lack=True) as path:
+        with self._got(name, most) as path:
             if path.exists():
                 return path.read_bytes()[: most + 1]
         if self.listed(name):
@@ -238,12 +231,12 @@ class Server(Place):
         return None
 
     @contextmanager
-    def _got(self, name: str, most: int, *, may_lack: bool = False) -> Iterator[Path]:
-        """A file that was fetched; one that has more bytes is not fetched to its end."""
+    def _got(self, name: str, most: int) -> Iterator[Path]:
+        """A file that was fetched, if it is there; one with more bytes, not to its end."""
         path = self._scratch / secrets.token_hex(8)
         try:
             with suppress(_EnoughError):
-                line = f'{"-" if may_lack else ""}get {_quoted(name)} "{path}"'
+                line = f'-get {_quoted(name)} "{path}"'
                 self.sftp(line, watch=lambda _: _check_size(path, most))
             yield path
         finally:
@@ -252,15 +245,12 @@ class Server(Place):
     def send(self, sent: Sending) -> None:
         """As of `Place`; goes on at the last byte that is there."""
         name, part = sent.name, sent.part
-        folders = [str(one) for one in reversed(PurePosixPath(name).parents)]
         with sent.source.opened(name, sent.size) as fd:
-            sha256, digest = _digests(fd, name)
+            sha256, digest = _digests(fd)
             if digest != sent.digest:
                 raise sent.damaged()
-            if name not in self._found:
-                self.sftp(*(f"-mkdir {_quoted(folder)}" for folder in folders[3:]))
             there = self._found.pop(part, 0)
-            for at in [there, 0] if 0 < there <= sent.size else [0]:  # the end may be torn
+            for at in sent.begins(there):
                 sent.count(at, False)
                 if at < sent.size or not at:
                     self._send(fd, part, at, sent)
@@ -268,7 +258,7 @@ class Server(Place):
                     self.move(part, name)
                     return
         self.drop(part)
-        raise RefusedError(f"{self.address}/{name} did not arrive as it was sent. Copy again.")
+        raise sent.not_arrived(self)
 
     def _send(self, fd: int, part: str, at: int, sent: Sending) -> None:
         done = at
@@ -293,7 +283,7 @@ class Server(Place):
         sha256 = ""
         if self.has_shell:
             with suppress(RefusedError), sent.source.opened(sent.name, sent.size) as fd:
-                found, digest = _digests(fd, sent.name)
+                found, digest = _digests(fd)
                 sha256 = found if digest == sent.digest else ""
         return self._is(sent.name, sha256, sent)
 
@@ -304,8 +294,9 @@ class Server(Place):
             code, said = self.shell(f"sha256sum < {path} && sync {path}")
             if sha256 or code:
                 return code == 0 and said.split()[:1] == [sha256]
-        with self._got(name, sent.size) as place, place.open("rb") as file:
-            return _digests(file.fileno(), name)[1] == sent.digest
+        with suppress(FileNotFoundError), self._got(name, sent.size) as got, got.open("rb") as file:
+            return _digests(file.fileno())[1] == sent.digest
+        return False
 
     def sftp(
         self,
@@ -335,17 +326,11 @@ class Server(Place):
             *("sftp", "-q", "-S", str(self._scratch / "ssh"), *self._options),
             *("-o", "BatchMode=no", "-b", "-", *options, host),
         ]
-        with _running(words, passed) as (process, said, errors):
-            assert process.stdin is not None
-            with suppress(BrokenPipeError), process.stdin as stream:
-                stream.write(script.encode())
-            _wait(process, said, watch)
-            self._check_reached(process, errors)
-            if process.returncode:
-                why = _reason(errors)
-                hint = " Is there room?" if "Failure" in why else ""  # all that sftp says of it
-                raise StoreError(f"{self.address}: {why}.{hint}")
-            return _text(said).splitlines()
+        code, said, why = self._run(_running(words, passed), script, watch)
+        if code:
+            hint = " Is there room?" if "Failure" in why else ""  # all that sftp says of it
+            raise StoreError(f"{self.address}: {why}.{hint}")
+        return said.splitlines()
 
     def shell(self, script: str) -> tuple[int, str]:
         """Exit code and output of a script that runs in the folder of the store.
@@ -353,12 +338,29 @@ class Server(Place):
         Raises:
             StoreError: The server is not reached.
         """
-        with self._ssh_process(script) as (process, said, errors):
+        return self._run(self._ssh_process(script))[:2]
+
+    def _run(
+        self,
+        running: AbstractContextManager[_Running],
+        given: str = "",
+        watch: Callable[[int], None] = lambda _: None,
+    ) -> tuple[int, str, str]:
+        """Exit code, output and complaints of a program."""
+        with running as (process, said, errors):
             assert process.stdin is not None
-            process.stdin.close()
-            _wait(process, said)
+            with suppress(BrokenPipeError), process.stdin as stream:
+                stream.write(given.encode())
+            while True:
+                with suppress(subprocess.TimeoutExpired):
+                    process.wait(_POLL_S)
+                    break
+                safe_point()
+                watch(process.pid)
+                if os.fstat(said.fileno()).st_size > _MAX_SAID:
+                    raise StoreError(f"{self.address} says more than any store has to say.")
             self._check_reached(process, errors)
-            return process.returncode, _text(said)
+            return process.returncode, _text(said), _reason(errors)
 
     def _ssh_process(self, script: str) -> AbstractContextManager[_Running]:
         script = f"cd -- {shlex.quote(self._root)} && {script}"
@@ -384,33 +386,9 @@ class _ServerManifests(Manifests):
         names = (Path(name) for name in self._server.listed(MANIFESTS))
         return sorted(name.stem for name in names if name.suffix == ".json" and is_id(name.stem))
 
-    @contextmanager
-    def creating(self) -> Iterator[Callable[[Manifest], None]]:
-        """Create manifests; others may create some meanwhile, but not the same."""
-        yield self._create
-
     def _create(self, manifest: Manifest) -> None:
-        server, final = self._server, _path(manifest.id)
         exists = RecordingExistsError(f"There is a recording {manifest.id} already.")
-        with self._beside(encode(manifest)) as new:
-            if server.has_shell:
-                folder = f"{RECORDINGS}/{manifest.id}"
-                self._replaced(
-                    f"{MANIFESTS}/.lock",
-                    f"test -e {final} && exit {_CHANGED}; : >> {folder}/{MANIFEST_LOCK} && "
-                    f"{{ sync {folder} {RECORDINGS} || sync; }} && mv {new} {final} && "
-                    f"touch {RECORDINGS}",  # from which readers see that a recording has come
-                    exists,
-                )
-                return
-            server.put(b"", f"{RECORDINGS}/{manifest.id}/{MANIFEST_LOCK}")
-            try:
-                mark = f"{RECORDINGS}/{MARK}{secrets.token_hex(8)}"  # as `touch` does
-                server.sftp(f"rename -l {new} {final}", f"-mkdir {mark}", f"-rmdir {mark}")
-            except StoreError:
-                if not server.listed(final):
-                    raise
-                raise exists from None
+        self._put(manifest.id, encode(manifest), "", exists)
 
     def _get(self, recording: str) -> tuple[bytes, str]:
         data = self._server.fetched(_path(recording), MAX_BYTES)
@@ -418,31 +396,47 @@ class _ServerManifests(Manifests):
             raise FileNotFoundError
         return data, hashlib.sha256(data).hexdigest()
 
-    def _alone(self, recording: str) -> AbstractContextManager[None]:
-        return nullcontext()
-
     def _replace(self, recording: str, data: bytes, version: str) -> None:
-        server, final = self._server, _path(recording)
-        changed = ObjectChangedError(f"{server.address}/{final} was changed meanwhile.")
-        with self._beside(data) as new:
+        changed = ObjectChangedError(f"{self._server.address}: {recording} was changed meanwhile.")
+        self._put(recording, data, version, changed)
+
+    def _put(self, recording: str, data: bytes, version: str, changed: HybridlogError) -> None:
+        """Write a manifest if the one there has a version still; none if that is empty."""
+        server = self._server
+        new = server.put_beside(data, MANIFESTS)  # until it is renamed
+        try:
             if server.has_shell:
-                folder = f"{RECORDINGS}/{recording}"
-                self._replaced(
-                    f"{folder}/manifest.lock",
-                    f'test "$(sha256sum < {final})" = "{version}  -" || exit {_CHANGED}; '
-                    f"ln -f {final} {folder}/manifest.old; mv {new} {final}",
-                    changed,
-                )
+                self._put_by_shell(recording, new, version, changed)
                 return
             with self._locked(recording):
-                if self._get(recording)[1] != version:
+                now = ""
+                with suppress(FileNotFoundError):
+                    now = self._get(recording)[1]
+                if now != version:
                     raise changed
-                server.move(new, final)
+                if not version:
+                    server.put(b"", f"{RECORDINGS}/{recording}/{MANIFEST_LOCK}")
+                mark = f"{RECORDINGS}/{MARK}{secrets.token_hex(8)}"  # as `touch` does
+                server.sftp(f"rename {new} {_path(recording)}", f"-mkdir {mark}", f"-rmdir {mark}")
+        except BaseException:
+            with suppress(StoreError):
+                server.drop(new)
+            raise
 
-    def _replaced(self, lock: str, script: str, changed: HybridlogError) -> None:
-        """Run a script there under a lock; names of files are on the disk before and after."""
-        sync = f"{{ sync {lock.rpartition('/')[0]} {MANIFESTS} || sync; }}"
-        script = f"{sync} && {{ {script}; }} && {sync}"
+    def _put_by_shell(
+        self, recording: str, new: str, version: str, changed: HybridlogError
+    ) -> None:
+        """Rename a manifest there under a lock; names of files are on the disk before and after."""
+        folder, final, address = f"{RECORDINGS}/{recording}", _path(recording), self._server.address
+        lock = f"{folder}/{MANIFEST_LOCK}" if version else f"{MANIFESTS}/.lock"
+        sync = f"{{ sync {folder} {RECORDINGS} {MANIFESTS} || sync; }}"
+        is_same = f'test "$(sha256sum 2> /dev/null < {final})" = "{version and version + "  -"}"'
+        # From a touched folder readers see that a recording has come.
+        script = (
+            f"{sync} && {{ {is_same} || exit {_CHANGED}; : >> {folder}/{MANIFEST_LOCK}; "
+            f"ln -f {final} {folder}/{MANIFEST_OLD} 2> /dev/null; "
+            f"mv {new} {final} && touch {RECORDINGS}; }} && {sync}"
+        )
         code, said = self._server.shell(
             f"exec flock -w {WAIT_S:.0f} {lock} sh -c {shlex.quote(script)} 2>&1"
         )
@@ -450,20 +444,9 @@ class _ServerManifests(Manifests):
             raise changed
         if code:
             raise StoreError(
-                f"{self._server.address}: a manifest cannot be written ({said.strip()[:500]}), or "
-                f"another process has held {lock} for {WAIT_S:.0f} s."
+                f"{address}: a manifest cannot be written ({said.strip()[:500]}), or another "
+                f"process has held {lock} for {WAIT_S:.0f} s."
             )
-
-    @contextmanager
-    def _beside(self, data: bytes) -> Iterator[str]:
-        """A file with a new manifest, beside the others until it is renamed."""
-        new = self._server.put_beside(data, MANIFESTS)
-        try:
-            yield new
-        except BaseException:
-            with suppress(StoreError):
-                self._server.drop(new)
-            raise
 
     @contextmanager
     def _locked(self, recording: str) -> Iterator[None]:
@@ -487,18 +470,13 @@ class _ServerManifests(Manifests):
         finally:
             server.sftp(f"-rmdir {lock}")
 
-    def old(self, recording: str) -> Manifest | None:
-        """As of `Manifests`; nobody asks for it there."""
-        return None
-
     def _drop(self, recording: str) -> None:
-        raise _only_there(self._server)
+        raise StoreError(f"Recordings of {self._server.address} can only be removed there.")
 
-    def _delete_files(self, recording: str) -> None:
-        raise _only_there(self._server)
+    _delete_files = _drop
 
     def _forget(self, recording: str, *, says_so: bool) -> None:
-        raise _only_there(self._server)
+        self._drop(recording)
 
 
 _Running = tuple["subprocess.Popen[bytes]", "IO[bytes]", "IO[bytes]"]
@@ -526,22 +504,6 @@ def _running(words: Sequence[str], passed: int | None) -> Iterator[_Running]:
             except BaseException:
                 process.kill()
                 raise
-
-
-def _wait(
-    process: subprocess.Popen[bytes],
-    said: IO[bytes],
-    watch: Callable[[int], None] = lambda _: None,
-) -> None:
-    """Wait for the end of a process; a safe point now and then."""
-    while True:
-        with suppress(subprocess.TimeoutExpired):
-            process.wait(_POLL_S)
-            return
-        safe_point()
-        watch(process.pid)
-        if os.fstat(said.fileno()).st_size > _MAX_SAID:
-            raise StoreError("The server says more than any store has to say.")
 
 
 class _EnoughError(Exception):
@@ -606,18 +568,14 @@ def _position(process: int, fd: int) -> int:
     return found
 
 
-def _digests(fd: int, name: str) -> tuple[str, str]:
+def _digests(fd: int) -> tuple[str, str]:
     """SHA-256, which servers can work out, and the digest of an open file."""
-    sha256, digest, pieces = hashlib.sha256(), hasher(), read(fd, 0, os.fstat(fd).st_size)
-    while piece := readable(pieces, name):
+    sha256, digest = hashlib.sha256(), hasher()
+    for piece in read(fd, 0, os.fstat(fd).st_size):
         safe_point()
         sha256.update(piece)
         digest.update(piece)
     return sha256.hexdigest(), digest.hexdigest()
-
-
-def _only_there(server: Server) -> StoreError:
-    return StoreError(f"Recordings of {server.address} can only be removed there.")
 
 
 def _parts(url: str) -> tuple[str, list[str], str]:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import pytest
 
-from hybridlog_storage.copy import How, copy
+from hybridlog_storage.copy import copy
 from hybridlog_storage.copy_places import BucketStore
 from hybridlog_storage.errors import HybridlogError
 from hybridlog_storage.manifests import BucketManifests
@@ -118,16 +118,6 @@ def test_a_bucket_that_is_cut_at_any_request(
     resumed(source, target, cut, proxy.reset)
 
 
-def test_large_files_go_in_parts(make: Makes, proxy: Proxy, limit: Limit) -> None:
-    limit(bucket_whole_bytes=100_000, bucket_part_bytes=50_000)
-    source, target = make("directory"), make("bucket")
-    source.begin(recording())
-    copy(source.source, target.place, RECORDING)
-    assert sum("uploadId" in path for _, path, _ in proxy.requests) > 10
-    target.check(recording())
-    assert copy(source.source, target.place, RECORDING, How(check=True)).sent == []
-
-
 def test_requests_to_a_bucket(make: Makes, proxy: Proxy) -> None:
     source, target = make("directory"), make("bucket")
     source.begin(recording())
@@ -159,20 +149,3 @@ def test_a_server_without_conditions_is_refused_before_the_first_write(
         BucketManifests(Bucket(target.bucket.address)).change(RECORDING, edited)
     assert target.manifests().read(RECORDING) == before
     assert [name for name in target.names() if "probe" in name] == []
-
-
-def test_a_bucket_that_changes_a_byte_is_noticed(make: Makes, proxy: Proxy) -> None:
-    source, target = make("directory"), make("bucket")
-    source.begin(recording())
-    assert target.bucket is not None
-    target.bucket.check_conditions()
-    path = f"{RECORDING}/000001.mcap"
-    proxy.spoil = lambda number: (
-        "flip" if "PUT" in (now := proxy.requests[number - 1]) and path in now[1] else ""
-    )
-    with pytest.raises(HybridlogError, match="did not arrive"):
-        copy(source.source, target.place, RECORDING)
-    proxy.reset()
-    assert not target.is_there()
-    assert "000001.mcap" in copy(source.source, target.place, RECORDING).sent
-    target.check(recording())

@@ -242,7 +242,6 @@ def test_a_manifest_without_end_is_not_read_to_its_end(make: Makes, kind: str) -
 def test_what_is_left_of_a_file_that_no_longer_comes_goes(make: Makes, kind: str) -> None:
     source, target = make("directory"), make(kind)
     source.begin(SMALL)
-    copy(source.source, target.place, RECORDING)
     target.write(f"recordings/{RECORDING}/.0.part", b"x")
     copy(source.source, target.place, RECORDING, How(prepare=without_payloads))
     assert any(name.endswith(".part") for name in target.names())

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import random
 import shutil
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +20,6 @@ from tests.cli.within import answer
 from tests.copying.conftest import STATES, all_answers, answers, expire, files_in
 from tests.copying.server import Sshd
 from tests.limits import Limit
-
-ROUNDS = 6
-SEED = 20_261_128
 
 
 def _flip_a_bit(path: Path) -> None:
@@ -70,28 +65,6 @@ def test_all_of_it_is_there(robots: Path, tmp_path: Path, to: To) -> None:
         assert not store.verify().findings
     again = copied(robots, to(lab))
     assert (again.copied, sorted(again.known), again.bytes_copied) == ([], sorted(STATES), 0)
-
-
-@pytest.mark.parametrize("kind", ["shell", "sftp"])
-def test_a_connection_is_cut_at_any_byte(
-    robots: Path, tmp_path: Path, sshd: dict[str, Sshd], kind: str
-) -> None:
-    """Nothing is seen before all of it is there."""
-    draw, server, lab = random.Random(SEED), sshd[kind], tmp_path / "lab"
-    server.reset()
-    copied(robots, {"to": server.url(lab), "ssh": server.ssh}, "calm")
-    seen = []
-    for _ in range(ROUNDS):
-        server.left = draw.randrange(20_000, 90_000)
-        with suppress(StoreError):
-            copied(robots, {"to": server.url(lab), "ssh": server.ssh}, "noted")
-        seen.append(names_in(lab))
-        with hl.open(lab, mongo="none") as store:
-            assert not store.verify().findings
-    server.reset()
-    copied(robots, {"to": server.url(lab), "ssh": server.ssh}, "noted")
-    assert all(names in (["calm"], ["calm", "noted"]) for names in seen), seen
-    assert answers(lab, "noted") == answers(robots, "noted")
 
 
 @pytest.mark.parametrize("expires", [False, True])
@@ -337,12 +310,3 @@ def test_what_a_stopped_copy_has_left_is_out_of_sight(robots: Path, tmp_path: Pa
     (lab / "manifests" / f"{recording}.json").unlink()
     with hl.open(lab, mongo="none") as store:
         assert [*store.repairs.unreadable] == [recording]
-
-
-def test_the_rate_is_limited(robots: Path, tmp_path: Path) -> None:
-    with pytest.MonkeyPatch.context() as patch:
-        pauses: list[float] = []
-        patch.setattr(copy, "pause", pauses.append)
-        copied(robots, {"to": tmp_path / "lab"}, "recorded", limit_rate=100_000)
-    assert sum(pauses) > 0.1
-    assert max(pauses) < 10

@@ -20,7 +20,6 @@ from tests.copies import bring
 from tests.copying.conftest import (
     STATES,
     all_answers,
-    expire,
     files_in,
     robots,  # noqa: F401 - a fixture
     sshd,  # noqa: F401 - a fixture
@@ -101,36 +100,6 @@ def _cut(most: int) -> Callable[..., Iterator[bytes]]:
     return pieces
 
 
-@pytest.mark.parametrize("step", [4, pytest.param(1, marks=pytest.mark.exhaustive)])
-def test_a_copy_is_cut_after_each_request(
-    robots: Path,  # noqa: F811
-    address: str,
-    proxy: Proxy,
-    step: int,
-) -> None:
-    with hl.open(robots, mongo="none") as store:
-        for allowed in range(1, 200, step):
-            files.mounted.clear()
-            proxy.requests.clear()
-            proxy.spoil = lambda number, last=allowed: "403" if number > last else ""
-            try:
-                assert [*store.copy(address, ["driven"]).refused] == []
-                break
-            except BucketError:
-                proxy.reset()
-                files.mounted.clear()
-                with suppress(StoreError), hl.open(address) as there:
-                    if there.directory.ids():
-                        assert there.recordings("driven").topic("/number").count() > 20
-        else:
-            pytest.fail("it never ends")
-        assert allowed > 8
-        proxy.reset()
-        assert store.copy(address, ["driven"]).known == ["driven"]
-    files.mounted.clear()
-    assert all_answers(Path(address), "driven") == all_answers(robots, "driven")
-
-
 def test_fields_come_first_and_payloads_go_here(
     robots: Path,  # noqa: F811
     address: str,
@@ -174,26 +143,3 @@ def test_fields_come_first_and_payloads_go_here(
     with hl.open(here, mongo="none") as store:
         said = " ".join(store.recordings("recorded").topic("/cloud").completeness().sentences)
         assert f"{address} has more payloads of recorded." in said
-
-
-def test_damaged_recordings_are_refused(
-    robots: Path,  # noqa: F811
-    address: str,
-    tmp_path: Path,
-) -> None:
-    """And those that lost payloads there keep them here."""
-    here = tmp_path / "here"
-    with hl.open(robots, mongo="none") as robot:
-        robot.copy(here, ["recorded", "noted"])
-    path = places.segment(here, "noted", 1)
-    data = bytearray(path.read_bytes())
-    data[len(data) // 3] ^= 1
-    path.write_bytes(data)
-    with hl.open(here, mongo="none") as store:
-        report = store.copy(address)
-        assert (report.copied, [*report.refused]) == (["recorded"], ["noted"])
-        assert "do not have the digest" in report.refused["noted"]
-        expire(store, "recorded")
-        with hl.open(robots, mongo="none") as robot:
-            assert robot.copy(f"{address}2", ["recorded"]).copied == ["recorded"]
-        assert store.copy(f"{address}2", ["recorded"]).known == ["recorded"]

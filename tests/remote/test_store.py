@@ -147,17 +147,6 @@ def test_a_change_is_one_manifest(
         assert not store.verify().findings
 
 
-def test_the_command_copies(here: Path, address: str, proxy: Proxy) -> None:
-    said = answer("copy", "-r", "short-*", address, "--json", store=here).json
-    assert (said["copied"], said["known"]) == (["short-0", "short-1", "short-2"], [])
-    proxy.requests.clear()
-    said = answer("copy", "-r", "short-*", address, "--json", store=here).json
-    assert (said["copied"], said["known"]) == ([], ["short-0", "short-1", "short-2"])
-    assert len(proxy.requests) <= 3 + 3
-    with hl.open(address) as store:
-        assert store.topic("/arm").count() == 60
-
-
 def test_two_who_change_at_once(here: Path, address: str, proxy: Proxy) -> None:
     publish_all(here, address, ("run", "short-0"))
     one = hl.open(address)

@@ -15,87 +15,53 @@ import os
 import struct
 import threading
 from collections.abc import Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Final
-from weakref import WeakValueDictionary
+from typing import Final, Self
 
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk.files import user_directory
 from hybridlog_storage.errors import ObjectChangedError, ResourceError
-from hybridlog_storage.remote.bucket import Bucket, Object, joined_ranges
+from hybridlog_storage.remote.bucket import Bucket, Object
 
 LOST: Final = "its object in the bucket is missing or was changed"
 MAX_CACHED: Final = 16 << 30
 """Bytes that the cached blocks of a user may take."""
 BLOCK: Final = 64 << 10
 _TAIL: Final = 256 << 10  # what is fetched of an end at least: summaries and footers lie there
-_PIECE: Final = 64 << 20  # fetched at once
+_GAP: Final = (1 << 20) // BLOCK  # blocks that cost less than another request
+_PIECE: Final = (8 << 20) // BLOCK  # blocks of a request
+_PARALLEL: Final = 8
 _CHECK_EVERY: Final = 256 << 20  # fetched bytes between two looks at the size of the cache
-_NEAR: Final = (1 << 20) // BLOCK  # blocks between two reads that follow each other
-_MAX_WINDOW: Final = (8 << 20) // BLOCK
 _MARK: Final = struct.Struct("<II")
-_DATA: Final = ".data"
-_SUMS: Final = ".sums"
 
 
 class CachedFile(int):
     """A handle of the cached file of an object, which fetches what is read."""
 
-    blocks: Blocks
+    _cache: BlockCache
+    _bucket: Bucket
+    _about: Object
+    _lock: threading.Lock
+    _proved: set[int]
 
-    def fetch(self, ranges: Iterable[tuple[int, int]]) -> None:
-        """Make ranges of bytes readable; see `Blocks.fetch`."""
-        self.blocks.fetch(self, ranges)
+    def __new__(cls, fd: int, cache: BlockCache, bucket: Bucket, about: Object) -> Self:
+        """A handle that takes over an open file."""
+        made = super().__new__(cls, fd)
+        made._cache, made._bucket, made._about = cache, bucket, about
+        made._lock, made._proved = threading.Lock(), set()
+        return made
 
     def identity(self) -> tuple[int, ...]:
         """A value that no other object has, nor this one after a change."""
-        return inode_of(self.blocks.about), self.blocks.about.size
+        return inode_of(self._about), self._about.size
 
     def again(self) -> CachedFile:
         """Another handle of the same file."""
-        return _handle(os.dup(self), self.blocks)
+        return CachedFile(os.dup(self), self._cache, self._bucket, self._about)
 
-
-class Blocks:
-    """The blocks of an object."""
-
-    def __init__(self, cache: BlockCache, bucket: Bucket, about: Object) -> None:
-        self._cache = cache
-        self._bucket = bucket
-        self.about = about
-        named = "\n".join([bucket.address, about.name, about.version, str(about.size)])
-        self._path = cache.path / hashlib.sha256(named.encode()).hexdigest()[:40]
-        self._lock = threading.Lock()
-        self._proved: set[int] = set()
-        self._inode = -1
-        self._next = -1  # the block behind the last one that was fetched
-        self._window = 0  # blocks to fetch ahead
-
-    def open(self) -> CachedFile:
-        """A new handle of its file.
-
-        Raises:
-            OSError: The file cannot be made.
-        """
-        flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
-        fd = os.open(self._path.with_suffix(_DATA), flags, 0o600)
-        try:
-            if os.fstat(fd).st_size != self.about.size:
-                os.ftruncate(fd, self.about.size)
-            os.utime(fd)
-            return _handle(fd, self)
-        except BaseException:
-            os.close(fd)
-            raise
-
-    def forget(self) -> None:
-        """Remove what was kept of it, but for those who have opened it."""
-        for suffix in (_DATA, _SUMS):
-            with suppress(OSError):
-                self._path.with_suffix(suffix).unlink()
-
-    def fetch(self, fd: int, ranges: Iterable[tuple[int, int]]) -> None:
+    def fetch(self, ranges: Iterable[tuple[int, int]]) -> None:
         """Fetch the missing blocks of some ranges of bytes.
 
         Raises:
@@ -103,7 +69,7 @@ class Blocks:
             BucketError: The server does not answer.
             ResourceError: The cache cannot be written.
         """
-        size = self.about.size
+        size = self._about.size
         wanted: set[int] = set()
         for begin, end in ranges:
             first, last = begin, min(end, size)
@@ -112,66 +78,47 @@ class Blocks:
                     first = min(first, max(size - _TAIL, 0))
                 wanted.update(range(first // BLOCK, -(-last // BLOCK)))
         with self._lock:
-            inode = os.fstat(fd).st_ino
-            if inode != self._inode:  # it was removed from the cache and made again
-                self._inode, self._proved = inode, set()
             wanted -= self._proved
             if wanted:
-                self._fetch(fd, sorted(wanted))
+                self._fetch(sorted(wanted))
 
-    def _fetch(self, fd: int, wanted: list[int]) -> None:
-        flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
+    def _fetch(self, wanted: list[int]) -> None:
         with self._cache.writing():
-            sums = os.open(self._path.with_suffix(_SUMS), flags, 0o600)
+            sums = _opened(self._cache.paths(self._bucket, self._about)[1])
         try:
             with self._cache.writing():
-                missing = [number for number in wanted if not self._is_there(fd, sums, number)]
-            missing += self._ahead_of(missing)
-            for piece in _pieces(joined_ranges([self._range(number) for number in missing])):
-                try:
-                    found = self._bucket.read(self.about.name, piece, size=self.about.size)
-                except (FileNotFoundError, ObjectChangedError) as error:
-                    self._bucket.lost.add(self.about.name)
-                    self.forget()  # so that others notice it when they begin to read
-                    place = f"{self._bucket.address}/{self.about.name}"
-                    raise OSError(errno.EIO, LOST, place) from error
-                with self._cache.writing():
-                    for (begin, _), data in zip(piece, found, strict=True):
-                        self._keep(fd, sums, begin, data)
-                self._cache.added(sum(map(len, found)))
+                missing = [number for number in wanted if not self._is_there(sums, number)]
+            with ThreadPoolExecutor(_PARALLEL) as pool:
+                for _ in pool.map(lambda piece: self._bring(sums, *piece), _pieces(missing)):
+                    pass
             self._proved.update(wanted)
         finally:
             os.close(sums)
 
-    def _ahead_of(self, missing: list[int]) -> list[int]:
-        """Blocks behind the missing ones, more each time that a file is read on and on."""
-        if not missing:
-            return []
-        goes_on = 0 <= missing[0] - self._next <= _NEAR
-        self._window = min(max(2 * self._window, _NEAR // 4), _MAX_WINDOW) if goes_on else 0
-        end = missing[-1] + 1
-        self._next = min(end + self._window, -(-self.about.size // BLOCK))
-        return list(range(end, self._next))
+    def _bring(self, sums: int, first: int, last: int) -> None:
+        """Fetch blocks, the last one with them."""
+        about, bucket = self._about, self._bucket
+        begin, end = first * BLOCK, min((last + 1) * BLOCK, about.size)
+        try:
+            data = memoryview(bucket.read(about.name, begin, end, about.size))
+        except (FileNotFoundError, ObjectChangedError) as error:
+            bucket.lost.add(about.name)
+            self._cache.forget(bucket, about)  # so that others notice it when they begin to read
+            raise OSError(errno.EIO, LOST, f"{bucket.address}/{about.name}") from error
+        sizes = range(0, len(data), BLOCK)
+        marks = b"".join(_MARK.pack(1, crc32(data[at : at + BLOCK])) for at in sizes)
+        with self._cache.writing():
+            done = 0
+            while done < len(data):
+                done += os.pwrite(self, data[done:], begin + done)
+            os.pwrite(sums, marks, first * _MARK.size)
+        self._cache.added(len(data))
 
-    def _range(self, number: int) -> tuple[int, int]:
-        return number * BLOCK, min((number + 1) * BLOCK, self.about.size)
-
-    def _is_there(self, fd: int, sums: int, number: int) -> bool:
+    def _is_there(self, sums: int, number: int) -> bool:
         mark = os.pread(sums, _MARK.size, number * _MARK.size)
         if len(mark) < _MARK.size or mark == bytes(_MARK.size):
             return False
-        begin, end = self._range(number)
-        return mark == _MARK.pack(1, crc32(os.pread(fd, end - begin, begin)))
-
-    def _keep(self, fd: int, sums: int, begin: int, data: bytes) -> None:
-        view = memoryview(data)
-        done = 0
-        while done < len(view):
-            done += os.pwrite(fd, view[done:], begin + done)
-        marks = [_MARK.pack(1, crc32(view[at : at + BLOCK])) for at in range(0, len(view), BLOCK)]
-        os.pwrite(sums, b"".join(marks), begin // BLOCK * _MARK.size)
-        first = begin // BLOCK
-        self._proved.update(range(first, first + len(marks)))
+        return mark == _MARK.pack(1, crc32(os.pread(self, BLOCK, number * BLOCK)))
 
 
 class BlockCache:
@@ -188,7 +135,6 @@ class BlockCache:
         self.path = path
         self._most = most
         self._since_check = _CHECK_EVERY
-        self._known: WeakValueDictionary[tuple[str, Object], Blocks] = WeakValueDictionary()
         self._lock = threading.Lock()
 
     def open(self, bucket: Bucket, about: Object) -> CachedFile:
@@ -197,22 +143,29 @@ class BlockCache:
         Raises:
             ResourceError: The file cannot be made.
         """
-        blocks = self._blocks(bucket, about)
         with self.writing():
             self.path.mkdir(mode=0o700, parents=True, exist_ok=True)
-            return blocks.open()
+            fd = _opened(self.paths(bucket, about)[0])
+            try:
+                if os.fstat(fd).st_size != about.size:
+                    os.ftruncate(fd, about.size)
+                os.utime(fd)
+            except BaseException:
+                os.close(fd)
+                raise
+            return CachedFile(fd, self, bucket, about)
+
+    def paths(self, bucket: Bucket, about: Object) -> tuple[Path, Path]:
+        """The files with the blocks of an object, and with their checksums."""
+        named = "\n".join([bucket.address, about.name, about.version, str(about.size)])
+        path = self.path / hashlib.sha256(named.encode()).hexdigest()[:40]
+        return path.with_suffix(".data"), path.with_suffix(".sums")
 
     def forget(self, bucket: Bucket, about: Object) -> None:
-        """Remove what was kept of an object, so that it is read from the server again."""
-        self._blocks(bucket, about).forget()
-
-    def _blocks(self, bucket: Bucket, about: Object) -> Blocks:
-        with self._lock:
-            key = bucket.address, about
-            blocks = self._known.get(key)
-            if blocks is None:
-                blocks = self._known[key] = Blocks(self, bucket, about)
-            return blocks
+        """Remove what was kept of an object, but for those who have opened it."""
+        for path in self.paths(bucket, about):
+            with suppress(OSError):
+                path.unlink()
 
     @contextmanager
     def writing(self) -> Iterator[None]:
@@ -232,22 +185,19 @@ class BlockCache:
             if self._since_check < min(_CHECK_EVERY, self._most):
                 return
             self._since_check = 0
-        self._make_room()
-
-    def _make_room(self) -> None:
         found = []
         with suppress(OSError), os.scandir(self.path) as entries:
             for entry in entries:
                 with suppress(OSError):
                     about = entry.stat(follow_symlinks=False)
                     found.append((about.st_mtime_ns, about.st_blocks * 512, entry.path))
-        left = sum(size for _, size, _ in found)
-        for _, size, path in sorted(found):
+        left = sum(taken for _, taken, _ in found)
+        for _, taken, path in sorted(found):
             if left <= self._most:
                 return
             with suppress(OSError):
                 os.unlink(path)  # noqa: PTH108 - as the listing has it
-            left -= size
+            left -= taken
 
 
 def inode_of(about: Object) -> int:
@@ -256,25 +206,16 @@ def inode_of(about: Object) -> int:
     return int.from_bytes(hashlib.sha256(named).digest()[:7], "big")
 
 
-def _handle(fd: int, blocks: Blocks) -> CachedFile:
-    handle = CachedFile(fd)
-    handle.blocks = blocks
-    return handle
+def _opened(path: Path) -> int:
+    return os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
 
 
-def _pieces(ranges: Iterable[tuple[int, int]]) -> Iterator[list[tuple[int, int]]]:
-    """Ranges in groups that fit into memory; long ones are cut."""
-    group: list[tuple[int, int]] = []
-    room = _PIECE
-    for begin, end in ranges:
-        at = begin
-        while at < end:
-            cut = min(end, at + room)
-            group.append((at, cut))
-            room -= cut - at
-            at = cut
-            if not room:
-                yield group
-                group, room = [], _PIECE
-    if group:
-        yield group
+def _pieces(numbers: Iterable[int]) -> list[tuple[int, int]]:
+    """First and last block of each request for some blocks, in order."""
+    pieces: list[tuple[int, int]] = []
+    for number in numbers:
+        if pieces and number - pieces[-1][1] <= _GAP + 1 and number - pieces[-1][0] < _PIECE:
+            pieces[-1] = pieces[-1][0], number
+        else:
+            pieces.append((number, number))
+    return pieces

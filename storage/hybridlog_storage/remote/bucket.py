@@ -1,8 +1,8 @@
 """Objects in a bucket, by way of obstore (extra `remote`).
 
 A bucket has no locks and no renames. What it has are conditions: an object is created only if
-its name is free, and read or replaced only if it is still the version that was seen. A server
-that ignores conditions would lose data in silence, so it is refused before the first write.
+its name is free, and replaced only if it is still the version that was seen. A server that
+ignores conditions would lose data in silence, so it is refused before the first write.
 
 Credentials and the address of a server of one's own come from the environment, as obstore
 reads them (`AWS_ACCESS_KEY_ID`, `AWS_ENDPOINT_URL`, `AWS_ALLOW_HTTP`, `GOOGLE_…`, `AZURE_…`).
@@ -16,12 +16,11 @@ import os
 import re
 import secrets
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import timedelta
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from hybridlog_storage.errors import (
     BucketError,
@@ -31,22 +30,18 @@ from hybridlog_storage.errors import (
     UsageError,
 )
 from hybridlog_storage.lazy import lazy
+from hybridlog_storage.remote import address_of
 
 if TYPE_CHECKING:
-    from obstore import GetOptions, GetResult, PutMode
+    from obstore import GetOptions, PutMode
     from obstore.store import ObjectStore
 
     from hybridlog_storage.messages import Buffer
 
-SCHEMES: Final = ("s3://", "gs://", "az://")
-"""How the address of a store in a bucket begins."""
-JOINED_GAP: Final = 1 << 20
-"""Bytes between two ranges that cost less than another request."""
 PART_BYTES: Final = 64 << 20
 """Size from which an object is uploaded in parts."""
 _PART: Final = 16 << 20
 _PAGE: Final = 1000  # names that servers list at once
-_PARALLEL: Final = 8
 _TRIES: Final = 4
 _READ_S: Final = 60
 _WRITE_S: Final = 900
@@ -55,7 +50,6 @@ _CUT = re.compile(r"(?i)body|reset|closed|incomplete|timed? ?out|eof|sending req
 _NO_BUCKET = re.compile(r"NoSuchBucket|ContainerNotFound|bucket does not exist")
 _ROLES = re.compile(r"169\.254\.|metadata\.google")  # asked if the environment has no key
 _MD5: Final = re.compile(r"[0-9a-f]{32}(-[0-9]{1,5})?")  # of the whole, or of parts
-_ANY_MD5: Final = "0" * 32
 _HOST = re.compile(r"https?://[^/\s]+")
 _SECRETS = re.compile(r"(?i)(signature|credential|token|sig|key)=[^&\s\"]+")
 
@@ -79,10 +73,25 @@ class Object:
     size: int
     version: str
 
-
-def is_bucket(address: object) -> bool:
-    """True for the address of a place in a bucket, such as `s3://lab/store`."""
-    return isinstance(address, str) and address.startswith(SCHEMES)
+    def has_md5_of(self, pieces: Iterable[Buffer]) -> bool:
+        """True if its version is the MD5 of some bytes, as most servers that speak S3 have it."""
+        tag = self.version.strip('"')
+        if not _MD5.fullmatch(tag):
+            return False
+        sums, now, room = [], hashlib.md5(usedforsecurity=False), _PART
+        for piece in pieces:
+            view = memoryview(piece)
+            while "-" in tag and len(view) > room:
+                now.update(view[:room])
+                sums.append(now.digest())
+                view, now, room = view[room:], hashlib.md5(usedforsecurity=False), _PART
+            now.update(view)
+            room -= len(view)
+        if "-" not in tag:
+            return tag == now.hexdigest()
+        sums.append(now.digest())
+        whole = hashlib.md5(b"".join(sums), usedforsecurity=False)
+        return tag == f"{whole.hexdigest()}-{len(sums)}"
 
 
 class Bucket:
@@ -100,83 +109,51 @@ class Bucket:
     """
 
     def __init__(self, address: str) -> None:
-        if not is_bucket(address) or not address.partition("://")[2].strip("/"):
+        found = address_of(address)
+        if found is None:
             raise UsageError(f"{address!r} is not the address of a bucket, as s3://lab/store is.")
-        self.address = address.rstrip("/")
+        self.address = found
         self.lost: set[str] = set()
-        self._has_conditions = self._replaces = False
-        self._has_digests = True
-        self._reading = _opened(self.address, _READ_S)
+        self._honoured: set[type] = set()  # kinds of conditions
+        self._reading = _opened(found, _READ_S)
 
     @lazy
     def _writing(self) -> ObjectStore:
         return _opened(self.address, _WRITE_S)
 
-    def objects(self, prefix: str = "", *, after: str | None = None) -> Iterator[Object]:
+    def objects(self, prefix: str = "") -> list[Object]:
         """All objects whose names begin with a folder's name, in order; 1,000 a request.
 
         Args:
             prefix: Whole parts of names: `recordings/` has what is below it.
-            after: Only names behind this one.
 
         Raises:
             BucketError: The server does not answer, or refuses.
         """
-        while True:
-            page, is_last = self._again(prefix, partial(self._page, prefix, after))
-            yield from page
-            if is_last:
-                return
-            after = page[-1].name
-
-    def _page(self, prefix: str, after: str | None) -> tuple[list[Object], bool]:
         import obstore
 
-        pages = iter(obstore.list(self._reading, prefix or None, offset=after, chunk_size=_PAGE))
-        found = [_object(about, str(about["path"])) for about in next(pages, ())]
-        return found, len(found) < _PAGE
+        def listed() -> list[Object]:
+            pages = obstore.list(self._reading, prefix or None, chunk_size=_PAGE)
+            return [_object(about, str(about["path"])) for page in pages for about in page]
 
-    def read(
-        self,
-        name: str,
-        ranges: Sequence[tuple[int, int]],
-        version: str | None = None,
-        size: int | None = None,
-    ) -> list[bytes]:
-        """Parts of an object; ranges are joined where the gap costs less than a request.
+        return self._again(prefix, listed)
+
+    def read(self, name: str, begin: int, end: int, size: int) -> bytes:
+        """Part of an object.
 
         Args:
             name: The object.
-            ranges: Begin and end of each part, in any order.
-            version: The version it must have, if one is known.
-            size: The bytes it must have in all, if they are known.
+            begin: The first byte.
+            end: The byte behind the last one.
+            size: The bytes it must have in all.
 
         Raises:
             FileNotFoundError: It does not exist.
-            ObjectChangedError: It has another version or size.
+            ObjectChangedError: It has another size.
             BucketError: The server does not answer, or refuses.
         """
-        joined = joined_ranges(ranges)
-        if len(joined) > 1:
-            with ThreadPoolExecutor(min(len(joined), _PARALLEL)) as pool:
-                found = list(pool.map(lambda r: self._range(name, r, version, size), joined))
-        else:
-            found = [self._range(name, one, version, size) for one in joined]
-        parts = []
-        for begin, end in ranges:
-            place = next(n for n, (low, high) in enumerate(joined) if low <= begin and end <= high)
-            low = joined[place][0]
-            parts.append(bytes(memoryview(found[place])[begin - low : end - low]))
-        return parts
-
-    def _range(
-        self, name: str, wanted: tuple[int, int], version: str | None, size: int | None
-    ) -> bytes:
-        begin, end = wanted
-        if begin == end:
-            return b""
-        about, data = self._get(name, {"range": (begin, end)}, version, end - begin)
-        if len(data) != end - begin or size not in {None, about.size}:
+        about, data = self._get(name, {"range": (begin, end)}, end - begin)
+        if (about.size, len(data)) != (size, end - begin):
             raise ObjectChangedError(f"{self._place(name)} has another size than it had.")
         return data
 
@@ -187,37 +164,17 @@ class Bucket:
             FileNotFoundError: It does not exist.
             BucketError: The server does not answer, or refuses.
         """
-        return self._get(name, {}, None, most)
+        return self._get(name, {}, most)
 
-    def _get(
-        self, name: str, options: dict[str, Any], version: str | None, most: int
-    ) -> tuple[Object, bytes]:
+    def _get(self, name: str, options: GetOptions, most: int) -> tuple[Object, bytes]:
         import obstore
-
-        if version is not None:
-            options = {**options, "if_match": version}
 
         def read() -> tuple[Object, bytes]:
-            answer = obstore.get(self._reading, name, options=cast("GetOptions", options))
-            about = _object(answer.meta, name)
-            if version not in {None, about.version}:  # the server ignores conditions
-                raise ObjectChangedError(f"{self._place(name)} was changed meanwhile.")
-            return about, _content(answer, most)
+            answer = obstore.get(self._reading, name, options=options)
+            data = bytes(next(iter(answer.stream(most + 1)), b""))
+            return _object(answer.meta, name), data[: most + 1]
 
         return self._again(name, read)
-
-    def head(self, name: str) -> Object | None:
-        """The size and version of an object; None if it does not exist.
-
-        Raises:
-            BucketError: The server does not answer, or refuses.
-        """
-        import obstore
-
-        try:
-            return self._again(name, lambda: _object(obstore.head(self._reading, name), name))
-        except FileNotFoundError:
-            return None
 
     def create(self, name: str, content: bytes) -> str:
         """Create an object of a free name. One that has this very content counts as created.
@@ -229,22 +186,14 @@ class Bucket:
             ObjectExistsError: The name is taken, by other content.
             BucketError: The server does not answer, refuses, or ignores conditions.
         """
-        from obstore.exceptions import AlreadyExistsError
-
-        self.check_conditions()
-        with suppress(AlreadyExistsError):  # by another writer, or by this one whose answer is lost
+        self._check("create")
+        with suppress(ObjectExistsError):  # by another writer, or by this one whose answer is lost
             return self._put(name, content, "create")
         with suppress(FileNotFoundError):
             about, found = self.read_whole(name, len(content))
             if found == content:
                 return about.version
         raise ObjectExistsError(f"{self._place(name)} exists, with other content.")
-
-    def pieces(self, about: Object) -> Iterator[bytes]:
-        """The content of an object, some megabytes at a time; errors as of `read`."""
-        for at in range(0, about.size, _PART):
-            end = min(at + _PART, about.size)
-            yield self._range(about.name, (at, end), about.version, about.size)
 
     def replace(self, name: str, content: bytes, version: str) -> str:
         """Replace an object that has still a version.
@@ -256,36 +205,8 @@ class Bucket:
             ObjectChangedError: It has another one.
             BucketError: The server does not answer, refuses, or ignores conditions.
         """
-        self._check_replaces()
+        self._check({"e_tag": f'"{"0" * 32}"'})
         return self._put(name, content, {"e_tag": version})
-
-    def _check_replaces(self) -> None:
-        """Try once, in one request, whether the server honours the condition of `replace`."""
-        from obstore.exceptions import NotSupportedError
-
-        if self._has_conditions or self._replaces:
-            return
-        name = f"probe-{secrets.token_hex(8)}"
-        try:
-            self._put(name, b"", {"e_tag": f'"{_ANY_MD5}"'})  # of what does not exist
-            self.delete([name])
-        except (FileNotFoundError, ObjectChangedError):
-            self._replaces = True
-            return
-        except NotSupportedError:
-            pass
-        self.check_conditions()
-
-    def digest(self, about: Object) -> str:
-        """A digest of the content of an object: the server's, or it is read; see `digest_like`.
-
-        Raises:
-            FileNotFoundError: It does not exist.
-            ObjectChangedError: It has another version.
-            BucketError: The server does not answer, or refuses.
-        """
-        tag = _tag(about) if self._has_digests else ""
-        return tag or digest_like("", self.pieces(about))
 
     def put(self, name: str, size: int, pieces: Iterable[Buffer]) -> Object:
         """Write an object, which takes the place of one of its name; not if `pieces` raises.
@@ -298,28 +219,14 @@ class Bucket:
         Raises:
             BucketError: The server does not answer, refuses, or ignores conditions.
         """
-        self.check_conditions()
-        if size <= PART_BYTES:
-            content = b"".join(pieces)
-            return Object(name, size, self._put(name, content, "overwrite"))
         import obstore
 
-        writer = obstore.open_writer(self._writing, name, buffer_size=_PART, max_concurrency=4)
-        try:
-            with self.explained(name):
-                for piece in pieces:
-                    writer.write(bytes(piece))
-                writer.close()
-        except BaseException as error:
-            with suppress(Exception):  # the first one counts
-                writer.__exit__(type(error), error, error.__traceback__)
-            if isinstance(error, OSError):  # of the writer, which has others than the library
-                raise BucketError(self._problem(name, _reason(error))) from error
-            raise
-        about = self.head(name)
-        if about is None or about.size != size:
-            raise BucketError(f"{self._place(name)} did not arrive.")
-        return about
+        self._check("create")
+        if size <= PART_BYTES:
+            return Object(name, size, self._put(name, b"".join(pieces), "overwrite"))
+        with self._explained(name):
+            made = obstore.put(self._writing, name, pieces, chunk_size=_PART, max_concurrency=4)
+            return Object(name, size, _version(made))
 
     def delete(self, names: Sequence[str]) -> None:
         """Delete objects; those that do not exist are left out.
@@ -329,70 +236,59 @@ class Bucket:
         """
         import obstore
 
-        for at in range(0, len(names), _PAGE):
-            some = names[at : at + _PAGE]
-            try:
-                self._again(some[0], partial(obstore.delete, self._writing, some))
-            except FileNotFoundError:  # some servers stop there
-                for name in some if len(some) > 1 else ():
-                    self.delete([name])
+        if not names:
+            return
+        try:
+            self._again(names[0], partial(obstore.delete, self._writing, names))
+        except FileNotFoundError:  # some servers stop there
+            for name in names if len(names) > 1 else ():
+                self.delete([name])
 
-    def check_conditions(self) -> None:
-        """Try once, before the first write, whether the server honours conditions.
+    def _check(self, mode: PutMode) -> None:
+        """Try once, before the first write, whether the server honours a condition.
 
         Raises:
-            BucketError: It ignores them: writers would overwrite each other in silence.
+            BucketError: It ignores it: writers would overwrite each other in silence.
         """
-        from obstore.exceptions import AlreadyExistsError, NotSupportedError
+        from obstore.exceptions import NotSupportedError
 
-        if self._has_conditions:
+        if type(mode) in self._honoured:
             return
-        name = f"probe-{secrets.token_hex(8)}"
-
-        def is_refused(mode: PutMode) -> bool:
-            try:
-                self._put(name, b"other", mode)
-            except (AlreadyExistsError, ObjectChangedError):
-                return True
-            except NotSupportedError:
-                pass
-            return False
-
+        name, is_made = f"probe-{secrets.token_hex(8)}", mode == "create"
         try:
-            stale = self._put(name, b"hybridlog", "overwrite")
-            # Of what a server encrypts, tags are of another kind, and look the same.
-            self._has_digests = stale.strip('"') == digest_like(_ANY_MD5, [b"hybridlog"])
-            self._put(name, b"hybridlog 2", "overwrite")
-            is_safe = is_refused("create") and is_refused({"e_tag": stale})
+            if is_made:
+                self._put(name, b"1", mode)
+            self._put(name, b"2", mode)  # the name is taken, or there is nothing to replace
+            is_made = True
+        except (FileNotFoundError, ObjectChangedError, ObjectExistsError):
+            self._honoured.add(type(mode))
+            return
+        except NotSupportedError:
+            pass
         finally:
-            self.delete([name])
-        if not is_safe:
-            raise BucketError(
-                f"The server of {self.address} ignores conditions of writers (If-None-Match, "
-                "If-Match), so two writers would lose data in silence. Use a server that honours "
-                "them, or copy to a directory."
-            )
-        self._has_conditions = True
+            if is_made:
+                self.delete([name])
+        raise BucketError(
+            f"The server of {self.address} ignores conditions of writers (If-None-Match, "
+            "If-Match), so two writers would lose data in silence. Use a server that honours "
+            "them, or copy to a directory."
+        )
 
     def _put(self, name: str, content: bytes, mode: PutMode) -> str:
         import obstore
 
-        def put() -> str:
-            done = obstore.put(self._writing, name, content, mode=mode, use_multipart=False)
-            return _version(done)
-
-        return self._again(name, put)
+        put = partial(obstore.put, self._writing, name, content, mode=mode, use_multipart=False)
+        return self._again(name, lambda: _version(put()))
 
     def _again(self, name: str, work: Callable[[], _T]) -> _T:
-        """Do something again if the connection broke.
+        """Do something again if the connection broke, where the library does not.
 
-        The library repeats requests that change nothing, but not what was cut while it was
-        read. Writers have conditions, and see what a request did whose answer was lost.
+        Writers have conditions, and see what a request did whose answer was lost.
         """
         from obstore.exceptions import GenericError
 
         for attempt in range(_TRIES):
-            with self.explained(name):
+            with self._explained(name):
                 try:
                     return work()
                 except GenericError as error:
@@ -404,7 +300,7 @@ class Bucket:
         return f"{self.address}/{name}"
 
     @contextmanager
-    def explained(self, name: str) -> Iterator[None]:
+    def _explained(self, name: str) -> Iterator[None]:
         """Raise errors of the library as errors of this program."""
         from obstore import exceptions
 
@@ -422,12 +318,14 @@ class Bucket:
             ) from error
         except exceptions.PreconditionError as error:
             raise ObjectChangedError(f"{self._place(name)} was changed meanwhile.") from error
+        except exceptions.AlreadyExistsError as error:
+            raise ObjectExistsError(f"{self._place(name)} exists.") from error
         except (exceptions.PermissionDeniedError, exceptions.UnauthenticatedError) as error:
             raise BucketError(
                 f"{self.address}: the server refuses access. Credentials come from the "
                 "environment, such as AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY."
             ) from error
-        except (exceptions.AlreadyExistsError, exceptions.NotSupportedError):
+        except exceptions.NotSupportedError:
             raise
         except (exceptions.BaseError, ValueError) as error:
             raise BucketError(self._problem(name, _reason(error))) from error
@@ -448,46 +346,6 @@ class Bucket:
                 "AWS_ENDPOINT_URL its address?"
             )
         return f"{self._place(name)}: {reason}"
-
-
-def digest_like(found: str, pieces: Iterable[Buffer]) -> str:
-    """A digest of bytes, of the kind of another digest.
-
-    Args:
-        found: A digest of `Bucket.digest`: of objects that were sent in parts it is of theirs.
-        pieces: The bytes.
-    """
-    if not _MD5.fullmatch(found):
-        whole = hashlib.sha256()
-        for piece in pieces:
-            whole.update(piece)
-        return whole.hexdigest()
-    sums, now, left = [], hashlib.md5(usedforsecurity=False), _PART
-    for piece in pieces:
-        view = memoryview(piece)
-        while "-" in found and len(view) > left:
-            now.update(view[:left])
-            sums.append(now.digest())
-            view, now, left = view[left:], hashlib.md5(usedforsecurity=False), _PART
-        now.update(view)
-        left -= len(view)
-    if "-" not in found:
-        return now.hexdigest()
-    sums.append(now.digest())
-    return f"{hashlib.md5(b''.join(sums), usedforsecurity=False).hexdigest()}-{len(sums)}"
-
-
-def joined_ranges(
-    ranges: Iterable[tuple[int, int]], gap: int = JOINED_GAP
-) -> list[tuple[int, int]]:
-    """Ranges in order, joined where the gap between two is small."""
-    joined: list[tuple[int, int]] = []
-    for begin, end in sorted(ranges):
-        if joined and begin - joined[-1][1] <= gap:
-            joined[-1] = joined[-1][0], max(joined[-1][1], end)
-        else:
-            joined.append((begin, end))
-    return joined
 
 
 def _check_process(address: str) -> None:
@@ -524,15 +382,6 @@ def _allows_http() -> bool:
     return any(os.environ.get(name, "").lower() in {"1", "true"} for name in names)
 
 
-def _content(answer: GetResult, most: int) -> bytes:
-    found = bytearray()
-    for piece in answer.stream(1 << 20):
-        found += piece
-        if len(found) > most:
-            return bytes(found[: most + 1])
-    return bytes(found)
-
-
 def _object(about: Any, name: str) -> Object:
     return Object(name, int(about["size"]), _version(about))
 
@@ -542,12 +391,6 @@ def _version(about: Any) -> str:
     if not isinstance(version, str) or not version:
         raise ValueError("the server gives no entity tags")
     return version
-
-
-def _tag(about: Object) -> str:
-    """The MD5 in the version of an object, as most servers that speak S3 have it; else empty."""
-    tag = about.version.strip('"')
-    return tag if _MD5.fullmatch(tag) else ""
 
 
 def _reason(error: Exception) -> str:

@@ -12,9 +12,7 @@ is derived may be missing:
 from __future__ import annotations
 
 import errno
-import json
 import os
-import re
 import secrets
 import stat
 import tempfile
@@ -25,13 +23,15 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar, Final
+from typing import Annotated, Any, ClassVar, Final
 
+from msgspec import Meta, MsgspecError, json
 from msgspec.structs import replace
 
 from hybridlog_storage import manifest as truth
 from hybridlog_storage.cells import Cells, drop, put
 from hybridlog_storage.checksum import crc32
+from hybridlog_storage.copy_places import RECORDINGS, BucketStore, Directory, Sending
 from hybridlog_storage.disk import files
 from hybridlog_storage.disk.directory import (
     Listing,
@@ -51,23 +51,25 @@ from hybridlog_storage.manifest import Manifest, decode, with_rows
 from hybridlog_storage.manifests import BucketManifests
 from hybridlog_storage.remote.blocks import LOST, BlockCache, inode_of
 from hybridlog_storage.remote.bucket import Bucket, Object
+from hybridlog_storage.settings import MAX_SETTINGS, NONE, StoreSettings, settings_of, settings_text
 from hybridlog_storage.settings import NAME as SETTINGS
-from hybridlog_storage.settings import NONE, StoreSettings, read_settings, settings_text
 
 LOOK_EVERY_S: Final = 5.0
 """Seconds between two looks for changes of others, for each thousand recordings."""
 CATALOG: Final = "manifests/catalog"
 """Name of the object with the catalog; where manifests lie, so that one listing tells of it."""
-RECORDINGS: Final = "recordings"
 TABLES: Final = "tables"
 _MANIFEST: Final = "manifest"
 _TABLES: Final = "tables"
 """Kinds of cells, by recording: its manifest with its version, and the objects of its tables."""
 _FEW: Final = 4  # manifests that are read one by one, even if there is a newer catalog
 _MAX_CATALOG: Final = 1 << 30  # bytes, packed and unpacked
-_MAX_SETTINGS: Final = 1 << 20
-_PIECE: Final = 16 << 20  # bytes of a file that are fetched or sent at once
-_TABLE: Final = re.compile(rf"{TABLES}/[^/\x00]{{1,255}}/[^/\x00]{{1,255}}")
+_PART: Final = r"(?!\.\.?(?:/|$))[^/\x00]{1,255}"
+_Row = tuple[
+    Annotated[str, Meta(pattern=f"^{TABLES}/{_PART}/{_PART}$")],
+    Annotated[int, Meta(ge=0, lt=1 << 50)],
+    str,
+]
 _FOLDER: Final = stat.S_IFDIR | 0o555
 _FILE: Final = stat.S_IFREG | 0o444
 
@@ -136,7 +138,7 @@ class CatalogCells(Cells):
     def put_tables(self, recording: str, objects: Collection[Object] = ()) -> None:
         """List the tables of a recording; those that were listed before are deleted."""
         before = _objects(self.read(_TABLES, recording) or b"")
-        body = json.dumps([[one.name, one.size, one.version] for one in objects]).encode()
+        body = json.encode([(one.name, one.size, one.version) for one in objects])
         cell = put(_TABLES, recording, body) if objects else drop(_TABLES, recording)
         self.write(lambda: [cell])
         self._bucket.delete(sorted({one.name for one in before} - {one.name for one in objects}))
@@ -202,10 +204,7 @@ class SeenManifests(BucketManifests):
     ) -> Manifest:
         """Remove a recording with all its objects, and those of others whose removal was cut."""
         removed = super().remove(recording, check)
-        for one in [*self.objects]:
-            with suppress(ManifestError):  # it is told where it is asked about
-                if self._read(one)[0].status == "removed":
-                    super().remove(one)
+        self.clear()
         return removed
 
     def _read(self, recording: str) -> tuple[Manifest, str]:
@@ -292,16 +291,10 @@ class BucketFiles:
         self.cache = cache
         self.cells = CatalogCells(bucket, cache)
         self.manifests = SeenManifests(bucket, self.cells)
-        self._settings: tuple[Object, bytes] | None = None
         self._files: dict[str, tuple[Manifest, dict[str, Object]]] = {}
 
     def open(self, inner: tuple[str, ...]) -> int:
         """A handle for reading a file that a manifest or the catalog lists."""
-        if inner == (SETTINGS,):
-            with tempfile.TemporaryFile() as file:
-                file.write(self.settings())
-                file.seek(0)
-                return os.dup(file.fileno())
         listed: Mapping[str, Object] = {}
         if len(inner) > 2 and inner[0] == RECORDINGS:
             with suppress(RecordingGoneError):
@@ -343,24 +336,6 @@ class BucketFiles:
             known = self._files[manifest.id] = manifest, found
         return known[1]
 
-    def settings(self) -> bytes:
-        """The file of settings, read once."""
-        if self._settings is None:
-            self._settings = self.bucket.read_whole(SETTINGS, _MAX_SETTINGS)
-        return self._settings[1]
-
-    def change_settings(self, change: Callable[[], bytes]) -> None:
-        """Replace the file of settings by what is made of the newest one.
-
-        Raises:
-            BucketError: The server does not answer, or refuses; or they have just been changed.
-        """
-        self._settings = self.bucket.read_whole(SETTINGS, _MAX_SETTINGS)
-        try:
-            self.bucket.replace(SETTINGS, change(), self._settings[0].version)
-        finally:
-            self._settings = None
-
 
 _mounting = threading.Lock()
 
@@ -391,18 +366,22 @@ class RemoteDirectory(StoreDirectory):
 
     def __init__(self, address: str, *, read_only: bool = False) -> None:
         self.source = mount(address)
-        try:
-            self.source.settings()
-        except FileNotFoundError as error:
-            raise StoreError(
-                f"There is no store at {address}. `hybridlog copy {address}` makes one from a "
-                "store on a disk."
-            ) from error
-        super().__init__(self.source.path, read_only=read_only)
+        self.path, self.read_only = self.source.path, read_only
         # No server that a bucket names is asked.
-        self.settings = replace(self.settings, mongo=NONE)
+        self.settings = replace(self._read_settings()[1], mongo=NONE)
         self.manifests = self.seen = self.source.manifests
         self.seen.look(now=True)
+
+    def _read_settings(self) -> tuple[str, StoreSettings]:
+        """The version of the object with the settings, and these."""
+        try:
+            about, content = self.bucket.read_whole(SETTINGS, MAX_SETTINGS)
+        except FileNotFoundError as error:
+            raise StoreError(
+                f"There is no store at {self.place}. `hybridlog copy {self.place}` makes one from "
+                "a store on a disk."
+            ) from error
+        return about.version, settings_of(content, self.place)
 
     @classmethod
     def create_in(cls, address: str) -> RemoteDirectory:
@@ -412,11 +391,13 @@ class RemoteDirectory(StoreDirectory):
             BucketError: The server does not answer, refuses, or ignores conditions.
         """
         try:
-            mount(address).settings()
-        except FileNotFoundError:
-            settings = settings_text(StoreSettings(os.urandom(16).hex(), mongo=NONE))
-            with suppress(ObjectExistsError):  # another process makes it, too
-                mount(address).bucket.create(SETTINGS, settings)
+            return cls(address)
+        except StoreError as error:
+            if not isinstance(error.__cause__, FileNotFoundError):
+                raise
+        with suppress(ObjectExistsError):  # another process makes it, too
+            new = StoreSettings(secrets.token_hex(16), mongo=NONE)
+            mount(address).bucket.create(SETTINGS, settings_text(new))
         return cls(address)
 
     @property
@@ -429,10 +410,7 @@ class RemoteDirectory(StoreDirectory):
         """The address by which another process opens it."""
         return self.bucket.address
 
-    @property
-    def place(self) -> str:
-        """Its address."""
-        return self.bucket.address
+    place = address
 
     @property
     def when_empty(self) -> str:
@@ -458,13 +436,11 @@ class RemoteDirectory(StoreDirectory):
 
     def change_settings(self, **changes: Any) -> None:
         """Change settings of the store."""
-
-        def changed() -> bytes:
-            self.settings = replace(read_settings(self.path), **changes)
-            return settings_text(self.settings)
-
         self.check_changes()
-        self.source.change_settings(changed)
+        version, now = self._read_settings()
+        new = replace(now, **changes)
+        self.bucket.replace(SETTINGS, settings_text(new), version)
+        self.settings = replace(new, mongo=NONE)
 
     def make_folder(self, recording: str) -> None:
         """Raise: nothing is recorded into a bucket."""
@@ -540,13 +516,9 @@ class RemoteDirectory(StoreDirectory):
 
     def listed_bytes(self) -> int:
         """Bytes of all files that manifests list, and of tables."""
-        found = sum(o.size for own in self.source.cells.tables().values() for o in own.values())
-        for one in self.ids():
-            with suppress(StoreError):
-                found += sum(
-                    o.size for o in self.source.files_of(self.manifests.read(one)).values()
-                )
-        return found
+        tables = sum(o.size for own in self.source.cells.tables().values() for o in own.values())
+        manifests = self.manifests.each(self.ids())
+        return tables + sum(one.bytes for now in manifests for one in listed_files(now))
 
     @contextmanager
     def retaining(self) -> Iterator[bool]:
@@ -583,51 +555,31 @@ class RemoteDirectory(StoreDirectory):
             StoreError: An object that is needed is lost; or another process was faster.
         """
         before = self.manifests.read(recording)
-        objects = self.source.files_of(before)
+        listed = {one.path: one for one in listed_files(before)}
+        there = BucketStore(self.bucket, self.manifests)
         # Others may do the same, so all that is made here has names of its own.
         version = 1 + secrets.randbelow(9 * 10**8)
         with tempfile.TemporaryDirectory(prefix="hybridlog-") as place:
             here = StoreDirectory.create(Path(place) / "store")
             here.manifests.create(before)
-            folder = here.recording(recording)
+            disk = Directory(here.path)
             for number in segments:
                 if number in before.logs and before.logs[number].is_here:
-                    name = before.logs[number].name
-                    self._fetch(objects[name], folder / name)
+                    disk.send(Sending(there, recording, *listed[before.logs[number].name]))
             yield here, version
             after = here.manifests.read(recording)
-            made = self.source.files_of(after)
-            new = [path for path in made if path not in objects]
+            made = {one.path: one for one in listed_files(after)}
+            new = made.keys() - listed.keys()
             try:
                 for path in new:
-                    self._send(folder / path, made[path])
+                    there.send(Sending(disk, recording, *made[path]))
                 self.manifests.change(recording, partial(_brought, before, after, check))
             except BaseException:
                 with suppress(BucketError):
-                    self.bucket.delete([made[path].name for path in new])
+                    self.bucket.delete([f"{RECORDINGS}/{recording}/{path}" for path in new])
                 raise
-        self.bucket.delete([one.name for path, one in objects.items() if path not in made])
-
-    def _fetch(self, about: Object, path: Path) -> None:
-        """Write an object to a file, past the cache; it has the digest that the manifest states."""
-        path.parent.mkdir(parents=True, exist_ok=True)
-        found = truth.hasher()
-        try:
-            with path.open("wb") as file:
-                for at in range(0, about.size, _PIECE):
-                    part = at, min(at + _PIECE, about.size)
-                    (piece,) = self.bucket.read(about.name, [part], size=about.size)
-                    found.update(piece)
-                    file.write(piece)
-        except (FileNotFoundError, ObjectChangedError) as error:
-            self.bucket.lost.add(about.name)
-            raise StoreError(f"{self.place}/{about.name}: {LOST}.") from error
-        if found.hexdigest() != about.version:
-            raise StoreError(f"{self.place}/{about.name} is damaged.")
-
-    def _send(self, path: Path, about: Object) -> None:
-        with path.open("rb") as file:
-            self.bucket.put(about.name, about.size, iter(partial(file.read, _PIECE), b""))
+        left = listed.keys() - made.keys()
+        self.bucket.delete([f"{RECORDINGS}/{recording}/{path}" for path in left])
 
 
 def _brought(
@@ -648,14 +600,10 @@ def _brought(
 
 
 def _objects(body: bytes) -> list[Object]:
-    """Objects of tables, of which nothing is believed that does not fit."""
-    found = []
-    with suppress(ValueError, TypeError, RecursionError):
-        for name, size, version in json.loads(body):
-            is_sound = type(size) is int and 0 <= size < 1 << 50 and isinstance(version, str)
-            if is_sound and _TABLE.fullmatch(name) and ".." not in name.split("/"):
-                found.append(Object(name, size, version))
-    return found
+    """Objects of tables; none of a list that does not fit."""
+    with suppress(MsgspecError):
+        return [Object(*row) for row in json.decode(body, type=list[_Row])]
+    return []
 
 
 def _version(about: Object | None) -> str:

@@ -481,6 +481,8 @@ class SegmentReader:
             SegmentError: They cannot be read.
         """
         crc = 0
+        with suppress(OSError):  # what is missing is told when it is read
+            files.fetch(self._fd, [(offset, offset + length)])
         for at in range(offset, offset + length, _PIECE):
             piece = self.read(at, min(_PIECE, offset + length - at))
             crc = crc32(piece, crc)
