@@ -13,10 +13,10 @@ from tests.faults.steps import Fault, Point
 SOME: list[tuple[str, Fault, str, int, bool]] = [
     ("rm", "die", "rename", 0, True),
     ("rm", "torn", "delete number", 0, False),
-    ("rm", "TERM", "replace hybridlog.recordings", 0, True),
+    ("rm", "TERM", "update hybridlog.recordings", 0, True),
     ("reindex", "die", "delete stamped", 0, True),
     ("reindex", "INT", "insert number", 0, True),
-    ("reindex one", "database", "replace hybridlog.recordings", 1, False),
+    ("reindex one", "database", "update hybridlog.recordings", 1, False),
     ("rename", "die", "rename", 0, False),
     ("tag", "torn", "write .<id>.new", 0, False),
     ("mark", "die", "rename .<id>.new", 0, False),

@@ -443,10 +443,15 @@ class Database:
         collection: str,
         filter: Mapping[str, object],  # noqa: A002
         change: Mapping[str, object],
+        *,
+        upsert: bool = False,
     ) -> None:
-        """Apply update operators, which may be applied twice, to every matching document."""
+        """Apply update operators, which may be applied twice, to every matching document.
+
+        With `upsert` a document is made if none matches.
+        """
         of = self._database[collection]
-        self._again(lambda: of.update_many(dict(filter), dict(change)))
+        self._again(lambda: of.update_many(dict(filter), dict(change), upsert=upsert))
 
     def delete(self, collection: str, filter: Mapping[str, object]) -> int:  # noqa: A002
         """Delete every matching document; return their number. `{}` deletes all."""

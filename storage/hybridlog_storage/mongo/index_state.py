@@ -92,15 +92,17 @@ class IndexState:
         return self._db.count(RECORDINGS)
 
     def begin(self, entry: RecordingEntry, segments: Mapping[str, str] | None = None) -> None:
-        """Mirror a recording whose documents are about to be made, or removed.
+        """Note that documents of a recording are about to be made, or removed.
+
+        A mirror that is there stays until the end: it says which documents may be there.
 
         Args:
             entry: The recording.
             segments: Digest of each segment whose documents stay, by its number as text.
         """
         index = {"made": secrets.token_hex(8), "segments": dict(segments or {})}
-        document = {**_mirrored(entry), "_id": entry.key, "index": index}
-        self._db.replace(RECORDINGS, {"_id": entry.key}, document)
+        change = {"$set": {"index": index}, "$setOnInsert": _mirrored(entry)}
+        self._db.update(RECORDINGS, {"_id": entry.key}, change, upsert=True)
 
     def show(self, entry: RecordingEntry) -> None:
         """Mirror a recording; leave the state of its index unchanged."""
