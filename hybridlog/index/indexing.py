@@ -102,8 +102,6 @@ class ChunkIndexer:
                 chunk.offset,
                 chunk.length,
                 chunk.trailer,
-                chunk.crc,
-                chunk.trailer_crc,
                 int(chunk.batch.log_time.min()),
                 int(chunk.batch.log_time.max()),
                 of_chunk,

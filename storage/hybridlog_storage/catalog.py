@@ -286,8 +286,6 @@ class ChunkEntry:
         offset: Byte of the chunk record in the file.
         length: Bytes of the chunk record.
         trailer: Bytes of message indexes and arrival numbers behind it.
-        crc: CRC-32 of the stored chunk record.
-        trailer_crc: CRC-32 of the trailer.
         first: Least log time, ns.
         last: Greatest log time, ns.
         stats: By channel id.
@@ -299,8 +297,6 @@ class ChunkEntry:
     offset: Int
     length: Int
     trailer: Int
-    crc: Int
-    trailer_crc: Int
     first: Int
     last: Int
     stats: Mapping[int, ChannelStats]
@@ -316,8 +312,6 @@ class ChunkEntry:
             last=self.last,
             channels=tuple(self.stats),
             number=self.number,
-            crc=self.crc,
-            trailer_crc=self.trailer_crc,
         )
 
     @property
@@ -983,7 +977,7 @@ def channel_entry(channel_id: int, channel: Channel, reason: str | None) -> Chan
 
 
 def _size(table: ChunkTable) -> int:
-    return int(table.chunks.nbytes + table.parts.nbytes + table.others.nbytes)
+    return int(table.chunks.nbytes + table.parts.nbytes)
 
 
 def _least(a: int | None, b: int | None) -> int | None:
