@@ -21,7 +21,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
-from mcap.records import ChunkIndex, Metadata
+from mcap.records import Metadata
 from mcap.stream_reader import StreamReader
 
 from hybridlog_storage.checksum import crc32
@@ -41,11 +41,8 @@ from hybridlog_storage.segments.segment_format import (
     END_METADATA,
     LOSSES_METADATA,
     RECORDING_METADATA,
-    ChunkSummary,
     arrival_record,
-    chunk_index_record,
     json_metadata,
-    record_bytes,
     trailer_of,
 )
 from hybridlog_storage.segments.segment_reader import ChunkPlace, SegmentReader, SegmentSummary
@@ -495,37 +492,6 @@ def test_no_chunk_follows_one_that_failed(tmp_path: Path, calls: Calls) -> None:
     assert writer.written.total() == 0
 
 
-NUMBER = st.integers(0, 2**62)
-
-
-@given(
-    st.builds(
-        ChunkSummary,
-        **dict.fromkeys(("first", "last", "offset", "length"), NUMBER),
-        **dict.fromkeys(("compressed_size", "uncompressed_size"), NUMBER),
-        indexes=st.dictionaries(st.integers(1, 65535), st.integers(0, 2**32), max_size=40),
-        compression=st.sampled_from(["", "lz4", "zstd"]),
-    )
-)
-def test_the_record_of_a_chunk_index_is_that_of_the_mcap_package(chunk: ChunkSummary) -> None:
-    at, places = chunk.offset + chunk.length, {}
-    for channel, size in chunk.indexes.items():
-        places[channel], at = at, at + size
-    assert chunk_index_record(chunk) == record_bytes(
-        ChunkIndex(
-            chunk_length=chunk.length,
-            chunk_start_offset=chunk.offset,
-            compression=chunk.compression,
-            compressed_size=chunk.compressed_size,
-            message_end_time=chunk.last,
-            message_index_length=sum(chunk.indexes.values()),
-            message_index_offsets=places,
-            message_start_time=chunk.first,
-            uncompressed_size=chunk.uncompressed_size,
-        )
-    )
-
-
 def expected(batches: Sequence[Sequence[Row]]) -> list[tuple[str, bytes, int, int, int]]:
     return sorted((CHANNELS[c].topic, p, t, pub, s) for rows in batches for c, p, t, pub, s in rows)
 
@@ -799,7 +765,7 @@ def test_a_segment_whose_head_found_no_room_can_be_made_again(tmp_path: Path) ->
         SegmentFile.create(tmp_path, 0, RECORDING)
     assert not list(tmp_path.iterdir())
     segment = SegmentFile.create(tmp_path, 0, RECORDING)
-    assert segment.seal(sync=False, on_sealing=lambda _: None).name == "000000.mcap"
+    assert segment.prepare(sync=False).file == segment.publish().name == "000000.mcap"
 
 
 def test_old_chunks_are_flushed_and_young_ones_are_not(
@@ -1130,7 +1096,7 @@ def test_a_sealed_segment_is_not_replaced(tmp_path: Path) -> None:
     opened.unlink()
     segment = SegmentFile.create(tmp_path, 0, RECORDING)
     with pytest.raises(StoreError, match="Move one of them"):
-        segment.seal(sync=False, on_sealing=lambda _: None)
+        segment.prepare(sync=False)
 
 
 def test_a_damaged_message_index_costs_no_message(tmp_path: Path) -> None:

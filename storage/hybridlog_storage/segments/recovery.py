@@ -12,6 +12,8 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from mcap.records import ChunkIndex
+
 from hybridlog_storage.disk import durability, files
 from hybridlog_storage.disk.append_file import BLOCK, AppendFile
 from hybridlog_storage.errors import SegmentError, StoreError
@@ -29,10 +31,10 @@ from hybridlog_storage.segments.segment_format import (
     END_METADATA,
     INDEX_HEAD,
     START,
-    ChunkSummary,
     compression_of,
     damaged_head,
     group_of,
+    index_offsets,
     index_order,
     json_metadata,
     trailer_of,
@@ -213,12 +215,13 @@ class _Rest:
             self._damage.append(Damage(offset + length, size, "message indexes are damaged"))
         parts, first, last = parts_of(batch, index_order(batch.channel, batch.log_time))
         self._segment.note_chunk(
-            ChunkSummary(
-                first=first,
-                last=last,
-                offset=offset,
-                length=length,
-                indexes=indexes,
+            ChunkIndex(
+                message_start_time=first,
+                message_end_time=last,
+                chunk_start_offset=offset,
+                chunk_length=length,
+                message_index_offsets=index_offsets(indexes, offset + length),
+                message_index_length=sum(indexes.values()),
                 compression=compression,
                 compressed_size=compressed,
                 uncompressed_size=CHUNK_HEAD.unpack_from(head)[4],
@@ -253,7 +256,8 @@ class _Rest:
             elif one.offset < walk.end:
                 segment.rewrite(one.offset, damaged_head(one.length))
         self.complete(is_new=is_new)
-        return segment.seal(sync=True, on_sealing=on_sealing)
+        on_sealing(segment.prepare(sync=True))
+        return segment.publish()
 
     def complete(self, *, is_new: bool = False) -> str:
         """Write the summary, unless it is there; return the digest of the file.

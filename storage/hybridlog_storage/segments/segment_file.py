@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from mcap.opcode import Opcode
 from mcap.records import (
     AttachmentIndex,
+    ChunkIndex,
     DataEnd,
     Footer,
     McapRecord,
@@ -38,11 +39,10 @@ from hybridlog_storage.segments.segment_format import (
     MAGIC,
     RECORDING_METADATA,
     START,
-    ChunkSummary,
     arrival_record,
     channel_record,
-    chunk_index_record,
     definitions_chunk,
+    index_offsets,
     json_metadata,
     metadata_record,
     padding_record,
@@ -335,13 +335,15 @@ class SegmentFile:
             )
         self._append(parts)
         for chunk, place in zip(chunks, stored, strict=True):
+            sizes = {channel: len(data) for channel, data in chunk.indexes.items()}
             self.note_chunk(
-                ChunkSummary(
-                    first=chunk.first,
-                    last=chunk.last,
-                    offset=place.offset,
-                    length=place.length,
-                    indexes={channel: len(data) for channel, data in chunk.indexes.items()},
+                ChunkIndex(
+                    message_start_time=chunk.first,
+                    message_end_time=chunk.last,
+                    chunk_start_offset=place.offset,
+                    chunk_length=place.length,
+                    message_index_offsets=index_offsets(sizes, place.offset + place.length),
+                    message_index_length=sum(sizes.values()),
                     compression=chunk.compression,
                     compressed_size=place.compressed_size,
                     uncompressed_size=chunk.uncompressed_size,
@@ -351,7 +353,7 @@ class SegmentFile:
             )
         return stored
 
-    def note_chunk(self, chunk: ChunkSummary, parts: NDArray[np.void], trailer: int) -> None:
+    def note_chunk(self, chunk: ChunkIndex, parts: NDArray[np.void], trailer: int) -> None:
         """Note a chunk that is in the file already.
 
         Args:
@@ -359,14 +361,15 @@ class SegmentFile:
             parts: `PART`[c], statistics of each channel in it.
             trailer: Bytes of message indexes and arrival record behind it.
         """
-        place, span = (chunk.offset, chunk.length, trailer), (chunk.first, chunk.last)
+        span = chunk.message_start_time, chunk.message_end_time
+        place = chunk.chunk_start_offset, chunk.chunk_length, trailer
         self.table.chunk(place, span, parts)
-        self._chunk_indexes += chunk_index_record(chunk)
+        self._chunk_indexes += record_bytes(chunk)
         counts = zip(parts["channel"].tolist(), parts["messages"].tolist(), strict=True)
         for channel, count in counts:
             self._counts[channel] = self._counts.get(channel, 0) + count
-        self._first = chunk.first if self._first is None else min(self._first, chunk.first)
-        self._last = max(self._last, chunk.last)
+        self._first = span[0] if self._first is None else min(self._first, span[0])
+        self._last = max(self._last, span[1])
 
     def rewrite(self, position: int, data: Buffer) -> None:
         """Overwrite bytes damaged by a crash or the disk."""
@@ -389,28 +392,16 @@ class SegmentFile:
         except OSError as error:
             raise durability.explain(error, self.path, "syncing") from error
 
-    def seal(self, *, sync: bool, on_sealing: OnSealing) -> Path:
-        """Write the summary, close, and give the file its final name.
-
-        After `on_sealing` or the rename has failed, a second call repeats only the missing
-        steps.
+    def prepare(self, *, sync: bool) -> Sealed:
+        """Write the summary, and close the file; may be repeated.
 
         Args:
-            sync: Force the file to the disk before `on_sealing` is called.
-            on_sealing: Called with the complete file, before it gets its final name.
-
-        Returns:
-            The sealed file.
+            sync: Force the file to the disk.
 
         Raises:
             StoreError: It cannot be written, or a sealed segment of this number exists.
             DiskFullError: No room for the summary; the file is unchanged.
         """
-        on_sealing(self.prepare(sync=sync))
-        return self.publish()
-
-    def prepare(self, *, sync: bool) -> Sealed:
-        """Complete and close the file, as the first part of `seal`; may be repeated."""
         final = self.path.with_name(sealed_name(self.number))
         try:
             if self.path != final and _is_there(final):
@@ -427,7 +418,7 @@ class SegmentFile:
         return sealed
 
     def publish(self, *, sync: bool = True) -> Path:
-        """Give the file its final name, as the last part of `seal`; may be repeated.
+        """Give a prepared file its final name; may be repeated.
 
         Args:
             sync: Return once the name is on the disk.
@@ -473,18 +464,6 @@ class SegmentFile:
             self._file.trim()
         except OSError as error:
             raise durability.explain(error, self.path, "sealing") from error
-
-    def finish(self) -> None:
-        """Force a complete file to the disk and close it, without giving it another name.
-
-        Raises:
-            HybridlogError: It cannot be written.
-        """
-        try:
-            self._file.finish(sync=True)
-        except OSError as error:
-            raise durability.explain(error, self.path, "writing") from error
-        self._finished = True
 
     def abandon(self) -> None:
         """Close without sealing; the next opening of the store recovers the file."""

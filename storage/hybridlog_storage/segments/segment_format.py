@@ -29,8 +29,6 @@ from hybridlog_storage.disk.copying import windows
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.lazy import RowType
 from hybridlog_storage.mcap.mcap_content import (
-    CHUNK_INDEX_HEAD,
-    INDEX_PLACE,
     MESSAGE_HEAD,
     RECORD_HEAD,
     read_record,
@@ -207,48 +205,6 @@ def chunk_head(
             struct.pack("<Q", compressed_size),
         )
     )
-
-
-class ChunkSummary(NamedTuple):
-    """The entry of a chunk in the summary; its message indexes directly follow the chunk.
-
-    Attributes:
-        first: Smallest log time, ns.
-        last: Largest log time, ns.
-        offset: Byte of the file where it starts.
-        length: Bytes of the chunk record.
-        indexes: Bytes of each channel's message index record, in their order in the file.
-        compression: MCAP name of the codec.
-        compressed_size: Bytes of compressed content.
-        uncompressed_size: Bytes of content.
-    """
-
-    first: int
-    last: int
-    offset: int
-    length: int
-    indexes: Mapping[int, int]
-    compression: str
-    compressed_size: int
-    uncompressed_size: int
-
-
-def chunk_index_record(chunk: ChunkSummary) -> bytes:
-    """The chunk index record of this entry."""
-    name = chunk.compression.encode()
-    places = index_offsets(chunk.indexes, chunk.offset + chunk.length)
-    table = b"".join(map(INDEX_PLACE.pack, places.keys(), places.values()))
-    tail = struct.pack(
-        f"<QI{len(name)}sQQ",
-        sum(chunk.indexes.values()),
-        len(name),
-        name,
-        chunk.compressed_size,
-        chunk.uncompressed_size,
-    )
-    head = CHUNK_INDEX_HEAD.pack(chunk.first, chunk.last, chunk.offset, chunk.length, len(table))
-    body = head + table + tail
-    return RECORD_HEAD.pack(Opcode.CHUNK_INDEX, len(body)) + body
 
 
 def compression_of(record: Buffer) -> tuple[str, int]:

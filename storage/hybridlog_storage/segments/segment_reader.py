@@ -17,9 +17,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, Self
 
 import numpy as np
 from mcap.opcode import Opcode
-from mcap.records import AttachmentIndex, Metadata, MetadataIndex, Statistics
-from mcap.records import Channel as ChannelRecord
-from mcap.records import Schema as SchemaRecord
+from mcap.records import AttachmentIndex, Metadata, MetadataIndex
 
 from hybridlog_storage.buffers import buffers
 from hybridlog_storage.checksum import crc32
@@ -30,7 +28,7 @@ from hybridlog_storage.manifest import hasher
 from hybridlog_storage.mcap.mcap_content import (
     RECORD_HEAD,
     parse_content,
-    read_record,
+    parse_summary,
 )
 from hybridlog_storage.messages import EXPIRED_IDS, MARKS_CHANNEL, Buffer, Channel, with_expired
 from hybridlog_storage.ordering import distinct
@@ -62,6 +60,7 @@ from hybridlog_storage.segments.statements import end_of, loss_rows
 from hybridlog_storage.stopping import check_wanted
 
 if TYPE_CHECKING:
+    from mcap.summary import Summary
     from numpy.typing import NDArray
 
     from hybridlog_storage.messages import Batch
@@ -157,18 +156,6 @@ class SegmentSummary:
         return places_of(self.table)
 
 
-@dataclass(slots=True)
-class _Records:
-    """The needed records of a summary."""
-
-    schemas: dict[int, SchemaRecord]
-    channels: dict[int, ChannelRecord]
-    attachments: list[AttachmentIndex]
-    metadata: list[MetadataIndex]
-    statistics: Statistics | None
-    table: Buffer | None
-
-
 class SegmentReader:
     """One sealed segment file.
 
@@ -253,8 +240,7 @@ class SegmentReader:
             SegmentError: It is missing, damaged, or has another format.
         """
         with self._explained():
-            start, tail = self._tail()
-            return self._summary(_records(tail[: len(tail) - _TAIL]), start)
+            return self._summary(*self._records())
 
     @contextmanager
     def _explained(self) -> Iterator[None]:
@@ -267,8 +253,8 @@ class SegmentReader:
                 "restore the file, or see what is left with `mcap recover`."
             ) from error
 
-    def _tail(self) -> tuple[int, memoryview]:
-        """Start of the summary, and the checked bytes from there on."""
+    def _records(self) -> tuple[Summary, Buffer | None, int]:
+        """The checked summary, the content of the chunk table, and where they start."""
         if self.size < len(MAGIC) + _TAIL:
             raise _NoSummaryError("it is too short")
         tail = self.read(self.size - _TAIL, _TAIL)
@@ -281,16 +267,21 @@ class SegmentReader:
         data = self.read(start, self.size - start)
         if crc32(data[: len(data) - len(MAGIC) - 4]) != crc:
             raise _NoSummaryError("its checksum differs")
-        return start, data
+        try:
+            # The chunk table says more than chunk indexes, and is faster to read.
+            found, others = parse_summary(data[: len(data) - _TAIL], skipped=Opcode.CHUNK_INDEX)
+        except SegmentError as error:
+            raise _NoSummaryError(str(error)) from error
+        return found, others.get(CHUNK_TABLE_OPCODE), start
 
-    def _table(self, records: _Records, start: int) -> ChunkTable:
-        if records.table is None:
+    def _table(self, records: Summary, body: Buffer | None, start: int) -> ChunkTable:
+        if body is None:
             self._refuse_other_format(records)
-            if all(index.name != RECORDING_METADATA for index in records.metadata):
+            if all(index.name != RECORDING_METADATA for index in records.metadata_indexes):
                 raise SegmentError(f"{self.path} is no segment of a hybridlog store.")
             raise _NoSummaryError("its chunk table is missing")
         try:
-            table = ChunkTable.from_bytes(records.table)
+            table = ChunkTable.from_bytes(body)
         except SegmentError as error:
             self._refuse_other_format(records)
             raise _NoSummaryError(str(error)) from error
@@ -298,17 +289,17 @@ class SegmentReader:
             raise _NoSummaryError("its chunk table is of another file")
         return table
 
-    def _refuse_other_format(self, records: _Records) -> None:
+    def _refuse_other_format(self, records: Summary) -> None:
         """Raise if the header names another format."""
-        for index in records.metadata:
+        for index in records.metadata_indexes:
             if index.name == RECORDING_METADATA:
                 check_format(json_of(self.metadata(index)), self.path)
 
-    def _summary(self, records: _Records, start: int) -> SegmentSummary:
-        table = self._table(records, start)
+    def _summary(self, records: Summary, body: Buffer | None, start: int) -> SegmentSummary:
+        table = self._table(records, body, start)
         found: dict[str, dict[str, object]] = {}
         losses: list[dict[str, Any]] = []
-        for index in records.metadata:
+        for index in records.metadata_indexes:
             if index.name in {RECORDING_METADATA, END_METADATA}:
                 found[index.name] = json_of(self.metadata(index))
                 if index.name == RECORDING_METADATA:
@@ -334,8 +325,8 @@ class SegmentReader:
             schema_ids={i: r.schema_id for i, r in records.channels.items()},
             counts=counts,
             losses=losses,
-            attachments=records.attachments,
-            metadata=[i for i in records.metadata if not i.name.startswith(OUR_NAMES)],
+            attachments=records.attachment_indexes,
+            metadata=[i for i in records.metadata_indexes if not i.name.startswith(OUR_NAMES)],
             table=table,
             start=start,
             size=self.size,
@@ -348,8 +339,7 @@ class SegmentReader:
             SegmentError: As `summary`.
         """
         with self._explained():
-            _, tail = self._tail()
-            return _records(tail[: len(tail) - _TAIL]).metadata
+            return self._records()[0].metadata_indexes
 
     def metadata(self, index: MetadataIndex) -> Metadata:
         """A metadata record.
@@ -492,51 +482,6 @@ class SegmentReader:
 
 class _NoSummaryError(SegmentError):
     """A summary that is missing or damaged."""
-
-
-def _records(summary: memoryview) -> _Records:
-    """Parse a checked summary."""
-    found = _Records({}, {}, [], [], None, None)
-    at = 0
-    while at < len(summary):
-        if at + RECORD_HEAD.size > len(summary):
-            raise _NoSummaryError("it ends in the middle of a record")
-        opcode, length = RECORD_HEAD.unpack_from(summary, at)
-        at += RECORD_HEAD.size
-        if length > len(summary) - at:
-            raise _NoSummaryError("it ends in the middle of a record")
-        body = summary[at : at + length]
-        at += length
-        if opcode == CHUNK_TABLE_OPCODE:
-            found.table = body
-        if opcode not in _WANTED:
-            continue  # such as chunk indexes: the chunk table holds more and is faster to read
-        try:
-            record, _ = read_record(opcode, body)
-        except SegmentError as error:
-            raise _NoSummaryError(str(error)) from error
-        if isinstance(record, SchemaRecord):
-            found.schemas[record.id] = record
-        elif isinstance(record, ChannelRecord):
-            found.channels[record.id] = record
-        elif isinstance(record, AttachmentIndex):
-            found.attachments.append(record)
-        elif isinstance(record, MetadataIndex):
-            found.metadata.append(record)
-        elif isinstance(record, Statistics):
-            found.statistics = record
-    return found
-
-
-_WANTED = frozenset(
-    {
-        Opcode.SCHEMA,
-        Opcode.CHANNEL,
-        Opcode.ATTACHMENT_INDEX,
-        Opcode.METADATA_INDEX,
-        Opcode.STATISTICS,
-    }
-)
 
 
 def _counts(table: ChunkTable) -> dict[int, int]:

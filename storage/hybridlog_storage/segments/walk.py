@@ -186,8 +186,7 @@ class Walk:
         if opcode == Opcode.CHUNK:
             return self._take_chunk(at, end)
         if opcode == 0:
-            rest = self._reader.read(at, min(self._reader.size - at, _SEARCHED))
-            error = SegmentError if np.frombuffer(rest, np.uint8).any() else _TornError
+            error = _TornError if self._is_room(at) else SegmentError
             raise error("no record starts here")
         is_large = opcode in {Opcode.ATTACHMENT, DAMAGED_OPCODE}
         if opcode in {Opcode.METADATA, PADDING_OPCODE} or is_large:
@@ -322,14 +321,21 @@ class Walk:
         return behind if found is None and is_plausible else found
 
     def _is_plausible(self, at: int) -> bool:
-        """True if a record may start at a byte, or the file ends there."""
-        if at >= self._reader.size:
-            return at == self._reader.size
+        """True if a record may start at a byte, or the data of the file end there."""
+        if at >= self._reader.size or self._is_room(at):
+            return at <= self._reader.size
         try:
             opcode, end = self._head(at)
         except _TornError:
             return False
         return opcode in _KINDS and end <= self._reader.size
+
+    def _is_room(self, at: int) -> bool:
+        """True if zeros follow, as a writer leaves behind its last block."""
+        if any(self._peek(at, _HEAD)):
+            return False
+        rest = self._reader.read(at, min(self._reader.size - at, _SEARCHED))
+        return not np.frombuffer(rest, np.uint8).any()
 
     def _search(self, start: int, end: int) -> int | None:
         """The first byte of a range where a chunk or a metadata record proves itself."""
