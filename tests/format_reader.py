@@ -494,7 +494,7 @@ class Recording:
                 try:
                     for _ in segment.chunk(chunk):
                         pass
-                except Damaged as error:
+                except (Damaged, zstandard.ZstdError) as error:
                     yield (number, chunk), str(error)
 
     def _lost_segments(self, listed: Mapping[int, Mapping[str, Any]]) -> Iterator[dict[str, Any]]:
