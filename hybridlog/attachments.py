@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.messages import Channel
     from hybridlog_storage.segments.attachments import Attachment
-    from hybridlog_storage.segments.chunk_table import ChunkTable
     from hybridlog_storage.segments.open_segment import Flushed
     from hybridlog_storage.segments.segment_reader import SegmentSummary
 
@@ -127,7 +126,7 @@ def attachments_of(session: Session, entry: RecordingEntry) -> list[StoredAttach
     found: list[StoredAttachment] = []
     for number, summary in _summaries(session, entry):
         for index in summary.attachments:
-            source = partial(_open, session, entry.id, number, summary.table, index)
+            source = partial(_open, session, entry.id, number, index)
             found.append(
                 StoredAttachment(
                     recording=entry.name,
@@ -189,7 +188,7 @@ def _metadata_records(
     if entry.metadata_records:
         for number, summary in _summaries(session, entry):
             for index in summary.metadata:
-                yield partial(_read, session, entry.id, number, summary.table, index)
+                yield partial(_read, session, entry.id, number, index)
 
 
 def _summaries(
@@ -200,16 +199,12 @@ def _summaries(
     yield from sorted(entry.flushed.items())
 
 
-def _open(
-    session: Session, recording: str, number: int, table: ChunkTable, index: AttachmentIndex
-) -> Attachment:
-    return session.segment(recording, number).attachment(table, index)
+def _open(session: Session, recording: str, number: int, index: AttachmentIndex) -> Attachment:
+    return session.segment(recording, number).attachment(index)
 
 
-def _read(
-    session: Session, recording: str, number: int, table: ChunkTable, index: MetadataIndex
-) -> StoredMetadata:
-    record = session.segment(recording, number).metadata(table, index)
+def _read(session: Session, recording: str, number: int, index: MetadataIndex) -> StoredMetadata:
+    record = session.segment(recording, number).metadata(index)
     return StoredMetadata(record.name, dict(record.metadata))
 
 

@@ -57,8 +57,6 @@ class Chunk(NamedTuple):
     offset: int
     length: int
     trailer: int
-    crc: int
-    trailer_crc: int
     first: int
     last: int
     parts: int
@@ -74,14 +72,6 @@ class Part(NamedTuple):
     last: int
     first_publish: int
     last_publish: int
-
-
-class Other(NamedTuple):
-    """A row of `others`."""
-
-    offset: int
-    length: int
-    crc: int
 
 
 class Content:
@@ -246,24 +236,18 @@ class Segment:
         return data
 
     def _table(self, body: bytes, start: int) -> None:
-        n, m, k = struct.unpack_from("<III", body)
-        size = 52 * n + 48 * m + 20 * k
+        n, m = struct.unpack_from("<II", body)
+        size = 44 * n + 48 * m
         demand(size <= 1 << 28, "the chunk table is too large")
-        raw = unpacked(body[12:], size)
-        self.chunks = [Chunk(*row) for row in struct.iter_unpack("<QQQIIqqI", raw[: 52 * n])]
-        raw = raw[52 * n :]
-        self.parts = [Part(*row) for row in struct.iter_unpack("<IIQqqqq", raw[: 48 * m])]
-        self.others = [Other(*row) for row in struct.iter_unpack("<QQI", raw[48 * m :])]
-        pieces = [(c.offset, c.length) for c in self.chunks]
-        pieces += [(c.offset + c.length, c.trailer) for c in self.chunks]
-        pieces += [(o.offset, o.length) for o in self.others]
+        raw = unpacked(body[8:], size)
+        self.chunks = [Chunk(*row) for row in struct.iter_unpack("<QQQqqI", raw[: 44 * n])]
+        self.parts = [Part(*row) for row in struct.iter_unpack("<IIQqqqq", raw[44 * n :])]
         at = 0
-        for offset, length in sorted(pieces):
-            demand(offset == at and length > 0, "not every byte is covered once")
-            at += length
-        demand(at == start, "not every byte before the summary is covered")
-        demand(self.chunks == sorted(self.chunks), "the chunks are not in order")
-        demand(self.others == sorted(self.others), "the other stretches are not in order")
+        for chunk in self.chunks:
+            demand(at <= chunk.offset, "the chunks are not in order")
+            demand(min(chunk[:3]) > 0, "a chunk without bytes")
+            at = sum(chunk[:3])
+        demand(at <= start, "a chunk in the summary")
         demand(sum(c.parts for c in self.chunks) == m, "the parts")
         counts: dict[int, int] = {}
         for number, chunk in enumerate(self.chunks):
@@ -281,36 +265,21 @@ class Segment:
         return self.parts[before : before + self.chunks[number].parts]
 
     def _json(self, name: str) -> list[dict[str, Any]]:
-        """The metadata records of a name, after the checksums of the stretches they are in."""
+        """The metadata records of a name, after their checksums."""
         found = []
         for offset, length, its_name in self._metadata:
             if its_name != name:
                 continue
-            (stretch,) = (
-                o
-                for o in self.others
-                if o.offset <= offset and offset + length <= o.offset + o.length
-            )
-            self._check(stretch)
-            ((_, opcode, body),) = records(self.data[offset : offset + length])
+            record = self.data[offset : offset + length]
+            crc = zlib.crc32(record[:-8], zlib.crc32(struct.pack("<Q", offset)))
+            demand(record[-8:] == b"%08x" % crc, "the checksum of a metadata record")
+            ((_, opcode, body),) = records(record)
             content = Content(body)
             demand((opcode, content.text()) == (0x0C, name), "no metadata record")
-            found.append(json.loads(content.mapping()["json"]))
+            values = content.mapping()
+            demand(list(values)[-1] == "hybridlog.crc32", "the last key of a metadata record")
+            found.append(json.loads(values["json"]))
         return found
-
-    def _check(self, piece: Other) -> None:
-        data = self.data[piece.offset : piece.offset + piece.length]
-        demand(zlib.crc32(data) == piece.crc, f"byte {piece.offset}")
-
-    @property
-    def is_whole(self) -> bool:
-        """True if every byte before the summary has its checksum."""
-        pieces = [(c.offset, c.length, c.crc) for c in self.chunks]
-        pieces += [(c.offset + c.length, c.trailer, c.trailer_crc) for c in self.chunks]
-        return all(
-            zlib.crc32(self.data[offset : offset + length]) == crc
-            for offset, length, crc in [*pieces, *self.others]
-        )
 
     @property
     def totals(self) -> dict[int, list[int]]:
@@ -323,41 +292,31 @@ class Segment:
             now[2:] = min(now[2], part.first), max(now[3], part.last)
         return found
 
-    def check_others(self) -> None:
-        for piece in self.others:
-            self._check(piece)
-
     def chunk(self, number: int) -> Iterator[tuple[int, Told]]:
         """Offset of the payload, and the message, of all messages of a chunk."""
         place = self.chunks[number]
         end = place.offset + place.length
         record, trailer = self.data[place.offset : end], self.data[end : end + place.trailer]
-        demand(zlib.crc32(record) == place.crc, "the checksum of a chunk")
-        is_indexed = zlib.crc32(trailer) == place.trailer_crc
         ((_, opcode, body),) = records(record)
         demand(opcode == 0x06, "no chunk")
         messages = list(records(self._content(Content(body), place)))
-        *indexes, (_, opcode, arrivals) = records(trailer)
+        at = trailer.rindex(struct.pack("<Q", place.offset)) - 9
+        ((_, opcode, arrivals),) = records(trailer[at:])
         demand(opcode == 0x90, "no arrival record")
-        owner, size, *checksums, own = struct.unpack_from("<QQIIIII", arrivals)
-        demand(owner == place.offset, "the arrival record of another chunk")
-        demand(zlib.crc32(arrivals[36:], zlib.crc32(arrivals[:32])) == own, "an arrival record")
-        proven = [self.data[owner - size : owner], record[: self._head(record)], record]
-        proven.append(trailer[: len(trailer) - len(arrivals) - 9] if is_indexed else b"")
-        demand(
-            all(zlib.crc32(d) == crc for d, crc in zip(proven, checksums, strict=True) if d),
-            "the checksums of an arrival record",
-        )
-        steps = struct.unpack(f"<{len(messages)}q", unpacked(arrivals[36:], 8 * len(messages)))
+        _, head, crc = struct.unpack_from("<QII", arrivals)
+        demand(zlib.crc32(record[: self._head(record)]) == head, "the head of a chunk")
+        is_indexed = zlib.crc32(trailer[:at]) == crc
+        steps = struct.unpack(f"<{len(messages)}q", unpacked(arrivals[16:], 8 * len(messages)))
         seq = 0
         heads = []
-        for step, (at, opcode, message) in zip(steps, messages, strict=True):
+        for step, (start, opcode, message) in zip(steps, messages, strict=True):
             demand(opcode == 0x05, "no message")
             seq += step
             channel, sequence, log_time, publish = struct.unpack_from("<HIQQ", message)
-            heads.append((channel, log_time, at))
-            yield at + 31, self._told(seq, channel, log_time, publish, sequence, message[22:])
+            heads.append((channel, log_time, start))
+            yield start + 31, self._told(seq, channel, log_time, publish, sequence, message[22:])
         if is_indexed:
+            indexes = records(trailer[:at])
             listed = [row for _, opcode, index in indexes for row in self._index(opcode, index)]
             demand(sorted(heads) == sorted(listed), "the message indexes")
         self._compare(number, messages)
@@ -444,9 +403,6 @@ class GoneSegment(Segment):
             found[place : place + own] = front[at + 16 : at + 16 + own]
             at += 16 + own
         return bytes(found)
-
-    def check_others(self) -> None:
-        """They are gone, too."""
 
     def chunk(self, number: int) -> Iterator[tuple[int, Told]]:
         try:
@@ -539,7 +495,7 @@ class Recording:
                 try:
                     for _ in segment.chunk(chunk):
                         pass
-                except Damaged as error:
+                except (Damaged, zstandard.ZstdError) as error:
                     yield (number, chunk), str(error)
 
     def _lost_segments(self, listed: Mapping[int, Mapping[str, Any]]) -> Iterator[dict[str, Any]]:
@@ -613,10 +569,6 @@ class Recording:
     def messages(self) -> Iterator[tuple[tuple[int, int, int], Told]]:
         """All messages: segment, chunk and offset as in `_meta.ref`; the message."""
         for number, segment in self.segments.items():
-            segment.check_others()
-            if number not in self.unlisted and segment.is_whole:
-                listed = self.manifest.logs[number]["digest"]
-                demand(segment.digest == listed, "the digest of a segment")
             for chunk in range(len(segment.chunks)):
                 if (number, chunk) not in self.damage:
                     for offset, message in segment.chunk(chunk):

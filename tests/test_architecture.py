@@ -55,7 +55,7 @@ ALLOWED = {
         "hybridlog_storage.segments.chunk_builder",
         "hybridlog_storage.mcap.mcap_content",
         "hybridlog_storage.mcap.mcap_scan",
-        "hybridlog_storage.segments.open_segment",
+        "hybridlog_storage.segments.walk",
         "hybridlog_storage.segments.recovery",
         "hybridlog_storage.segments.segment_file",
         "hybridlog_storage.segments.segment_format",

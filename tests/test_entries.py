@@ -391,7 +391,7 @@ def test_any_flipped_bit_of_a_summary_costs_that_segment(made: Made) -> None:
     """Or nothing at all: no other answer comes of it."""
     path = made.segments[3]
     whole = path.read_bytes()
-    end = read_summary(path, 3).table.end
+    end = read_summary(path, 3).start
     for at in range(end, len(whole), 7):
         data = bytearray(whole)
         data[at] ^= 1 << at % 8

@@ -73,8 +73,6 @@ def chunk_of(messages: Sequence[Message], number: int) -> StoredChunk:
         offset=1000 * number,
         length=50,
         trailer=5,
-        crc=number,
-        trailer_crc=100 + number,
         batch=batch,
         seq=np.arange(len(messages)),
         compressed_size=9,
@@ -107,7 +105,6 @@ def test_an_entry_says_what_is_in_its_chunk(chunks: list[list[Message]]) -> None
         assert entry.recording == RECORDING
         assert (entry.segment, entry.number) == (chunk.segment, chunk.number)
         assert (entry.offset, entry.length, entry.trailer) == (chunk.offset, 50, 5)
-        assert (entry.crc, entry.trailer_crc) == (chunk.crc, chunk.trailer_crc)
         times = [log_time for _, _, log_time, _ in messages]
         assert (entry.first, entry.last) == (min(times), max(times))
         assert entry.messages == len(messages)

@@ -430,6 +430,4 @@ def _place_of(chunk: StoredChunk) -> ChunkPlace:
         last=int(chunk.batch.log_time.max()),
         channels=(),
         number=chunk.number,
-        crc=chunk.crc,
-        trailer_crc=chunk.trailer_crc,
     )

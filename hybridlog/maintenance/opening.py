@@ -425,7 +425,6 @@ def recover_segments(
     directory: StoreDirectory, recording: str, listing: Listing, manifest: Manifest | None
 ) -> list[Recovered]:
     """Seal what a killed recorder has left; the manifest, if there is one, lists it first."""
-    from hybridlog_storage.segments.open_segment import next_seq_in
     from hybridlog_storage.segments.recovery import recover_segment
 
     path = directory.recording(recording)
@@ -451,15 +450,9 @@ def recover_segments(
 
             directory.manifests.change(recording, change)
 
-    def recovered(number: int, name: str) -> Recovered:
-        others = {*listing.open, *listing.sealed} - {number}
-
-        def other_seq(group: int) -> int:
-            return next_seq_in(path, (other for other in others if other >= group))
-
-        return recover_segment(path / name, announce, recording=said, other_seq=other_seq)
-
-    return [recovered(number, name) for number, name in listing.open.items()]
+    return [
+        recover_segment(path / name, announce, recording=said) for name in listing.open.values()
+    ]
 
 
 def _end_of(inventory: Inventory) -> dict[str, Any]:

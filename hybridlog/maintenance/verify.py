@@ -307,7 +307,7 @@ class _Check:
         with SegmentCheck(self._path / name, digest) as check:
             for offset, problem in check.problems(tell):
                 self._is_damaged = True
-                is_data = check.summary is not None and offset < check.summary.table.end
+                is_data = check.summary is not None and offset < check.summary.start
                 cure = RESTORE if is_data else _REPAIR
                 self.found(f"{name} byte {offset}", problem, cure)
 

@@ -20,7 +20,7 @@ from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.manifest import hasher
 from hybridlog_storage.messages import MARKS_CHANNEL, Batch
 from hybridlog_storage.segments.chunk import StoredChunk
-from hybridlog_storage.segments.chunk_table import CHUNK, OTHER, PART, ChunkTable
+from hybridlog_storage.segments.chunk_table import CHUNK, PART, ChunkTable
 from hybridlog_storage.segments.open_segment import Flushed
 from hybridlog_storage.segments.segment_reader import SegmentReader
 
@@ -64,7 +64,7 @@ class _MarksLog(SegmentReader):
         chunks["parts"] = 1
         parts["channel"] = MARKS_CHANNEL
         parts["messages"] = [*map(len, self._chunks)]
-        table = ChunkTable(chunks, parts, np.zeros(0, OTHER), is_flushed=True)
+        table = ChunkTable(chunks, parts, is_flushed=True)
         self.flushed = Flushed(table, (), (), self)
 
     def read_chunk(self, place: ChunkPlace) -> StoredChunk:

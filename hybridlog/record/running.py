@@ -166,7 +166,7 @@ def _losses(
     yield from joined([*rows, *(row for one in segments.values() for row in one.losses)])
     yield from (row for row in before if row["cause"] == Cause.SEGMENT)
     for number, segment in segments.items():
-        for damage in filter(None, (*segment.damaged, segment.stopped)):
+        for damage in segment.damaged:
             yield _damaged(number, damage.reason, damage.offset, damage.length)
     for number, reason in unreadable.items():
         yield _damaged(number, reason)

@@ -866,7 +866,7 @@ def channel_entry(channel_id: int, channel: Channel, reason: str | None) -> Chan
 
 
 def _size(table: ChunkTable) -> int:
-    return int(table.chunks.nbytes + table.parts.nbytes + table.others.nbytes)
+    return int(table.chunks.nbytes + table.parts.nbytes)
 
 
 def _least(a: int | None, b: int | None) -> int | None:

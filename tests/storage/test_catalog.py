@@ -41,7 +41,7 @@ from hybridlog_storage.catalog import (
 )
 from hybridlog_storage.cells import put
 from hybridlog_storage.messages import Channel, Schema, schema_hash
-from hybridlog_storage.segments.chunk_table import CHUNK, OTHER, PART, ChunkTable
+from hybridlog_storage.segments.chunk_table import CHUNK, PART, ChunkTable
 from tests.imports import ROOT
 from tests.limits import Limit
 
@@ -94,13 +94,10 @@ def segment(rng: random.Random, chunks: int) -> tuple[ChunkTable, list[dict[int,
         first = min(s.first for s in stats.values() if s.first is not None)
         last = max(s.last for s in stats.values() if s.last is not None)
         length, trailer = rng.randrange(50, 90), rng.randrange(5, 20)
-        crcs = rng.randrange(1 << 32), rng.randrange(1 << 32)
-        rows.append((at, length, trailer, *crcs, first, last, len(stats)))
+        rows.append((at, length, trailer, first, last, len(stats)))
         at += length + trailer
         told.append(stats)
-    others = [(0, 20, 7), (at, 10, 8)]
-    table = ChunkTable(np.array(rows, CHUNK), np.array(parts, PART), np.array(others, OTHER))
-    return table, told
+    return ChunkTable(np.array(rows, CHUNK), np.array(parts, PART)), told
 
 
 def rows_of(catalog: Catalog) -> dict[str, tuple[str, RecordingEntry]]:
@@ -484,11 +481,9 @@ def test_skews_add_up_exactly(skews: list[int], rng: random.Random) -> None:
     """Those of senders without a clock are beyond what floats hold one by one."""
 
     def total(values: Sequence[int]) -> ChannelStats:
-        rows = [(20 + 10 * n, 8, 2, 0, 0, 5, 5, 1) for n in range(len(values))]
+        rows = [(20 + 10 * n, 8, 2, 5, 5, 1) for n in range(len(values))]
         parts = [(1, 1, 1, 5, 5, 5, 5)] * len(values)
-        table = ChunkTable(
-            np.array(rows, CHUNK), np.array(parts, PART), np.array([(0, 20, 0)], OTHER)
-        )
+        table = ChunkTable(np.array(rows, CHUNK), np.array(parts, PART))
         told = {
             n: {1: ChannelStats(stamped=1, first_stamp=5, last_stamp=5, skew_sum=float(v))}
             for n, v in enumerate(values)

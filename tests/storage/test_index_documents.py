@@ -53,8 +53,6 @@ def chunk_of(
         offset=2**41,
         length=100,
         trailer=50,
-        crc=0,
-        trailer_crc=0,
         batch=batch,
         seq=arrivals,
         compressed_size=90,

@@ -20,13 +20,12 @@ from hybridlog.formats.reading import (
 )
 from hybridlog.wording import listed
 from hybridlog_storage.errors import SegmentError, SourceError
+from hybridlog_storage.mcap.mcap_content import ChunkContent, ScanDamage
 from hybridlog_storage.mcap.mcap_scan import (
     MAGIC,
-    ChunkContent,
     End,
     Item,
     Loose,
-    ScanDamage,
     ScannedChunk,
     read_summary,
     scan,

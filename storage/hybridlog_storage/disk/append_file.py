@@ -105,7 +105,10 @@ class AppendFile:
         try:
             self._append(parts)
         except OSError:
-            self._step_back(before)
+            hasher = self._hasher
+            with suppress(OSError):  # later writes overwrite it, and `finish` cuts the rest
+                self.cut(before)
+            self._hasher = hasher
             raise
         if self._hasher is not None:
             for part in parts:
@@ -158,15 +161,17 @@ class AppendFile:
         return -position % BLOCK
 
     def cut(self, position: int) -> None:
-        """Truncate the file at a position; not for direct writes.
+        """Truncate the file at a position. Later writes go through the page cache; they are few.
 
         Raises:
-            OSError: when the system refuses.
+            OSError: when the system refuses; they overwrite what is behind it.
         """
-        assert self._stage is None
-        files.system.truncate(self._fd, position)
+        self._stage = self._hasher = None
+        self.position = position
+        flags = fcntl.fcntl(self._fd, fcntl.F_GETFL)
+        fcntl.fcntl(self._fd, fcntl.F_SETFL, flags & ~DIRECT)
         os.lseek(self._fd, position, os.SEEK_SET)
-        self.position, self._hasher = position, None
+        files.system.truncate(self._fd, position)
 
     def rewrite(self, position: int, data: Buffer) -> None:
         """Overwrite bytes of the file; not for direct writes.
@@ -214,19 +219,6 @@ class AppendFile:
         if self._fd >= 0:
             os.close(self._fd)
             self._fd = -1
-
-    def _step_back(self, position: int) -> None:
-        """Undo a failed write; the bytes before it are whole, and can be appended to.
-
-        Later writes go through the page cache; they are few.
-        """
-        self._stage = None
-        self.position = position
-        flags = fcntl.fcntl(self._fd, fcntl.F_GETFL)
-        fcntl.fcntl(self._fd, fcntl.F_SETFL, flags & ~DIRECT)
-        os.lseek(self._fd, position, os.SEEK_SET)
-        with suppress(OSError):  # later writes overwrite it, and `finish` cuts the rest
-            files.system.truncate(self._fd, position)
 
     def _put(self, pieces: list[NDArray[np.uint8]]) -> None:
         """Write pieces and the staged bytes; stage the bytes behind the last block."""

@@ -17,6 +17,7 @@ from mcap import records
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
+from mcap.summary import Summary
 
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.lazy import RowType
@@ -33,11 +34,9 @@ if TYPE_CHECKING:
 
 RECORD_HEAD = struct.Struct("<BQ")
 """Opcode and length of the content, at the start of every record."""
-CHUNK_INDEX_HEAD = struct.Struct("<QQQQI")  # fields before its map of message indexes,
 _SIZE = struct.Struct("<I")
 _NUMBER = struct.Struct("<H")
 _NUMBERS = struct.Struct("<HH")
-INDEX_PLACE = struct.Struct("<HQ")  # an entry of that map
 
 MESSAGE_HEAD = RowType(
     ("opcode", "u1"),
@@ -424,27 +423,6 @@ def _read_message_index(content: Buffer) -> tuple[records.MessageIndex, int]:
     return records.MessageIndex(channel, entries), 6 + length
 
 
-def _read_chunk_index(content: Buffer) -> tuple[records.ChunkIndex, int]:
-    first, last, start, length, offsets_size = CHUNK_INDEX_HEAD.unpack_from(content)
-    at = CHUNK_INDEX_HEAD.size + offsets_size
-    offsets = content[CHUNK_INDEX_HEAD.size : at]
-    index_length, name_size = struct.unpack_from("<QI", content, at)
-    name = content[at + 12 : at + 12 + name_size]
-    compressed, uncompressed = struct.unpack_from("<QQ", content, at + 12 + name_size)
-    record = records.ChunkIndex(
-        message_start_time=first,
-        message_end_time=last,
-        chunk_start_offset=start,
-        chunk_length=length,
-        message_index_offsets=dict(INDEX_PLACE.iter_unpack(offsets)),
-        message_index_length=index_length,
-        compression=str(name, "utf-8"),
-        compressed_size=compressed,
-        uncompressed_size=uncompressed,
-    )
-    return record, at + 28 + name_size
-
-
 def _read_schema(content: Buffer) -> tuple[records.Schema, int]:
     (number,) = _NUMBER.unpack_from(content)
     name, at = _sized(content, 2)
@@ -489,11 +467,11 @@ _FREQUENT: dict[int, Callable[[Buffer], tuple[Record, int]]] = {
     Opcode.SCHEMA: _read_schema,
     Opcode.CHANNEL: _read_channel,
     Opcode.MESSAGE_INDEX: _read_message_index,
-    Opcode.CHUNK_INDEX: _read_chunk_index,
 }
 _READERS: dict[int, Callable[[ReadDataStream], Record]] = {
     Opcode.HEADER: records.Header.read,
     Opcode.FOOTER: records.Footer.read,
+    Opcode.CHUNK_INDEX: records.ChunkIndex.read,
     Opcode.ATTACHMENT_INDEX: records.AttachmentIndex.read,
     Opcode.STATISTICS: records.Statistics.read,
     Opcode.METADATA: records.Metadata.read,
@@ -530,3 +508,65 @@ def read_record(opcode: int, content: Buffer) -> tuple[Record | None, int]:
         name = Opcode(opcode).name.replace("_", " ").lower()  # every parsed kind has a name
         raise SegmentError(f"a {name} record is damaged ({error or 'too short'})") from error
     return record, stream.count
+
+
+_LAST_KNOWN = max(Opcode)
+_IN_SUMMARY = frozenset(
+    {
+        Opcode.SCHEMA,
+        Opcode.CHANNEL,
+        Opcode.CHUNK_INDEX,
+        Opcode.ATTACHMENT_INDEX,
+        Opcode.METADATA_INDEX,
+        Opcode.STATISTICS,
+        Opcode.SUMMARY_OFFSET,
+    }
+)
+
+
+def is_in_summary(opcode: int) -> bool:
+    """True for a kind of record that a summary may have."""
+    return opcode in _IN_SUMMARY or opcode > _LAST_KNOWN
+
+
+def parse_summary(data: Buffer, *, skipped: int = 0) -> tuple[Summary, dict[int, Buffer]]:
+    """Parse the records between the data of a file and its footer.
+
+    Args:
+        data: Their bytes.
+        skipped: Opcode of records that are not parsed.
+
+    Returns:
+        The summary; and the content of the last record of each kind that MCAP does not know.
+
+    Raises:
+        SegmentError: It is damaged.
+    """
+    view, at = memoryview(data), 0
+    found = Summary()
+    others: dict[int, Buffer] = {}
+    while at < len(view):
+        if at + RECORD_HEAD.size > len(view):
+            raise SegmentError("it ends in the middle of a record")
+        opcode, length = RECORD_HEAD.unpack_from(view, at)
+        at += RECORD_HEAD.size
+        if length > len(view) - at or not is_in_summary(opcode):
+            raise SegmentError("it ends in the middle of a record")
+        body = view[at : at + length]
+        at += length
+        if opcode > _LAST_KNOWN:
+            others[opcode] = body
+        record, _ = read_record(opcode, body) if opcode != skipped else (None, 0)
+        if isinstance(record, records.Schema):
+            found.schemas[record.id] = record
+        elif isinstance(record, records.Channel):
+            found.channels[record.id] = record
+        elif isinstance(record, records.ChunkIndex):
+            found.chunk_indexes.append(record)
+        elif isinstance(record, records.AttachmentIndex):
+            found.attachment_indexes.append(record)
+        elif isinstance(record, records.MetadataIndex):
+            found.metadata_indexes.append(record)
+        elif isinstance(record, records.Statistics):
+            found.statistics = record
+    return found, others

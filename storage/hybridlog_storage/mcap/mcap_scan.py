@@ -2,7 +2,7 @@
 
 `scan` yields the records of a file in order, with bounded memory. Behind damage it
 continues at the next chunk of the summary, or else where plausible records follow one
-another again. It reads foreign files and, for recovery and checks, the store's segments.
+another again.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, BinaryIO, NamedTuple, TypeAlias
 import numpy as np
 from mcap import records
 from mcap.opcode import Opcode
-from mcap.summary import Summary
 
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.errors import SegmentError
@@ -25,12 +24,13 @@ from hybridlog_storage.mcap.mcap_content import (
     MIN_RECORDS,
     RECORD_HEAD,
     ChunkContent,
-    Definition,
     Record,
     ScanDamage,
     TornChunk,
+    is_in_summary,
     parse_content,
     parse_parts,
+    parse_summary,
     read_record,
 )
 from hybridlog_storage.messages import MAX_PAYLOAD
@@ -46,21 +46,7 @@ from hybridlog_storage.segments.compression import (
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-__all__ = [
-    "MAGIC",
-    "ChunkContent",
-    "Definition",
-    "End",
-    "Item",
-    "Loose",
-    "PrivateRecord",
-    "ScanDamage",
-    "ScannedChunk",
-    "TornChunk",
-    "parse_content",
-    "read_summary",
-    "scan",
-]
+    from mcap.summary import Summary
 
 MAGIC = b"\x89MCAP0\r\n"
 """First and last eight bytes of an MCAP file."""
@@ -94,17 +80,6 @@ _PLAIN = frozenset(
 )
 _BETWEEN_CHUNKS = frozenset(
     {Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode.ATTACHMENT, Opcode.METADATA, Opcode.DATA_END}
-)
-_SUMMARY_OPCODES = frozenset(
-    {
-        Opcode.SCHEMA,
-        Opcode.CHANNEL,
-        Opcode.CHUNK_INDEX,
-        Opcode.ATTACHMENT_INDEX,
-        Opcode.METADATA_INDEX,
-        Opcode.STATISTICS,
-        Opcode.SUMMARY_OFFSET,
-    }
 )
 _LEAST = {
     Opcode.HEADER: 8,
@@ -166,35 +141,17 @@ class ScannedChunk:
                 raise SegmentError("its checksum differs")
         yield from parse_parts(self.compression, self.part, self.uncompressed_size)
 
-    def content_bytes(self, *, check_crc: bool = True) -> bytes | memoryview:
+    def content_bytes(self) -> bytes | memoryview:
         """The uncompressed content, for `parse_content`.
-
-        Args:
-            check_crc: Compare the checksum, if the chunk has one.
 
         Raises:
             SegmentError: It does not decompress, or its checksum differs.
         """
         data = self.part.again().read()
         content = decompress(self.compression, data, self.uncompressed_size, limit=self.limit)
-        if check_crc and self.uncompressed_crc not in {0, crc32(content)}:
+        if self.uncompressed_crc not in {0, crc32(content)}:
             raise SegmentError("its checksum differs")
         return content
-
-
-@dataclass(slots=True)
-class PrivateRecord:
-    """A record of the application range, opcode 0x80 and above.
-
-    Attributes:
-        opcode: Its opcode.
-        offset: Byte of the record in the file.
-        data: Its content, without the head.
-    """
-
-    opcode: int
-    offset: int
-    data: memoryview
 
 
 @dataclass(slots=True)
@@ -222,7 +179,7 @@ class End(NamedTuple):
     clean: bool
 
 
-Item: TypeAlias = Record | Attachment | ScannedChunk | PrivateRecord | Loose | ScanDamage | End
+Item: TypeAlias = Record | Attachment | ScannedChunk | Loose | ScanDamage | End
 """An item of `scan`."""
 
 
@@ -230,7 +187,6 @@ def scan(
     file: BinaryIO,
     *,
     size: int,
-    start: int = len(MAGIC),
     limit: int = MAX_UNCOMPRESSED,
     summary: Summary | None = None,
 ) -> Iterator[tuple[int, Item]]:
@@ -242,7 +198,6 @@ def scan(
     Args:
         file: Seekable; its position is moved.
         size: Bytes of the file.
-        start: Byte of the first record.
         limit: Largest chunk, compressed or not, in bytes; larger ones, and messages above
             `MAX_PAYLOAD`, count as damage and are skipped.
         summary: From `read_summary`, which is called if this is None. It gives the
@@ -257,7 +212,7 @@ def scan(
     """
     if summary is None:
         summary = read_summary(file, size)
-    return _Scanner(file, size, start, limit, summary).items()
+    return _Scanner(file, size, limit, summary).items()
 
 
 def read_summary(file: BinaryIO, size: int) -> Summary | None:
@@ -279,20 +234,10 @@ def read_summary(file: BinaryIO, size: int) -> Summary | None:
     data = file.read(end - footer.summary_start + _FOOTER_SIZE - 4)
     if footer.summary_crc not in {0, crc32(data)}:
         return None
-    view = memoryview(data)[: end - footer.summary_start]
-    summary = Summary()
-    at = 0
     try:
-        while at < len(view):
-            opcode, length = RECORD_HEAD.unpack_from(view, at)
-            if length > len(view) - at - _HEAD or not _is_in_summary(opcode):
-                return None
-            record, _ = read_record(opcode, view[at + _HEAD : at + _HEAD + length])
-            _add_to_summary(summary, record)
-            at += _HEAD + length
-    except (SegmentError, struct.error):
+        return parse_summary(memoryview(data)[: end - footer.summary_start])[0]
+    except SegmentError:
         return None
-    return summary
 
 
 def _read_footer(file: BinaryIO, size: int) -> records.Footer | None:
@@ -306,25 +251,6 @@ def _read_footer(file: BinaryIO, size: int) -> records.Footer | None:
     if RECORD_HEAD.unpack_from(tail) != (Opcode.FOOTER, _FOOTER_SIZE - _HEAD):
         return None
     return records.Footer(*struct.unpack_from("<QQI", tail, _HEAD))
-
-
-def _is_in_summary(opcode: int) -> bool:
-    return opcode in _SUMMARY_OPCODES or opcode > _LAST_KNOWN
-
-
-def _add_to_summary(summary: Summary, record: Record | None) -> None:
-    if isinstance(record, records.Schema):
-        summary.schemas[record.id] = record
-    elif isinstance(record, records.Channel):
-        summary.channels[record.id] = record
-    elif isinstance(record, records.ChunkIndex):
-        summary.chunk_indexes.append(record)
-    elif isinstance(record, records.AttachmentIndex):
-        summary.attachment_indexes.append(record)
-    elif isinstance(record, records.MetadataIndex):
-        summary.metadata_indexes.append(record)
-    elif isinstance(record, records.Statistics):
-        summary.statistics = record
 
 
 class _Window:
@@ -468,15 +394,14 @@ def _is_other_record(content: memoryview) -> bool:
 class _Scanner:
     """The state of one scan."""
 
-    def __init__(
-        self, file: BinaryIO, size: int, start: int, limit: int, summary: Summary | None
-    ) -> None:
+    def __init__(self, file: BinaryIO, size: int, limit: int, summary: Summary | None) -> None:
         self._window = _Window(file, size)
         self._limit = limit
-        self._start = self._at = start
+        self._at = len(MAGIC)
+        self._is_first = True  # of logs whose bytes follow one another
         # End of the fields of the last record. If the length of that record was wrong, the
         # search for the next one starts here, not where the length points.
-        self._behind = start
+        self._behind = self._at
         self._places = _Places(self._window, summary)
         self._chunked = bool(summary and summary.chunk_indexes)
         self._stop = self._end_by_footer(summary)
@@ -528,7 +453,7 @@ class _Scanner:
             if opcode == Opcode.FOOTER and self._window.peek(end, len(MAGIC)) == MAGIC:
                 self._at = end + len(MAGIC)
                 return True
-            if not _is_in_summary(opcode) or end > self._window.size:
+            if not is_in_summary(opcode) or end > self._window.size:
                 return False
             self._at = end
 
@@ -539,7 +464,7 @@ class _Scanner:
         """
         self._at = self._behind = self._at + len(MAGIC)
         self._places = _Places(self._window, None)
-        self._stop, self._start = None, -1
+        self._stop, self._is_first = None, False
         self._chunked = self._is_ended = False
 
     def _step(self) -> Iterator[tuple[int, Item]]:
@@ -664,9 +589,7 @@ class _Scanner:
         elif opcode != Opcode.ATTACHMENT and end - start > _MAX_PLAIN:
             if opcode <= _LAST_KNOWN:
                 yield at, self._too_large(at, end, opcode)
-        elif opcode >= _FIRST_PRIVATE:
-            yield at, PrivateRecord(opcode, at, self._window.at(start, end - start))
-        else:
+        elif opcode < _FIRST_PRIVATE:
             try:
                 item, used = self._parsed(opcode, start, end - start)
             except SegmentError as error:
@@ -691,7 +614,7 @@ class _Scanner:
             return
         self._at = at + _DATA_END_SIZE
         crc = int.from_bytes(self._window.at(at + _HEAD, 4), "little")
-        if crc and self._needs_crc and self._start == len(MAGIC) and self._crc_up_to(at) != crc:
+        if crc and self._needs_crc and self._is_first and self._crc_up_to(at) != crc:
             reason = "the checksum of all data differs: some bytes before this one have changed"
             yield at, ScanDamage(0, at, reason, opcode=Opcode.DATA_END)
         yield at, records.DataEnd(crc)
@@ -708,7 +631,7 @@ class _Scanner:
         if len(raw) < _HEAD:
             return True
         opcode, length = RECORD_HEAD.unpack(raw)
-        is_known = opcode == Opcode.FOOTER or _is_in_summary(opcode)
+        is_known = opcode == Opcode.FOOTER or is_in_summary(opcode)
         return is_known and length <= self._window.size - end - _HEAD
 
     # Damage

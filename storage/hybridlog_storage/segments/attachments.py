@@ -110,14 +110,14 @@ class Attachment:
 
 
 def parse_attachment(
-    head: Buffer, part: FilePart, *, check_crc: bool = True
+    head: Buffer, part: FilePart, *, needs_crc: bool = False
 ) -> tuple[Attachment, int]:
     """Parse an attachment record.
 
     Args:
         head: The beginning of its content, up to `MAX_HEAD` bytes.
         part: Its whole content.
-        check_crc: Compare the checksum, if the record has one.
+        needs_crc: Compare the checksum also where it is 0, which says that there is none.
 
     Returns:
         The attachment, and the size of its fields, bytes.
@@ -137,7 +137,7 @@ def parse_attachment(
         raise SegmentError("an attachment record is damaged (its content runs over its end)")
     found = Attachment(log_time, create_time, name, media_type, part.section(at, size))
     (crc,) = _CRC.unpack(part.section(at + size, _CRC.size).read())
-    if crc and check_crc:
+    if crc or needs_crc:
         of_content = crc32(memoryview(head)[:at])
         for piece in found.pieces():
             of_content = crc32(piece, of_content)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from hybridlog_storage.checksum import crc32, crc32_combine
+from hybridlog_storage.checksum import crc32
 from hybridlog_storage.mcap.mcap_content import MESSAGE_HEAD
 from hybridlog_storage.segments.chunk_table import parts_of
 from hybridlog_storage.segments.segment_format import (
@@ -37,7 +37,6 @@ class PackedChunk:
         head: The chunk record up to the compressed content.
         data: The compressed content.
         head_crc: CRC-32 of the head.
-        crc: CRC-32 of head and data.
         indexes: Message index record of each channel, by channel id.
         indexes_crc: CRC-32 of all of them, concatenated.
         arrivals: The arrival numbers, packed.
@@ -53,7 +52,6 @@ class PackedChunk:
     head: bytes
     data: Buffer
     head_crc: int
-    crc: int
     indexes: dict[int, bytes]
     indexes_crc: int
     arrivals: bytes
@@ -72,19 +70,14 @@ def pack(
     compression, data = compressor.compress(batch.buffer, hurried=hurried)
     order = index_order(batch.channel, batch.log_time)
     parts, first, last = parts_of(batch, order)
-    content_crc = crc32(batch.buffer)
     head = chunk_head(
         first=first,
         last=last,
         uncompressed_size=size,
-        crc=content_crc,
+        crc=crc32(batch.buffer),
         compression=compression,
         compressed_size=len(data),
     )
-    head_crc, content = crc32(head), content_crc
-    if compression:
-        content = crc32(data)
-    crc = crc32_combine(head_crc, content, len(data))
     starts = batch.offset - MESSAGE_HEAD.itemsize
     indexes = message_indexes(batch.channel, batch.log_time, starts, order)
     indexes_crc = 0
@@ -99,8 +92,7 @@ def pack(
         compression=compression,
         head=head,
         data=data,
-        head_crc=head_crc,
-        crc=crc,
+        head_crc=crc32(head),
         indexes=indexes,
         indexes_crc=indexes_crc,
         arrivals=pack_arrivals(seq),
@@ -118,8 +110,6 @@ class StoredChunk:
         offset: Byte of the chunk record in the file.
         length: Bytes of the chunk record.
         trailer: Bytes of the message indexes and arrival numbers that follow it.
-        crc: CRC-32 of the stored chunk record, including its head.
-        trailer_crc: CRC-32 of the trailer.
         batch: Its messages over the uncompressed content; `channel` holds channel ids.
         seq: int64[n], arrival numbers.
         compressed_size: Bytes of compressed content.
@@ -130,8 +120,6 @@ class StoredChunk:
     offset: int
     length: int
     trailer: int
-    crc: int
-    trailer_crc: int
     batch: Batch
     seq: NDArray[np.int64]
     compressed_size: int

@@ -1,9 +1,7 @@
-"""The chunk table of a segment: positions and checksums of all its parts.
+"""The chunk table of a segment: where its chunks lie, and what each channel has in them.
 
-MCAP has checksums of a chunk's content and of the summary. It has none of chunk heads,
-message indexes, metadata and definitions. The chunk table closes the gap: it is a record
-of the summary with checksums that cover every byte before the summary. So a reader uses
-only checked bytes.
+It is a record of the summary, whose checksum covers it. Other readers of MCAP have chunk indexes
+there, which say less.
 """
 
 from __future__ import annotations
@@ -14,7 +12,6 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from hybridlog_storage.checksum import crc32, crc32_combine
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.lazy import RowType
 from hybridlog_storage.messages import EXPIRED_IDS
@@ -31,15 +28,12 @@ CHUNK: Final = RowType(
     ("offset", "<u8"),
     ("length", "<u8"),
     ("trailer", "<u8"),
-    ("crc", "<u4"),
-    ("trailer_crc", "<u4"),
     ("first", "<i8"),
     ("last", "<i8"),
     ("parts", "<u4"),
 )
 """A chunk: offset and bytes of its record, bytes of the message indexes and arrival record
-behind it, CRC-32 of the record and of the part behind it, first and last log time in ns,
-and its number of rows in `parts`."""
+behind it, first and last log time in ns, and its number of rows in `parts`."""
 PART: Final = RowType(
     ("channel", "<u4"),
     ("messages", "<u4"),
@@ -51,50 +45,34 @@ PART: Final = RowType(
 )
 """The messages of one channel in one chunk: number, bytes of their payloads, first and
 last log time, first and last publish time, times in ns."""
-OTHER: Final = RowType(("offset", "<u8"), ("length", "<u8"), ("crc", "<u4"))
-"""A stretch of the file outside of chunks: its start, its bytes, its CRC-32."""
-
-_HEAD = struct.Struct("<III")  # rows of chunks, parts and others
-_CHUNK_ROW = struct.Struct("<QQQIIqqI")
-_OTHER_ROW = struct.Struct("<QQI")
-_DTYPES = (CHUNK, PART, OTHER)
+_HEAD = struct.Struct("<II")  # rows of chunks and parts
+_CHUNK_ROW = struct.Struct("<QQQqqI")
+_DTYPES = (CHUNK, PART)
 _MAX_BYTES = 1 << 28
 _MAX_FILE = 1 << 62
 _MAX_CHANNEL = 65535
 _MAX_LIST_MESSAGES = 32  # messages
-_MERGED = 1 << 16  # bytes: checking one record reads its whole stretch
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ChunkTable:
-    """All parts of a segment before its summary.
-
-    Chunks with their trailers, and the other stretches, cover every byte from 0 to `end`
-    exactly once.
+    """The chunks of a segment.
 
     Attributes:
         chunks: `CHUNK`[n], in file order; the row is the chunk's number.
         parts: `PART`[m], chunk by chunk, by channel id within one.
-        others: `OTHER`[k], in file order.
-        is_flushed: The segment is not sealed yet: publish times are unknown, and the table covers
-            chunks and indexed records only.
+        is_flushed: The segment is not sealed yet: publish times are unknown.
     """
 
     chunks: NDArray[np.void]
     parts: NDArray[np.void]
-    others: NDArray[np.void]
     is_flushed: bool = False
 
     @property
     def end(self) -> int:
-        """Bytes covered by the table; the summary starts there."""
-        ends = [0]
-        if len(self.chunks):
-            last = self.chunks[-1]
-            ends.append(int(last["offset"]) + int(last["length"]) + int(last["trailer"]))
-        if len(self.others):
-            ends.append(int(self.others[-1]["offset"]) + int(self.others[-1]["length"]))
-        return max(ends)
+        """Byte of the file where the last chunk ends, with what belongs to it; 0 without one."""
+        last = self.chunks[-1:][["offset", "length", "trailer"]].tolist()
+        return sum(last[0]) if last else 0
 
     def part_bounds(self) -> NDArray[np.int64]:
         """Bounds of each chunk's rows in `parts`.
@@ -138,21 +116,9 @@ class ChunkTable:
             found[name] = np.maximum.reduceat(rows[name], starts)
         return found
 
-    def stretch(self, offset: int, length: int) -> tuple[int, int, int] | None:
-        """The stretch of `others` that holds a record.
-
-        Returns:
-            Byte at which it starts, its bytes and its CRC-32; None when there is none.
-        """
-        row = int(np.searchsorted(self.others["offset"], offset, side="right")) - 1
-        if row < 0:
-            return None
-        start, size, crc = (int(value) for value in self.others[row])
-        return (start, size, crc) if offset + length <= start + size else None
-
     def to_bytes(self) -> bytes:
         """The content of the table's record: row counts, then the rows as one zstd frame."""
-        rows = (self.chunks, self.parts, self.others)
+        rows = self.chunks, self.parts
         return _HEAD.pack(*map(len, rows)) + checked_frame(b"".join(r.tobytes() for r in rows))
 
     @classmethod
@@ -175,7 +141,7 @@ class ChunkTable:
         for count, size, dtype in zip(counts, sizes, _DTYPES, strict=True):
             arrays.append(np.frombuffer(raw, dtype, count, at))
             at += size
-        table = cls(arrays[0], arrays[1], arrays[2])
+        table = cls(arrays[0], arrays[1])
         problem = _problem(table)
         if problem is not None:
             raise SegmentError(f"the chunk table is damaged: {problem}")
@@ -184,23 +150,16 @@ class ChunkTable:
 
 def _problem(table: ChunkTable) -> str | None:
     """The contradiction in a table, None if it is consistent."""
-    chunks, parts, others = table.chunks, table.parts, table.others
-    pieces = [(chunks["offset"], chunks["length"]), (others["offset"], others["length"])]
-    pieces.append((chunks["offset"] + chunks["length"], chunks["trailer"]))
-    starts, sizes = (np.concatenate(column) for column in zip(*pieces, strict=True))
-    if (starts >= _MAX_FILE).any() or (sizes >= _MAX_FILE).any():
+    chunks = table.chunks
+    sizes = [chunks[name] for name in ("offset", "length", "trailer")]
+    if any((size >= _MAX_FILE).any() for size in sizes):
         return "a place lies beyond all files"
-    if not sizes.all():
+    if not all(size.all() for size in sizes):
         return "something has no bytes"
-    order = np.argsort(starts, kind="stable")
-    ends = (starts + sizes)[order]
-    if len(ends) and (starts[order][0] != 0 or (starts[order][1:] != ends[:-1]).any()):
-        return "it does not cover each byte once"
-    if (np.diff(chunks["offset"].astype(np.int64)) <= 0).any():
+    ends = sizes[0] + sizes[1] + sizes[2]
+    if (ends[:-1] > chunks["offset"][1:]).any():
         return "its chunks are not in order"
-    if (np.diff(others["offset"].astype(np.int64)) <= 0).any():
-        return "its stretches are not in order"
-    return _part_problem(table, parts)
+    return _part_problem(table, table.parts)
 
 
 def _part_problem(table: ChunkTable, parts: NDArray[np.void]) -> str | None:
@@ -265,106 +224,26 @@ class TableBuilder:
         """Number of chunks so far, which is the number of the next one."""
         self.parts = 0
         """Rows of parts so far."""
-        self.end = 0
-        """Byte up to which the file is covered."""
-        self.unproven = 0, 0
-        """Bytes since the last arrival record, which the next one proves; their CRC-32."""
         self._chunks = bytearray()
         self._parts = bytearray()
-        self._others = bytearray()
-        self._last: tuple[int, int, int] | None = None  # the last stretch, which may still grow
 
     def chunk(
-        self,
-        *,
-        offset: int,
-        length: int,
-        trailer: int,
-        crc: int,
-        trailer_crc: int,
-        first: int,
-        last: int,
-        parts: NDArray[np.void],
+        self, place: tuple[int, int, int], span: tuple[int, int], parts: NDArray[np.void]
     ) -> None:
-        """Add a chunk that starts where the last piece ended.
+        """Add a chunk.
 
         Args:
-            offset: Byte of the chunk record.
-            length: Bytes of the chunk record.
-            trailer: Bytes of message indexes and arrival record behind it.
-            crc: CRC-32 of the chunk record.
-            trailer_crc: CRC-32 of the trailer.
-            first: Smallest log time in it, ns.
-            last: Largest log time in it, ns.
+            place: Byte and length of the chunk record, and bytes of message indexes and arrival
+                record behind it.
+            span: Smallest and largest log time in it, ns.
             parts: `PART`[c], from `parts_of`.
         """
-        assert offset == self.end
-        self._finish_stretch()
-        self._chunks += _CHUNK_ROW.pack(
-            offset, length, trailer, crc, trailer_crc, first, last, len(parts)
-        )
+        self._chunks += _CHUNK_ROW.pack(*place, *span, len(parts))
         self._parts += parts.tobytes()
         self.chunks += 1
         self.parts += len(parts)
-        self.unproven = 0, 0
-        self.end = offset + length + trailer
 
-    def other(self, content: Buffer, *, alone: bool = False) -> None:
-        """Add a record outside of chunks that starts where the last piece ended.
-
-        Small neighbours share a row. The division into rows depends only on the records, not
-        on when they were written.
-
-        Args:
-            content: The record.
-            alone: Give it a row of its own, so that reading it does not depend on neighbours.
-        """
-        if alone:
-            self.stretch(len(content), crc32(content))
-            return
-        if not len(content):
-            return
-        last, self._last = self._last, None
-        if last is not None and last[1] + len(content) <= _MERGED:
-            self._last = last[0], last[1] + len(content), crc32(content, last[2])
-        else:
-            self._last = last
-            self._finish_stretch()
-            self._last = self.end, len(content), crc32(content)
-        size, crc = self.unproven
-        self.unproven = size + len(content), crc32(content, crc)
-        self.end += len(content)
-
-    def proof(self, record: Buffer) -> None:
-        """Add an arrival record that follows no chunk."""
-        self.other(record)
-        self.unproven = 0, 0
-
-    def stretch(self, length: int, crc: int) -> None:
-        """Add bytes outside of chunks, in a row of their own."""
-        self._finish_stretch()
-        if length:
-            self._others += _OTHER_ROW.pack(self.end, length, crc)
-            size, before = self.unproven
-            self.unproven = size + length, crc32_combine(before, crc, length)
-            self.end += length
-
-    def build(self, record: Buffer = b"") -> ChunkTable:
-        """The table of all added pieces, and of a record that is about to follow."""
-        before = self.end, self._last, self.unproven, len(self._others)
-        self.other(record)
-        others = bytes(self._others)
-        if self._last is not None:
-            others += _OTHER_ROW.pack(*self._last)
-        self.end, self._last, self.unproven, length = before
-        del self._others[length:]
-        return ChunkTable(
-            np.frombuffer(bytes(self._chunks), CHUNK),
-            np.frombuffer(bytes(self._parts), PART),
-            np.frombuffer(others, OTHER),
-        )
-
-    def _finish_stretch(self) -> None:
-        if self._last is not None:
-            self._others += _OTHER_ROW.pack(*self._last)
-            self._last = None
+    def build(self, *, is_flushed: bool = False) -> ChunkTable:
+        """The table of all added chunks; see `ChunkTable`."""
+        chunks, parts = bytes(self._chunks), bytes(self._parts)
+        return ChunkTable(np.frombuffer(chunks, CHUNK), np.frombuffer(parts, PART), is_flushed)

@@ -59,10 +59,8 @@ def front(reader: SegmentReader, summary: SegmentSummary, log: File) -> bytes:
     Raises:
         SegmentError: It is damaged.
     """
-    records, _ = reader.indexes()
-    found = (summary.table.stretch(one.offset, one.length) for one in records)
-    stretches = {at: size for at, size, _ in filter(None, found)}
-    stretches[summary.table.end] = reader.size - summary.table.end
+    stretches = {one.offset: one.length for one in reader.records()}
+    stretches[summary.start] = reader.size - summary.start
     line = encode_file(log)
     body: list[Buffer] = [line]
     for at, size in sorted(stretches.items()):
@@ -140,7 +138,7 @@ class GoneLog(SegmentReader):
     def grow(self) -> None:
         """Nothing: it was sealed."""
 
-    def digest(self) -> str:
+    def digest(self, _: object = None) -> str:
         """BLAKE3 of the log, as the manifest had it."""
         return self.log.digest
 

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 from mcap.opcode import Opcode
 from mcap.records import (
     AttachmentIndex,
+    ChunkIndex,
     DataEnd,
     Footer,
-    Header,
     McapRecord,
     Metadata,
     MetadataIndex,
@@ -25,7 +25,7 @@ from mcap.records import (
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk import durability, files
 from hybridlog_storage.disk.append_file import AppendFile
-from hybridlog_storage.errors import StoreError
+from hybridlog_storage.errors import HybridlogError, StoreError
 from hybridlog_storage.mcap.mcap_content import RECORD_HEAD
 from hybridlog_storage.messages import EXPIRED_IDS, schema_hash
 from hybridlog_storage.segments.attachments import Attachment
@@ -35,18 +35,16 @@ from hybridlog_storage.segments.segment_format import (
     ARRIVAL_HEAD,
     CHUNK_TABLE_OPCODE,
     FORMAT_VERSION,
-    LIBRARY,
     LOSSES_METADATA,
     MAGIC,
-    PROFILE,
     RECORDING_METADATA,
-    ChunkSummary,
-    Proof,
+    START,
     arrival_record,
     channel_record,
-    chunk_index_record,
     definitions_chunk,
+    index_offsets,
     json_metadata,
+    metadata_record,
     padding_record,
     record_bytes,
     schema_record,
@@ -63,7 +61,6 @@ SEALED_SUFFIX = ".mcap"
 ROWS_SUFFIX = ".rows.parquet"
 _SEALED = re.compile(r"(?P<number>[0-9]{6})\.mcap")
 _ROWS = re.compile(r"[0-9]{6}(\.[1-9][0-9]{0,9})?\.rows\.parquet")
-_SMALL_DEFINITIONS = 1024  # bytes of definitions that are not compressed
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,7 +184,6 @@ class SegmentFile:
         self._attachment_indexes: list[AttachmentIndex] = []
         self._metadata_indexes: list[MetadataIndex] = []
         self._counts: dict[int, int] = {}
-        self._listed = 0  # chunks that other readers of MCAP find
         self._first: int | None = None
         self._last = 0
         self._sealed: Sealed | None = None  # once the file is complete
@@ -199,7 +195,6 @@ class SegmentFile:
         directory: Path,
         number: int,
         recording: Mapping[str, object],
-        next_seq: int = 0,
         *,
         group: int | None = None,
         sync: bool = False,
@@ -210,7 +205,6 @@ class SegmentFile:
             directory: The recording's directory.
             number: Segment number, also the file's name.
             recording: Catalog entry of the recording, stored in the file.
-            next_seq: One more than the greatest arrival number in the segments before.
             group: Number of the first segment of its group; its own by default.
             sync: Return once the file's name is on the disk.
 
@@ -224,10 +218,9 @@ class SegmentFile:
         except OSError as error:
             raise durability.explain(error, path, "creating") from error
         segment = cls(path, number, file, group=group)
-        head = [MAGIC, record_bytes(Header(profile=PROFILE, library=LIBRARY))]
         try:
-            segment._write(head)
-            segment.add_recording(recording, next_seq)
+            segment._append([START])
+            segment.add_recording(recording)
             if sync:
                 segment._sync_folder()
         except BaseException:
@@ -257,12 +250,11 @@ class SegmentFile:
         """True if written bytes are on the disk already, except for the file's length."""
         return self._file.direct
 
-    def define(self, channels: Iterable[tuple[int, int, Channel]], *, write: bool = True) -> None:
-        """Write channels; before each its schema, on its first use in the file.
+    def define(self, channels: Iterable[tuple[int, int, Channel]]) -> None:
+        """Write channels, each with its schema on its first use in the file, as a chunk.
 
         Args:
             channels: Id, id of the schema, and channel.
-            write: False for channels that are in the file already.
         """
         records: list[bytes] = []
         schemas: dict[int, Schema] = {}
@@ -273,60 +265,42 @@ class SegmentFile:
                     records.append(record_bytes(schema_record(schema_id, channel.schema)))
                 schemas[schema_id] = channel.schema
             records.append(record_bytes(channel_record(channel_id, schema_id, channel)))
-        if write and records:
-            content = b"".join(records)
-            if len(content) < _SMALL_DEFINITIONS:
-                self._write(records)
-            else:
-                self._write([definitions_chunk(content)])
-                self._prove()
+        if records:
+            self._append([definitions_chunk(b"".join(records), self.position)])
         self.schemas |= schemas
         self.channels |= {number: (schema, channel) for number, schema, channel in defined}
 
-    def add_recording(self, recording: Mapping[str, object], next_seq: int = 0) -> None:
+    def add_recording(self, recording: Mapping[str, object]) -> None:
         """Append the metadata of the recording and of the segment."""
         about = {"segment": self.number, "group": self.group, "format": FORMAT_VERSION}
-        about["next_seq"] = next_seq
         self.add_metadata(json_metadata(RECORDING_METADATA, {**recording, **about}))
 
     def add_metadata(self, record: Metadata) -> None:
         """Append a metadata record."""
-        data = record_bytes(record)
         offset = self.position
-        size, crc = self.table.unproven
-        proof = arrival_record(Proof(0, size + len(data), crc32(data, crc)))
-        self._append([data, proof])
-        self.table.other(data, alone=True)
-        self.table.proof(proof)
-        self.note_metadata(record.name, offset, len(data))
-
-    def note_metadata(self, name: str, offset: int, length: int) -> None:
-        """Note a metadata record that is in the file already."""
-        self._metadata_indexes.append(MetadataIndex(offset=offset, length=length, name=name))
+        data = metadata_record(record, offset)
+        self._append([data])
+        index = MetadataIndex(offset=offset, length=len(data), name=record.name)
+        self._metadata_indexes.append(index)
 
     def add_attachment(self, attachment: Attachment) -> None:
         """Append an attachment, piece by piece."""
         offset = self.position
-        crc = 0
-        for piece in attachment.record():
-            self._append([piece])
-            crc = crc32(piece, crc)
-        length = self.position - offset
-        self.table.stretch(length, crc)
-        self.note_attachment(attachment, offset, length)
-        self._prove()
+        try:
+            for piece in attachment.record():
+                self._append([piece])
+        except BaseException:
+            with suppress(HybridlogError):  # later records overwrite it
+                self.cut(offset)
+            raise
+        self._attachment_indexes.append(attachment.index(offset, self.position - offset))
 
-    def _prove(self) -> None:
-        """Append checksums of the records since the last chunk."""
-        size, crc = self.table.unproven
-        if size:
-            proof = arrival_record(Proof(0, size, crc))
-            self._append([proof])
-            self.table.proof(proof)
-
-    def note_attachment(self, attachment: Attachment, offset: int, length: int) -> None:
-        """Note an attachment that is in the file already."""
-        self._attachment_indexes.append(attachment.index(offset, length))
+    def note_extras(
+        self, metadata: Iterable[MetadataIndex], attachments: Iterable[AttachmentIndex]
+    ) -> None:
+        """Note metadata records and attachments that are in the file already."""
+        self._metadata_indexes += metadata
+        self._attachment_indexes += attachments
 
     def end_behind(self, chunk: PackedChunk, at: int) -> int:
         """Byte of the file where a chunk ends that is appended when the file has `at` bytes."""
@@ -338,95 +312,64 @@ class SegmentFile:
         """Append chunks with their message indexes and arrival numbers in one write."""
         parts: list[Buffer] = []
         stored: list[StoredChunk] = []
-        paddings: list[bytes] = []
         at = self.position
-        size, crc = self.table.unproven
         for chunk in chunks:
             padding = self._padding(chunk.data, at, len(chunk.head))
             offset = at + len(padding)
             length = len(chunk.head) + len(chunk.data)
-            before = size + len(padding), crc32(padding, crc)
-            size = crc = 0
-            proof = Proof(offset, *before, chunk.head_crc, chunk.crc, chunk.indexes_crc)
-            arrivals = arrival_record(proof, chunk.arrivals)
-            trailer_length = sum(map(len, chunk.indexes.values())) + len(arrivals)
+            arrivals = arrival_record(offset, chunk.head_crc, chunk.indexes_crc, chunk.arrivals)
+            trailer = sum(map(len, chunk.indexes.values())) + len(arrivals)
             parts += [padding, chunk.head, chunk.data, *chunk.indexes.values(), arrivals]
-            at = offset + length + trailer_length
-            paddings.append(padding)
+            at = offset + length + trailer
             stored.append(
                 StoredChunk(
                     segment=self.number,
                     number=self.chunks + len(stored),
                     offset=offset,
                     length=length,
-                    trailer=trailer_length,
-                    crc=chunk.crc,
-                    trailer_crc=crc32(arrivals, chunk.indexes_crc),
+                    trailer=trailer,
                     batch=chunk.batch,
                     seq=chunk.seq,
                     compressed_size=len(chunk.data),
                 )
             )
         self._append(parts)
-        for chunk, padding, place in zip(chunks, paddings, stored, strict=True):
-            self.table.other(padding)
+        for chunk, place in zip(chunks, stored, strict=True):
+            sizes = {channel: len(data) for channel, data in chunk.indexes.items()}
             self.note_chunk(
-                ChunkSummary(
-                    first=chunk.first,
-                    last=chunk.last,
-                    offset=place.offset,
-                    length=place.length,
-                    indexes={channel: len(data) for channel, data in chunk.indexes.items()},
+                ChunkIndex(
+                    message_start_time=chunk.first,
+                    message_end_time=chunk.last,
+                    chunk_start_offset=place.offset,
+                    chunk_length=place.length,
+                    message_index_offsets=index_offsets(sizes, place.offset + place.length),
+                    message_index_length=sum(sizes.values()),
                     compression=chunk.compression,
                     compressed_size=place.compressed_size,
                     uncompressed_size=chunk.uncompressed_size,
                 ),
                 chunk.parts,
-                trailer=place.trailer,
-                crc=place.crc,
-                trailer_crc=place.trailer_crc,
+                place.trailer,
             )
         return stored
 
-    def append_trailer(self, trailer: bytes) -> None:
-        """Append indexes and arrival numbers of a chunk that a crash cut off."""
-        self._append([trailer])
-
-    def note_chunk(
-        self,
-        chunk: ChunkSummary,
-        parts: NDArray[np.void],
-        *,
-        trailer: int,
-        crc: int,
-        trailer_crc: int,
-    ) -> None:
+    def note_chunk(self, chunk: ChunkIndex, parts: NDArray[np.void], trailer: int) -> None:
         """Note a chunk that is in the file already.
 
         Args:
             chunk: Its entry in the summary.
             parts: `PART`[c], statistics of each channel in it.
             trailer: Bytes of message indexes and arrival record behind it.
-            crc: CRC-32 of the chunk record.
-            trailer_crc: CRC-32 of the trailer.
         """
-        self.table.chunk(
-            offset=chunk.offset,
-            length=chunk.length,
-            trailer=trailer,
-            crc=crc,
-            trailer_crc=trailer_crc,
-            first=chunk.first,
-            last=chunk.last,
-            parts=parts,
-        )
-        self._chunk_indexes += chunk_index_record(chunk)
-        self._listed += 1
+        span = chunk.message_start_time, chunk.message_end_time
+        place = chunk.chunk_start_offset, chunk.chunk_length, trailer
+        self.table.chunk(place, span, parts)
+        self._chunk_indexes += record_bytes(chunk)
         counts = zip(parts["channel"].tolist(), parts["messages"].tolist(), strict=True)
         for channel, count in counts:
             self._counts[channel] = self._counts.get(channel, 0) + count
-        self._first = chunk.first if self._first is None else min(self._first, chunk.first)
-        self._last = max(self._last, chunk.last)
+        self._first = span[0] if self._first is None else min(self._first, span[0])
+        self._last = max(self._last, span[1])
 
     def rewrite(self, position: int, data: Buffer) -> None:
         """Overwrite bytes damaged by a crash or the disk."""
@@ -449,28 +392,16 @@ class SegmentFile:
         except OSError as error:
             raise durability.explain(error, self.path, "syncing") from error
 
-    def seal(self, *, sync: bool, on_sealing: OnSealing) -> Path:
-        """Write the summary, close, and give the file its final name.
-
-        After `on_sealing` or the rename has failed, a second call repeats only the missing
-        steps.
+    def prepare(self, *, sync: bool) -> Sealed:
+        """Write the summary, and close the file; may be repeated.
 
         Args:
-            sync: Force the file to the disk before `on_sealing` is called.
-            on_sealing: Called with the complete file, before it gets its final name.
-
-        Returns:
-            The sealed file.
+            sync: Force the file to the disk.
 
         Raises:
             StoreError: It cannot be written, or a sealed segment of this number exists.
             DiskFullError: No room for the summary; the file is unchanged.
         """
-        on_sealing(self.prepare(sync=sync))
-        return self.publish()
-
-    def prepare(self, *, sync: bool) -> Sealed:
-        """Complete and close the file, as the first part of `seal`; may be repeated."""
         final = self.path.with_name(sealed_name(self.number))
         try:
             if self.path != final and _is_there(final):
@@ -487,7 +418,7 @@ class SegmentFile:
         return sealed
 
     def publish(self, *, sync: bool = True) -> Path:
-        """Give the file its final name, as the last part of `seal`; may be repeated.
+        """Give a prepared file its final name; may be repeated.
 
         Args:
             sync: Return once the name is on the disk.
@@ -505,26 +436,25 @@ class SegmentFile:
 
     def complete(self) -> Sealed:
         """Write the summary, without renaming the file or forcing it to the disk."""
-        if self._sealed is not None:
-            return self._sealed
-        self._prove()
-        # In one write: without room the file is unchanged, and can be sealed again.
-        end = record_bytes(DataEnd(data_section_crc=0))
-        table = self.table.build(end)
-        assert table.end == self.position + len(end)
-        tail = self._summary(table) + MAGIC
-        self._append([end, tail])
+        if self._sealed is None:
+            # In one write: without room the file is unchanged, and can be sealed again.
+            self._append([self.tail(self.position)])
+            self.note_complete()
+        assert self._sealed is not None
+        return self._sealed
+
+    def note_complete(self) -> None:
+        """Note that the summary is in the file."""
         channels = {number: channel for number, (_, channel) in self.channels.items()}
         self._sealed = Sealed(
             self.number,
             sealed_name(self.number),
             self.position,
             self._digest(),
-            sealed_channels(table, channels),
+            sealed_channels(self.table.build(), channels),
             self.group,
             any(index.name == LOSSES_METADATA for index in self._metadata_indexes),
         )
-        return self._sealed
 
     def trim(self) -> None:
         """Give a complete file its length: of several, before the first is forced to the disk."""
@@ -534,18 +464,6 @@ class SegmentFile:
             self._file.trim()
         except OSError as error:
             raise durability.explain(error, self.path, "sealing") from error
-
-    def finish(self) -> None:
-        """Force a complete file to the disk and close it, without giving it another name.
-
-        Raises:
-            HybridlogError: It cannot be written.
-        """
-        try:
-            self._file.finish(sync=True)
-        except OSError as error:
-            raise durability.explain(error, self.path, "writing") from error
-        self._finished = True
 
     def abandon(self) -> None:
         """Close without sealing; the next opening of the store recovers the file."""
@@ -558,12 +476,6 @@ class SegmentFile:
             return b""
         least = RECORD_HEAD.size
         return padding_record(least + self._file.room_before(content, at + least + head))
-
-    def _write(self, records: Sequence[bytes]) -> None:
-        """Append records outside of chunks."""
-        self._append(records)
-        for record in records:
-            self.table.other(record)
 
     def _append(self, parts: Sequence[Buffer]) -> None:
         try:
@@ -583,9 +495,11 @@ class SegmentFile:
         except OSError as error:
             raise durability.explain(error, self.path, "creating") from error
 
-    def _summary(self, table: ChunkTable) -> bytes:
-        start = table.end
-        body = table.to_bytes()
+    def tail(self, at: int) -> bytes:
+        """What ends the file when it has `at` bytes: the end of the data, and the summary."""
+        end = record_bytes(DataEnd(data_section_crc=0))
+        start = at = at + len(end)
+        body = self.table.build().to_bytes()
         groups: list[tuple[int, bytes]] = [
             (Opcode.SCHEMA, _joined(schema_record(i, s) for i, s in self.schemas.items())),
             (
@@ -599,7 +513,6 @@ class SegmentFile:
             (CHUNK_TABLE_OPCODE, RECORD_HEAD.pack(CHUNK_TABLE_OPCODE, len(body)) + body),
         ]
         offsets: list[SummaryOffset] = []
-        at = start
         for opcode, records in groups:
             if records:
                 offsets.append(
@@ -611,14 +524,14 @@ class SegmentFile:
         # The footer's checksum covers the summary and the footer up to the checksum itself.
         covered = record_bytes(footer)[:-4]
         footer.summary_crc = crc32(covered, crc32(summary))
-        return summary + record_bytes(footer)
+        return end + summary + record_bytes(footer) + MAGIC
 
     def _statistics(self) -> Statistics:
         return Statistics(
             attachment_count=len(self._attachment_indexes),
             channel_count=len(self.channels),
             channel_message_counts=dict(sorted(self._counts.items())),
-            chunk_count=self._listed,
+            chunk_count=self.chunks,
             message_count=sum(self._counts.values()),
             message_end_time=self._last,
             message_start_time=self._first or 0,

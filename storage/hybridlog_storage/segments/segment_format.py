@@ -21,7 +21,7 @@ import zstandard
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import Channel as ChannelRecord
-from mcap.records import McapRecord, Metadata
+from mcap.records import Header, McapRecord, Metadata
 from mcap.records import Schema as SchemaRecord
 
 from hybridlog_storage.checksum import crc32
@@ -29,10 +29,9 @@ from hybridlog_storage.disk.copying import windows
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.lazy import RowType
 from hybridlog_storage.mcap.mcap_content import (
-    CHUNK_INDEX_HEAD,
-    INDEX_PLACE,
     MESSAGE_HEAD,
     RECORD_HEAD,
+    read_record,
 )
 from hybridlog_storage.messages import Batch, Buffer, Channel, Schema
 from hybridlog_storage.ordering import run_starts
@@ -55,19 +54,21 @@ NO_PUBLISH_TIME: Final = "hybridlog.no_publish_time"
 NO_INDEX: Final = "hybridlog.no_index"
 
 ARRIVAL_OPCODE: Final = 0x90
-"""Record of the application range of opcodes: checksums of what stands before it, and the
-arrival numbers of a chunk's messages when it follows one."""
+"""Record of the application range of opcodes: the arrival numbers of the chunk before it."""
 PADDING_OPCODE: Final = 0x91
 """Record of zeros, so that the content of the chunk behind it starts at a block."""
-
 CHUNK_TABLE_OPCODE: Final = 0x92
 """Record of the summary: the chunk table, see `chunk_table`."""
+DAMAGED_OPCODE: Final = 0x93
+"""Record of bytes that were damaged when a crash was recovered."""
+METADATA_CHECK: Final = "hybridlog.crc32"
+"""Last key of each metadata record: eight hexadecimal digits of a CRC-32."""
 
 CHUNK_HEAD: Final = struct.Struct("<BQQQQI")
 INDEX_HEAD: Final = struct.Struct("<BQHI")
-PROOF: Final = struct.Struct("<QQIIIII")
-"""Fields of an arrival record: those of `Proof`, then a CRC-32 of the record."""
-ARRIVAL_HEAD: Final = RECORD_HEAD.size + PROOF.size
+ARRIVALS: Final = struct.Struct("<QII")
+"""Fields of an arrival record: byte of its chunk, CRC-32 of the chunk's head and of its indexes."""
+ARRIVAL_HEAD: Final = RECORD_HEAD.size + ARRIVALS.size
 """Bytes of an arrival record without its numbers."""
 
 _INDEX_ENTRY = RowType(("log_time", "<u8"), ("offset", "<u8"))
@@ -80,6 +81,10 @@ def record_bytes(record: McapRecord) -> bytes:
     builder = RecordBuilder()
     record.write(builder)
     return builder.end()  # type: ignore[no-any-return, no-untyped-call]
+
+
+START: Final = MAGIC + record_bytes(Header(profile=PROFILE, library=LIBRARY))
+"""The first bytes of every segment."""
 
 
 def schema_record(schema_id: int, schema: Schema) -> SchemaRecord:
@@ -150,6 +155,36 @@ def json_of(record: Metadata) -> dict[str, object]:
     return value
 
 
+def metadata_record(record: Metadata, offset: int) -> bytes:
+    """A metadata record as it is written at a byte of a segment, with its checksum."""
+    values = {key: value for key, value in record.metadata.items() if key != METADATA_CHECK}
+    data = record_bytes(Metadata(record.name, {**values, METADATA_CHECK: "0" * 8}))
+    return data[:-8] + _metadata_check(data, offset)
+
+
+def metadata_of(data: Buffer, offset: int) -> Metadata:
+    """The metadata record at a byte of a segment, without its checksum.
+
+    Raises:
+        SegmentError: None is there, or it is damaged.
+    """
+    if len(data) < RECORD_HEAD.size + 8 or bytes(data[-8:]) != _metadata_check(data, offset):
+        raise SegmentError("its checksum differs")
+    opcode, length = RECORD_HEAD.unpack_from(data)
+    record, used = read_record(opcode, memoryview(data)[RECORD_HEAD.size :])
+    is_whole = length == used == len(data) - RECORD_HEAD.size
+    if not isinstance(record, Metadata) or not is_whole:
+        raise SegmentError("its fields do not fill it")
+    record.metadata.pop(METADATA_CHECK, None)
+    return record
+
+
+def _metadata_check(data: Buffer, offset: int) -> bytes:
+    """Checksum of the place of a metadata record and of all but its last eight bytes."""
+    crc = crc32(memoryview(data)[:-8], crc32(offset.to_bytes(8, "little")))
+    return b"%08x" % crc
+
+
 def chunk_head(
     *,
     first: int,
@@ -172,48 +207,6 @@ def chunk_head(
     )
 
 
-class ChunkSummary(NamedTuple):
-    """The entry of a chunk in the summary; its message indexes directly follow the chunk.
-
-    Attributes:
-        first: Smallest log time, ns.
-        last: Largest log time, ns.
-        offset: Byte of the file where it starts.
-        length: Bytes of the chunk record.
-        indexes: Bytes of each channel's message index record, in their order in the file.
-        compression: MCAP name of the codec.
-        compressed_size: Bytes of compressed content.
-        uncompressed_size: Bytes of content.
-    """
-
-    first: int
-    last: int
-    offset: int
-    length: int
-    indexes: Mapping[int, int]
-    compression: str
-    compressed_size: int
-    uncompressed_size: int
-
-
-def chunk_index_record(chunk: ChunkSummary) -> bytes:
-    """The chunk index record of this entry."""
-    name = chunk.compression.encode()
-    places = index_offsets(chunk.indexes, chunk.offset + chunk.length)
-    table = b"".join(map(INDEX_PLACE.pack, places.keys(), places.values()))
-    tail = struct.pack(
-        f"<QI{len(name)}sQQ",
-        sum(chunk.indexes.values()),
-        len(name),
-        name,
-        chunk.compressed_size,
-        chunk.uncompressed_size,
-    )
-    head = CHUNK_INDEX_HEAD.pack(chunk.first, chunk.last, chunk.offset, chunk.length, len(table))
-    body = head + table + tail
-    return RECORD_HEAD.pack(Opcode.CHUNK_INDEX, len(body)) + body
-
-
 def compression_of(record: Buffer) -> tuple[str, int]:
     """Compression of a checked chunk record, and bytes of its compressed content."""
     at = CHUNK_HEAD.size
@@ -233,6 +226,11 @@ def padding_record(size: int) -> bytes:
     """A padding record of `size` bytes, including its head."""
     length = size - RECORD_HEAD.size
     return RECORD_HEAD.pack(PADDING_OPCODE, length) + bytes(length)
+
+
+def damaged_head(size: int) -> bytes:
+    """The head of a record of `size` damaged bytes, including itself."""
+    return RECORD_HEAD.pack(DAMAGED_OPCODE, size - RECORD_HEAD.size)
 
 
 def index_order(channel: NDArray[np.int32], log_time: NDArray[np.int64]) -> NDArray[np.intp]:
@@ -286,8 +284,8 @@ def last_time_of(index: bytes) -> int:
     return int(np.frombuffer(index, _INDEX_ENTRY, offset=len(index) - _INDEX_ENTRY.itemsize)[0][0])
 
 
-def definitions_chunk(content: bytes) -> bytes:
-    """A chunk record with definitions alone: compressed they have a fifth of the bytes."""
+def definitions_chunk(content: bytes, offset: int) -> bytes:
+    """A chunk of definitions alone at a byte of a file, with its arrival record."""
     packed = checked_frame(content)
     head = chunk_head(
         first=0,
@@ -297,7 +295,8 @@ def definitions_chunk(content: bytes) -> bytes:
         compression="zstd",
         compressed_size=len(packed),
     )
-    return head + packed
+    arrivals = arrival_record(offset, crc32(head), 0, pack_arrivals(np.empty(0, np.int64)))
+    return b"".join((head, packed, arrivals))
 
 
 def checked_frame(data: Buffer) -> bytes:
@@ -317,34 +316,17 @@ def pack_arrivals(seq: NDArray[np.int64]) -> bytes:
     return checked_frame(steps.tobytes())
 
 
-class Proof(NamedTuple):
-    """Checksums of a part of a segment, in the arrival record behind it.
+def arrival_record(chunk: int, head_crc: int, indexes_crc: int, packed: Buffer) -> bytes:
+    """The record with the packed arrival numbers of a chunk.
 
-    They prove what an open segment has so far; the chunk table repeats them for a sealed one.
-
-    Attributes:
-        chunk: Byte of the file where the chunk record starts; 0 if the record follows no chunk.
-        length: Bytes before the chunk that it covers; without a chunk, before the record.
-        before: CRC-32 of these bytes.
-        head: CRC-32 of the head of the chunk record; 0 without a chunk, as are the others.
-        record: CRC-32 of the chunk record.
-        indexes: CRC-32 of the message indexes.
+    Args:
+        chunk: Byte of the file where the chunk record starts.
+        head_crc: CRC-32 of the chunk record before its content.
+        indexes_crc: CRC-32 of its message indexes.
+        packed: From `pack_arrivals`.
     """
-
-    chunk: int
-    length: int
-    before: int
-    head: int = 0
-    record: int = 0
-    indexes: int = 0
-
-
-def arrival_record(proof: Proof, packed: Buffer = b"") -> bytes:
-    """The record with checksums and, behind a chunk, with its packed arrival numbers."""
-    fields = PROOF.pack(*proof, 0)[:-4]
-    own = crc32(packed, crc32(fields))
-    head = RECORD_HEAD.pack(ARRIVAL_OPCODE, PROOF.size + len(packed))
-    return b"".join((head, fields, own.to_bytes(4, "little"), packed))
+    head = RECORD_HEAD.pack(ARRIVAL_OPCODE, ARRIVALS.size + len(packed))
+    return b"".join((head, ARRIVALS.pack(chunk, head_crc, indexes_crc), packed))
 
 
 def group_of(recording: Mapping[str, object], number: int) -> int:
@@ -353,102 +335,86 @@ def group_of(recording: Mapping[str, object], number: int) -> int:
     return group if isinstance(group, int) and 0 <= group <= number else number
 
 
-def proof_of(body: Buffer) -> Proof:
-    """Parse the checksums in the body of an arrival record.
+class Trailer(NamedTuple):
+    """The records behind a chunk.
 
-    Raises:
-        SegmentError: The record is damaged.
+    Attributes:
+        length: Their bytes.
+        head_crc: CRC-32 of the chunk record before its content.
+        indexes: Channel id and entries (`log_time`, `offset`) of each message index; None if
+            they have changed.
+        packed: The packed arrival numbers.
     """
-    if len(body) < PROOF.size:
-        raise SegmentError("the arrival record is damaged")
-    *fields, own = PROOF.unpack_from(body)
-    view = memoryview(body)
-    if crc32(view[PROOF.size :], crc32(view[: PROOF.size - 4])) != own:
-        raise SegmentError("the arrival record is damaged")
-    return Proof(*fields)
+
+    length: int
+    head_crc: int
+    indexes: list[tuple[int, NDArray[np.void]]] | None
+    packed: memoryview
+
+    def arrivals(self, count: int) -> NDArray[np.int64]:
+        """The arrival numbers of a chunk's messages, in chunk order.
+
+        Raises:
+            SegmentError: They are damaged, or not `count`.
+        """
+        try:
+            if count > _MAX_ARRIVALS:
+                raise SegmentError("there are too many")
+            raw = decompress("zstd", self.packed, count * 8)
+        except SegmentError as error:
+            raise SegmentError(f"its arrival numbers are damaged: {error}") from error
+        return np.cumsum(np.frombuffer(raw, "<i8"), dtype=np.int64)
+
+    def starts(self) -> NDArray[np.int64] | None:
+        """Start of each message record in the chunk, ascending; None if the indexes changed."""
+        if not self.indexes:
+            return None
+        found = [entries["offset"].astype(np.int64) for _, entries in self.indexes]
+        # Each channel's starts are sorted already; merging sorted runs is ten times as fast.
+        return np.sort(np.concatenate(found), kind="stable")
 
 
-def arrivals_of(body: Buffer, count: int) -> tuple[int, NDArray[np.int64]]:
-    """Parse the body of an arrival record into chunk offset and arrival numbers.
+def trailer_of(data: Buffer, chunk: int) -> Trailer:
+    """Parse the records behind a chunk, whatever follows them.
 
-    Raises:
-        SegmentError: The record is damaged or does not hold `count` numbers.
-    """
-    if len(body) < PROOF.size or count > _MAX_ARRIVALS:
-        raise SegmentError("the record of arrival numbers is damaged")
-    try:
-        raw = decompress("zstd", memoryview(body)[PROOF.size :], count * 8)
-    except SegmentError as error:
-        raise SegmentError(f"the record of arrival numbers is damaged: {error}") from error
-    (chunk_offset,) = struct.unpack_from("<Q", body)
-    return chunk_offset, np.cumsum(np.frombuffer(raw, "<i8"), dtype=np.int64)
-
-
-def message_starts(trailer: Buffer) -> NDArray[np.int64]:
-    """Start of each message record in a chunk, ascending, from its message indexes.
+    Its message indexes may be damaged: the arrival record says where its chunk starts, and is
+    found by that.
 
     Args:
-        trailer: The message index records, and the record of arrival numbers.
-
-    Returns:
-        int64[n]; as right as the trailer is.
+        data: The bytes behind the chunk.
+        chunk: Byte of the file where the chunk record starts.
 
     Raises:
-        SegmentError: The trailer holds something else.
+        SegmentError: Its arrival numbers are missing.
     """
-    indexes, _ = split_trailer(trailer)
-    found = [entries["offset"].astype(np.int64) for _, entries in indexes]
-    # Each channel's starts are sorted already; merging sorted runs is ten times as fast.
-    return np.sort(np.concatenate(found), kind="stable") if found else np.empty(0, np.int64)
+    raw, owner = bytes(data), chunk.to_bytes(8, "little")
+    at = raw.find(owner)
+    while at >= 0:
+        start = at - RECORD_HEAD.size
+        if start >= 0 and raw[start] == ARRIVAL_OPCODE and at + ARRIVALS.size <= len(raw):
+            end = at + RECORD_HEAD.unpack_from(raw, start)[1]
+            if at + ARRIVALS.size <= end <= len(raw):
+                _, head_crc, crc = ARRIVALS.unpack_from(raw, at)
+                indexes = _indexes_of(raw[:start]) if crc32(raw[:start]) == crc else None
+                packed = memoryview(raw)[at + ARRIVALS.size : end]
+                return Trailer(end, head_crc, indexes, packed)
+        at = raw.find(owner, at + 1)
+    raise SegmentError("its arrival numbers are missing")
 
 
-def message_times(trailer: Buffer) -> dict[int, NDArray[np.int64]]:
-    """Log times of the messages of a chunk by channel, from its message indexes.
-
-    Args:
-        trailer: The message index records, and the record of arrival numbers.
-
-    Returns:
-        int64[n], ns, ascending; as right as the trailer is.
-
-    Raises:
-        SegmentError: The trailer holds something else.
-    """
-    indexes, _ = split_trailer(trailer)
-    return {channel: entries["log_time"].astype(np.int64) for channel, entries in indexes}
-
-
-def split_trailer(trailer: Buffer) -> tuple[list[tuple[int, NDArray[np.void]]], memoryview]:
-    """Parse the records behind a chunk.
-
-    Args:
-        trailer: Exactly the message index records and the record of arrival numbers.
-
-    Returns:
-        Channel id and entries (`log_time`, `offset`) of each message index; the body of the
-        record of arrival numbers.
-
-    Raises:
-        SegmentError: It holds other bytes.
-    """
-    view = memoryview(trailer)
+def _indexes_of(data: bytes) -> list[tuple[int, NDArray[np.void]]] | None:
+    """Channel id and entries of message indexes; None if they are wrong."""
     found: list[tuple[int, NDArray[np.void]]] = []
     at = 0
-    while at + INDEX_HEAD.size <= len(view) and view[at] != ARRIVAL_OPCODE:
-        opcode, length, channel, size = INDEX_HEAD.unpack_from(view, at)
+    while at + INDEX_HEAD.size <= len(data):
+        opcode, length, channel, size = INDEX_HEAD.unpack_from(data, at)
         start = at + INDEX_HEAD.size
         at = start + size
         is_index = opcode == Opcode.MESSAGE_INDEX and size + 6 == length
-        if not is_index or size % _INDEX_ENTRY.itemsize or at > len(view):
-            raise SegmentError("its message indexes are damaged")
-        found.append((channel, np.frombuffer(view[start:at], _INDEX_ENTRY)))
-    if at + RECORD_HEAD.size + PROOF.size > len(view):
-        raise SegmentError("its arrival numbers are missing")
-    opcode, length = RECORD_HEAD.unpack_from(view, at)
-    at += RECORD_HEAD.size
-    if opcode != ARRIVAL_OPCODE or at + length != len(view):
-        raise SegmentError("its arrival numbers are damaged")
-    return found, view[at:]
+        if not is_index or not size or size % _INDEX_ENTRY.itemsize or at > len(data):
+            return None
+        found.append((channel, np.frombuffer(data[start:at], _INDEX_ENTRY)))
+    return found if at == len(data) else None
 
 
 def messages_at(content: Buffer, starts: NDArray[np.int64]) -> Batch | None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import stat
 import struct
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,9 +17,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, Self
 
 import numpy as np
 from mcap.opcode import Opcode
-from mcap.records import AttachmentIndex, Metadata, MetadataIndex, Statistics
-from mcap.records import Channel as ChannelRecord
-from mcap.records import Schema as SchemaRecord
+from mcap.records import AttachmentIndex, Metadata, MetadataIndex
 
 from hybridlog_storage.buffers import buffers
 from hybridlog_storage.checksum import crc32
@@ -28,10 +26,9 @@ from hybridlog_storage.disk.append_file import BLOCK, DIRECT
 from hybridlog_storage.errors import SegmentError, exhausted
 from hybridlog_storage.manifest import hasher
 from hybridlog_storage.mcap.mcap_content import (
-    MESSAGE_HEAD,
     RECORD_HEAD,
     parse_content,
-    read_record,
+    parse_summary,
 )
 from hybridlog_storage.messages import EXPIRED_IDS, MARKS_CHANNEL, Buffer, Channel, with_expired
 from hybridlog_storage.ordering import distinct
@@ -53,22 +50,17 @@ from hybridlog_storage.segments.segment_format import (
     MAGIC,
     OUR_NAMES,
     RECORDING_METADATA,
-    arrivals_of,
     channel_of,
-    chunk_head,
-    index_order,
     json_of,
-    message_indexes,
-    message_starts,
-    message_times,
     messages_at,
-    split_trailer,
+    metadata_of,
+    trailer_of,
 )
 from hybridlog_storage.segments.statements import end_of, loss_rows
 from hybridlog_storage.stopping import check_wanted
 
 if TYPE_CHECKING:
-    from blake3 import blake3
+    from mcap.summary import Summary
     from numpy.typing import NDArray
 
     from hybridlog_storage.messages import Batch
@@ -91,8 +83,6 @@ class ChunkPlace:
         first: Smallest log time in it, ns.
         last: Largest log time in it, ns.
         channels: Ids of the channels in it.
-        crc: CRC-32 of the chunk record, including its head.
-        trailer_crc: CRC-32 of the trailer.
     """
 
     number: int
@@ -102,8 +92,6 @@ class ChunkPlace:
     first: int
     last: int
     channels: tuple[int, ...]
-    crc: int
-    trailer_crc: int
 
     @property
     def is_expired(self) -> bool:
@@ -124,8 +112,6 @@ class ChunkPlace:
             offset=self.offset,
             length=self.length,
             trailer=self.trailer,
-            crc=self.crc,
-            trailer_crc=self.trailer_crc,
             batch=batch,
             seq=seq,
             compressed_size=compressed_size,
@@ -146,6 +132,7 @@ class SegmentSummary:
         attachments: Attachments of the source, in file order.
         metadata: Metadata records of the source, in file order.
         table: The chunk table.
+        start: Byte where the summary starts.
         size: Bytes of the file.
     """
 
@@ -158,24 +145,13 @@ class SegmentSummary:
     attachments: list[AttachmentIndex]
     metadata: list[MetadataIndex]
     table: ChunkTable
+    start: int
     size: int
 
     @property
     def chunks(self) -> list[ChunkPlace]:
         """Position of each chunk, in file order."""
         return places_of(self.table)
-
-
-@dataclass(slots=True)
-class _Records:
-    """The needed records of a summary."""
-
-    schemas: dict[int, SchemaRecord]
-    channels: dict[int, ChannelRecord]
-    attachments: list[AttachmentIndex]
-    metadata: list[MetadataIndex]
-    statistics: Statistics | None
-    table: Buffer | None
 
 
 class SegmentReader:
@@ -262,20 +238,7 @@ class SegmentReader:
             SegmentError: It is missing, damaged, or has another format.
         """
         with self._explained():
-            start, tail = self._tail()
-            records = _records(tail[: len(tail) - _TAIL])
-            return self._summary(records, self._table(records, start))
-
-    def table(self) -> ChunkTable:
-        """The chunk table of the summary, without reading metadata.
-
-        Raises:
-            SegmentError: As `summary`.
-        """
-        with self._explained():
-            start, tail = self._tail()
-            table = self._table(_records(tail[: len(tail) - _TAIL]), start)
-            return table.with_added(self._added) if self._added else table
+            return self._summary(*self._records())
 
     @contextmanager
     def _explained(self) -> Iterator[None]:
@@ -288,8 +251,8 @@ class SegmentReader:
                 "restore the file, or see what is left with `mcap recover`."
             ) from error
 
-    def _tail(self) -> tuple[int, memoryview]:
-        """Start of the summary, and the checked bytes from there on."""
+    def _records(self) -> tuple[Summary, Buffer | None, int]:
+        """The checked summary, the content of the chunk table, and where they start."""
         if self.size < len(MAGIC) + _TAIL:
             raise _NoSummaryError("it is too short")
         tail = self.read(self.size - _TAIL, _TAIL)
@@ -302,42 +265,47 @@ class SegmentReader:
         data = self.read(start, self.size - start)
         if crc32(data[: len(data) - len(MAGIC) - 4]) != crc:
             raise _NoSummaryError("its checksum differs")
-        return start, data
+        try:
+            # The chunk table says more than chunk indexes, and is faster to read.
+            found, others = parse_summary(data[: len(data) - _TAIL], skipped=Opcode.CHUNK_INDEX)
+        except SegmentError as error:
+            raise _NoSummaryError(str(error)) from error
+        return found, others.get(CHUNK_TABLE_OPCODE), start
 
-    def _table(self, records: _Records, start: int) -> ChunkTable:
-        if records.table is None:
+    def _table(self, records: Summary, body: Buffer | None, start: int) -> ChunkTable:
+        if body is None:
             self._refuse_other_format(records)
-            if all(index.name != RECORDING_METADATA for index in records.metadata):
+            if all(index.name != RECORDING_METADATA for index in records.metadata_indexes):
                 raise SegmentError(f"{self.path} is no segment of a hybridlog store.")
             raise _NoSummaryError("its chunk table is missing")
         try:
-            table = ChunkTable.from_bytes(records.table)
+            table = ChunkTable.from_bytes(body)
         except SegmentError as error:
             self._refuse_other_format(records)
             raise _NoSummaryError(str(error)) from error
-        if table.end != start:
+        if table.end > start:
             raise _NoSummaryError("its chunk table is of another file")
         return table
 
-    def _refuse_other_format(self, records: _Records) -> None:
-        """Raise if the unchecked header names another format."""
-        for index in records.metadata:
+    def _refuse_other_format(self, records: Summary) -> None:
+        """Raise if the header names another format."""
+        for index in records.metadata_indexes:
             if index.name == RECORDING_METADATA:
-                record = _metadata(self.read(index.offset, index.length), index.offset, self.path)
-                check_format(json_of(record), self.path)
+                check_format(json_of(self.metadata(index)), self.path)
 
-    def _summary(self, records: _Records, table: ChunkTable) -> SegmentSummary:
+    def _summary(self, records: Summary, body: Buffer | None, start: int) -> SegmentSummary:
+        table = self._table(records, body, start)
         found: dict[str, dict[str, object]] = {}
         losses: list[dict[str, Any]] = []
-        for index in records.metadata:
+        for index in records.metadata_indexes:
             if index.name in {RECORDING_METADATA, END_METADATA}:
-                found[index.name] = json_of(self.metadata(table, index))
+                found[index.name] = json_of(self.metadata(index))
                 if index.name == RECORDING_METADATA:
                     check_format(found[index.name], self.path)
                 else:
                     found[index.name] = dict(end_of(found[index.name]))
             elif index.name == LOSSES_METADATA:
-                losses += loss_rows(json_of(self.metadata(table, index)))
+                losses += loss_rows(json_of(self.metadata(index)))
         if RECORDING_METADATA not in found:
             raise SegmentError(f"{self.path} is no segment of a hybridlog store.")
         stated = records.statistics.channel_message_counts if records.statistics else {}
@@ -355,97 +323,80 @@ class SegmentReader:
             schema_ids={i: r.schema_id for i, r in records.channels.items()},
             counts=counts,
             losses=losses,
-            attachments=records.attachments,
-            metadata=[i for i in records.metadata if not i.name.startswith(OUR_NAMES)],
+            attachments=records.attachment_indexes,
+            metadata=[i for i in records.metadata_indexes if not i.name.startswith(OUR_NAMES)],
             table=table,
+            start=start,
             size=self.size,
         )
 
-    def indexes(self) -> tuple[list[MetadataIndex], list[AttachmentIndex]]:
-        """Index records of the metadata and the attachments.
+    def records(self) -> list[MetadataIndex]:
+        """Places of all metadata records, the store's own, too.
 
         Raises:
             SegmentError: As `summary`.
         """
         with self._explained():
-            _, tail = self._tail()
-            records = _records(tail[: len(tail) - _TAIL])
-            return records.metadata, records.attachments
+            return self._records()[0].metadata_indexes
 
-    def metadata(self, table: ChunkTable, index: MetadataIndex) -> Metadata:
-        """A metadata record, after checking the stretch that holds it.
+    def metadata(self, index: MetadataIndex) -> Metadata:
+        """A metadata record.
 
         Raises:
             SegmentError: It is damaged.
         """
-        what = f"metadata record {index.name!r}"
-        start, length = self._check_stretch(table, index, what)
-        data = self.read(start, length)
-        at = index.offset - start
-        return _metadata(data[at : at + index.length], index.offset, self.path)
+        try:
+            return metadata_of(self.read(index.offset, index.length), index.offset)
+        except SegmentError as error:
+            raise self._lost("metadata record", index, str(error)) from error
 
-    def attachment(self, table: ChunkTable, index: AttachmentIndex) -> Attachment:
+    def attachment(self, index: AttachmentIndex) -> Attachment:
         """An attachment, after checking all its bytes; they are read again later.
 
         Raises:
             SegmentError: It is damaged.
         """
-        self._check_stretch(table, index, f"attachment {index.name!r}")
         start, size = index.offset + RECORD_HEAD.size, index.length - RECORD_HEAD.size
         head = self.read(start, max(min(size, MAX_HEAD), 0))
         part = FilePart(FileHandle(self._fd), start, size)
-        found, _ = parse_attachment(head, part, check_crc=False)
+        try:
+            found, _ = parse_attachment(head, part, needs_crc=True)
+        except SegmentError as error:
+            raise self._lost("attachment", index, str(error)) from error
         if found.index(index.offset, index.length) != index:
-            raise SegmentError(f"{self.path}: another attachment is at byte {index.offset}.")
+            raise self._lost("attachment", index, "another one is there")
         return found
 
-    def _check_stretch(
-        self, table: ChunkTable, index: MetadataIndex | AttachmentIndex, what: str
-    ) -> tuple[int, int]:
-        """Start and length of the stretch that holds a record, after checking it."""
-        stretch = table.stretch(index.offset, index.length)
-        if stretch is None:
-            raise _NoSummaryError(f"no {what} lies at byte {index.offset}")
-        start, length, crc = stretch
-        if self.checksum(start, length) != crc:
-            raise SegmentError(
-                f"{self.path}: bytes {start} to {start + length} are damaged, and with them the "
-                f"{what} at byte {index.offset}. Restore the file."
-            )
-        return start, length
+    def _lost(self, what: str, index: MetadataIndex | AttachmentIndex, why: str) -> SegmentError:
+        return SegmentError(
+            f"The {what} {index.name!r} at byte {index.offset} of {self.path} is damaged: {why}. "
+            "Restore the file."
+        )
 
     def read_chunk(self, place: ChunkPlace) -> StoredChunk:
         """Read, decompress and check one chunk.
 
         Args:
-            place: Its position. Its checksums are compared before any byte of the chunk is
-                used. Damaged message indexes are ignored: messages and arrival numbers have
-                checksums of their own.
+            place: Its position. Damaged message indexes are ignored: messages and arrival
+                numbers have checksums of their own.
 
         Raises:
-                SegmentError: It is missing or damaged; the message names file and offset.
+            SegmentError: It is missing or damaged; the message names file and offset.
         """
         check_wanted()
         data = self.read(place.offset, place.length + place.trailer)
-        record, trailer = data[: place.length], data[place.length :]
         try:
-            if crc32(record) != place.crc:
-                raise SegmentError("its checksum differs")
-            content, compressed = open_chunk(record)
-            batch = self._messages(place, content, trailer)
-            seq = check_arrivals(trailer, place.offset, len(batch))
+            content, times, compressed = open_chunk(data[: place.length])
+            if times != (place.first, place.last):
+                raise SegmentError("its times are not those of the chunk table")
+            trailer = trailer_of(data[place.length :], place.offset)
+            starts = trailer.starts()
+            batch = None if starts is None else messages_at(content, starts)
+            batch = parse_content(content).batch if batch is None else batch
+            seq = trailer.arrivals(len(batch))
         except SegmentError as error:
             raise self._damaged(place, error) from error
         return place.stored(self.number, batch, seq, compressed)
-
-    def _messages(self, place: ChunkPlace, content: Buffer, trailer: memoryview) -> Batch:
-        """The messages of a chunk; damaged message indexes are ignored."""
-        if crc32(trailer) != place.trailer_crc:
-            return parse_content(content).batch
-        found = messages_at(content, message_starts(trailer))
-        if found is None:
-            raise SegmentError("its message indexes do not fit its messages")
-        return found
 
     def _damaged(self, place: ChunkPlace, error: SegmentError) -> SegmentError:
         return SegmentError(f"Chunk at byte {place.offset} of {self.path} is damaged: {error}")
@@ -462,42 +413,31 @@ class SegmentReader:
             SegmentError: They are missing or damaged; the message names file and offset.
         """
         check_wanted()
-        trailer = self.read(place.offset + place.length, place.trailer)
-        if crc32(trailer) == place.trailer_crc:
-            return message_times(trailer)
+        behind = self.read(place.offset + place.length, place.trailer)
+        try:
+            indexes = trailer_of(behind, place.offset).indexes
+        except SegmentError as error:
+            raise self._damaged(place, error) from error
+        if indexes:
+            return {channel: rows["log_time"].astype(np.int64) for channel, rows in indexes}
         batch = self.read_chunk(place).batch
         channels = distinct(batch.channel).tolist()
         return {c: np.sort(batch.log_time[batch.channel == c]) for c in channels}
 
-    def checksum(self, offset: int, length: int, digest: blake3 | None = None) -> int:
-        """CRC-32 of a range of bytes of the file.
+    def digest(self, progress: Callable[[int], None] | None = None) -> str:
+        """BLAKE3 of all bytes, which are read for it.
 
         Args:
-            offset: Where it starts.
-            length: Its bytes.
-            digest: Gets these bytes, too.
-
-        Raises:
-            SegmentError: They cannot be read.
-        """
-        crc = 0
-        with suppress(OSError):  # what is missing is told when it is read
-            files.fetch(self._fd, [(offset, offset + length)])
-        for at in range(offset, offset + length, _PIECE):
-            piece = self.read(at, min(_PIECE, offset + length - at))
-            crc = crc32(piece, crc)
-            if digest is not None:
-                digest.update(piece)
-        return crc
-
-    def digest(self) -> str:
-        """BLAKE3 of all bytes, which are read for it.
+            progress: Called with the number of bytes read so far.
 
         Raises:
             SegmentError: They cannot be read.
         """
         found = hasher()
-        self.checksum(0, self.size, found)
+        for at in range(0, self.size, _PIECE):
+            found.update(self.read(at, min(_PIECE, self.size - at)))
+            if progress is not None:
+                progress(at)
         return found.hexdigest()
 
     @property
@@ -542,67 +482,10 @@ class _NoSummaryError(SegmentError):
     """A summary that is missing or damaged."""
 
 
-def _records(summary: memoryview) -> _Records:
-    """Parse a checked summary."""
-    found = _Records({}, {}, [], [], None, None)
-    at = 0
-    while at < len(summary):
-        if at + RECORD_HEAD.size > len(summary):
-            raise _NoSummaryError("it ends in the middle of a record")
-        opcode, length = RECORD_HEAD.unpack_from(summary, at)
-        at += RECORD_HEAD.size
-        if length > len(summary) - at:
-            raise _NoSummaryError("it ends in the middle of a record")
-        body = summary[at : at + length]
-        at += length
-        if opcode == CHUNK_TABLE_OPCODE:
-            found.table = body
-        if opcode not in _WANTED:
-            continue  # such as chunk indexes: the chunk table holds more and is faster to read
-        try:
-            record, _ = read_record(opcode, body)
-        except SegmentError as error:
-            raise _NoSummaryError(str(error)) from error
-        if isinstance(record, SchemaRecord):
-            found.schemas[record.id] = record
-        elif isinstance(record, ChannelRecord):
-            found.channels[record.id] = record
-        elif isinstance(record, AttachmentIndex):
-            found.attachments.append(record)
-        elif isinstance(record, MetadataIndex):
-            found.metadata.append(record)
-        elif isinstance(record, Statistics):
-            found.statistics = record
-    return found
-
-
-_WANTED = frozenset(
-    {
-        Opcode.SCHEMA,
-        Opcode.CHANNEL,
-        Opcode.ATTACHMENT_INDEX,
-        Opcode.METADATA_INDEX,
-        Opcode.STATISTICS,
-    }
-)
-
-
 def _counts(table: ChunkTable) -> dict[int, int]:
     """Messages of each channel in a table."""
     totals = table.by_channel()
     return dict(zip(totals["channel"].tolist(), totals["messages"].tolist(), strict=True))
-
-
-def _metadata(data: memoryview, offset: int, path: Path) -> Metadata:
-    try:
-        opcode, length = RECORD_HEAD.unpack_from(data)
-        if opcode == Opcode.METADATA and length == len(data) - RECORD_HEAD.size:
-            record, _ = read_record(opcode, data[RECORD_HEAD.size :])
-            if isinstance(record, Metadata):
-                return record
-    except (SegmentError, struct.error) as error:
-        raise SegmentError(f"Metadata at byte {offset} of {path} is damaged: {error}.") from error
-    raise SegmentError(f"No metadata record is at byte {offset} of {path}.")
 
 
 def places_of(table: ChunkTable) -> list[ChunkPlace]:
@@ -620,7 +503,7 @@ def place_of(table: ChunkTable, number: int, bounds: NDArray[np.int64] | None = 
         bounds: The table's `part_bounds`, if they are at hand.
     """
     bounds = table.part_bounds() if bounds is None else bounds
-    offset, length, trailer, crc, trailer_crc, first, last, _ = table.chunks[number].item()
+    offset, length, trailer, first, last, _ = table.chunks[number].item()
     return ChunkPlace(
         number=number,
         offset=offset,
@@ -629,8 +512,6 @@ def place_of(table: ChunkTable, number: int, bounds: NDArray[np.int64] | None = 
         first=first,
         last=last,
         channels=tuple(table.parts["channel"][bounds[number] : bounds[number + 1]].tolist()),
-        crc=crc,
-        trailer_crc=trailer_crc,
     )
 
 
@@ -648,19 +529,15 @@ def check_format(recording: Mapping[str, object], path: Path) -> None:
         )
 
 
-def open_chunk(record: memoryview) -> tuple[Buffer, int]:
-    """Content and compressed size of a whole chunk record.
-
-    Args:
-        record: The chunk record, including its head, whose checksum was compared. So that of
-            uncompressed content is not computed again.
+def open_chunk(record: memoryview) -> tuple[Buffer, tuple[int, int], int]:
+    """Content, first and last log time, and compressed size of a whole chunk record.
 
     Raises:
-            SegmentError: It is not a chunk record, or damaged.
+        SegmentError: It is not a chunk record, or damaged.
     """
     if len(record) < CHUNK_HEAD.size + 4:
         raise SegmentError("the record is too short")
-    opcode, length, _, _, size, crc = CHUNK_HEAD.unpack_from(record)
+    opcode, length, first, last, size, crc = CHUNK_HEAD.unpack_from(record)
     if opcode != Opcode.CHUNK or length + RECORD_HEAD.size != len(record):
         raise SegmentError("no chunk record is there")
     at = CHUNK_HEAD.size
@@ -675,46 +552,6 @@ def open_chunk(record: memoryview) -> tuple[Buffer, int]:
     if compressed != len(record) - at:
         raise SegmentError("the length of its records is wrong")
     content = decompress(compression, record[at:], size)
-    if compression and crc32(content) != crc:
+    if crc32(content) != crc:
         raise SegmentError("its checksum differs")
-    return content, compressed
-
-
-def right_head(batch: Batch, size: int, crc: int, compression: str, compressed: int) -> bytes:
-    """The correct head of a chunk record."""
-    return chunk_head(
-        first=int(batch.log_time.min()),
-        last=int(batch.log_time.max()),
-        uncompressed_size=size,
-        crc=crc,
-        compression=compression,
-        compressed_size=compressed,
-    )
-
-
-def indexes_of(batch: Batch) -> dict[int, bytes]:
-    """The correct message index records of a chunk, by channel id."""
-    order = index_order(batch.channel, batch.log_time)
-    starts = batch.offset - MESSAGE_HEAD.itemsize
-    return message_indexes(batch.channel, batch.log_time, starts, order)
-
-
-def check_arrivals(trailer: Buffer, chunk_offset: int, count: int) -> NDArray[np.int64]:
-    """Parse and check the arrival numbers of a chunk's messages.
-
-    Args:
-        trailer: The message indexes and the record of arrival numbers.
-        chunk_offset: Byte of the file where the chunk starts.
-        count: Number of its messages.
-
-    Returns:
-        int64[count], in chunk order.
-
-    Raises:
-        SegmentError: They are missing, damaged, or belong to another chunk.
-    """
-    _, body = split_trailer(trailer)
-    owner, seq = arrivals_of(body, count)
-    if owner != chunk_offset:
-        raise SegmentError("its arrival numbers belong to another chunk")
-    return seq
+    return content, (first, last), compressed

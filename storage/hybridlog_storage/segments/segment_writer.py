@@ -204,7 +204,6 @@ class RecordingWriter:
         self._extras: list[Metadata | Attachment] = []  # not in a segment yet
         self._broken: BaseException | None = None
         self._next_seq = 0
-        self._stored_seq = 0
         self._group: SegmentGroup | None = None
         self._number = 0
         self._closed: list[Path] = []
@@ -620,7 +619,6 @@ class RecordingWriter:
         for channel_id, data in chunk.indexes.items():
             self.written[channel_id] += entries_of(data)
             self._last_times[channel_id] = last_time_of(data)
-        self._stored_seq = max(self._stored_seq, int(chunk.seq.max()) + 1)
         self._on_chunk(stored, self.channels)
         self._stored_bytes += chunk.uncompressed_size
         if self._on_written is not None:
@@ -650,7 +648,6 @@ class RecordingWriter:
             self._directory,
             self._number,
             self._recording,
-            self._stored_seq,
             group=group,
             sync=self.settings.sync == "chunk",
         )

@@ -1,0 +1,404 @@
+"""Walks over the records of a segment without a summary: one being written, or left by a crash.
+
+Each record has a checksum of its own, so what is whole is known at once. Behind damage the walk
+goes on where the damaged record ends, or at the next record that proves itself.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import numpy as np
+from mcap.opcode import Opcode
+from mcap.records import AttachmentIndex, MetadataIndex
+from mcap.records import Schema as SchemaRecord
+
+from hybridlog_storage.checksum import crc32
+from hybridlog_storage.errors import SegmentError
+from hybridlog_storage.mcap.mcap_content import MESSAGE_HEAD, RECORD_HEAD, parse_content
+from hybridlog_storage.segments.attachments import MAX_HEAD, parse_attachment
+from hybridlog_storage.segments.chunk_table import PART, parts_of
+from hybridlog_storage.segments.compression import FilePart
+from hybridlog_storage.segments.segment_format import (
+    ARRIVAL_OPCODE,
+    CHUNK_HEAD,
+    DAMAGED_OPCODE,
+    END_METADATA,
+    LOSSES_METADATA,
+    PADDING_OPCODE,
+    RECORDING_METADATA,
+    START,
+    Trailer,
+    channel_of,
+    compression_of,
+    head_length,
+    index_order,
+    json_of,
+    metadata_of,
+    trailer_of,
+)
+from hybridlog_storage.segments.segment_reader import open_chunk
+from hybridlog_storage.segments.statements import loss_rows
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from hybridlog_storage.messages import Buffer, Channel
+    from hybridlog_storage.segments.segment_reader import SegmentReader
+
+_WINDOW: Final = 4096  # bytes read at once around the heads of records
+_SEARCHED: Final = 1 << 20  # bytes searched at once for the next record
+_MAX_RECORD: Final = 1 << 28  # bytes of what is read into memory as a whole
+_MAX_PADDING: Final = 2 * _WINDOW  # bytes
+_CHUNK_HEAD_SIZE: Final = CHUNK_HEAD.size + 16  # with the longest name of a compression
+_UNKNOWN: Final = np.iinfo(np.int64)  # publish times stand in the messages only
+_ORPHAN: Final = "it belongs to no chunk"
+_HEAD: Final = RECORD_HEAD.size
+
+
+@dataclass(frozen=True, slots=True)
+class Damage:
+    """A part of a segment that cannot be read.
+
+    Attributes:
+        offset: Byte of the file where it starts.
+        length: Its bytes.
+        reason: The damage.
+    """
+
+    offset: int
+    length: int
+    reason: str
+
+
+class WalkedChunk(NamedTuple):
+    """A chunk whose head, arrival numbers and channels are whole; its content was not read.
+
+    Attributes:
+        offset: Byte of the chunk record.
+        length: Its bytes.
+        trailer: Bytes of message indexes and arrival numbers behind it.
+        parts: `PART`[c], statistics of each channel in it; publish times are unknown.
+    """
+
+    offset: int
+    length: int
+    trailer: int
+    parts: NDArray[np.void]
+
+
+class _TornError(SegmentError):
+    """A record whose end is not in the file."""
+
+
+class Walk:
+    """What a segment has so far.
+
+    Args:
+        reader: Reads the file.
+
+    Attributes:
+        recording: What it says of its recording; None without.
+        channels: Id of the schema, and channel, by id of the channel.
+        schemas: Schemas by id, also of channels that are not defined.
+        chunks: Its chunks, in file order.
+        losses: Rows of the loss ledger.
+        has_end: Whether the end of the recording is there.
+        attachments: Its attachments, in file order.
+        metadata: All metadata records, in file order.
+        damaged: What cannot be read, in file order.
+        stopped: What is at the end of the file, if no writer leaves that; else None.
+        is_complete: Whether the end of the data was reached: the writer had begun the summary.
+        end: Where the last whole record ends, or damage before a later one.
+    """
+
+    def __init__(self, reader: SegmentReader) -> None:
+        self._reader = reader
+        self._window = memoryview(b"")
+        self._start = 0  # of the window
+        self.recording: dict[str, Any] | None = None
+        self.channels: dict[int, tuple[int, Channel]] = {}
+        self.schemas: dict[int, SchemaRecord] = {}
+        self.chunks: list[WalkedChunk] = []
+        self.losses: list[dict[str, Any]] = []
+        self.has_end = False
+        self.attachments: list[AttachmentIndex] = []
+        self.metadata: list[MetadataIndex] = []
+        self.damaged: list[Damage] = []
+        self.stopped: Damage | None = None
+        self.is_complete = False
+        self.end = len(START)
+
+    def go_on(self) -> None:
+        """Read what follows the last whole record.
+
+        Raises:
+            SegmentError: The file cannot be read, or has another format.
+        """
+        self.stopped, self.is_complete, self._window = None, False, memoryview(b"")
+        while not self.is_complete and self.end < self._reader.size:
+            at = self.end
+            try:
+                self.end = self._record(at)
+            except SegmentError as error:
+                is_torn = isinstance(error, _TornError)
+                behind = self._search(at + 1, self._reader.size) if is_torn else self._next(at)
+                if behind is not None:
+                    self._damage(at, behind, str(error))
+                    self.end = behind
+                    continue
+                if not is_torn:
+                    self.stopped = Damage(at, self._reader.size - at, str(error))
+                return
+
+    def _damage(self, at: int, behind: int, reason: str) -> None:
+        last = self.damaged[-1] if self.damaged else None
+        if last is not None and reason == _ORPHAN and last.offset + last.length == at:
+            self.damaged[-1] = Damage(last.offset, behind - last.offset, last.reason)
+        else:
+            self.damaged.append(Damage(at, behind - at, reason))
+
+    def _peek(self, at: int, size: int) -> memoryview:
+        """Bytes of the file, fewer at its end."""
+        begin = at - self._start
+        if begin < 0 or begin + size > len(self._window):
+            left = max(self._reader.size - at, 0)
+            self._start, begin = at, 0
+            self._window = self._reader.read(at, min(max(size, _WINDOW), left))
+        return self._window[begin : begin + size]
+
+    def _head(self, at: int) -> tuple[int, int]:
+        """Opcode of a record, and where it ends."""
+        head = self._peek(at, _HEAD)
+        if len(head) < _HEAD:
+            raise _TornError("the file ends in the middle of a record")
+        opcode, length = RECORD_HEAD.unpack(head)
+        return opcode, at + _HEAD + length
+
+    def _record(self, at: int) -> int:
+        """Take a record; return where it ends, with what belongs to it."""
+        opcode, end = self._head(at)
+        if opcode == Opcode.DATA_END and end - at == _HEAD + 4:
+            self.is_complete = True
+            return at
+        if opcode == Opcode.CHUNK:
+            return self._take_chunk(at, end)
+        if opcode == 0:
+            error = _TornError if self._is_room(at) else SegmentError
+            raise error("no record starts here")
+        is_large = opcode in {Opcode.ATTACHMENT, DAMAGED_OPCODE}
+        if opcode in {Opcode.METADATA, PADDING_OPCODE} or is_large:
+            if not is_large and end - at > _MAX_RECORD:
+                raise SegmentError("the record is too large")
+            if end > self._reader.size:
+                raise _TornError("the file ends in the middle of a record")
+            if opcode == Opcode.METADATA:
+                self._take_metadata(at, end)
+            elif opcode == Opcode.ATTACHMENT:
+                self._take_attachment(at, end)
+            elif opcode == DAMAGED_OPCODE:
+                self._damage(at, end, "it was damaged when the recording was recovered")
+            elif end - at > _MAX_PADDING or any(self._reader.read(at, end - at)[_HEAD:]):
+                raise SegmentError("padding has other bytes than zeros")
+            return end
+        if opcode in {Opcode.MESSAGE_INDEX, ARRIVAL_OPCODE}:
+            raise SegmentError(_ORPHAN)
+        raise SegmentError(f"a record of kind {opcode}")
+
+    def _take_metadata(self, at: int, end: int) -> None:
+        try:
+            record = metadata_of(self._reader.read(at, end - at), at)
+        except SegmentError as error:
+            raise SegmentError(f"a metadata record is damaged: {error}") from error
+        if record.name == LOSSES_METADATA:
+            self.losses += loss_rows(json_of(record))
+        elif record.name == RECORDING_METADATA:
+            self.recording = json_of(record)
+        self.has_end |= record.name == END_METADATA
+        self.metadata.append(MetadataIndex(offset=at, length=end - at, name=record.name))
+
+    def _take_attachment(self, at: int, end: int) -> None:
+        start, size = at + _HEAD, end - at - _HEAD
+        head = self._reader.read(start, min(size, MAX_HEAD))
+        with self._reader.stream() as file:
+            found, used = parse_attachment(head, FilePart(file, start, size), needs_crc=True)
+        if used != size:
+            raise SegmentError("an attachment record is longer than its fields")
+        self.attachments.append(found.index(at, end - at))
+
+    # Chunks
+
+    def _take_chunk(self, at: int, end: int) -> int:
+        self._check_head(at, end)
+        head = self._chunk_head(at)
+        trailer = self._trailer(at, end, head)
+        if crc32(head) != trailer.head_crc:
+            raise SegmentError("the head of a chunk changed: its checksum differs")
+        if trailer.indexes == []:
+            self._define(at, end)
+            return end + trailer.length
+        parts = self._parts(at, end, head, trailer)
+        lost = {*parts["channel"].tolist()} - self.channels.keys()
+        if lost:
+            raise SegmentError(f"the definition of its channel {min(lost)} is lost")
+        self.chunks.append(WalkedChunk(at, end - at, trailer.length, parts))
+        return end + trailer.length
+
+    def _check_head(self, at: int, end: int) -> None:
+        """Raise if the head of a chunk contradicts itself, or the file ends in the chunk."""
+        if end - at < _CHUNK_HEAD_SIZE:
+            raise SegmentError("a chunk record is too short")
+        try:
+            head = self._chunk_head(at)
+            is_right = at + len(head) + compression_of(head)[1] == end
+        except struct.error:
+            is_right = False
+        if not is_right and len(self._peek(at, _CHUNK_HEAD_SIZE)) == _CHUNK_HEAD_SIZE:
+            raise SegmentError("the lengths of a chunk contradict each other")
+        if end > self._reader.size:
+            raise _TornError("the file ends in the middle of a chunk")
+
+    def _chunk_head(self, at: int) -> bytes:
+        """A chunk record before its content."""
+        head = bytes(self._peek(at, _CHUNK_HEAD_SIZE))
+        return head[: head_length(head)]
+
+    def _define(self, at: int, end: int) -> None:
+        """Take a chunk of definitions."""
+        for definition in parse_content(self._content(at, end)).definitions:
+            record = definition.record
+            if isinstance(record, SchemaRecord):
+                self.schemas[record.id] = record
+            else:
+                self.channels[record.id] = record.schema_id, channel_of(record, self.schemas)
+
+    def _content(self, at: int, end: int) -> Buffer:
+        if end - at > _MAX_RECORD:
+            raise SegmentError("a chunk is too large")
+        return open_chunk(self._reader.read(at, end - at))[0]
+
+    def _trailer(self, at: int, end: int, head: bytes) -> Trailer:
+        """What stands behind a chunk, also if its message indexes are damaged."""
+        behind, opcode = end, int(Opcode.MESSAGE_INDEX)
+        size = self._reader.size
+        while opcode in {Opcode.MESSAGE_INDEX, DAMAGED_OPCODE} and behind + _HEAD <= size:
+            opcode, behind = self._head(behind)
+        is_whole = opcode == ARRIVAL_OPCODE and behind <= size
+        if not is_whole:
+            # Message indexes have at most as many bytes as the messages.
+            content = CHUNK_HEAD.unpack_from(head)[4]
+            behind = min(size, end + content + _WINDOW)
+        try:
+            if behind - end > _MAX_RECORD:
+                raise SegmentError("its message indexes are too large")
+            return trailer_of(self._reader.read(end, behind - end), at)
+        except SegmentError as error:
+            if behind == size and not is_whole:
+                raise _TornError(str(error)) from error
+            raise
+
+    def _parts(self, at: int, end: int, head: bytes, trailer: Trailer) -> NDArray[np.void]:
+        """Statistics of each channel in a chunk; by its messages if its indexes are damaged."""
+        if trailer.indexes:
+            return _parts_by_index(trailer.indexes, CHUNK_HEAD.unpack_from(head)[4])
+        batch = parse_content(self._content(at, end)).batch
+        if not len(batch):
+            raise SegmentError("it has no messages")
+        return parts_of(batch, index_order(batch.channel, batch.log_time))[0]
+
+    # Behind damage
+
+    def _next(self, at: int) -> int | None:
+        """Where to go on behind a damaged record; None if nothing whole follows."""
+        try:
+            _, behind = self._head(at)
+            is_plausible = self._is_plausible(behind)
+        except _TornError:
+            return None
+        found = self._search(at + _HEAD, behind if is_plausible else self._reader.size)
+        return behind if found is None and is_plausible else found
+
+    def _is_plausible(self, at: int) -> bool:
+        """True if a record may start at a byte, or the data of the file end there."""
+        if at >= self._reader.size or self._is_room(at):
+            return at <= self._reader.size
+        try:
+            opcode, end = self._head(at)
+        except _TornError:
+            return False
+        return opcode in _KINDS and end <= self._reader.size
+
+    def _is_room(self, at: int) -> bool:
+        """True if zeros follow, as a writer leaves behind its last block."""
+        if any(self._peek(at, _HEAD)):
+            return False
+        rest = self._reader.read(at, min(self._reader.size - at, _SEARCHED))
+        return not np.frombuffer(rest, np.uint8).any()
+
+    def _search(self, start: int, end: int) -> int | None:
+        """The first byte of a range where a chunk or a metadata record proves itself."""
+        for block in range(start, end - _HEAD, _SEARCHED):
+            raw = self._reader.read(block, min(_SEARCHED + _HEAD, end - block))
+            data = np.frombuffer(raw, np.uint8)
+            # No length reaches 2^40, which excludes nearly all positions.
+            kind = data[: 1 - _HEAD]
+            is_start = (kind == int(Opcode.CHUNK)) | (kind == int(Opcode.METADATA))
+            is_start &= (data[6:-2] == 0) & (data[7:-1] == 0) & (data[8:] == 0)
+            for place in np.flatnonzero(is_start).tolist():
+                if self._proves_itself(block + place):
+                    return block + int(place)
+        return None
+
+    def _proves_itself(self, at: int) -> bool:
+        try:
+            opcode, end = self._head(at)
+            if end > self._reader.size or end - at > _MAX_RECORD:
+                return False
+            if opcode == Opcode.METADATA:
+                metadata_of(self._reader.read(at, end - at), at)
+                return True
+            self._check_head(at, end)
+            head = self._chunk_head(at)
+            return crc32(head) == self._trailer(at, end, head).head_crc
+        except SegmentError:
+            return False
+
+
+_KINDS: Final = frozenset(
+    {
+        Opcode.CHUNK,
+        Opcode.MESSAGE_INDEX,
+        Opcode.METADATA,
+        Opcode.ATTACHMENT,
+        Opcode.DATA_END,
+        ARRIVAL_OPCODE,
+        PADDING_OPCODE,
+        DAMAGED_OPCODE,
+    }
+)
+
+
+def _parts_by_index(indexes: list[tuple[int, NDArray[np.void]]], size: int) -> NDArray[np.void]:
+    """Statistics of each channel in a chunk, from its message indexes.
+
+    Args:
+        indexes: They, checked.
+        size: Bytes of the chunk's content.
+
+    Returns:
+        `PART`[c], by channel id.
+    """
+    times = [rows["log_time"].astype(np.int64) for _, rows in indexes]
+    starts = np.concatenate([rows["offset"] for _, rows in indexes]).astype(np.int64)
+    counts = np.array([len(rows) for _, rows in indexes])
+    order = np.argsort(starts, kind="stable")
+    sizes = np.empty(len(starts), np.int64)
+    sizes[order] = np.diff(starts[order], append=size) - MESSAGE_HEAD.itemsize
+    parts = np.empty(len(indexes), PART)
+    parts["channel"], parts["messages"] = [channel for channel, _ in indexes], counts
+    parts["payload_bytes"] = np.add.reduceat(sizes, np.cumsum(counts) - counts)
+    parts["first"], parts["last"] = [t[0] for t in times], [t[-1] for t in times]
+    parts["first_publish"], parts["last_publish"] = _UNKNOWN.min, _UNKNOWN.max
+    return parts
