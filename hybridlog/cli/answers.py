@@ -176,20 +176,19 @@ class Tabular(Forced, AsJson):
         if form is None and path is None:
             form = self.usual[not sys.stdout.isatty()]
         elif form is None and path is not None:
-            form = form_of(path, self.formats)
+            form = form_of(path, suffixes_of(self.formats))
         quiet = getattr(self, "quiet", False)
         return Destination(
             form=form or SCREEN, path=path, force=self.force, limit=self.limit, quiet=quiet
         )
 
 
-def form_of(path: Path, formats: Iterable[str]) -> str:
+def form_of(path: Path, suffixes: Mapping[str, str]) -> str:
     """The format that the name of an output gives.
 
     Raises:
         UsageError: It gives none.
     """
-    suffixes = suffixes_of(formats)
     if path.suffix.lower() not in suffixes:
         raise UsageError(
             f"The name {path} does not give the format: add --format, or end it in "
@@ -650,6 +649,14 @@ def latched(counters: Counters) -> str:
         frames = output.counted(counters.frames, "frame")
         found += f" and {frames} of video in front, from the key frame on"
     return found
+
+
+def write_bytes(target: Target, content: bytes) -> None:
+    """Write a file, all of it or nothing, or into a stream."""
+    from hybridlog.formats.writing import Sink
+
+    with Sink(target) as sink:
+        sink.write(content)
 
 
 def check_room(path: Path, *, force: bool, is_directory: bool = False) -> None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 
 from hybridlog.cli import output
-from hybridlog.cli.answers import Listing, answering, check_room
+from hybridlog.cli.answers import Listing, answering, check_room, write_bytes
 from hybridlog.cli.app import DIFFERENT
 from hybridlog.cli.binder import argument, command, option
 from hybridlog.cli.completion import complete_topic
@@ -77,7 +77,7 @@ def check_command(given: _Check) -> None:
         if make is not None:
             if len({one.recording for one in found}) != 1:
                 raise UsageError("A contract is made from one good recording: name it with -r.")
-            _write(make, contract_of(found))
+            write_bytes(make, contract_of(found).encode())
             return
         is_one = len({one.recording for one in found}) == 1
         # Losses are left out only where there are none; a late start may be why a topic is bad.
@@ -121,7 +121,7 @@ def _show_verdict(results: Sequence[Result], recordings: int, given: _Check) -> 
     from hybridlog.contract.judge import broken, junit_of
 
     if given.junit is not None:
-        _write(given.junit, junit_of(results))
+        write_bytes(given.junit, junit_of(results).encode())
     bad = broken(results)
     names = ("recording", "topic", "rule", "wanted", "found")
     given.answer(map(asdict, results if given.as_json else bad), [*map(Column, names)])
@@ -138,14 +138,6 @@ def _verdict(results: Sequence[Result], where: str = "") -> str:
     return (
         f"{output.counted(len(results), 'rule')}{where}: {len(broken(results)) or 'none'} broken."
     )
-
-
-def _write(path: Path, text: str) -> None:
-    from hybridlog.formats.writing import Sink
-
-    sink = Sink(path)
-    sink.write(text.encode())
-    sink.commit()
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -70,7 +70,7 @@ def export_command(given: _Given) -> None:
     target, force, quiet, split = given.target, given.force, given.quiet, given.split
     if str(target) == "-":
         raise UsageError("export writes files; for a pipe: `hybridlog fetch '**' -F mcap -o -`.")
-    form = given.form or form_of(target, _LOGS)
+    form = given.form or form_of(target, suffixes_of(_LOGS))
     front = Front(latched=not given.no_latched, original_times=given.original_times)
     settings = given.settings(form)
     if form in _LOGS and split is None:

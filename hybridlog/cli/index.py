@@ -46,7 +46,7 @@ class _List(_Shared):
 @command(_List, "list", to=index_command)
 def list_(given: _List) -> None:
     """List the indexes on fields."""
-    with given.opened(needs_database=True) as store:
+    with given.opened(require_database=True) as store:
         found = store.index.list() if given.topic is None else store.index.list(given.topic)
     _print(found, given)
 
@@ -62,7 +62,7 @@ class _Fields(_Shared):
 @command(_Fields, to=index_command)
 def add(given: _Fields) -> None:
     """Make an index on fields of a topic, for all recordings."""
-    with given.opened(needs_database=True) as store:
+    with given.opened(require_database=True) as store:
         found = store.index.add(given.topic, *given.field)
     _print(found, given)
 
@@ -71,7 +71,7 @@ def add(given: _Fields) -> None:
 def remove(given: _Fields) -> None:
     """Drop an index."""
     topic, field = given.topic, given.field
-    with given.opened(needs_database=True) as store:
+    with given.opened(require_database=True) as store:
         if not store.index.remove(topic, *field):
             known = ", ".join(" ".join(one.fields) for one in store.index.list(topic)) or "none"
             raise UsageError(f"{topic} has no index on {' '.join(field)}. Its indexes: {known}.")
@@ -87,7 +87,7 @@ def address(given: _Shared) -> None:
     first. The embedded MongoDB keeps its address, waits ten minutes for the first client, and
     runs as long as one is connected.
     """
-    with given.opened(needs_database=True) as store:
+    with given.opened(require_database=True) as store:
         found = store.index.address()
         from hybridlog.index.of_store import contents
 
@@ -118,7 +118,7 @@ def rebuild(given: _Rebuild) -> None:
     that needs the index finishes the recording at which it stopped.
     """
     started = time.monotonic()
-    with given.opened(needs_database=True, cache_mb=given.cache_size, quiet=given.quiet) as store:
+    with given.opened(require_database=True, cache_mb=given.cache_size, quiet=given.quiet) as store:
         chosen = given.recordings_in(store)
         total = sum(entry.stored_bytes for entry in chosen.summaries)
         with (
@@ -222,7 +222,7 @@ def watch_command(given: _Watch) -> None:
     For a server into whose store robots copy. While MongoDB is unavailable, it tries again.
     Several may watch one store.
     """
-    with given.opened(needs_database=True, quiet=given.quiet, is_lasting=True) as store:
+    with given.opened(require_database=True, quiet=given.quiet, is_lasting=True) as store:
         look = partial(_look, store, given)
         watch(store.directory.path, look, pause_s=given.every, quiet=given.quiet)
 

@@ -427,31 +427,31 @@ def show_segment(path: Path, *, as_json: bool) -> None:
     ]
     first = min((place.first for place in chunks), default=None)
     last = max((place.last for place in chunks), default=None)
+    about = {
+        "segment": str(path),
+        "bytes": bytes_all,
+        "recording": summary.recording,
+        "end": summary.end,
+        "first_ns": first,
+        "last_ns": last,
+        "chunks": len(chunks),
+        "channels": channels,
+    }
     if as_json:
-        output.print_json(
-            {
-                "segment": str(path),
-                "bytes": bytes_all,
-                "recording": summary.recording,
-                "end": summary.end,
-                "first_ns": first,
-                "last_ns": last,
-                "chunks": len(chunks),
-                "channels": channels,
-            }
-        )
+        output.print_json(about)
         return
-    fields: list[tuple[str, object]] = [
-        ("segment", path),
-        ("recording", summary.recording.get("name")),
-        ("id", summary.recording.get("id")),
-        ("start", output.time_text(first)),
-        ("last", output.time_text(last)),
-        ("bytes", output.size(bytes_all)),
-        ("chunks", len(chunks)),
-        ("messages", sum(summary.counts.values())),
-    ]
-    print_fields(fields)
+    print_fields(
+        [
+            ("segment", path),
+            ("recording", summary.recording.get("name")),
+            ("id", summary.recording.get("id")),
+            ("start", output.time_text(first)),
+            ("last", output.time_text(last)),
+            ("bytes", output.size(bytes_all)),
+            ("chunks", len(chunks)),
+            ("messages", sum(summary.counts.values())),
+        ]
+    )
     output.say()
     kind = Column("type", short=lambda channel: (channel["type"] or "").rpartition("/")[2])
     print_table([Column("topic"), kind, *numbers("messages", "chunks")], channels)

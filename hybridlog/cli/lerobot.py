@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import click
 
 from hybridlog.cli import output
+from hybridlog.cli.answers import check_room, write_bytes
 from hybridlog.cli.binder import option
 from hybridlog.cli.completion import complete_topic
 from hybridlog.cli.progress import Bar
@@ -113,12 +114,8 @@ def _proposed(query: Query) -> str:
 
 
 def _write_map(text: str, target: Path, *, force: bool, quiet: bool) -> None:
-    if target.exists() and not force:
-        raise UsageError(f"{target} exists; name another file, or add --force.")
-    try:
-        target.write_text(text)
-    except OSError as error:
-        raise UsageError(f"{target} cannot be written: {error.strerror}.") from error
+    check_room(target, force=force)
+    write_bytes(target, text.encode())
     if not quiet:
         output.note(f"{target}: look at it, then add --map {target}.")
 

@@ -10,6 +10,7 @@ from hybridlog.cli.record_choices import (
     DEFAULT_CHUNK,
     OF_ENVIRONMENT,
     RecordChoices,
+    matchers,
     segment_settings,
 )
 
@@ -32,8 +33,8 @@ def recorder_options(choices: RecordChoices) -> RecorderOptions:
     from hybridlog.live.policy import priority_rule, throttle_rule
     from hybridlog.live.recorder import RecorderOptions
     from hybridlog.live.triggers import Trigger
-    from hybridlog.query.topics import matcher
 
+    chosen, no_index = matchers(choices)
     budget_bytes = choices.budget or default_budget()
     # Each topic of large messages has an open chunk, and all of them are to fit.
     chunk_size = min(max(budget_bytes >> 8, _MIN_CHUNK), DEFAULT_CHUNK)
@@ -45,9 +46,7 @@ def recorder_options(choices: RecordChoices) -> RecorderOptions:
     return RecorderOptions(
         name=choices.name or _name(choices),
         tags=parse_tags(choices.set_tag),
-        matcher=matcher(choices.topics, choices.exclude)
-        if choices.topics or choices.exclude
-        else None,
+        matcher=chosen,
         throttles=[throttle_rule(*one) for one in choices.throttle],
         priorities=[priority_rule(*one) for one in choices.priority],
         duration_s=choices.duration,
@@ -61,7 +60,7 @@ def recorder_options(choices: RecordChoices) -> RecorderOptions:
         triggers=[Trigger.of(text) for text in choices.trigger],
         before_s=choices.before,
         after_s=choices.after or 0.0,
-        no_index=matcher(choices.no_index) if choices.no_index else None,
+        no_index=no_index,
         use_sim_time=choices.use_sim_time,
         contract=None if choices.contract is None else Contract.read(choices.contract),
     )

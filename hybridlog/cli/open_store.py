@@ -8,7 +8,7 @@ from contextlib import contextmanager, nullcontext
 from itertools import chain, islice
 from pathlib import Path
 from shlex import quote
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import click
 
@@ -32,50 +32,37 @@ def opened_store(
     path: Path | None,
     mongo: str | None,
     *,
-    create: bool = False,
-    needs_database: bool = False,
-    cache_mb: int | None = None,
     quiet: bool = False,
     is_lasting: bool = False,
     snapshot: bool = False,
     records: bool = False,
-    recover: bool = True,
+    **how: Any,
 ) -> Iterator[Store]:
     """The open store.
 
     Args:
         path: Its directory; without, `HYBRIDLOG_STORE` or `./hybridlog-store`.
         mongo: URI of the MongoDB that holds the index.
-        create: Make it if there is none.
-        needs_database: Fail when MongoDB is unavailable.
-        cache_mb: Size of the embedded MongoDB's cache in MiB.
         quiet: No progress while the index is brought up to date.
         is_lasting: The command goes on while recordings change; what it meets is repaired
             meanwhile.
         snapshot: All that the command asks is of one moment.
         records: The command records, also while MongoDB is unavailable.
-        recover: False to leave what a crash has cut to another opening, which reports it.
+        how: Of `open_store`; what is not recovered is reported by another opening.
     """
     from hybridlog_storage.lazy import import_numpy_late
 
     import_numpy_late()
     from hybridlog.store import open_store
 
-    near = [] if path or create else _stores_near()
+    recover = how.get("recover", True)
+    near = [] if path or how.get("create") else _stores_near()
     if len(near) == 1 and _reads():
         path = near[0]
         note(f"Store: {path}, the only one below this folder.")
     try:
         with Bar("indexing", quiet=quiet) as bar:
-            store = open_store(
-                path,
-                mongo=mongo,
-                create=create,
-                require_database=needs_database,
-                progress=bar.part,
-                cache_mb=cache_mb,
-                recover=recover,
-            )
+            store = open_store(path, mongo=mongo, progress=bar.part, **how)
     except StoreError as error:
         if near and path is None:
             named = " or ".join(f"--store {quote(str(one))}" for one in near[:_MAX_LISTED])

@@ -371,14 +371,14 @@ class Latched:
         excludes=("no_latched",),
     )
 
-    def check_latched(self, form: str | None) -> None:
-        """Refuse what has no effect in a format; None for a recording.
+    def check_latched(self, form: str) -> None:
+        """Refuse what has no effect in a format.
 
         Raises:
             UsageError: The format has no such messages.
         """
         logs = formats_of("log")
-        if self.original_times and form not in {None, *logs}:
+        if self.original_times and form not in logs:
             raise UsageError(
                 f"Latched messages from before the time range are in {' and '.join(logs)}, not in "
                 f"{form}: leave out --original-times."

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, ClassVar
 import click
 
 from hybridlog.cli import output
-from hybridlog.cli.answers import answering, check_room, not_written
+from hybridlog.cli.answers import answering, check_room, form_of, not_written, write_bytes
 from hybridlog.cli.binder import command, option
 from hybridlog.cli.completion import complete_path
 from hybridlog.cli.options import Asking, Forced, parse_fields
@@ -90,12 +90,7 @@ def _form(path: Path | None, form: str | None) -> str:
         return ""
     if str(path) == "-" and form is not None and sys.stdout.isatty():
         raise UsageError(f"{form} is no text for a terminal: name a file with -o.")
-    if form is None and path.suffix.lower()[1:] not in _FORMATS:
-        raise UsageError(
-            f"The name {path} does not give the format: add --format, or end it in "
-            f"{', '.join(f'.{name}' for name in _FORMATS)}."
-        )
-    return form or path.suffix.lower()[1:]
+    return form or form_of(path, {f".{name}": name for name in _FORMATS})
 
 
 def _size(text: str) -> tuple[int, int]:
@@ -107,15 +102,8 @@ def _size(text: str) -> tuple[int, int]:
 
 def _write(found: Sequence[Line], form: str, size: tuple[int, int], path: Path | None) -> None:
     from hybridlog.drawing.figure import figure
-    from hybridlog.formats.writing import Sink
 
-    made = figure(found, size=size, form=form)
-    sink = Sink(sys.stdout.buffer if path is None else path)
-    try:
-        sink.write(made)
-        sink.commit()
-    finally:
-        sink.abort()
+    write_bytes(path or sys.stdout.buffer, figure(found, size=size, form=form))
 
 
 def _print(found: Sequence[Line]) -> None:

@@ -32,6 +32,7 @@ from hybridlog_storage.errors import UsageError
 if TYPE_CHECKING:
     from contextlib import AbstractContextManager
 
+    from hybridlog.query.topics import TopicMatcher
     from hybridlog.store import Store
     from hybridlog_storage.segments.segment_writer import SegmentSettings
 
@@ -190,7 +191,7 @@ def check_choices(choices: RecordChoices) -> None:
     """Refuse parameters that do not fit together.
 
     Raises:
-        UsageError: Neither a log nor a robot, or what is not fit for several logs.
+        UsageError: Neither a log nor a robot, both, or --watch of a file.
     """
     if choices.paths and choices.is_live:
         raise UsageError("Give either logs to record or a robot (--ros1, --ros2, …), not both.")
@@ -198,14 +199,17 @@ def check_choices(choices: RecordChoices) -> None:
         raise UsageError(
             "Nothing to record: give a log, or --ros1, --ros2, --foxglove URL or --replay FILE."
         )
-    if choices.is_live:
-        return
-    if choices.name is not None and len(choices.paths) > 1:
-        raise UsageError("--name names one recording: give one path, or leave it out.")
-    choices.check_latched(None)
     for path in choices.paths if choices.watch else ():
         if not path.is_dir():
             raise UsageError(f"--watch takes directories, and {path} is none.")
+
+
+def matchers(choices: RecordChoices) -> tuple[TopicMatcher | None, TopicMatcher | None]:
+    """The topics, and those without index documents; new ones, as each counts its uses."""
+    from hybridlog.query.topics import matcher
+
+    chosen = matcher(choices.topics, choices.exclude) if choices.topics or choices.exclude else None
+    return chosen, matcher(choices.no_index) if choices.no_index else None
 
 
 def segment_settings(choices: RecordChoices, chunk_size: int = DEFAULT_CHUNK) -> SegmentSettings:

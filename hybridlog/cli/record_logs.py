@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -17,7 +18,7 @@ from hybridlog.cli import output
 from hybridlog.cli.ls import with_misfits
 from hybridlog.cli.options import parse_tags
 from hybridlog.cli.progress import Bar
-from hybridlog.cli.record_choices import RecordChoices, opened_to_record, segment_settings
+from hybridlog.cli.record_choices import RecordChoices, matchers, opened_to_record, segment_settings
 from hybridlog.cli.render import Column, bytes_of, numbers, print_fields, print_table
 from hybridlog.cli.signals import if_stopped
 from hybridlog.cli.watching import watch
@@ -38,7 +39,6 @@ if TYPE_CHECKING:
     from hybridlog.formats.find import Found, Watch
     from hybridlog.formats.log_set import LogSet
     from hybridlog.formats.reading import Source
-    from hybridlog.query.topics import TopicMatcher
     from hybridlog.record.recorder import RecordOptions, RecordReport
     from hybridlog.store import Store
 
@@ -52,55 +52,40 @@ def record_logs(choices: RecordChoices) -> None:
     if choices.name is not None and len(logs) > 1:
         raise UsageError(f"--name names one recording; there are {len(logs)} logs.")
     # Wrong options are found before a store is made.
-    recorder = LogRecorder(choices, Results(choices, logs, is_search=walked is not None))
-    check_new_store(choices, logs)
-    done = recorder.results
-    for problem in walked.problems if walked is not None else ():
-        done.fail(None, problem)
+    recorder = LogRecorder(choices, logs, is_search=walked is not None)
     total, before = sum(log.size for log in logs), 0
-    try:
-        with (
-            if_stopped(done.on_stop),
-            opened_to_record(choices) as store,
-            at_safe_points(),
-            Bar(_what(logs), total, quiet=choices.quiet) as bar,
-        ):
-            for log in logs:
-                safe_point()
-                # A single one needs no name beside the bar.
-                name = f"{log.path.name}: " if len(logs) > 1 else ""
-                recorder.record(store, log, partial(_shown, bar, before, name))
-                before += log.size
-    finally:
-        done.show()
-    done.exit()
+    with (
+        recorder.opened() as store,
+        at_safe_points(),
+        Bar(_what(logs), total, quiet=choices.quiet) as bar,
+    ):
+        for problem in walked.problems if walked is not None else ():
+            recorder.fail(None, problem)
+        for log in logs:
+            safe_point()
+            # A single one needs no name beside the bar.
+            name = f"{log.path.name}: " if len(logs) > 1 else ""
+            recorder.record(store, log, partial(_shown, bar, before, name))
+            before += log.size
 
 
 def record_watched(choices: RecordChoices) -> None:
     """Record what lies in directories, and what comes into them, until a signal ends it."""
     from hybridlog.formats.find import Watch
 
-    done = Results(choices, (), is_search=True)
-    recorder = LogRecorder(choices, done)
-    check_new_store(choices, [])
+    recorder = LogRecorder(choices, (), is_search=True)
     watches = [Watch(path, choices.settle) for path in choices.paths]
     for one in watches:
         one.check()
-    try:
-        with if_stopped(done.on_stop), opened_to_record(choices) as store:
-            look = partial(_look, recorder, store, watches, set[Path]())
-            places = ", ".join(map(str, choices.paths))
-            watch(places, look, quiet=choices.quiet, report=partial(done.fail, None))
-            left = [path for one in watches for path in one.unfinished()]
-            for path in left[:_MAX_UNFINISHED]:
-                output.note(
-                    f"{path} is not complete; `hybridlog record {path}` records what it has."
-                )
-            if more := left[_MAX_UNFINISHED:]:
-                output.note(f"and {len(more)} more that are not complete")
-    finally:
-        done.show()
-    done.exit()
+    with recorder.opened() as store:
+        look = partial(_look, recorder, store, watches, set[Path]())
+        places = ", ".join(map(str, choices.paths))
+        watch(places, look, quiet=choices.quiet, report=partial(recorder.fail, None))
+        left = [path for one in watches for path in one.unfinished()]
+        for path in left[:_MAX_UNFINISHED]:
+            output.note(f"{path} is not complete; `hybridlog record {path}` records what it has.")
+        if more := left[_MAX_UNFINISHED:]:
+            output.note(f"and {len(more)} more that are not complete")
 
 
 def _look(
@@ -175,87 +160,6 @@ def _shown(bar: Bar, before: int, name: str, read: int, messages: int) -> None:
     bar(before + read, f"{name}{output.counted(messages, 'message')}")
 
 
-class LogRecorder:
-    """Records logs with the options of the command.
-
-    Attributes:
-        results: What came of the logs.
-
-    Raises:
-        UsageError: An option is wrong.
-    """
-
-    def __init__(self, choices: RecordChoices, results: Results) -> None:
-        self.results = results
-        self._choices = choices
-        self._settings = segment_settings(choices)
-        self._tags = parse_tags(choices.set_tag)
-        _matchers(choices)
-
-    def record(self, store: Store, log: LogSet, progress: Callable[[int, int], None]) -> None:
-        """Record a log, or those parts of it that are not in the store yet.
-
-        Raises:
-            HybridlogError: It was the only one, and cannot be recorded.
-        """
-        for piece in self._pieces(store, log):
-            self.results.begin(piece.path)
-            try:
-                report = self._record_one(store, piece, progress)
-                report.entry = with_misfits(store, report.entry)
-                self.results.add(piece.path, report)
-            except AlreadyRecordedError as error:
-                self.results.known(piece.path, error)
-            except (SourceError, UsageError) as error:
-                self.results.fail(piece.path, error)
-        self.results.finish(log)
-
-    def _pieces(self, store: Store, log: LogSet) -> Iterator[LogSet]:
-        """The log; in a search, the missing parts of it if others were recorded on their own."""
-        from hybridlog.formats.log_set import LogSet
-        from hybridlog.formats.reading import fingerprint
-
-        missing: list[Path] = []
-        if self.results.is_search and not self._choices.again and len(log.files) > 1:
-            find = store.catalog.with_fingerprint
-            try:
-                prints = fingerprint(log.files)
-            except SourceError:
-                prints = None  # the error is told when it is recorded
-            if prints is not None and find(prints.whole) is None:
-                of_files = zip(log.files, prints.parts, strict=True)
-                missing = [file for file, part in of_files if find(part) is None]
-        is_whole = not missing or len(missing) == len(log.files)
-        yield from [log] if is_whole else map(LogSet.at, missing)
-
-    def _record_one(
-        self, store: Store, log: LogSet, progress: Callable[[int, int], None]
-    ) -> RecordReport:
-        from hybridlog.record.recorder import RecordOptions
-
-        choices = self._choices
-        with anywhere():
-            source = log.open()
-        with source:
-            matcher, no_index = _matchers(choices)
-            options = RecordOptions(
-                name=choices.name or log.name,
-                tags=self._tags,
-                matcher=matcher,
-                between=_between(source, log, choices),
-                latched=not choices.no_latched,
-                original_times=choices.original_times,
-                again=choices.again,
-                settings=self._settings,
-                no_index=no_index,
-            )
-            report = store.record(source, options, progress)
-            _check_not_empty(report, source, store, options)
-        for pattern in (p for one in (matcher, no_index) if one is not None for p in one.unused()):
-            output.note(f"{log.path}: no topic fits {output.quoted(pattern)}.")
-        return report
-
-
 def check_new_store(choices: RecordChoices, logs: Sequence[LogSet]) -> None:
     """Fail before a store is made, when no log can be read or the server does not answer."""
     from hybridlog.maintenance.lease import check
@@ -325,26 +229,24 @@ def _outside(source: Source, between: tuple[int, int]) -> TimeError:
     return TimeError(f"{source.path} has no message from {low} up to {high}{spans}.")
 
 
-def _matchers(choices: RecordChoices) -> tuple[TopicMatcher | None, TopicMatcher | None]:
-    """The topics, and those without index documents; new ones, as each counts its uses."""
-    from hybridlog.query.topics import matcher
-
-    chosen = matcher(choices.topics, choices.exclude) if choices.topics or choices.exclude else None
-    return chosen, matcher(choices.no_index) if choices.no_index else None
-
-
-class Results:
-    """Results of logs, for the table at the end and the exit code.
+class LogRecorder:
+    """Records logs with the options of the command; what came of them is told at the end.
 
     Args:
         choices: The options.
         logs: The logs to record; without any, each is reported at once, as there is no end.
         is_search: Whether logs are looked for in directories, so that known ones are no error.
+
+    Raises:
+        UsageError: An option is wrong.
     """
 
     def __init__(self, choices: RecordChoices, logs: Sequence[LogSet], *, is_search: bool) -> None:
         self._choices = choices
-        self._logs, self.is_search = logs, is_search
+        self._settings = segment_settings(choices)
+        self._tags = parse_tags(choices.set_tag)
+        matchers(choices)
+        self._logs, self._is_search = logs, is_search
         self._unfinished = [log.path for log in logs]
         self._current: Path | None = None
         self._recorded = self._known = self._failed = 0
@@ -354,17 +256,89 @@ class Results:
         self._summaries: list[dict[str, Any]] = []
         self._messages: list[str] = []
 
-    def begin(self, path: Path) -> None:
-        """The log at a path is recorded now."""
-        self._current = path
+    @contextmanager
+    def opened(self) -> Iterator[Store]:
+        """The store; at the end the results are shown, and an error sets the exit code."""
+        check_new_store(self._choices, self._logs)
+        try:
+            with if_stopped(self._on_stop), opened_to_record(self._choices) as store:
+                yield store
+        finally:
+            self._show()
+        if self._exit_code:
+            raise click.exceptions.Exit(self._exit_code)
 
-    def finish(self, log: LogSet) -> None:
-        """Note that a log is done: all of it is stored, or reported as left out."""
+    def record(self, store: Store, log: LogSet, progress: Callable[[int, int], None]) -> None:
+        """Record a log, or those parts of it that are not in the store yet.
+
+        Raises:
+            HybridlogError: It was the only one, and cannot be recorded.
+        """
+        for piece in self._pieces(store, log):
+            self._current = piece.path
+            try:
+                report = self._record_one(store, piece, progress)
+                report.entry = with_misfits(store, report.entry)
+                self._add(piece.path, report)
+            except AlreadyRecordedError as error:
+                if not self._is_search:
+                    self.fail(piece.path, error)
+                else:
+                    self._current = None
+                    self._known += 1
+                    self._summarise({"path": str(piece.path), "known": str(error)})
+            except (SourceError, UsageError) as error:
+                self.fail(piece.path, error)
+        # All of it is stored, or reported as left out.
         if log.path in self._unfinished:
             self._unfinished.remove(log.path)
 
-    def add(self, path: Path, report: RecordReport) -> None:
-        """Add a recording."""
+    def _pieces(self, store: Store, log: LogSet) -> Iterator[LogSet]:
+        """The log; in a search, the missing parts of it if others were recorded on their own."""
+        from hybridlog.formats.log_set import LogSet
+        from hybridlog.formats.reading import fingerprint
+
+        missing: list[Path] = []
+        if self._is_search and not self._choices.again and len(log.files) > 1:
+            find = store.catalog.with_fingerprint
+            try:
+                prints = fingerprint(log.files)
+            except SourceError:
+                prints = None  # the error is told when it is recorded
+            if prints is not None and find(prints.whole) is None:
+                of_files = zip(log.files, prints.parts, strict=True)
+                missing = [file for file, part in of_files if find(part) is None]
+        is_whole = not missing or len(missing) == len(log.files)
+        yield from [log] if is_whole else map(LogSet.at, missing)
+
+    def _record_one(
+        self, store: Store, log: LogSet, progress: Callable[[int, int], None]
+    ) -> RecordReport:
+        from hybridlog.record.recorder import RecordOptions
+
+        choices = self._choices
+        with anywhere():
+            source = log.open()
+        with source:
+            matcher, no_index = matchers(choices)
+            options = RecordOptions(
+                name=choices.name or log.name,
+                tags=self._tags,
+                matcher=matcher,
+                between=_between(source, log, choices),
+                latched=not choices.no_latched,
+                original_times=choices.original_times,
+                again=choices.again,
+                settings=self._settings,
+                no_index=no_index,
+            )
+            report = store.record(source, options, progress)
+            _check_not_empty(report, source, store, options)
+        for pattern in (p for one in (matcher, no_index) if one is not None for p in one.unused()):
+            output.note(f"{log.path}: no topic fits {output.quoted(pattern)}.")
+        return report
+
+    def _add(self, path: Path, report: RecordReport) -> None:
         self._current = None
         self._recorded += 1
         for error in _problems(path, report, quiet=self._choices.quiet):
@@ -379,19 +353,6 @@ class Results:
                 f"{output.size(entry.stored_bytes)}, from {path}"
             )
 
-    def known(self, path: Path, error: AlreadyRecordedError) -> None:
-        """Add a log whose content is in the store.
-
-        Raises:
-            AlreadyRecordedError: It is the only one.
-        """
-        if not self.is_search:
-            self.fail(path, error)
-            return
-        self._current = None
-        self._known += 1
-        self._summarise({"path": str(path), "known": str(error)})
-
     def fail(self, path: Path | None, error: HybridlogError) -> None:
         """Add an error.
 
@@ -399,7 +360,7 @@ class Results:
             HybridlogError: It is of the only log.
         """
         self._current = None
-        if len(self._logs) == 1 and not self.is_search:
+        if len(self._logs) == 1 and not self._is_search:
             self._unfinished.clear()
             raise error
         output.note(f"hybridlog: {error}")
@@ -416,7 +377,7 @@ class Results:
         elif self._choices.as_json:
             output.print_json_line(summary)
 
-    def on_stop(self) -> str:
+    def _on_stop(self) -> str:
         """The effect of stopping now on the recordings."""
         left = list(self._unfinished)
         if self._current is not None:
@@ -428,17 +389,17 @@ class Results:
             parts.append(f"{output.counted(self._recorded, 'recording')} stored{before}.")
         return " ".join(parts)
 
-    def show(self) -> None:
+    def _show(self) -> None:
         """Print the finished recordings, and what became of the others."""
         choices = self._choices
         if choices.as_json and self._summaries:
-            one = len(choices.paths) == 1 and not self.is_search
+            one = len(choices.paths) == 1 and not self._is_search
             output.print_json(self._summaries[0] if one else self._summaries)
         elif len(self._reports) == 1 and not choices.as_json and not choices.quiet:
             _print_one(*self._reports[0])
         elif self._reports and not choices.as_json and not choices.quiet:
             _print_several([report for _, report in self._reports])
-        if not self.is_search:
+        if not self._is_search:
             return
         for message in self._messages:
             output.note(f"not recorded: {message}")
@@ -449,11 +410,6 @@ class Results:
                 f"{output.counted(self._recorded, 'log')} recorded, {self._known} in the store "
                 f"already, {self._failed} not recorded."
             )
-
-    def exit(self) -> None:
-        """Exit with the code of the first error, if there is one."""
-        if self._exit_code:
-            raise click.exceptions.Exit(self._exit_code)
 
 
 def _summary(path: Path, report: RecordReport) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import signal
 import sys
 import time
@@ -25,14 +24,6 @@ if TYPE_CHECKING:
     from hybridlog.store import Store
 
 _EVERY_S = 1.0
-
-
-@dataclass(frozen=True, slots=True)
-class _Field:
-    """A field whose values are summarized."""
-
-    topic: str
-    path: str
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,7 +75,7 @@ def top_command(given: _Given) -> None:
             if opened is not None:
                 values = _values(opened, recorder, state, fields, span)
             if given.as_json:
-                print(json.dumps({**summary_of(state), "fields": values}), flush=True)  # noqa: T201
+                output.print_json_line({**summary_of(state), "fields": values})
             elif table is not None:
                 table.show(state, _lines(values))
             else:
@@ -106,34 +97,22 @@ def _ended_by_ctrl_c() -> Iterator[None]:
             raise
 
 
-def _field(text: str) -> _Field:
+def _field(text: str) -> tuple[str, str]:
+    """The topic and the field."""
     topic, sign, path = text.rpartition(":")
     if not sign or not topic or not path or path.startswith("$"):
         raise UsageError(f"--field takes TOPIC:FIELD, such as scan:ranges.min, not {text!r}.")
-    return _Field(topic, path)
+    return topic, path
 
 
 def _values(
     store: Store,
     recording: str,
     state: RecorderState,
-    fields: Sequence[_Field],
+    fields: Sequence[tuple[str, str]],
     span: int,
 ) -> list[dict[str, Any]]:
-    """Least, mean and greatest of each field in the last seconds, of what is flushed."""
-    since = time.time_ns() - span
-    found = []
-    for topic, field in _resolved(state, fields):
-        row: dict[str, Any] = {"topic": topic, "field": field.path, "n": 0}
-        with suppress(UsageError):  # nothing has come yet
-            (one, *_) = store.query([topic], [recording]).between(since).stats(field.path)
-            row |= {"n": one.count, "least": one.min, "mean": one.mean, "greatest": one.max}
-        found.append(row)
-    return found
-
-
-def _resolved(state: RecorderState, fields: Sequence[_Field]) -> Iterator[tuple[str, _Field]]:
-    """Each field with the full name of its topic.
+    """Least, mean and greatest of each field in the last seconds, of what is flushed.
 
     Raises:
         TopicError: No topic has that name.
@@ -141,12 +120,18 @@ def _resolved(state: RecorderState, fields: Sequence[_Field]) -> Iterator[tuple[
     """
     from hybridlog.query.topics import resolve
 
-    topics = [topic.topic for topic in state.topics]
-    for field in fields:
-        (topic, *others) = resolve([field.topic], topics)
+    since, topics = time.time_ns() - span, [topic.topic for topic in state.topics]
+    found = []
+    for name, field in fields:
+        (topic, *others) = resolve([name], topics)
         if others:
-            raise UsageError(f"{field.topic!r} fits several topics: name one.")
-        yield topic, field
+            raise UsageError(f"{name!r} fits several topics: name one.")
+        row: dict[str, Any] = {"topic": topic, "field": field, "n": 0}
+        with suppress(UsageError):  # nothing has come yet
+            (one, *_) = store.query([topic], [recording]).between(since).stats(field)
+            row |= {"n": one.count, "least": one.min, "mean": one.mean, "greatest": one.max}
+        found.append(row)
+    return found
 
 
 def _lines(values: Sequence[Mapping[str, Any]]) -> list[str]:

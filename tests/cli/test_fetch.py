@@ -217,7 +217,7 @@ def test_latched_messages_stand_in_front(store: Path, seen: list[Seen], tmp_path
 def test_options_about_latched_messages_without_any() -> None:
     with pytest.raises(UsageError, match="not in csv"):
         Latched(no_latched=False, original_times=True).check_latched("csv")
-    for form in ("mcap", "bag", None):
+    for form in ("mcap", "bag"):
         Latched(no_latched=False, original_times=True).check_latched(form)
     Latched(no_latched=True, original_times=False).check_latched("csv")
 
