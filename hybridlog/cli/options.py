@@ -323,7 +323,7 @@ class Verbose:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Asking(Filtered, Verbose):
+class Asking(Verbose, Filtered):
     """Options of commands that answer about messages."""
 
 

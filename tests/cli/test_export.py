@@ -34,7 +34,7 @@ def test_a_topic_beside_the_range_is_said_and_left_out(store: Path, tmp_path: Pa
 def test_wrong_targets(store: Path, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("mine")
     nameless = run("export", tmp_path / "x", store=store, code=2)
-    assert "end it in .mcap or .bag, or name a directory" in nameless.err
+    assert "add --format, or end it in .mcap, .bag." in nameless.err
     run("export", tmp_path / "x.csv", store=store, code=2)
     with contextlib.chdir(tmp_path):
         assert "for a pipe" in run("export", "-", "-F", "mcap", store=store, code=2).err
