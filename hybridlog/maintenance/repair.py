@@ -27,7 +27,7 @@ from hybridlog_storage.manifest import replace
 from hybridlog_storage.mongo.index_state import IndexState
 from hybridlog_storage.segments.gone_log import open_log
 from hybridlog_storage.segments.recovery import rebuild_summary
-from hybridlog_storage.segments.segment_check import SegmentCheck
+from hybridlog_storage.segments.segment_check import damage_of
 from hybridlog_storage.segments.segment_file import is_rows
 
 if TYPE_CHECKING:
@@ -118,8 +118,7 @@ def _damage(path: Path, inventory: Inventory) -> Iterator[Repaired]:
         if is_rows(name):
             continue
         digest = inventory.digest(number)
-        with SegmentCheck(path / name, digest) as check:
-            problems = list(check.problems())
+        problems, _ = damage_of(path / name, digest)
         if problems and rebuild_summary(path / name, digest):
             yield Repaired(inventory.name, name, "its summary was rebuilt")
         else:

@@ -18,7 +18,7 @@ from hybridlog_storage.manifest import encode
 from hybridlog_storage.mongo.collection_names import collection_of
 from hybridlog_storage.mongo.index_documents import between
 from hybridlog_storage.mongo.index_state import IndexState
-from hybridlog_storage.segments.segment_check import SegmentCheck
+from hybridlog_storage.segments.segment_check import damage_of
 from hybridlog_storage.segments.segment_file import is_rows
 
 if TYPE_CHECKING:
@@ -304,12 +304,10 @@ class _Check:
             self._lost[collection_of(topic)] += int(part["messages"])
 
     def _check_bytes(self, name: str, digest: str, tell: Callable[[int], None]) -> None:
-        with SegmentCheck(self._path / name, digest) as check:
-            for offset, problem in check.problems(tell):
-                self._is_damaged = True
-                is_data = check.summary is not None and offset < check.summary.start
-                cure = RESTORE if is_data else _REPAIR
-                self.found(f"{name} byte {offset}", problem, cure)
+        found, has_summary = damage_of(self._path / name, digest, tell)
+        self._is_damaged |= bool(found)
+        for offset, problem in found:
+            self.found(f"{name} byte {offset}", problem, RESTORE if has_summary else _REPAIR)
 
     @property
     def _rebuild(self) -> str:

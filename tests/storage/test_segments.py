@@ -34,7 +34,7 @@ from hybridlog_storage.segments.attachments import Attachment
 from hybridlog_storage.segments.chunk import StoredChunk
 from hybridlog_storage.segments.compression import Compressor, FilePart
 from hybridlog_storage.segments.recovery import Recovered, recover_segment
-from hybridlog_storage.segments.segment_check import SegmentCheck
+from hybridlog_storage.segments.segment_check import damage_of
 from hybridlog_storage.segments.segment_file import Sealed, SealedChannel, SegmentFile
 from hybridlog_storage.segments.segment_format import (
     CHUNK_TABLE_OPCODE,
@@ -121,8 +121,7 @@ def recorder(
 
 
 def problems(path: Path, digest: str = "") -> list[tuple[int, str]]:
-    with SegmentCheck(path, digest) as check:
-        return list(check.problems())
+    return damage_of(path, digest)[0]
 
 
 def summary_of(path: Path, number: int) -> SegmentSummary:
@@ -1255,8 +1254,7 @@ def test_a_full_disk_costs_nothing_that_was_told_of(
     found = []
     for path in sorted(directory.iterdir()):
         number = int(path.name.removesuffix(".mcap"))
-        with SegmentCheck(path, told[path.name].digest) as check:
-            assert list(check.problems()) == []
+        assert problems(path, told[path.name].digest) == []
         with SegmentReader(path, number) as reader:
             summary = reader.summary()
             assert summary.size == told[path.name].bytes
@@ -1291,17 +1289,15 @@ def test_all_that_is_wrong_is_told_at_once(tmp_path: Path) -> None:
         damaged[at] ^= 1
     path.write_bytes(damaged)
     read: list[int] = []
-    with SegmentCheck(path) as check:
-        found = list(check.problems(read.append))
+    found, has_summary = damage_of(path, progress=read.append)
     assert [start for start, _ in found] == [chunks[0].offset]
     assert "chunk 0" in found[0][1]
     assert read == sorted(read)
-    assert check.summary is not None
+    assert has_summary
     # Without its summary, what has a checksum of its own is still looked at.
     damaged[-3] ^= 1
     damaged[chunks[0].offset + 30] ^= 1
     path.write_bytes(damaged)
-    with SegmentCheck(path) as check:
-        assert check.summary is None
-        starts = [start for start, _ in check.problems()]
-    assert chunks[0].offset in starts
+    found, has_summary = damage_of(path)
+    assert not has_summary
+    assert chunks[0].offset in [start for start, _ in found]

@@ -17,6 +17,7 @@ from mcap.records import ChunkIndex
 from hybridlog_storage.disk import durability, files
 from hybridlog_storage.disk.append_file import BLOCK, AppendFile
 from hybridlog_storage.errors import SegmentError, StoreError
+from hybridlog_storage.mcap.mcap_content import parse_content
 from hybridlog_storage.messages import Schema
 from hybridlog_storage.segments.chunk_table import parts_of
 from hybridlog_storage.segments.segment_file import (
@@ -27,7 +28,6 @@ from hybridlog_storage.segments.segment_file import (
 )
 from hybridlog_storage.segments.segment_format import (
     ARRIVAL_HEAD,
-    CHUNK_HEAD,
     END_METADATA,
     INDEX_HEAD,
     START,
@@ -39,7 +39,7 @@ from hybridlog_storage.segments.segment_format import (
     json_metadata,
     trailer_of,
 )
-from hybridlog_storage.segments.segment_reader import ChunkPlace, SegmentReader, check_format
+from hybridlog_storage.segments.segment_reader import SegmentReader, check_format, open_chunk
 from hybridlog_storage.segments.walk import Damage, Walk, WalkedChunk
 
 
@@ -189,42 +189,35 @@ class _Rest:
 
     def _take(self, chunk: WalkedChunk) -> int:
         """Note a chunk if its content is whole; return how many messages it has."""
-        offset, length, trailer, known = chunk
-        times = int(known["first"].min()), int(known["last"].max())
+        offset, length, trailer, _ = chunk
+        data = self._reader.read(offset, length + trailer)
         try:
-            batch = self._reader.read_chunk(
-                ChunkPlace(
-                    number=0,
-                    offset=offset,
-                    length=length,
-                    trailer=trailer,
-                    first=times[0],
-                    last=times[1],
-                    channels=(),
-                )
-            ).batch
+            content, times, compressed = open_chunk(data[:length])
+            batch = parse_content(content).batch
+            behind = trailer_of(data[length:], offset)
+            behind.arrivals(len(batch))
+            parts, *span = parts_of(batch, index_order(batch.channel, batch.log_time))
+            if times != (*span,):
+                raise SegmentError("its times are not those of its messages")
         except SegmentError as error:
-            self._damage.append(Damage(offset, length + trailer, str(error)))
+            reason = f"a chunk is damaged: {error}"
+            self._damage.append(Damage(offset, length + trailer, reason))
             return 0
-        head = self._reader.read(offset, length)
-        compression, compressed = compression_of(head)
-        behind = trailer_of(self._reader.read(offset + length, trailer), offset)
         indexes = {channel: INDEX_HEAD.size + rows.nbytes for channel, rows in behind.indexes or ()}
         if not indexes:
             size = trailer - ARRIVAL_HEAD - len(behind.packed)
             self._damage.append(Damage(offset + length, size, "message indexes are damaged"))
-        parts, first, last = parts_of(batch, index_order(batch.channel, batch.log_time))
         self._segment.note_chunk(
             ChunkIndex(
-                message_start_time=first,
-                message_end_time=last,
+                message_start_time=times[0],
+                message_end_time=times[1],
                 chunk_start_offset=offset,
                 chunk_length=length,
                 message_index_offsets=index_offsets(indexes, offset + length),
                 message_index_length=sum(indexes.values()),
-                compression=compression,
+                compression=compression_of(data)[0],
                 compressed_size=compressed,
-                uncompressed_size=CHUNK_HEAD.unpack_from(head)[4],
+                uncompressed_size=len(content),
             ),
             parts,
             trailer,
