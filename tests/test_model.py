@@ -698,7 +698,6 @@ class Machine(RuleBasedStateMachine):
         laid = Laid.out(content)
         cut = len(content) if part == "sealed" else laid.cut(spot, part)
         whole = [n for n, c in enumerate(laid.chunks) if c.arrivals_end <= cut]
-        torn = [n for n, c in enumerate(laid.chunks) if c.end <= cut < c.arrivals_end]
         assert self.store.database is not None
         with pymongo.MongoClient[dict[str, Any]](self.uri) as client:
             index = Index(client[self.store.database.name], recording, number)
@@ -723,16 +722,6 @@ class Machine(RuleBasedStateMachine):
         survivors = {seq: m for seq, m in by_seq.items() if seq not in in_segment}
         assert list(self.store.repairs.recovered) == [known.name]
         survivors |= {seq: by_seq[seq] for n in whole for seq in arrivals[n]}
-        for chunk in torn:
-            # Its arrival numbers are lost: it arrived after all else, in its own order.
-            with pymongo.MongoClient[dict[str, Any]](self.uri) as client:
-                index = Index(client[self.store.database.name], recording, number)
-                new = index.arrivals()[chunk]
-            assert new == list(range(new[0], new[0] + len(new)))
-            in_files = (seq for seq, m in survivors.items() if m.topic != MARKS)
-            assert new[0] > max(in_files, default=-1)
-            for seq, old in zip(new, arrivals[chunk], strict=True):
-                survivors[seq] = replace(by_seq[old], seq=seq)
         if number == 0 and laid.described > cut and not known.marks:
             assert recording not in self.store.directory.ids()
             del self.model[recording]
@@ -977,7 +966,7 @@ class Laid:
     """Where records lie in a segment, read record by record.
 
     Attributes:
-        described: Where the arrival record ends that proves which recording this is.
+        described: Where the metadata record ends that says which recording this is.
         chunks: Its chunks with messages.
         end: Where the data section ends.
     """
@@ -1001,6 +990,7 @@ class Laid:
         described = 0
         chunks: list[LaidChunk] = []
         last: tuple[int, int] = (0, 0)
+        has_messages = False
         at = 8
         while True:
             opcode, length = struct.unpack_from("<BQ", content, at)
@@ -1008,14 +998,15 @@ class Laid:
             if opcode == 0x0F:
                 return cls(described, chunks, at)
             if opcode == 0x06:
-                last = at, end
-            elif opcode == 0x90:
-                # One of no chunk is behind other records, or behind a chunk of definitions.
-                (chunk,) = struct.unpack_from("<Q", content, at + 9)
-                if chunk:
-                    assert chunk == last[0]
-                    chunks.append(LaidChunk(*last, end))
+                last, has_messages = (at, end), False
+            elif opcode == 0x07:
+                has_messages = True  # others have definitions
+            elif opcode == 0x0C:
                 described = described or end
+            elif opcode == 0x90:
+                assert struct.unpack_from("<Q", content, at + 9) == last[:1]
+                if has_messages:
+                    chunks.append(LaidChunk(*last, end))
             at = end
 
 
