@@ -6,6 +6,7 @@ import io
 import struct
 from collections import Counter
 from typing import TYPE_CHECKING, Any, NamedTuple
+from unittest.mock import ANY
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from hybridlog.formats.mcap.reader import McapSource
 from hybridlog.formats.reading import BATCH_BYTES, BATCH_MESSAGES, Damage
 from hybridlog_storage.errors import SourceError
 from hybridlog_storage.mcap.mcap_scan import MAGIC, ScannedChunk, scan
+from hybridlog_storage.segments.segment_format import METADATA_CHECK
 from tests import places
 from tests.data import DATA, needs_data
 
@@ -427,4 +429,4 @@ def test_what_stands_behind_the_last_message_is_recorded(
             found = {a.name: a.data for a in reader.iter_attachments()}
             metadata = {record.name: record.metadata for record in reader.iter_metadata()}
     assert found == {"before": b"first", "behind": b"last"}
-    assert metadata["robot"] == {"name": "r2"}
+    assert metadata["robot"] == {"name": "r2", METADATA_CHECK: ANY}
