@@ -95,7 +95,12 @@ class Shared(ABC):
     @lazy
     def catalog(self) -> Catalog:
         """Recordings, channels, chunks and schemas."""
-        return open_catalog(self.directory)
+        made = open_catalog(self.directory)
+        made.fill = self._fill
+        return made
+
+    def _fill(self) -> None:
+        self._files.look_at_all()
 
     @lazy
     def tables(self) -> Tables:

@@ -9,6 +9,7 @@ import resource
 import shutil
 import signal
 import socket
+import sqlite3
 import struct
 import subprocess
 import sys
@@ -535,6 +536,28 @@ def test_a_damaged_catalog_is_made_again(store: Path, way: str) -> None:
     done = run("ls", "--json", store=store)
     assert (json.loads(done.out), done.err) == (listed, "")
     assert run("verify", store=store).err == ""
+
+
+@pytest.mark.parametrize("way", [*OF_CATALOG, "locked"])
+def test_a_catalog_lost_while_the_store_is_open(store: Path, way: str) -> None:
+    """Names stay unique, and content that is there is refused."""
+    with (
+        hl.open(store, mongo=NOWHERE) as opened,
+        contextlib.closing(sqlite3.connect(store / CATALOG)) as db,
+    ):
+        imu = opened.topic(IMU)
+        want = imu.count(), imu.where(WHERE).count(), sum(1 for _ in imu)
+        one, two = opened.summaries()
+        if way == "locked":
+            db.execute("BEGIN EXCLUSIVE")
+        else:
+            OF_CATALOG[way](store / CATALOG)
+        assert (imu.count(), imu.where(WHERE).count(), sum(1 for _ in imu)) == want
+        assert opened.catalog.with_fingerprint(two.source["fingerprint"]) is not None
+        assert opened.edit(one.id, name=two.name).name == f"{two.name}-2"
+        opened.refresh()
+        assert len(opened.recordings()) == 2
+        assert (imu.count(), imu.where(WHERE).count(), sum(1 for _ in imu)) == want
 
 
 @pytest.mark.parametrize("way", ["removed", "cut", "garbled"])

@@ -12,7 +12,7 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter, defaultdict
-from collections.abc import Collection, Container, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Container, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
@@ -71,6 +71,7 @@ _MAX_NOTED: Final = 1 << 17  # recordings with bounds of one kind
 _MAX_KINDS: Final = 256  # of bounds
 _MAX_SOUGHT: Final = 200  # bytes of a name; of long ones, a number takes the place of the end
 _FEW: Final = 100  # cells that are read one by one
+_TRIES: Final = 3  # to read it, while it is lost
 _T = TypeVar("_T")
 Ends = tuple[float | None, float | None]
 """The least and the greatest of some numbers; None twice without any."""
@@ -420,7 +421,11 @@ class Catalog:
     Attributes:
         is_in_memory: True if what is put into it stays in the memory of this process.
         has_changed: True if an ended recording was changed by this process.
+        fill: Puts all recordings of the store into it, once what it had is lost.
+        filled: The `opened` as of which it has them.
     """
+
+    fill: Callable[[], object] | None = None
 
     def __init__(
         self,
@@ -437,6 +442,13 @@ class Catalog:
         self._topics: dict[str, tuple[TopicType, ...]] = {}
         self._bounds: dict[str, dict[str, Ends]] = defaultdict(dict)  # to be written, by kind
         self._tables = Cache(_MAX_TABLES)
+        self.filled = 0
+
+    @property
+    def opened(self) -> int:
+        """Changes when what it had may be lost."""
+        self._cells.read(_SUMMARY, "")
+        return self._cells.opened
 
     @property
     def recordings_file(self) -> Path:
@@ -580,6 +592,19 @@ class Catalog:
 
     # Answers.
 
+    def _with(self, text: bytes) -> list[RecordingSummary]:
+        """Summaries of all recordings that have some text.
+
+        Raises:
+            CatalogError: It is lost again and again.
+        """
+        for _ in range(_TRIES):
+            bodies = self._cells.each(_SUMMARY, text).values()
+            if self.fill is None or self.filled == self._cells.opened:
+                return [one for body in bodies if (one := _read(_SUMMARY_OF, body))]
+            self.fill()
+        raise CatalogError(f"The catalog {self._store / CATALOG} is lost all the time. Ask again.")
+
     def summaries(self, recordings: Collection[str] | None = None) -> list[RecordingSummary]:
         """Summaries of recordings by id, None for all; unordered, without damaged ones."""
         indexed = self._bodies(_INDEX, recordings)
@@ -598,10 +623,9 @@ class Catalog:
     def names_like(self, name: str) -> set[tuple[str, str]]:
         """Names and ids of recordings whose names begin like this one, if one is called so."""
         quoted = encode(name)
-        if not self._cells.each(_SUMMARY, quoted):
+        if not self._with(quoted):
             return set()
-        bodies = self._cells.each(_SUMMARY, quoted[:_MAX_SOUGHT].removesuffix(b'"')).values()
-        return {(one.name, one.id) for body in bodies if (one := _read(_SUMMARY_OF, body))}
+        return {(o.name, o.id) for o in self._with(quoted[:_MAX_SOUGHT].removesuffix(b'"'))}
 
     def _bodies(self, kind: str, recordings: Collection[str] | None) -> dict[str, bytes]:
         """The cells of some recordings by id; None for all."""
@@ -637,11 +661,8 @@ class Catalog:
 
     def with_fingerprint(self, fingerprint: str) -> RecordingSummary | None:
         """A recording of a log with this content, or of one of which it is a part."""
-        for body in self._cells.each(_SUMMARY, _body(fingerprint)).values():
-            summary = _read(_SUMMARY_OF, body)
-            if summary is not None and fingerprint in _fingerprints(summary.source):
-                return summary
-        return None
+        found = self._with(_body(fingerprint))
+        return next((one for one in found if fingerprint in _fingerprints(one.source)), None)
 
     def _index(self, recording: str) -> _Indexed:
         return _indexed(self._cells.read(_INDEX, recording))

@@ -82,6 +82,7 @@ class Cells:
     Attributes:
         lock: Held while cells are read or changed.
         changes: Counts what was written here.
+        opened: Counts the databases that were used: a new one may lack what was written before.
     """
 
     def __init__(self, path: Path | None, owner: str, *, writes: bool = True) -> None:
@@ -89,7 +90,7 @@ class Cells:
         self._owner = crc32(f"{_VERSION} {owner}".encode()) >> 1
         self._writes = writes and path is not None
         self.lock = RLock()
-        self.changes = 0
+        self.changes = self.opened = 0
         self._db: sqlite3.Connection | None = None
         self._file: tuple[int, int] | None = None  # that is open; None in memory
         self._again_at = float("inf")
@@ -108,6 +109,7 @@ class Cells:
         if self._db is not None and self._is_current():
             return self._db
         self.close()
+        self.opened += 1
         if self._writes:
             self._db, self._file = self._opened()
             self._again_at = float("inf")
@@ -189,6 +191,7 @@ class Cells:
                     else:
                         break
             self.close()
+            self.opened += 1
             self._db = _connected()
             self._fill(self._db)
             self._again_at = time.monotonic() + _AGAIN_S if self._writes else float("inf")
