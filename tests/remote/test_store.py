@@ -96,25 +96,6 @@ def test_requests(published: str, proxy: Proxy) -> None:
         assert asked(store.topic("/arm").where("x > 5 and x < 50").count) == 0
 
 
-def test_edits(here: Path, address: str, proxy: Proxy) -> None:
-    publish_all(here, address, ("run", "short-0"))
-    with hl.open(address) as store:
-        store.edit("run", tag={"who": "me"})
-        store.edit("run", note="good")
-        assert store.edit("run", name="A new run").name == "A new run"
-        store.remove("short-0")
-        assert [one.name for one in store.recordings()] == ["A new run"]
-    files.mounted.clear()
-    with hl.open(address) as store:
-        (entry,) = store.recordings()
-        assert (entry.name, entry.tags) == ("A new run", {"place": "lab", "who": "me"})
-        assert [note["text"] for note in entry.notes] == ["good"]
-        assert store.topic("/arm").count() == 400
-        assert not store.verify().findings
-    answer("tag", "A new run", "why=test", store=Path(address))
-    assert "why=test" in answer("ls", store=Path(address)).out
-
-
 @pytest.mark.parametrize(
     "words",
     [
@@ -556,7 +537,8 @@ def test_all_commands_tell_of_lost_objects(here: Path, address: str) -> None:
     lose(address, "000001.mcap", run)
     assert "stored data lost" in told("ls").out
     assert told("ls", "--json").json[0]["status"] != "complete"
-    assert "202 messages lost" in told("fetch", "scan").err
+    said = told("fetch", "scan")
+    assert f"{420 - len(said.lines)} messages lost" in said.err
     assert [one["place"] for one in told("verify", "--json").json["findings"]] == ["segment 1"]
     assert "000001.mcap is missing" in commands.run("verify", store=Path(address), code=1).out
     lose(address, f"{run}.json")

@@ -69,6 +69,7 @@ _FOOTER = struct.Struct("<BQQQI")  # head, start of the summary and of its offse
 _TAIL = _FOOTER.size + len(MAGIC)
 _MAX_SUMMARY = 1 << 30
 _PIECE = 4 << 20  # bytes read at once for a checksum
+_AHEAD = 64 << 20  # bytes that are announced at once; a multiple of the former
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -435,6 +436,9 @@ class SegmentReader:
         """
         found = hasher()
         for at in range(0, self.size, _PIECE):
+            if at % _AHEAD == 0:
+                with suppress(OSError):  # what is missing is told when it is read
+                    files.fetch(self._fd, [(at, at + _AHEAD)])
             found.update(self.read(at, min(_PIECE, self.size - at)))
             if progress is not None:
                 progress(at)
