@@ -10,10 +10,8 @@ import shutil
 import signal
 import socket
 import sqlite3
-import struct
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -337,64 +335,7 @@ def test_a_recording_is_made_and_edited_though_its_mongod_ended(
         assert not verified.findings
 
 
-# --- resets, handles, roles ---
-
-
-class Resetting:
-    """A TCP proxy that resets the connection of some commands. A context manager.
-
-    Args:
-        target: Port of the server.
-        resets: Number of commands, from the first one, whose connection is reset.
-    """
-
-    def __init__(self, target: int, resets: int) -> None:
-        self._target = target
-        self.left = resets
-        self._listener = socket.create_server(("127.0.0.1", 0))
-        self.port = self._listener.getsockname()[1]
-
-    def __enter__(self) -> Resetting:
-        threading.Thread(target=self._accept, daemon=True).start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._listener.close()
-
-    def _accept(self) -> None:
-        with contextlib.suppress(OSError):
-            while True:
-                client, _ = self._listener.accept()
-                server = socket.create_connection(("127.0.0.1", self._target))
-                for pair in ((client, server), (server, client)):
-                    threading.Thread(target=self._forward, args=pair, daemon=True).start()
-
-    def _forward(self, source: socket.socket, target: socket.socket) -> None:
-        with contextlib.suppress(OSError), source, target:
-            while data := source.recv(1 << 16):
-                if self.left and b"$db\0\x08\0\0\0healing" in data:
-                    self.left -= 1
-                    source.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
-                    return
-                target.sendall(data)
-
-
-@pytest.mark.parametrize("resets", [1, 8])
-def test_opening_goes_on_after_resets(
-    store: Path, tmp_path: Path, server: str, resets: int
-) -> None:
-    port = int(server.partition("127.0.0.1:")[2].partition("/")[0])
-    with Resetting(port, resets) as proxy:
-        uri = server.replace(str(port), str(proxy.port))
-        with hl.open(store, mongo=uri, require_database=True) as opened:
-            assert sum(documents(opened)) > 0
-        assert not proxy.left
-
-
-@pytest.fixture
-def server(tmp_path: Path) -> Iterator[str]:
-    with other_mongod(tmp_path) as uri:
-        yield uri
+# --- handles, roles ---
 
 
 @pytest.fixture
@@ -466,17 +407,6 @@ def test_too_few_handles_are_told_as_that(store: Path) -> None:
     ended(store)
     assert before.keys() <= set((store / "mongod" / "data").iterdir())
     assert run("verify", store=store).err == ""
-
-
-def test_a_mongod_that_cannot_accept_for_lack_of_handles(store: Path, calls: Calls) -> None:
-    def refused(uri: str, **_: float) -> Database:
-        with (store / "mongod" / "mongod.log").open("a") as log:
-            log.write('{"s":"W","msg":"Error accepting","attr":"Too many open files"}\n')
-        raise ConnectionLostError("connection reset")
-
-    calls(Database, "connect", refused)
-    with hl.open(store) as opened, pytest.raises(DatabaseError, match="ran out of file handles"):
-        documents(opened)
 
 
 @pytest.mark.parametrize("has_catalog", [True, False])

@@ -23,7 +23,7 @@ from hybridlog.wording import listed
 from hybridlog_storage.errors import StoreError, UsageError
 
 if TYPE_CHECKING:
-    from hybridlog.index.field_indexes import FieldIndex
+    from hybridlog.index.of_store import FieldIndex
     from hybridlog.maintenance.report import ArraysOfTopic
     from hybridlog.store import Store
 
@@ -114,8 +114,8 @@ class _Rebuild(Choosing, _Shared):
 def rebuild(given: _Rebuild) -> None:
     """Rebuild the index from the segments, recording by recording.
 
-    Queries of the other recordings work meanwhile. After an interruption, the next command
-    that needs the index finishes the recording at which it stopped.
+    Without -r it is emptied first. After an interruption, the next command that needs the
+    index makes the rest.
     """
     started = time.monotonic()
     with given.opened(require_database=True, cache_mb=given.cache_size, quiet=given.quiet) as store:
@@ -123,8 +123,8 @@ def rebuild(given: _Rebuild) -> None:
         total = sum(entry.stored_bytes for entry in chosen.summaries)
         with (
             if_stopped(
-                "Finished recordings stay indexed; the next command that needs the index "
-                "finishes the recording at which it stopped."
+                "Finished recordings stay indexed; the next command that needs the index makes "
+                "the rest."
             ),
             Bar("index rebuild", total, quiet=given.quiet) as bar,
         ):

@@ -169,11 +169,7 @@ class Connection:
                 self.damage.append(self._mongod.damage)
         else:
             uri = with_password(uri)
-        try:
-            return Database.connect(uri, timeout_s=timeout_s)
-        except ConnectionLostError as error:
-            shortage = None if self._mongod is None else self._mongod.shortage()
-            raise (shortage or error) from error
+        return Database.connect(uri, timeout_s=timeout_s)
 
     def address(self, wait_s: float) -> str:
         """The URI of the index for other programs; it stays the same. Has no password.

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import TYPE_CHECKING, Final, TypeAlias
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
-from hybridlog.index import field_indexes
 from hybridlog.index.connection import IndexAddress, again_if_lost
 from hybridlog.query.query import Query
 from hybridlog.query.question import Question
@@ -13,10 +12,10 @@ from hybridlog_storage.errors import TopicError, UsageError
 from hybridlog_storage.mongo.collection_names import collection_of
 
 if TYPE_CHECKING:
-    from hybridlog.index.field_indexes import FieldIndex
     from hybridlog.maintenance.report import ArraysOfTopic, Progress
     from hybridlog.opened import OpenStore
     from hybridlog_storage.catalog import RecordingEntry
+    from hybridlog_storage.mongo.database import Database
 
 # `list` is a method below.
 _Entries: TypeAlias = "list[RecordingEntry]"
@@ -24,6 +23,24 @@ _FieldIndexes: TypeAlias = "list[FieldIndex]"
 _Arrays: TypeAlias = "list[ArraysOfTopic]"
 _CLIENTS_WAIT_S: Final = 600.0
 """Seconds for which a published MongoDB waits for clients."""
+_OWN_FIELDS: Final = ("_meta.t", "_meta.pub", "_meta.inserted_at", "_meta.rec")
+"""Fields that every index document has, in any topic."""
+_MAX_FIELDS: Final = 8
+
+
+class FieldIndex(NamedTuple):
+    """An index of MongoDB on some fields of a topic.
+
+    It changes the duration of a question and never its answer, so MongoDB alone has it, and
+    `index rebuild` leaves it in place.
+
+    Attributes:
+        topic: Full name.
+        fields: Fields in the order of the index.
+    """
+
+    topic: str
+    fields: tuple[str, ...]
 
 
 class Index:
@@ -87,9 +104,12 @@ class Index:
         """
         query = self._about(topic)
         database = self._shared.index.database_for("An index", writes=True)
-        query.fields(*(name for name in fields if name not in field_indexes.OWN_FIELDS))
-        field_indexes.add(database, query.topics, fields)
-        return field_indexes.of_topics(database, query.topics)
+        query.fields(*(name for name in fields if name not in _OWN_FIELDS))
+        keys = _keys(fields)
+        for name in map(collection_of, query.topics):
+            database.ensure_collection(name)
+            database.create_index(name, keys)
+        return _indexes(database, query.topics)
 
     @again_if_lost
     def remove(self, topic: str, *fields: str) -> int:
@@ -100,14 +120,15 @@ class Index:
         """
         query = self._about(topic)
         database = self._shared.index.database_for("An index", writes=True)
-        return field_indexes.remove(database, query.topics, fields)
+        keys = _keys(fields)
+        return sum(database.drop_index(collection_of(name), keys) for name in query.topics)
 
     @again_if_lost
     def list(self, *topics: str) -> _FieldIndexes:
         """The indexes on fields, of these topics or of all."""
         database = self._shared.index.database_for("Indexes")
         names = self._about(*topics).topics if topics else self._shared.now().topics()
-        return field_indexes.of_topics(database, names)
+        return _indexes(database, names)
 
     def arrays(self, *topics: str, off: bool = False, progress: Progress | None = None) -> _Arrays:
         """Keep long arrays in the tables of topics, beside their summaries.
@@ -168,6 +189,24 @@ class Index:
 
     def _about(self, *topics: str) -> Query:
         return Query(self._shared, Question(*self._shared.now().resolve(topics)))
+
+
+def _indexes(database: Database, topics: Iterable[str]) -> list[FieldIndex]:
+    """The indexes of some topics, in the order of the topics, by fields."""
+    return [
+        FieldIndex(topic, tuple(field for field, _ in keys))
+        for topic in topics
+        for keys in database.indexes(collection_of(topic))
+    ]
+
+
+def _keys(fields: Sequence[str]) -> list[tuple[str, int]]:
+    if not fields:
+        raise UsageError("Name at least one field; `hybridlog info -t TOPIC` lists them.")
+    if len(fields) > _MAX_FIELDS or len(set(fields)) != len(fields):
+        raise UsageError(f"An index takes up to {_MAX_FIELDS} fields, without duplicates.")
+    # Documents have no brackets: an index on an element is one on the array.
+    return [(field.replace("[]", ""), 1) for field in fields]
 
 
 @again_if_lost

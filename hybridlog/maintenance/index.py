@@ -167,8 +167,7 @@ class StoreIndex:
     def rebuild(self, entries: Iterable[RecordingEntry]) -> dict[str, HybridlogError]:
         """Rebuild the index of recordings from their segments, one after the other.
 
-        The other recordings can be asked meanwhile. The next opening finishes an interrupted
-        rebuild.
+        The next opening finishes an interrupted rebuild.
 
         Returns:
             Why some are unchanged, by id: another process holds them, or they are gone.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -16,12 +17,12 @@ from hybridlog.schema.column import STAMP
 from hybridlog_storage.errors import (
     ConnectionLostError,
     IndexChangedError,
+    StoreError,
     TopicError,
     WhereError,
 )
 from hybridlog_storage.mongo.collection_names import collection_of
-from hybridlog_storage.mongo.index_columns import KEY, key_columns
-from hybridlog_storage.mongo.index_documents import between
+from hybridlog_storage.mongo.index_documents import KEY_BYTES, between
 from hybridlog_storage.mongo.index_state import Indexed, IndexState
 from hybridlog_storage.stopping import check_wanted
 from hybridlog_storage.times import END
@@ -38,6 +39,9 @@ _MAX_RANGES = 100
 """Recordings whose log time is asked for apart: as many as one command takes."""
 _TRIES = 3
 _SEQ = Field(("_meta", "seq"))
+_KEY = np.dtype([("head", "V14"), ("key", ">u8", 3), ("end", "u1")])
+"""A document that has only its `_id`."""
+_HEAD = np.void(struct.pack("<i5siB", _KEY.itemsize, b"\x05_id", KEY_BYTES, 0))
 Filter = dict[str, object]
 _READABLE: Filter = {"_meta.error": {"$exists": False}}
 _WITHOUT_FIELDS: Filter = {"_meta.error": {"$exists": True}}
@@ -114,12 +118,14 @@ class IndexReader:
         A recording has each number once, whatever the topic.
         """
         found: dict[str, list[NDArray[np.int64]]] = defaultdict(list)
-        for raw in asked.database.each(asked.queries(parts, own), lambda _: {"$project": KEY}):
+        for raw in asked.database.each(
+            asked.queries(parts, own), lambda _: {"$project": {"_id": 1}}
+        ):
             check_wanted()
-            keys = key_columns(raw)
-            self._counters.documents_read += len(keys)
-            for recording in np.unique(keys.recording).tolist():
-                found[f"{recording:016x}"].append(keys.seq[keys.recording == recording])
+            _, recordings, seqs = keys_of(raw).T
+            self._counters.documents_read += len(seqs)
+            for recording in np.unique(recordings).tolist():
+                found[f"{recording:016x}"].append(seqs[recordings == recording].astype(np.int64))
         none = np.empty(0, np.int64)
         return {
             part.recording.key: np.unique(np.concatenate([none, *found[part.recording.key]]))
@@ -232,6 +238,19 @@ class _Asked:
                     condition.update(_on_clock(clock, bounds))
                 found.append((collection_of(topic), _joined(condition, own)))
         return found
+
+
+def keys_of(batch: bytes) -> NDArray[np.uint64]:
+    """uint64[n, 3]: log time, recording and arrival number of documents that have only `_id`.
+
+    Raises:
+        StoreError: A document is not one of hybridlog's.
+    """
+    if len(batch) % _KEY.itemsize == 0:
+        found = np.frombuffer(batch, _KEY)
+        if (found["head"] == _HEAD).all():
+            return found["key"].astype(np.uint64)
+    raise StoreError("An index document has an unexpected _id: run `hybridlog index rebuild`.")
 
 
 def _made(indexed: _Indexed) -> dict[str, str]:

@@ -360,13 +360,6 @@ class EmbeddedMongod:
             f"{cure.format(data=self.data)}".rstrip()
         )
 
-    def shortage(self) -> ResourceError | None:
-        """The error if the running mongod lacks file handles or memory, or did when it ended."""
-        kind, cure = _other_cause(self._last_run()) or (DatabaseError, "")
-        if kind is not ResourceError:
-            return None
-        return ResourceError(f"The mongod of {self._directory}: {cure} Its log is {self.log}.")
-
 
 START_LINE = "hybridlog: starts mongod\n"
 """What the keeper logs before it starts mongod."""
