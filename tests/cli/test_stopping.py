@@ -199,7 +199,7 @@ def stop(frame, event, argument):
 
 FILES = (
     "record_logs.py", "open_store.py",
-    "formats/writing.py", "formats/raw.py", "rosbag1/writer.py", "unfinished.py",
+    "formats/writing.py", "formats/raw.py", "mcap/writer.py", "rosbag1/writer.py", "unfinished.py",
 )
 MOMENT = sys.argv.pop(1)
 sys.setprofile(stop)
