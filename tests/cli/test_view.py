@@ -110,4 +110,4 @@ def test_an_origin_without_mcap_is_refused(store: Path) -> None:
     running = start("--store", store, "--allow-origin", "http://localhost:8080")
     _, errors = running.communicate(timeout=20)
     assert running.returncode == 2
-    assert "--allow-origin is about --mcap" in errors
+    assert "--allow-origin is for --mcap" in errors
