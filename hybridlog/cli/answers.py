@@ -23,7 +23,6 @@ from hybridlog.cli.progress import Bar
 from hybridlog.cli.render import ROWS_AT_ONCE, Column, print_table
 from hybridlog.cli.signals import if_stopped
 from hybridlog.formats import OUTPUTS, formats_of, is_directory, suffixes_of
-from hybridlog.formats.answer import Answer
 from hybridlog.formats.slices import IN_FORCE, Front, log_of, payload_bytes
 from hybridlog_storage.disk.unfinished import is_published, undone
 from hybridlog_storage.errors import PayloadError, UsageError
@@ -33,7 +32,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from hybridlog.attachments import Extras
-    from hybridlog.formats.answer import Line
+    from hybridlog.formats.answer import Answer, Line
     from hybridlog.formats.writing import Target
     from hybridlog.message import Message
     from hybridlog.query.answers.completeness import Completeness
@@ -368,6 +367,8 @@ def write_answer(
     Returns:
         Messages that are missing, because they do not fit their definition.
     """
+    from hybridlog.formats.answer import Answer
+
     if query.question.frame is not None:
         _write_in_frame(query, form, target, strict=strict)
         return 0
@@ -415,6 +416,8 @@ def write_answer(
 
 def _write_in_frame(query: Query, form: str, target: Target, *, strict: bool) -> None:
     """Write points and poses in the frame of the question."""
+    from hybridlog.formats.answer import Answer
+
     completeness = query.completeness if strict else None
     if OUTPUTS[form].content != "payloads":
         OUTPUTS[form].write(_rows(_checked(query.to_tables(), completeness)), target)
@@ -442,6 +445,7 @@ def _checked(pieces: Iterable[_T], completeness: Callable[[], Completeness] | No
 
 def write_following(following: Following, form: str) -> None:
     """Print messages as they come in a text format, and flush those that come together."""
+    from hybridlog.formats.answer import Answer
     from hybridlog.frames.answer import stream
     from hybridlog.frames.lines import lines
 
@@ -465,6 +469,8 @@ class _Anywhere:
 
 def _rows(tables: Iterable[pa.Table], schema: pa.Schema | None = None) -> Answer:
     """Tables as they are, or as lines."""
+    from hybridlog.formats.answer import Answer
+
     return Answer(lines=chain.from_iterable(map(_lines_of, tables)), tables=tables, schema=schema)
 
 
@@ -492,6 +498,7 @@ def _write_pictures(
         DefinitionError: the same.
     """
     from hybridlog.arrays.message_arrays import IMAGES
+    from hybridlog.formats.answer import Answer
     from hybridlog.query.answers.video import frames_in_front
     from hybridlog.schema.states import without_payload
 

@@ -36,7 +36,7 @@ _NEAR: Final = 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Check(Strict, Topics, Verbose, Listing):
+class _Check(Strict, Verbose, Topics, Listing):
     contract: Path | None = option(
         "Judge recordings by the rules in this file; exit code 12 if one is broken.",
         "FILE",

@@ -193,6 +193,8 @@ def check_choices(choices: RecordChoices) -> None:
     Raises:
         UsageError: Neither a log nor a robot, both, or --watch of a file.
     """
+    if choices.ros1 is not None and not choices.ros1.strip():
+        raise UsageError("A ROS master's URI looks like http://host:11311; this one is empty.")
     if choices.paths and choices.is_live:
         raise UsageError("Give either logs to record or a robot (--ros1, --ros2, …), not both.")
     if not choices.paths and not choices.is_live:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Given(Strict, Topics, Tabular, Verbose):
+class _Given(Strict, Verbose, Topics, Tabular):
     words: ClassVar[tuple[str, ...]] = ()  # type: ignore[misc]
     target: str | None = argument(
         "The frame of the results.", "[TARGET]", shell_complete=complete_frame

@@ -6,7 +6,6 @@ import csv
 import io
 import json
 import subprocess
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -269,19 +268,6 @@ def test_places_that_cannot_be_written(store: Path, tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_head_is_quiet(store: Path) -> None:
-    command = [*COMMAND, "fetch", "--store", str(store), "-t", "*image_raw", "-F", "raw"]
-    with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=environment()
-    ) as process:
-        assert process.stdout is not None
-        assert process.stderr is not None
-        assert process.stdout.read(1)
-        process.stdout.close()
-        assert process.stderr.read() == b""
-        assert process.wait() == 0
-
-
 def test_a_full_disk_behind_standard_output(store: Path) -> None:
     asked = (
         ["fetch", "-t", "scan", "-F", "csv"],
@@ -368,30 +354,6 @@ def test_the_closing_line_counts_what_is_given(capsys: pytest.CaptureFixture[str
     given = SimpleNamespace(quiet=False, verbose=True)
     print_end(cast("Topics", given), Counters(messages=251, reduced=12), 0.1)
     assert capsys.readouterr().err.startswith("239 messages, ")
-
-
-LOADED = """
-import atexit, os, sys
-os._exit = sys.exit  # a command leaves without the interpreter's own end
-atexit.register(lambda: print("pandas" in sys.modules, file=sys.stderr))
-from hybridlog.cli import main
-main()
-"""
-
-
-@pytest.mark.parametrize("form", ["jsonl", "table", "csv", "parquet", "npz", "mcap"])
-def test_pandas_is_not_loaded(form: str, store: Path, tmp_path: Path) -> None:
-    """It takes three tenths of a short command's time."""
-    to = [] if form in {"jsonl", "table"} else ["-o", str(tmp_path / f"x.{form}")]
-    done = subprocess.run(
-        [sys.executable, "-c", LOADED, *SCAN, "-F", form, *to],
-        capture_output=True,
-        text=True,
-        env=environment(HYBRIDLOG_STORE=str(store)),
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    assert done.stderr.splitlines()[-1] == "False"
 
 
 def test_remarks_follow_the_closing_line(store: Path) -> None:

@@ -130,9 +130,9 @@ def test_what_does_not_fit_a_directory(top: Path, tmp_path: Path) -> None:
     store = tmp_path / "store"
     for words, said in (
         ((top, "--name", "x"), "there are 4 logs"),
-        ((top, "--watch", "--name", "x"), "--watch makes many"),
+        ((top, "--watch", "--name", "x"), "--watch and --name exclude each other"),
         ((top / "a.mcap", "--watch"), "takes directories"),
-        (("--replay", top / "a.mcap", "--watch"), "not for a running robot"),
+        (("--replay", top / "a.mcap", "--watch"), "--replay and --watch exclude each other"),
         ((top, "--watch", "--settle", "soon"), "not a duration"),
     ):
         code, _, err = record(store, *words)

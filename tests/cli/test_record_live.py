@@ -420,7 +420,7 @@ def test_a_ring_keeps_the_end_and_what_is_pinned(logs: Path, tmp_path: Path) -> 
         ("--ros1 http://localhost:1 --speed 2", "--speed is for --replay"),
         ("--ros1 127.0.0.1:11311", "'127.0.0.1:11311' is not an address like http://host:port"),
         ("--ros1 localhost", "'localhost' is not an address like http://host:port"),
-        ("--ros1 '' --duration 1s", "'' is not an address like http://host:port"),
+        ("--ros1 '' --duration 1s", "looks like http://host:11311; this one is empty"),
         ("--ros1 {bag}", "is not an address like http://host:port"),
         ("--foxglove http://robot", "does not begin with ws://"),
         ("--ros2 --qos /nowhere/qos.yaml", "/nowhere/qos.yaml: cannot be opened"),

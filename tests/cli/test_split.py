@@ -95,7 +95,7 @@ def test_nothing_leaves_no_file(store: Path, tmp_path: Path) -> None:
     assert "exists" in run(*fetch, "--split-by", "recording", store=store, code=2).err
     assert [one.name for one in tmp_path.iterdir()] == ["x-two.csv"]
     for more, why in (
-        (("--split-by", "recording", "--count"), "--count and --split-by exclude each other"),
+        (("--split-by", "recording", "--count"), "--count and --output exclude each other"),
         (("-t", "odom", "--split-by", "ranges.min < 1"), "Name the topic of the predicate"),
     ):
         assert why in run(*fetch, *more, store=store, code=2).err

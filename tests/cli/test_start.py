@@ -320,7 +320,7 @@ def test_completion_names_the_shells_that_it_knows() -> None:
 
 
 def test_a_reader_that_ends_early_is_no_error(store: Path) -> None:
-    for arguments in (("--help",), ("info",), ("fetch", "-t", "scan", "-F", "raw")):
+    for arguments in (("--help",), ("info",), ("fetch", "-t", "*image_raw", "-F", "raw")):
         process = subprocess.Popen(
             [*COMMAND, *arguments],
             stdout=subprocess.PIPE,
@@ -388,9 +388,13 @@ def test_a_fetch_by_topic_and_time_imports_what_it_needs(
     assert len(ours) < most, sorted(ours)
 
 
-def test_a_count_by_content_imports_what_it_needs(store: Path) -> None:
+def test_a_question_by_content_imports_what_it_needs(store: Path, tmp_path: Path) -> None:
     question = ("fetch", "--store", store, "-t", "scan", "--where", "ranges.min < 1", "--count")
     loaded = modules_of(*question)
+    # Where pyarrow and numpy are at work, too.
+    for form in ("table", "csv", "parquet", "npz"):
+        to = ("-F", form) if form == "table" else ("-o", tmp_path / f"x.{form}")
+        assert "pandas" not in packages_of(*question[:-1], *to)
     # A table answers.
     unneeded = {"pandas", "pydantic", "rich", "pymongo", "rosbags"}
     assert {name.split(".")[0] for name in loaded} & unneeded == set()

@@ -199,7 +199,7 @@ def stop(frame, event, argument):
 
 FILES = (
     "record_logs.py", "open_store.py",
-    "formats/writing.py", "formats/raw.py", "rosbag1/writer.py", "unfinished.py",
+    "formats/writing.py", "formats/raw.py", "mcap/writer.py", "rosbag1/writer.py", "unfinished.py",
 )
 MOMENT = sys.argv.pop(1)
 sys.setprofile(stop)
@@ -226,11 +226,11 @@ def stop_at(moment: str, *command: str | Path, store: Path) -> subprocess.Comple
         ("call _what", ["robot.bag"], "Nothing of {robot.bag} is stored."),
         ("call _what", ["robot.bag", "odd.mcap"], "Nothing of 2 logs is stored."),
         (
-            "return Results.finish",
+            "return LogRecorder.record",
             ["odd.mcap", "robot.bag"],
             "Nothing of {robot.bag} is stored. 1 recording stored before.",
         ),
-        ("return Results.finish", ["odd.mcap"], "1 recording stored."),
+        ("return LogRecorder.record", ["odd.mcap"], "1 recording stored."),
     ],
 )
 def test_a_stopped_record_says_what_is_stored(

@@ -309,14 +309,6 @@ def test_binary_formats_are_kept_off_the_terminal(store: Path) -> None:
         assert "-o" in shown
 
 
-def test_control_characters_of_a_log(store: Path) -> None:
-    for width in (60, 160):
-        code, shown = on_terminal("fetch", "-t", "*x", "--store", store, width=width)
-        assert code == 0
-        assert "\\x1b[2Jboo" in shown
-        assert "\x1b[2J" not in shown
-
-
 def test_rm_asks(fresh: Path) -> None:
     code, shown = on_terminal("rm", "small", "--store", fresh, typed=b"n\n")
     assert code == 1

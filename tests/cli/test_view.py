@@ -65,16 +65,6 @@ def test_an_unknown_recording_is_refused_before_anything_is_served(store: Path) 
     assert "monday" in errors
 
 
-def test_the_only_store_below_the_folder_is_shown(tmp_path: Path) -> None:
-    StoreDirectory.create(tmp_path / "demo" / "robot-logs")
-    running = start("--json", folder=tmp_path)
-    assert running.stdout is not None
-    assert running.stdout.readline() == "{\n"
-    running.terminate()
-    _, errors = running.communicate(timeout=20)
-    assert "Store: demo/robot-logs, the only one below this folder." in errors
-
-
 def test_of_several_stores_none_is_guessed(tmp_path: Path) -> None:
     for name in ("one", "two"):
         StoreDirectory.create(tmp_path / name)
@@ -110,4 +100,4 @@ def test_an_origin_without_mcap_is_refused(store: Path) -> None:
     running = start("--store", store, "--allow-origin", "http://localhost:8080")
     _, errors = running.communicate(timeout=20)
     assert running.returncode == 2
-    assert "--allow-origin is about --mcap" in errors
+    assert "--allow-origin is for --mcap" in errors

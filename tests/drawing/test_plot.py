@@ -111,7 +111,7 @@ def test_standard_output_and_text(drive: Drive) -> None:
     ("arguments", "problem"),
     [
         (("-o", "x.gif"), "end it in .png, .svg, .pdf."),
-        (("-F", "svg"), "-o FILE.svg"),
+        (("-F", "svg"), "--format is for --output"),
         (("-o", "x.png", "--size", "1x1"), "A size is 1200x400"),
         (("-o", "x.png", "--size", "99999x100"), "A size is 1200x400"),
     ],

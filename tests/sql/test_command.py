@@ -189,7 +189,7 @@ def test_a_choice_of_recordings_and_a_time(root: Path) -> None:
     for scope, problem in (
         (["--last", "1d"], "There is no recording with messages from"),
         (["-r", "third"], "third"),
-        (["--last", "90y", "--between", "start", "end"], "--last is a range of time"),
+        (["--last", "90y", "--between", "start", "end"], "--last and --between exclude each other"),
     ):
         with pytest.raises(HybridlogError, match=problem):
             run(root, count, *scope)
