@@ -247,7 +247,7 @@ class Shared(ABC):
         topics = {channel.topic for channel in recording.channels}
         self._tables_tried -= {(recording.id, topic) for topic in topics}
         if "tables" in vars(self):
-            self.tables.look_again_for(recording, topics)
+            self.tables.look_again()
 
 
 def _make_room(opened: dict[Any, Any]) -> None:

@@ -34,6 +34,7 @@ ALLOWED = {
     "av": ("hybridlog.arrays.video",),
     "blake3": ("hybridlog_storage.disk.append_file", "hybridlog_storage.manifest"),
     "bson": (
+        "hybridlog.columns.rows_file",
         "hybridlog.query.predicate.mongo_filter",
         "hybridlog.query.predicate.tree",
         "hybridlog.schema.index_bodies",
@@ -64,6 +65,7 @@ ALLOWED = {
     ),
     "mcap_protobuf": ("hybridlog.schema.protobuf_codec",),
     "msgspec": (
+        "hybridlog.columns.layout",
         "hybridlog.entries",
         "hybridlog.live.state",
         "hybridlog.maintenance",
@@ -97,6 +99,7 @@ ALLOWED = {
         "hybridlog.schema.arrow_protobuf",
         "hybridlog.schema.arrow_types",
         "hybridlog.schema.codec",
+        "hybridlog.schema.left",
         "hybridlog.query",
         "hybridlog.sql",
         "hybridlog.tf",

@@ -102,11 +102,7 @@ def test_an_entry_says_what_is_in_its_chunk(chunks: list[list[Message]]) -> None
     stored = [chunk_of(messages, number) for number, messages in enumerate(chunks)]
     _, entries = ChunkIndexer(RECORDING).documents_of(stored, CHANNELS)
     for chunk, entry, messages in zip(stored, entries, chunks, strict=True):
-        assert entry.recording == RECORDING
         assert (entry.segment, entry.number) == (chunk.segment, chunk.number)
-        assert (entry.offset, entry.length, entry.trailer) == (chunk.offset, 50, 5)
-        times = [log_time for _, _, log_time, _ in messages]
-        assert (entry.first, entry.last) == (min(times), max(times))
         assert entry.messages == len(messages)
         assert set(entry.stats) == {channel for channel, _, _, _ in messages}
         for number, stats in entry.stats.items():

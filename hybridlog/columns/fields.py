@@ -280,18 +280,10 @@ def alike(pieces: Sequence[Array], *, by_type: bool = False) -> list[Array]:
         raise UnfitError(str(error)) from error
 
 
-def detached(array: Array, begin: int, end: int) -> Array:
-    """An array that shares no memory with a range of addresses.
-
-    Args:
-        array: The array.
-        begin: First address of memory that will be reused.
-        end: The address after its end.
-    """
-    if any(b is not None and begin <= b.address < end for b in array.buffers()):
-        half = len(array) // 2
-        return pa.concat_arrays([array.slice(0, half), array.slice(half)])
-    return array
+def copied(array: Array) -> Array:
+    """A copy of an array, which lets go the memory that it was read from."""
+    half = len(array) // 2
+    return pa.concat_arrays([array.slice(0, half), array.slice(half)])
 
 
 def without(array: Array, rows: Any, total: int) -> Array:

@@ -13,7 +13,6 @@ from __future__ import annotations
 import errno
 import logging
 import shutil
-import threading
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -51,7 +50,7 @@ if TYPE_CHECKING:
     from hybridlog.columns.fields import FieldShape
     from hybridlog.columns.parquet_file import ParquetFileWriter
     from hybridlog_storage.catalog import RecordingEntry
-    from hybridlog_storage.messages import Channel
+    from hybridlog_storage.messages import Buffer, Channel
     from hybridlog_storage.segments.chunk import StoredChunk
 
 GROUP_ROWS: Final = 131_072
@@ -291,21 +290,14 @@ class TableWriter:
         self._topics: dict[tuple[str, str], _Topic] = {}
         self._of_channel: dict[int, tuple[_Topic, Codec, State]] = {}
         self._has_publish_time: dict[int, bool] = {}
-        self._seen: Counter[int] = Counter()  # messages of each segment
-        self._sealed: dict[int, tuple[str, int]] = {}  # digest and messages
-        self._cut: dict[int, str] = {}  # digests of the closed segments
-        self._lock = threading.Lock()  # protects the sealed segments
+        self._seen: set[int] = set()  # segments
+        self._cut: dict[int, str] = {}  # digests of the closed ones
 
     @property
     def rows_in_memory(self) -> int:
         """Number of rows waiting to be written."""
         pieces = (piece.rows for topic in self._topics.values() for piece in topic.pieces)
         return sum(len(chunk.batch) for chunk in self._held) + sum(pieces)
-
-    def seal(self, segment: int, digest: str, messages: int) -> None:
-        """Register a sealed segment. Thread safe."""
-        with self._lock:
-            self._sealed[segment] = digest, messages
 
     def add(self, chunk: StoredChunk, channels: Mapping[int, Channel]) -> None:
         """Add the messages of a chunk."""
@@ -317,9 +309,8 @@ class TableWriter:
                 self._collect(chunk)
             else:
                 self._add_expired(chunk)
-            self._seen[chunk.segment] += len(chunk.batch)
+            self._seen.add(chunk.segment)
             self._spill(chunk.segment)
-            self._cut_sealed()
 
     def cut(self, segment: int, digest: str) -> None:
         """Register that a segment gets no more messages."""
@@ -382,13 +373,12 @@ class TableWriter:
         held, self._held = self._held, []
         batch = joined([chunk.batch for chunk in held])
         messages = Messages.joined([*map(Messages.of, held)])._replace(at=batch.offset)
-        data = np.frombuffer(batch.buffer, np.uint8)
         for topic, codec, state, rows in self._by_topic(messages.channel):
             piece = Piece(held[0].segment, messages.take(rows), None, state=state)
             piece.has_arrays = topic.has_arrays
             with self._only(topic):
                 if codec.indexed and state is State.WHOLE:
-                    self._add_fields(piece, topic, codec, data)
+                    self._add_fields(piece, topic, codec, batch.buffer)
                 topic.add(piece)
 
     def _by_topic(
@@ -419,12 +409,10 @@ class TableWriter:
             self._has_publish_time[number] = channel.has_publish_time
         return found
 
-    def _add_fields(
-        self, piece: Piece, topic: _Topic, codec: Codec, data: NDArray[np.uint8]
-    ) -> None:
-        from hybridlog.columns.fields import detached, without
+    def _add_fields(self, piece: Piece, topic: _Topic, codec: Codec, buffer: Buffer) -> None:
+        from hybridlog.columns.fields import copied, without
 
-        decoded = codec.columns(data.data, piece.messages.at, piece.messages.length)
+        decoded = codec.columns(buffer, piece.messages.at, piece.messages.length)
         piece.errors += [(bad.rows, bad.reason) for bad in decoded.unreadable]
         if not len(decoded.rows):
             return
@@ -432,9 +420,7 @@ class TableWriter:
         columns = topic.shape.columns(records)
         if topic.points is not None:
             columns = topic.points.with_points(columns, records)
-        begin = data.ctypes.data
-        columns = detached(columns, begin, begin + data.nbytes)
-        piece.fields = without(columns, decoded.rows, piece.rows)
+        piece.fields = without(copied(columns), decoded.rows, piece.rows)
 
     def _add_expired(self, chunk: StoredChunk) -> None:
         """Make rows of what is left of expired messages."""
@@ -525,23 +511,6 @@ class TableWriter:
         if shutil.disk_usage(self._root).free < _RESERVE:
             raise OSError(errno.ENOSPC, "the disk is nearly full")
 
-    def _cut_sealed(self) -> None:
-        """Finish files of sealed segments of which all messages have been added."""
-        if not self._sealed:
-            return
-        with self._lock:
-            ready = [
-                segment
-                for segment, (_, messages) in self._sealed.items()
-                if self._seen[segment] == messages
-            ]
-        for segment in sorted(ready):
-            if self._held and self._held[0].segment == segment:
-                self._decode()
-            with self._lock:
-                digest, _ = self._sealed.pop(segment)
-            self._cut_segment(segment, digest)
-
     def _cut_segment(self, segment: int, digest: str) -> None:
         """Finish the files of a segment; topics with few rows wait for the next one."""
         self._cut[segment] = digest
@@ -567,7 +536,7 @@ class TableWriter:
         from hybridlog.columns.folders import Addition, TableFolders
 
         self._decode()
-        for number in sorted(self._seen.keys() - self._cut.keys()):
+        for number in sorted(self._seen - self._cut.keys()):
             digest = entry.digests.get(str(number))
             if digest is not None:
                 self._cut_segment(number, digest)

@@ -249,14 +249,6 @@ class Tables:
             self._found.clear()
             self._looked_at.clear()
 
-    def look_again_for(self, recording: RecordingEntry, topics: Collection[str]) -> None:
-        """Look for tables of a recording again."""
-        with self._lock:
-            for topic in topics:
-                self._found.pop((recording.id, topic), None)
-            types = {channel.type for channel in recording.channels if channel.topic in topics}
-            self._looked_at -= types
-
     def reject(self, recording: RecordingEntry, topic: str) -> None:
         """Ignore the table from now on, because it was found to be damaged."""
         self._note_found((recording.id, topic), None, self._generation)

@@ -354,6 +354,8 @@ class IndexWriter:
 
     def _end_segment(self, segment: int, digest: str) -> None:
         """Store the decoding results of a segment, if all of it could be read."""
+        with self._cpu_slots:
+            self._tables.cut(segment, digest)
         stats, count = self._stats.pop(segment, {}), len(self._places[segment])
         if len(stats) == count:
             rows = decoded_rows([stats[number] for number in range(count)])

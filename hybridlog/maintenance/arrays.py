@@ -55,7 +55,7 @@ def index_arrays(
         if not wanted:
             continue
         tables.make(directory, entry, wanted, progress=progress)
-        known.look_again_for(entry, wanted)
+        known.look_again()
         for topic in wanted:
             is_left = _differs(known, entry, found[topic], off=off)
             (found[topic].left if is_left else found[topic].recordings).append(entry.name)

@@ -1,10 +1,10 @@
 """Deletes logs of a recording to make room; fields, counts and times of their messages stay.
 
-First the rows of a log are written to files of their own: the fields as in tables, the index
-documents, times, sizes and hashes (`columns/rows_file.py`). They are forced to the disk, and
-read and compared. Then one change of the manifest lists them, and says that the log is gone;
-from then on they are the truth. Then the log is deleted. A crash on either side of that change
-leaves files that the next opening removes.
+First the rows of a log are written to files of their own: the fields as in tables, times, sizes
+and hashes (`columns/rows_file.py`). They are forced to the disk, and read and compared. Then one
+change of the manifest lists them, and says that the log is gone; from then on they are the truth.
+Then the log is deleted. A crash on either side of that change leaves files that the next opening
+removes.
 """
 
 from __future__ import annotations

@@ -140,7 +140,7 @@ def make_noted(
     except TimeoutError:
         return False
     if is_made:
-        tables.look_again_for(entry, wanted)
+        tables.look_again()
         made = (one for one in sorted(wanted) if tables.of(entry, one) is not None)
         report.tables += [(entry.name, one) for one in made]
     return True
@@ -183,7 +183,7 @@ class TableChecker:
         wanted = missing(self._directory, entry, self._tables).union(self.damage(entry))
         if not wanted or not make(self._directory, entry, wanted):
             return []
-        self._tables.look_again_for(entry, wanted)
+        self._tables.look_again()
         return sorted(wanted - missing(self._directory, entry, self._tables))
 
     def damage(self, entry: RecordingEntry) -> dict[str, str]:

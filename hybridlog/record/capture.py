@@ -243,8 +243,6 @@ class Capture:
         else:
             self._change(change)
         for sealed in () if self._is_ring else group:
-            messages = sum(channel.messages for channel in sealed.channels)
-            self._tables.seal(sealed.segment, sealed.digest, messages)
             self.index.seal(sealed)
 
     def _change(self, how: Callable[[Manifest], Manifest]) -> None:

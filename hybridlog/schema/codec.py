@@ -7,7 +7,7 @@ documents are made from its result, in one way for all encodings.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NoReturn, Protocol, cast
+from typing import TYPE_CHECKING, Any, NoReturn, Protocol
 
 import numpy as np
 
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.schema.definition import FieldPath
-    from hybridlog.schema.left import LeftCodec
     from hybridlog.schema.objects import Objects
     from hybridlog_storage.messages import Batch, Buffer
 
@@ -212,7 +211,9 @@ def decode_each(
 def columns_of(codec: Codec, batch: Batch, fields: Collection[str] | None = None) -> Decoded:
     """Decode messages of one channel, with or without their payloads; see `Codec.columns`."""
     if batch.left is not None and len(batch) and batch.left.part[0] >= 0:
-        return cast("LeftCodec", codec).columns_of(batch.left, fields)
+        of_rows: Any = codec  # a `LeftCodec`
+        found: Decoded = of_rows.columns_of(batch.left, fields)
+        return found
     return codec.columns(batch.buffer, batch.offset, batch.length, fields)
 
 
