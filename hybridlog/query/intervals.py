@@ -447,8 +447,8 @@ def holding(
     until = np.append(begin[1:], end)
     if max_gap is not None:
         until = np.minimum(until, np.minimum(begin, END - max_gap) + max_gap)
-    rows = np.stack([begin, until, np.add.reduceat(count, first)], axis=1)
-    return joined(rows[holds[last]])
+    kept = holds[last]
+    return joined(np.stack([begin[kept], until[kept], np.add.reduceat(count, first)[kept]], axis=1))
 
 
 def changing(time: NDArray[np.int64], pause: int) -> NDArray[np.int64]:
