@@ -14,7 +14,6 @@ import threading
 import tracemalloc
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -418,16 +417,6 @@ def test_tables_have_the_order_of_iteration(ties: hl.Store) -> None:
         assert list(zip(frame.index.astype("int64"), frame["who"], frame["n"], strict=True)) == want
 
 
-def test_in_recording(ties: hl.Store) -> None:
-    query = ties.topic("/x").limit(3)
-    assert {m.recording for m in query.in_recording("two")} == {ties.entry("two").id}
-    assert len(list(query.in_recording("two"))) == 3
-    assert ties.topic("/x").in_recording("one", "two").count() == 12
-    assert ties.topic("/x").in_recording("one").where({"who": "one"}).count() == 6
-    with pytest.raises(TopicError, match="There are"):
-        query.in_recording("three")
-
-
 def test_a_range_that_is_empty_in_some_recordings(tmp_path: Path) -> None:
     """`2025-01-01` to `end` leaves out what was recorded before, and is no mistake."""
     first, later = 1_600_000_000 * SECOND, 1_700_000_000 * SECOND
@@ -660,15 +649,6 @@ def test_an_answer_survives_its_store(base: Path, store: hl.Store, robot: Truth)
     assert [m.raw for m in messages] == [m.raw for m in robot["/odom"][:10]]
     stamps = [nanoseconds(m.message.header.stamp) for m in robot["/odom"][:10]]
     assert [m.header_stamp_ns for m in messages] == stamps
-
-
-def test_a_query_is_a_value(store: hl.Store) -> None:
-    query = store.topic("/odom")
-    steps = [query.limit(1), query.every(2), query.reverse(), query.between("+1s", "+2s")]
-    assert all(s != query for s in steps)
-    assert query.count() == store.topic("/odom").count()
-    assert query.reverse().reverse() == query
-    assert all(a != b for a, b in pairwise(steps))
 
 
 def test_tables_in_parts_are_one_table_in_order(tmp_path: Path) -> None:

@@ -61,22 +61,17 @@ class Parts(NamedTuple):
         return np.flatnonzero(np.concatenate([[True], is_next])[: len(self.chunk)])
 
 
-def part_rows(segment: int, table: ChunkTable, known: int = 0) -> NDArray[np.int64]:
-    """The parts of a segment's chunks.
+def part_rows(segment: int, table: ChunkTable) -> NDArray[np.int64]:
+    """The parts of a segment's chunks: int64[n, 6], the columns of `Parts` without topics.
 
     Args:
         segment: Its number.
         table: Its chunks.
-        known: Leave out as many of its first chunks.
-
-    Returns:
-        int64[n, 6], the columns of `Parts` without topics.
     """
     counts = table.chunks["parts"]
-    parts = table.parts[int(counts[:known].sum()) :]
-    chunk = np.repeat(np.arange(known, len(counts)), counts[known:])
+    chunk = np.repeat(np.arange(len(counts)), counts)
     names = ("channel", "messages", "first", "last")
-    columns = [parts[name].astype(np.int64) for name in names]
+    columns = [table.parts[name].astype(np.int64) for name in names]
     return np.stack([np.full_like(chunk, segment), chunk, *columns], axis=1)
 
 

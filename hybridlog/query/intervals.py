@@ -415,110 +415,55 @@ def clipped(rows: NDArray[np.int64], span: Span) -> NDArray[np.int64]:
     return np.stack([begin[nonempty], end[nonempty], rows[nonempty, 2]], axis=1)
 
 
-class Holding:
-    """Turns the state at each message into the intervals in which it holds.
+def holding(
+    time: NDArray[np.int64],
+    holds: NDArray[np.bool_],
+    end: int,
+    max_gap: int | None,
+    before: int = 0,
+) -> NDArray[np.int64]:
+    """The intervals in which a state holds, from the state at each message.
 
     A message determines the state from its log time until the next message, and for at
     most `max_gap`. Of messages with the same log time, the last one counts.
 
     Args:
+        time: int64[n], log times, ns, ascending.
+        holds: bool[n], the state at each message.
+        end: End of the recording, ns; not before any message.
         max_gap: Longest time for which a message is valid, ns; None for any.
+        before: Number of messages, the first ones, that do not count as messages.
+
+    Returns:
+        int64[k, 3], begin, end, messages.
     """
-
-    def __init__(self, max_gap: int | None) -> None:
-        self._max_gap = max_gap
-        self._time = np.empty(0, np.int64)
-        self._holds = np.empty(0, np.bool_)
-        self._count = np.empty(0, np.int64)
-        self._open = np.empty((0, 3), np.int64)
-
-    def add(
-        self, time: NDArray[np.int64], holds: NDArray[np.bool_], *, counted: bool = True
-    ) -> NDArray[np.int64]:
-        """Add the next messages.
-
-        Args:
-            time: int64[n], log times, ascending, not before those of the last call.
-            holds: bool[n], the state at each message.
-            counted: True if they count as messages of an interval.
-
-        Returns:
-            int64[k, 3], begin, end, messages: intervals that have ended.
-        """
-        time = np.concatenate([self._time, time])
-        holds = np.concatenate([self._holds, holds])
-        count = np.zeros(len(time), np.int64)
-        count[: len(self._count)] = self._count
-        if counted:
-            count[len(self._count) :] = holds[len(self._count) :]
-        # The next call may continue the last log time.
-        whole = int(np.searchsorted(time, time[-1])) if len(time) else 0
-        self._time, self._holds, self._count = time[whole:], holds[whole:], count[whole:]
-        following = int(time[-1]) if whole else 0
-        return self._extend(time[:whole], holds[:whole], count[:whole], following)
-
-    def finish(self, end: int) -> NDArray[np.int64]:
-        """The remaining intervals, after the last message.
-
-        Args:
-            end: End of the recording, ns; not before any message.
-        """
-        ended = self._extend(self._time, self._holds, self._count, end)
-        return np.concatenate([ended, self._open])
-
-    def _extend(
-        self,
-        time: NDArray[np.int64],
-        holds: NDArray[np.bool_],
-        count: NDArray[np.int64],
-        following: int,
-    ) -> NDArray[np.int64]:
-        """Complete intervals of some log times, the open one first."""
-        if not len(time):
-            return np.empty((0, 3), np.int64)
-        first = run_starts(time)
-        last = np.append(first[1:], len(time)) - 1
-        begin = time[first]
-        end = np.append(begin[1:], following)
-        if self._max_gap is not None:
-            end = np.minimum(end, np.minimum(begin, END - self._max_gap) + self._max_gap)
-        rows = np.stack([begin, end, np.add.reduceat(count, first)], axis=1)[holds[last]]
-        rows = joined(np.concatenate([self._open, rows]))
-        self._open = rows[-1:]
-        return rows[:-1]
+    if not len(time):
+        return np.empty((0, 3), np.int64)
+    count = holds.astype(np.int64)
+    count[:before] = 0
+    first = run_starts(time)
+    last = np.append(first[1:], len(time)) - 1
+    begin = time[first]
+    until = np.append(begin[1:], end)
+    if max_gap is not None:
+        until = np.minimum(until, np.minimum(begin, END - max_gap) + max_gap)
+    kept = holds[last]
+    return joined(np.stack([begin[kept], until[kept], np.add.reduceat(count, first)[kept]], axis=1))
 
 
-class Changing:
-    """Groups steps (messages that differ from the one before) into changes.
+def changing(time: NDArray[np.int64], pause: int) -> NDArray[np.int64]:
+    """Steps (messages that differ from the one before) grouped into changes.
 
     Args:
+        time: int64[n], log times of the steps, ns, ascending.
         pause: Longest time between two steps of one change, ns.
+
+    Returns:
+        int64[k, 3], begin, end, steps.
     """
-
-    def __init__(self, pause: int) -> None:
-        self._pause = pause
-        self._open = np.empty((0, 3), np.int64)
-
-    def add(self, time: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Add the log times of the next steps, in order.
-
-        Returns:
-            int64[k, 3], begin, end, steps: changes that have ended.
-        """
-        if not len(time):
-            return np.empty((0, 3), np.int64)
-        time = placed(time)
-        times = np.stack([time, time + 1, np.ones_like(time)], axis=1)
-        rows = np.concatenate([self._open, times])
-        # An open change ends one nanosecond after its last step.
-        apart = rows[1:, 0] - (rows[:-1, 1] - 1) > self._pause
-        first = np.flatnonzero(np.concatenate([[True], apart]))
-        last = np.append(first[1:], len(rows)) - 1
-        steps = np.add.reduceat(rows[:, 2], first)
-        found = np.stack([rows[first, 0], rows[last, 1], steps], axis=1)
-        self._open = found[-1:]
-        return found[:-1]
-
-    def finish(self) -> NDArray[np.int64]:
-        """The change that is still open, if any."""
-        return self._open
+    if not len(time):
+        return np.empty((0, 3), np.int64)
+    time = placed(time)
+    first = np.append(0, np.flatnonzero(np.diff(time) > pause) + 1)
+    steps = np.diff(first, append=len(time))
+    return np.stack([time[first], time[first + steps - 1] + 1, steps], axis=1)

@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from mcap.writer import Writer
 
 import hybridlog as hl
-from hybridlog.query.intervals import Changing, Holding, Interval, Intervals
+from hybridlog.query.intervals import Interval, Intervals, changing, holding
 from hybridlog.query.rows_differ import rows_differ
 from hybridlog.schema.arrow_columns import array_of
 from hybridlog.schema.column import Arrays, Records, Scalars, Strings
@@ -49,19 +49,15 @@ def intervals(*rows: tuple[str, int, int]) -> Intervals:
 def test_a_state_may_be_believed_for_ever(max_gap: int) -> None:
     """No time that a recording can have is beyond what is believed."""
     begin = 1_400_000_000 * SECOND
-    holding = Holding(max_gap)
-    assert not len(holding.add(np.array([begin, begin + SECOND]), np.array([True, True])))
-    assert listed(holding.finish(begin + 2 * SECOND)) == [(begin, begin + 2 * SECOND, 2)]
+    times = np.array([begin, begin + SECOND])
+    found = holding(times, np.array([True, True]), begin + 2 * SECOND, max_gap)
+    assert listed(found) == [(begin, begin + 2 * SECOND, 2)]
 
 
-@given(st.lists(st.integers(0, 40), max_size=20), st.integers(0, 6), st.integers(1, 5))
-def test_steps_that_are_near_are_one_change(times: list[int], pause: int, block: int) -> None:
+@given(st.lists(st.integers(0, 40), max_size=20), st.integers(0, 6))
+def test_steps_that_are_near_are_one_change(times: list[int], pause: int) -> None:
     times = sorted(times)
-    changing = Changing(pause)
-    found = []
-    for place in range(0, len(times), block):
-        found += listed(changing.add(np.array(times[place : place + block], np.int64)))
-    found += listed(changing.finish())
+    found = listed(changing(np.array(times, np.int64), pause))
     want: Rows = []
     for time in times:
         if want and time - (want[-1][1] - 1) <= pause:

@@ -15,7 +15,7 @@ import numpy as np
 from hybridlog.query.answers.lost import lost_times
 from hybridlog.query.answers.marks import mark_topics, marks
 from hybridlog.query.answers.match_times import match_times
-from hybridlog.query.intervals import Changing, Holding, Intervals, clipped
+from hybridlog.query.intervals import Intervals, changing, clipped, holding
 from hybridlog.query.planner import Planner
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import DurationLike, parse_duration
@@ -66,8 +66,7 @@ class IntervalQueries:
         ]
         self._planner.batch_hint([p for *_, inner, before in spans for p in (*before, inner)])
         for part, span, inner, before in spans:
-            for rows in self._states_in(part, span, gap, inner, before):
-                yield part.recording.id, rows
+            yield part.recording.id, self._states_in(part, span, gap, inner, before)
 
     def _certain(self, max_gap: DurationLike | None, state: str) -> Intervals:
         """The time in which a state is certain, or the time in which none is."""
@@ -107,9 +106,8 @@ class IntervalQueries:
         quiet = parse_duration(pause)
         paths = [field.replace("[*]", "").replace("[]", "") for field in fields]
         return Intervals.of(
-            (part.recording.id, rows)
+            (part.recording.id, changing(self._steps_in(part, span, paths, tolerance), quiet))
             for part, span in self._spans()
-            for rows in self._changes_in(part, span, paths, tolerance, Changing(quiet))
         )
 
     def windows(self, before: DurationLike, after: DurationLike) -> Intervals:
@@ -166,21 +164,18 @@ class IntervalQueries:
 
     def _states_in(
         self, part: Part, span: Span, gap: int | None, inner: Part, before: Sequence[Part]
-    ) -> Iterator[NDArray[np.int64]]:
-        holding = Holding(gap)
+    ) -> NDArray[np.int64]:
+        # The last message before the range determines the state at its beginning.
         last = self._last_before(part, span, before)
-        if last is not None:
-            # The last message before the range determines the state at its beginning.
-            time, holds = last
-            yield clipped(holding.add(np.array([time]), np.array([holds]), counted=False), span)
-        for found in self._planner.outcomes(inner):
-            yield clipped(holding.add(found.log_time, found.holds), span)
-        yield clipped(holding.finish(extent_of(part.recording)[1]), span)
+        found = [(np.array([time]), np.array([holds])) for time, holds in last]
+        found += [(one.log_time, one.holds) for one in self._planner.outcomes(inner)]
+        found.append((np.empty(0, np.int64), np.empty(0, np.bool_)))
+        time, holds = (np.concatenate(column) for column in zip(*found, strict=True))
+        end = extent_of(part.recording)[1]
+        return clipped(holding(time, holds, end, gap, before=len(last)), span)
 
-    def _last_before(
-        self, part: Part, span: Span, first: Sequence[Part]
-    ) -> tuple[int, bool] | None:
-        """Time and outcome of the last message before a span, whether it matches or not.
+    def _last_before(self, part: Part, span: Span, first: Sequence[Part]) -> list[tuple[int, bool]]:
+        """Time and outcome of the last message before a span, if any, whether it matches or not.
 
         Args:
             part: The part.
@@ -189,26 +184,28 @@ class IntervalQueries:
         """
         further = (_bounded(part, (begin, span[0])) for begin in [*_earlier(part, span)][1:])
         for before in (*first, *further):
-            last = None
+            last: list[tuple[int, bool]] = []
             for found in self._beside(self._planner.outcomes, before):
                 if len(found.log_time):
-                    last = int(found.log_time[-1]), bool(found.holds[-1])
-            if last is not None:
+                    last = [(int(found.log_time[-1]), bool(found.holds[-1]))]
+            if last:
                 return last
-        return None
+        return []
 
-    def _changes_in(
-        self, part: Part, span: Span, paths: Collection[str], tolerance: float, changing: Changing
-    ) -> Iterator[NDArray[np.int64]]:
+    def _steps_in(
+        self, part: Part, span: Span, paths: Collection[str], tolerance: float
+    ) -> NDArray[np.int64]:
+        """Log times of the messages in a span that differ from the one before."""
         ask = partial(self._rows, paths=paths)
         summaries = _summaries(part, paths)
         names = [[path] if path in summaries else path.split(".") for path in paths]
         carried = self._row_before(part, span, ask)
+        found = [np.empty(0, np.int64)]
         for times, rows in ask(_bounded(part, span)):
             if len(rows):
                 differs, carried = _steps(carried, rows, names, tolerance)
-                yield changing.add(times[differs])
-        yield changing.finish()
+                found.append(times[differs])
+        return np.concatenate(found)
 
     def _rows(self, part: Part, paths: Collection[str]) -> Iterator[tuple[NDArray[np.int64], Rows]]:
         """Fields of the matching messages; summaries of arrays (`ranges.min`) as fields.

@@ -86,11 +86,6 @@ class Field(_Node):
         return ".".join(map(str, self.parts))
 
     @property
-    def is_sliced(self) -> bool:
-        """True if the path has a slice."""
-        return any(isinstance(part, Slice) for part in self.parts)
-
-    @property
     def names(self) -> str:
         """The path without array indexes, as in the types of fields."""
         return ".".join(part for part in self.parts if isinstance(part, str))
