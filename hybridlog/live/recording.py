@@ -13,7 +13,7 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, nullcontext, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
 from operator import index as index_of
 from queue import Empty, SimpleQueue
@@ -24,7 +24,7 @@ import numpy as np
 
 from hybridlog.columns.table_writer import load
 from hybridlog.index.index_writer import INTERVAL_S
-from hybridlog.live.memory import MIN_USER_BUDGET, default_budget, frozen_objects
+from hybridlog.live.memory import MIN_USER_BUDGET, default_budget
 from hybridlog.live.policy import SMALL_BYTES
 from hybridlog.record.capture import Backpressure, Capture
 from hybridlog.record.losses import Cause, Ledger, Loss
@@ -214,28 +214,24 @@ class LiveRecording:
         """Messages that are missing from this recording."""
         self.cut_off: Counter[str] = Counter()
         """Messages that a full disk cost, by topic; known after the end."""
-        self._frozen = ExitStack()
-        with self._frozen:
-            self._frozen.enter_context(frozen_objects)
-            self._capture = Capture(
-                directory,
-                catalog,
-                target,
-                name=name,
-                tags=options.tags,
-                source={**_SOURCE, **options.source, "flush_interval_s": options.flush_interval_s},
-                settings=options.settings,
-                no_index=options.no_index,
-                is_ring=options.is_ring,
-                pressure=Backpressure(
-                    skip_compression=lambda: self._is_under_pressure(self._compression_pressure),
-                    pause_indexing=lambda: self._is_under_pressure(self._index_pressure),
-                    index_interval_s=_index_interval_s(options.flush_interval_s),
-                    cpu_slots=threading.BoundedSemaphore(_idle_processors()),
-                    on_written=self._make_room,
-                ),
-            )
-            self._frozen = self._frozen.pop_all()
+        self._capture = Capture(
+            directory,
+            catalog,
+            target,
+            name=name,
+            tags=options.tags,
+            source={**_SOURCE, **options.source, "flush_interval_s": options.flush_interval_s},
+            settings=options.settings,
+            no_index=options.no_index,
+            is_ring=options.is_ring,
+            pressure=Backpressure(
+                skip_compression=lambda: self._is_under_pressure(self._compression_pressure),
+                pause_indexing=lambda: self._is_under_pressure(self._index_pressure),
+                index_interval_s=_index_interval_s(options.flush_interval_s),
+                cpu_slots=threading.BoundedSemaphore(_idle_processors()),
+                on_written=self._make_room,
+            ),
+        )
         self.id = self._capture.entry.id
         """Recording id."""
         self.name = self._capture.entry.name
@@ -441,18 +437,17 @@ class LiveRecording:
         self._stop()
 
     def _close_once(self) -> RecordReport:
-        with self._frozen:
-            try:
-                end = {"status": "complete", "losses": []}
-                if isinstance(self.failure, DiskFullError):
-                    failure = self._capture.close_truncated(end, self._cut_off())
-                elif self.failure is not None:
-                    raise self.failure
-                else:
-                    failure = self._close_whole(end)
-            except BaseException:
-                self._capture.abort()
-                raise
+        try:
+            end = {"status": "complete", "losses": []}
+            if isinstance(self.failure, DiskFullError):
+                failure = self._capture.close_truncated(end, self._cut_off())
+            elif self.failure is not None:
+                raise self.failure
+            else:
+                failure = self._close_whole(end)
+        except BaseException:
+            self._capture.abort()
+            raise
         return RecordReport(
             self._capture.entry,
             [],
@@ -494,8 +489,7 @@ class LiveRecording:
         """
         with self._closing:
             self._end()
-            with self._frozen:
-                self._capture.rollback()
+            self._capture.rollback()
 
     def _closed_beyond(self) -> int:
         """Bytes of closed chunks beyond those in normal operation."""

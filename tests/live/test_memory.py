@@ -5,16 +5,17 @@ from __future__ import annotations
 import gc
 import os
 import weakref
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-import hybridlog as hl
+from benchmarks.simulator.write import write_bag
 from hybridlog.live import memory as module
-from hybridlog.live.memory import FrozenObjects
+from hybridlog.live import recorder
 from hybridlog.live.recorder import RecorderOptions
 from hybridlog.live.recording import LiveOptions
+from tests.calls import Calls
+from tests.cli.within import answer as run
 
 MACHINE = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
 
@@ -56,16 +57,6 @@ def test_a_sixteenth(monkeypatch: pytest.MonkeyPatch, memory: int, want: int) ->
         module.default_budget.cache_clear()
 
 
-@pytest.fixture
-def frozen(monkeypatch: pytest.MonkeyPatch) -> Iterator[FrozenObjects]:
-    """A context of this test alone, which other tests cannot hold open."""
-    own = FrozenObjects()
-    monkeypatch.setattr("hybridlog.live.recording.frozen_objects", own)
-    gc.unfreeze()
-    yield own
-    assert gc.get_freeze_count() == 0
-
-
 class Knot:
     """Refers to itself: only the collector can take it away."""
 
@@ -73,38 +64,21 @@ class Knot:
         self.itself = self
 
 
-def test_objects_are_frozen_until_the_last_has_left(frozen: FrozenObjects) -> None:
-    knot = weakref.ref(Knot())
-    with frozen:
-        with frozen:
-            assert gc.get_freeze_count() > 1000
-        gc.collect()
-        assert knot() is not None
+def test_what_was_there_before_a_recorder_is_not_collected(tmp_path: Path, calls: Calls) -> None:
+    def look(*_: object) -> None:
         later = weakref.ref(Knot())
         gc.collect()
-        assert later() is None
+        found.append((knot() is not None, later() is None))
+
+    found: list[tuple[bool, bool]] = []
+    calls(recorder.Recorder, "start", look)
+    write_bag(tmp_path / "a.bag", duration_s=1)
+    gc.disable()
+    try:
+        knot = weakref.ref(Knot())
+        run("record", "--replay", tmp_path / "a.bag", "--speed", "100", store=tmp_path / "s")
+    finally:
+        gc.enable()
+    assert found == [(True, True)]
     gc.collect()
     assert knot() is None
-
-
-def test_what_a_process_has_frozen_itself_stays_frozen(frozen: FrozenObjects) -> None:
-    gc.freeze()
-    try:
-        with frozen:
-            pass
-        assert gc.get_freeze_count() > 1000
-    finally:
-        gc.unfreeze()
-
-
-@pytest.mark.usefixtures("frozen")
-def test_they_are_frozen_as_long_as_something_is_recorded(tmp_path: Path) -> None:
-    with hl.open(tmp_path / "store", create=True) as store:
-        with store.start("first"):
-            with store.start("second"):
-                pass
-            assert gc.get_freeze_count() > 1000
-        assert gc.get_freeze_count() == 0
-        third = store.start("third")
-        assert gc.get_freeze_count() > 1000
-        third.abort()
