@@ -864,8 +864,6 @@ class Store:
     def start(self, name: str, options: LiveOptions | None = None, **choices: Any) -> LiveRecording:
         """Start a live recording, which takes messages one by one.
 
-        Until it is closed, the garbage collector ignores existing objects.
-
         Args:
             name: Name of the recording.
             options: Options of the recording.

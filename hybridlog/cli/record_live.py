@@ -48,6 +48,7 @@ def record_live(choices: RecordChoices) -> None:
 
 
 def _record(choices: RecordChoices) -> None:
+    from hybridlog.live.memory import frozen_objects
     from hybridlog.live.recorder import Recorder, check_room
 
     # Wrong options are found before a store is made.
@@ -60,7 +61,7 @@ def _record(choices: RecordChoices) -> None:
             held.enter_context(source).check()
         store = held.enter_context(opened_to_record(choices, recover=False))
         check_room(shutil.disk_usage(store.directory.path).free, options.reserve_bytes)
-        with _stop_flag() as stop:
+        with _stop_flag() as stop, frozen_objects():
             recorder = Recorder(store, sources, options, display.say)
             recorder.start()
             recovery = _begin_recovery(choices, store)

@@ -13,7 +13,7 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, nullcontext, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
 from operator import index as index_of
 from queue import Empty, SimpleQueue
@@ -24,7 +24,7 @@ import numpy as np
 
 from hybridlog.columns.table_writer import load
 from hybridlog.index.index_writer import INTERVAL_S
-from hybridlog.live.memory import MIN_USER_BUDGET, MemoryReservation, default_budget, frozen_objects
+from hybridlog.live.memory import MIN_USER_BUDGET, default_budget
 from hybridlog.live.policy import SMALL_BYTES
 from hybridlog.record.capture import Backpressure, Capture
 from hybridlog.record.losses import Cause, Ledger, Loss
@@ -82,7 +82,6 @@ _TICK_S = 0.1  # interval of the writing thread when little comes
 _MIN_BATCH = 10  # messages per chunk: fewer cost less one by one than as a batch
 _FLUSH_AT = 0.95  # share of the flush interval after which chunks are closed
 _INDEX_INTERVALS = 4  # flush intervals between two passes of the index
-_LARGE_AT_WORK = 3  # large chunks in normal operation: two in compression, one being written
 _INDEXING_S = 2.0  # time to pack, write, convert and send the documents of a chunk
 _SKIP_COMPRESSION_AT = 8 << 20  # unwritten bytes; above it only chunks that shrink a lot are packed
 _DELAY_INDEX_AT = 32 << 20  # above it the index waits
@@ -91,7 +90,6 @@ _NO_LIMIT = nullcontext()
 _PRESSURE_HOLD_S = 1.0  # both measures last so long afterwards, or they would cause the next delay
 _LATE_S = 0.01  # a large message that waits longer for its copy starts both measures,
 _LATE_TIMES = 20  # for this multiple of its waiting time
-_RATE_S = 0.25  # interval at which the incoming rate is measured
 _MAX_NS = 1 << 63
 _SOURCE = {"path": "", "kind": "live", "profile": "", "bytes": 0}
 LIVE_SETTINGS = SegmentSettings(segment_size=1 << 30, segment_span_s=600.0)
@@ -216,30 +214,24 @@ class LiveRecording:
         """Messages that are missing from this recording."""
         self.cut_off: Counter[str] = Counter()
         """Messages that a full disk cost, by topic; known after the end."""
-        self._reservation = MemoryReservation(options.settings.chunk_size, options.budget_bytes)
-        self._frozen = ExitStack()
-        with self._frozen:
-            self._frozen.enter_context(frozen_objects)
-            self._capture = Capture(
-                directory,
-                catalog,
-                target,
-                name=name,
-                tags=options.tags,
-                source={**_SOURCE, **options.source, "flush_interval_s": options.flush_interval_s},
-                settings=options.settings,
-                no_index=options.no_index,
-                is_ring=options.is_ring,
-                pressure=Backpressure(
-                    skip_compression=lambda: self._is_under_pressure(self._compression_pressure),
-                    pause_indexing=lambda: self._is_under_pressure(self._index_pressure),
-                    index_interval_s=_index_interval_s(options.flush_interval_s),
-                    next_chunk_size=self._reservation.next_chunk_size,
-                    cpu_slots=threading.BoundedSemaphore(_idle_processors()),
-                    on_written=self._make_room,
-                ),
-            )
-            self._frozen = self._frozen.pop_all()
+        self._capture = Capture(
+            directory,
+            catalog,
+            target,
+            name=name,
+            tags=options.tags,
+            source={**_SOURCE, **options.source, "flush_interval_s": options.flush_interval_s},
+            settings=options.settings,
+            no_index=options.no_index,
+            is_ring=options.is_ring,
+            pressure=Backpressure(
+                skip_compression=lambda: self._is_under_pressure(self._compression_pressure),
+                pause_indexing=lambda: self._is_under_pressure(self._index_pressure),
+                index_interval_s=_index_interval_s(options.flush_interval_s),
+                cpu_slots=threading.BoundedSemaphore(_idle_processors()),
+                on_written=self._make_room,
+            ),
+        )
         self.id = self._capture.entry.id
         """Recording id."""
         self.name = self._capture.entry.name
@@ -445,18 +437,17 @@ class LiveRecording:
         self._stop()
 
     def _close_once(self) -> RecordReport:
-        with self._frozen:
-            try:
-                end = {"status": "complete", "losses": []}
-                if isinstance(self.failure, DiskFullError):
-                    failure = self._capture.close_truncated(end, self._cut_off())
-                elif self.failure is not None:
-                    raise self.failure
-                else:
-                    failure = self._close_whole(end)
-            except BaseException:
-                self._capture.abort()
-                raise
+        try:
+            end = {"status": "complete", "losses": []}
+            if isinstance(self.failure, DiskFullError):
+                failure = self._capture.close_truncated(end, self._cut_off())
+            elif self.failure is not None:
+                raise self.failure
+            else:
+                failure = self._close_whole(end)
+        except BaseException:
+            self._capture.abort()
+            raise
         return RecordReport(
             self._capture.entry,
             [],
@@ -498,14 +489,12 @@ class LiveRecording:
         """
         with self._closing:
             self._end()
-            with self._frozen:
-                self._capture.rollback()
+            self._capture.rollback()
 
     def _closed_beyond(self) -> int:
         """Bytes of closed chunks beyond those in normal operation."""
         usual = AT_WORK * self._options.settings.chunk_size
-        at_work = max(usual, _LARGE_AT_WORK * self._reservation.chunk_size)
-        return max(self._capture.writer.waiting - at_work, 0)
+        return max(self._capture.writer.waiting - usual, 0)
 
     def _unwritten(self) -> int:
         """Unwritten bytes: those not in chunks yet, and those of waiting chunks."""
@@ -539,12 +528,10 @@ class LiveRecording:
             self._room.notify_all()
         self._wake()
         self._thread.join()
-        self._reservation.close()
 
     def _run(self) -> None:
         """The writing thread."""
-        flushed = reported = measured = time.monotonic()
-        seen = 0
+        flushed = reported = time.monotonic()
         interval = self._options.flush_interval_s
         tick = min(_TICK_S, interval / 10)
         with suppress(BaseException), self._failing():
@@ -567,10 +554,6 @@ class LiveRecording:
                     if now - reported >= interval / 4:
                         self._write_losses()
                         reported = now
-                if now - measured >= _RATE_S:
-                    stored = self._capture.writer.totals.payload_bytes
-                    self._reservation.observe((stored - seen) / (now - measured))
-                    measured, seen = now, stored
 
     @contextmanager
     def _failing(self) -> Iterator[None]:

@@ -60,7 +60,6 @@ class Backpressure:
             fifth are compressed.
         pause_indexing: Returns whether writing is so far behind that indexing pauses.
         index_interval_s: Longest time between two passes of the index, seconds.
-        next_chunk_size: Returns the size in bytes of the next chunk.
         cpu_slots: Semaphore of the processors for packing that can wait, and for making documents
             and tables.
         on_written: Called on another thread when less content waits for the disk. `append`
@@ -70,7 +69,6 @@ class Backpressure:
     skip_compression: Callable[[], bool]
     pause_indexing: Callable[[], bool]
     index_interval_s: float
-    next_chunk_size: Callable[[], int]
     cpu_slots: BoundedSemaphore
     on_written: Callable[[], None]
 
@@ -172,7 +170,6 @@ class Capture:
             latched_apart=is_ring,
             on_sealing=self._announce,
             skip_compression=pressure.skip_compression if pressure else None,
-            next_chunk_size=pressure.next_chunk_size if pressure else None,
             cpu_slots=pressure.cpu_slots if pressure else None,
             on_written=pressure.on_written if pressure else None,
         )

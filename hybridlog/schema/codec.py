@@ -6,6 +6,7 @@ documents are made from its result, in one way for all encodings.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NoReturn, Protocol
 
@@ -15,7 +16,7 @@ from hybridlog.schema.column import STAMP, Records, row_of, top_level_names
 from hybridlog_storage.errors import DefinitionError, PayloadError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection
+    from collections.abc import Collection
 
     import pyarrow as pa
     from numpy.typing import NDArray
@@ -176,36 +177,57 @@ class OpaqueCodec:
         self.columns(payload, no_rows(), no_rows())
 
 
-def decode_each(
-    read: Callable[[memoryview], Any],
-    form: Callable[[list[Any]], Objects],
-    buffer: Buffer,
-    offset: NDArray[np.int64],
-    length: NDArray[np.int64],
-) -> Decoded:
-    """Decode payloads to objects one by one.
+class ObjectCodec(ABC):
+    """Codec of messages that are decoded to Python objects one by one."""
 
-    Args:
-        read: Makes the object; raises PayloadError.
-        form: Makes the objects one value.
-        buffer: Holds the payloads.
-        offset: int64[n], where each payload starts.
-        length: int64[n], bytes of each payload.
-    """
-    rows: list[int] = []
-    objects: list[Any] = []
-    bad: dict[str, list[int]] = {}
-    view = memoryview(buffer)
-    places = zip(offset.tolist(), length.tolist(), strict=True)
-    for row, (start, size) in enumerate(places):
-        try:
-            objects.append(read(view[start : start + size]))
-        except PayloadError as error:
-            bad.setdefault(str(error), []).append(row)
-        else:
-            rows.append(row)
-    unreadable = [Unreadable(np.array(r, np.intp), text) for text, r in bad.items()]
-    return Decoded(np.array(rows, np.intp), form(objects), unreadable, no_rows())
+    indexed = True
+    reason: str | None = None
+
+    def paths(self) -> list[FieldPath]:
+        """No fields: a message may have any content."""
+        return []
+
+    @abstractmethod
+    def decode(self, payload: Buffer) -> object:
+        """See `Codec.decode`."""
+
+    def read(self, payload: memoryview) -> Any:
+        """The object that columns are made from.
+
+        Raises:
+            PayloadError: The payload does not fit.
+        """
+        return self.decode(payload)
+
+    def form(self, values: list[Any], fields: Collection[str] | None) -> Objects:
+        """The objects as one value."""
+        from hybridlog.schema.objects import Objects
+
+        return Objects(values, fields)
+
+    def columns(
+        self,
+        buffer: Buffer,
+        offset: NDArray[np.int64],
+        length: NDArray[np.int64],
+        fields: Collection[str] | None = None,
+    ) -> Decoded:
+        """Decode messages; see `Codec.columns`."""
+        rows: list[int] = []
+        objects: list[Any] = []
+        bad: dict[str, list[int]] = {}
+        view = memoryview(buffer)
+        places = zip(offset.tolist(), length.tolist(), strict=True)
+        for row, (start, size) in enumerate(places):
+            try:
+                objects.append(self.read(view[start : start + size]))
+            except PayloadError as error:
+                bad.setdefault(str(error), []).append(row)
+            else:
+                rows.append(row)
+        unreadable = [Unreadable(np.array(r, np.intp), text) for text, r in bad.items()]
+        records = self.form(objects, fields)
+        return Decoded(np.array(rows, np.intp), records, unreadable, no_rows())
 
 
 def columns_of(codec: Codec, batch: Batch, fields: Collection[str] | None = None) -> Decoded:

@@ -4,24 +4,16 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import TYPE_CHECKING, cast
 
-from hybridlog.schema.codec import Codec, OpaqueCodec, decode_each
+from hybridlog.schema.codec import Codec, ObjectCodec, OpaqueCodec
 from hybridlog.schema.completion import has_hidden_fields
 from hybridlog.schema.definition_text import canonical
-from hybridlog.schema.objects import Objects
 from hybridlog.schema.states import GONE, State, encoding_of, state_of
 from hybridlog_storage.errors import DefinitionError, PayloadError
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
-
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from hybridlog.schema.codec import Decoded
-    from hybridlog.schema.definition import FieldPath
     from hybridlog.schema.objects import Plain
     from hybridlog_storage.messages import Buffer, Channel, Schema
 
@@ -94,25 +86,8 @@ def _defined(encoding: str, schema: Schema | None) -> Codec:
     )
 
 
-class JsonCodec:
+class JsonCodec(ObjectCodec):
     """Messages in JSON. A JSON schema is ignored."""
-
-    indexed = True
-    reason: str | None = None
-
-    def paths(self) -> list[FieldPath]:
-        """No fields: a message may have any content."""
-        return []
-
-    def columns(
-        self,
-        buffer: Buffer,
-        offset: NDArray[np.int64],
-        length: NDArray[np.int64],
-        fields: Collection[str] | None = None,
-    ) -> Decoded:
-        """Decode messages; see `Codec.columns`."""
-        return decode_each(self.decode, partial(Objects, fields=fields), buffer, offset, length)
 
     def decode(self, payload: Buffer) -> Plain:
         """Decode the JSON text into Python objects.

@@ -204,21 +204,6 @@ def parse_for_release(schema: Schema, release: Release) -> tuple[MessageType, fr
     return MessageType(schema.name, fields), frozenset(resolver.supplied)
 
 
-def standard_type(name: str, ros: Literal[1, 2]) -> MessageType | None:
-    """The standard ROS type of this name, None if unknown.
-
-    For sources with type names only.
-
-    Args:
-        name: Type name in either spelling, `sensor_msgs/Imu` or `sensor_msgs/msg/Imu`.
-        ros: ROS 1 or ROS 2; headers and times differ.
-    """
-    key = canonical(name)
-    if _standard_fields(key, DEFAULT_RELEASES[ros]) is None:
-        return None
-    return MessageType(name, _Resolver(name, {}, ros).message(key).fields)
-
-
 DEFAULT_RELEASES: dict[int, Release] = {1: "ROS1_NOETIC", 2: "ROS2_KILTED"}
 """Whose standard types are supplied where none is named, by version of ROS."""
 

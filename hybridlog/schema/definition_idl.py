@@ -9,6 +9,7 @@ The parser of rosbags is not used: it does not know enums, and fails on deep nes
 
 from __future__ import annotations
 
+import ast
 import operator
 import re
 from collections.abc import Callable, Mapping
@@ -32,20 +33,22 @@ _TOKEN = re.compile(
 _MAX_DEPTH = 16
 _MAX_DIGITS = 20
 _MAX_VALUE = 1 << 64
+_MAX_TOKENS = 200  # of an expression
 
-_OPERATORS: Mapping[str, tuple[int, Callable[[int, int], int]]] = {
-    "|": (1, operator.or_),
-    "^": (2, operator.xor),
-    "&": (3, operator.and_),
-    "<<": (4, operator.lshift),
-    ">>": (4, operator.rshift),
-    "+": (5, operator.add),
-    "-": (5, operator.sub),
-    "*": (6, operator.mul),
-    "/": (6, lambda one, other: int(Fraction(one, other))),
-    "%": (6, lambda one, other: one - other * int(Fraction(one, other))),
+_OPERATORS: Mapping[type[ast.operator], Callable[[int, int], int]] = {
+    ast.BitOr: operator.or_,
+    ast.BitXor: operator.xor,
+    ast.BitAnd: operator.and_,
+    ast.LShift: operator.lshift,
+    ast.RShift: operator.rshift,
+    ast.Add: operator.add,
+    ast.Sub: operator.sub,
+    ast.Mult: operator.mul,
+    ast.Div: lambda one, other: int(Fraction(one, other)),
+    ast.Mod: lambda one, other: one - other * int(Fraction(one, other)),
 }
-"""Operators of integer expressions: how tightly they bind, and what they do. Division cuts."""
+"""Operators of integer expressions, which bind as in Python. Division cuts."""
+_SIGNS = frozenset("()|^&<>+-*/%")
 
 _WORDS = {
     "boolean": "bool",
@@ -294,18 +297,22 @@ class _Parser:
     def _evaluated(self, tokens: list[str], scope: str) -> int | None:
         """The value of an integer expression; None for any other."""
 
-        def value(token: str) -> int:
+        def value(token: str) -> str:
             number = _integer(token)
             for candidate in _candidates(scope, token) if number is None else ():
                 if candidate in self._types.constants:
-                    return self._types.constants[candidate]
+                    number = self._types.constants[candidate]
+                    break
             if number is None:
                 raise ValueError(token)
-            return number
+            return f" {number} "
 
+        if len(tokens) > _MAX_TOKENS:
+            return None
         try:
-            return _Expression(tokens, value).whole()
-        except (ValueError, ZeroDivisionError):
+            text = "".join(token if token in _SIGNS else value(token) for token in tokens)
+            return _value(ast.parse(text.strip(), mode="eval").body)
+        except (ValueError, SyntaxError, MemoryError, RecursionError, ZeroDivisionError):
             return None
 
     def _constant(self, scope: list[str]) -> None:
@@ -323,65 +330,28 @@ class _Parser:
             pass
 
 
-class _Expression:
-    """An integer expression.
+def _value(node: ast.expr) -> int:
+    """The value of an integer expression.
 
-    Args:
-        tokens: Its tokens.
-        value: Returns the value of a number or a name; raises ValueError without one.
+    Raises:
+        ValueError: It is none, or too large.
+        ZeroDivisionError: It divides by zero.
     """
-
-    def __init__(self, tokens: list[str], value: Callable[[str], int]) -> None:
-        self._tokens = tokens
-        self._value = value
-        self._at = 0
-
-    def whole(self) -> int:
-        """Its value.
-
-        Raises:
-            ValueError: It is no integer expression, nested too deep or too large.
-            ZeroDivisionError: It divides by zero.
-        """
-        found = self._binary(0, 0)
-        if self._at < len(self._tokens):
-            raise ValueError(self._tokens[self._at])
-        return found
-
-    def _binary(self, binding: int, depth: int) -> int:
-        """A value and the operators behind it that bind more tightly."""
-        found = self._unary(depth)
-        while True:
-            sign = "".join(self._tokens[self._at : self._at + 1])
-            if sign in {"<", ">"}:
-                sign = "".join(self._tokens[self._at : self._at + 2])
-            tightness, apply = _OPERATORS.get(sign, (0, operator.add))
-            if tightness <= binding:
+    match node:
+        case ast.Constant(value=int(found)):
+            return found
+        case ast.UnaryOp(op=ast.UAdd(), operand=inner):
+            return _value(inner)
+        case ast.UnaryOp(op=ast.USub(), operand=inner):
+            return -_value(inner)
+        case ast.BinOp(op=sign, left=left, right=right) if type(sign) in _OPERATORS:
+            one, other = _value(left), _value(right)
+            if isinstance(sign, ast.LShift | ast.RShift) and not 0 <= other < 64:
+                raise ValueError(other)
+            found = _OPERATORS[type(sign)](one, other)
+            if abs(found) <= _MAX_VALUE:
                 return found
-            self._at += len(sign)
-            other = self._binary(tightness, depth)
-            if len(sign) == 2 and not 0 <= other < 64:
-                raise ValueError(sign)
-            found = apply(found, other)
-            if abs(found) > _MAX_VALUE:
-                raise ValueError(sign)
-
-    def _unary(self, depth: int) -> int:
-        negate = False
-        while (word := "".join(self._tokens[self._at : self._at + 1])) in {"+", "-"}:
-            self._at += 1
-            negate ^= word == "-"
-        self._at += 1
-        if word != "(":
-            found = self._value(word or ")")
-        elif depth == _MAX_DEPTH:
-            raise ValueError(word)
-        else:
-            found = self._binary(0, depth + 1)
-            if self._tokens[self._at : self._at + 1] != [")"]:
-                raise ValueError(word)
-            self._at += 1
-        return -found if negate else found
+    raise ValueError(ast.dump(node)[:40])
 
 
 def _integer(token: str) -> int | None:

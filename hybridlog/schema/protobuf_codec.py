@@ -18,7 +18,7 @@ from hybridlog.schema.arrow_protobuf import (
     map_key,
     nanoseconds_of,
 )
-from hybridlog.schema.codec import decode_each
+from hybridlog.schema.codec import ObjectCodec
 from hybridlog.schema.column import top_level_names
 from hybridlog.schema.definition import MAX_DEFINITION, FieldPath
 from hybridlog.schema.objects import Duration, Nanoseconds, Objects, top
@@ -28,15 +28,12 @@ if TYPE_CHECKING:
     from collections.abc import Collection
     from collections.abc import Set as AbstractSet
 
-    import numpy as np
     import pyarrow as pa
     from google.protobuf.descriptor import Descriptor, FieldDescriptor
     from google.protobuf.descriptor_pb2 import FileDescriptorProto
     from google.protobuf.descriptor_pool import DescriptorPool
     from google.protobuf.message import Message
-    from numpy.typing import NDArray
 
-    from hybridlog.schema.codec import Decoded
     from hybridlog.schema.objects import Plain
     from hybridlog_storage.messages import Buffer, Schema
 
@@ -62,7 +59,7 @@ _STANDARD = frozenset(
 """Protobuf's own files, which some writers leave out."""
 
 
-class ProtobufCodec:
+class ProtobufCodec(ObjectCodec):
     """Messages of one protobuf type.
 
     Unset fields with presence are not in the index document.
@@ -74,9 +71,6 @@ class ProtobufCodec:
         DefinitionError: The package is missing, or the definition cannot be used.
     """
 
-    indexed = True
-    reason: str | None = None
-
     def __init__(self, schema: Schema) -> None:
         self._name = schema.name
         self._class = _message_class(schema)
@@ -87,19 +81,9 @@ class ProtobufCodec:
         _add_paths(found, self._class.DESCRIPTOR, "", [], within_array=False)
         return found
 
-    def columns(
-        self,
-        buffer: Buffer,
-        offset: NDArray[np.int64],
-        length: NDArray[np.int64],
-        fields: Collection[str] | None = None,
-    ) -> Decoded:
-        """Decode messages; see `Codec.columns`."""
-
-        def form(values: list[Message]) -> Objects:
-            return _Messages(values, fields, self._class.DESCRIPTOR)
-
-        return decode_each(self.decode, form, buffer, offset, length)
+    def form(self, values: list[Message], fields: Collection[str] | None) -> Objects:
+        """The messages as one value."""
+        return _Messages(values, fields, self._class.DESCRIPTOR)
 
     def decode(self, payload: Buffer) -> Message:
         """Decode the protobuf message.

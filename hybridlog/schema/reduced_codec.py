@@ -12,27 +12,20 @@ from __future__ import annotations
 
 import hashlib
 import struct
-from functools import partial
 from typing import TYPE_CHECKING, NoReturn
 
 import numpy as np
 from bson.errors import BSONError
 
-from hybridlog.schema.codec import decode_each
+from hybridlog.schema.codec import ObjectCodec
 from hybridlog.schema.index_bodies import document_of, index_bodies
 from hybridlog.schema.left import missing_payload
-from hybridlog.schema.objects import Objects
 from hybridlog.schema.states import State
 from hybridlog_storage.errors import PayloadError
 from hybridlog_storage.messages import ORIGINAL_ENCODING, REDUCED, Channel
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
-
-    from numpy.typing import NDArray
-
-    from hybridlog.schema.codec import Codec, Decoded
-    from hybridlog.schema.definition import FieldPath
+    from hybridlog.schema.codec import Codec
     from hybridlog_storage.messages import Buffer
 
 
@@ -58,28 +51,24 @@ def reduce(codec: Codec, payload: bytes) -> bytes:
     return head + group.body.tobytes()
 
 
-class ReducedCodec:
+class ReducedCodec(ObjectCodec):
     """Codec of reduced messages: their values are those of the index documents.
 
     Integers are int64, and arrays over the limit are summaries.
     """
 
-    indexed = True
-    reason: str | None = None
+    def read(self, payload: memoryview) -> dict[str, object]:
+        """The stored fields.
 
-    def paths(self) -> list[FieldPath]:
-        """No fields of its own: the fields are those of complete messages."""
-        return []
-
-    def columns(
-        self,
-        buffer: Buffer,
-        offset: NDArray[np.int64],
-        length: NDArray[np.int64],
-        fields: Collection[str] | None = None,
-    ) -> Decoded:
-        """Decode the stored fields; see `Codec.columns`."""
-        return decode_each(_fields_in, partial(Objects, fields=fields), buffer, offset, length)
+        Raises:
+            PayloadError: The payload is not a reduced message.
+        """
+        try:
+            if len(payload) < _HEAD.size:
+                raise PayloadError("it is too short")
+            return document_of(bytes(payload[_HEAD.size :]))
+        except (BSONError, PayloadError) as error:
+            raise PayloadError(f"the payload is not a reduced message: {error}") from error
 
     def decode(self, payload: Buffer) -> NoReturn:
         """Raise, since the payload cannot be decoded.
@@ -90,12 +79,3 @@ class ReducedCodec:
         if len(payload) < _HEAD.size:
             raise PayloadError("the payload is not a reduced message: it is too short")
         raise missing_payload(State.REDUCED, *_HEAD.unpack_from(payload))
-
-
-def _fields_in(payload: memoryview) -> dict[str, object]:
-    try:
-        if len(payload) < _HEAD.size:
-            raise PayloadError("it is too short")
-        return document_of(bytes(payload[_HEAD.size :]))
-    except (BSONError, PayloadError) as error:
-        raise PayloadError(f"the payload is not a reduced message: {error}") from error

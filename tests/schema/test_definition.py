@@ -20,7 +20,6 @@ from hybridlog.schema.definition import (
     Text,
     parse_definition,
     paths,
-    standard_type,
 )
 from hybridlog_storage.errors import DefinitionError
 from hybridlog_storage.messages import Schema
@@ -65,22 +64,21 @@ def assert_same_type(found, desc, table) -> None:
 
 @pytest.mark.parametrize("ros", [1, 2])
 def test_every_standard_type_of_rosbags(ros):
-    table = get_typestore(Stores.ROS1_NOETIC if ros == 1 else Stores.ROS2_KILTED).fielddefs
-    read = 0
+    store = get_typestore(Stores.ROS1_NOETIC if ros == 1 else Stores.ROS2_KILTED)
+    table, read = store.fielddefs, 0
     for name in table:
         # A time as a message of its own is its two numbers.
         if name in {"builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration"}:
             continue
         try:
-            found = standard_type(name, ros)
+            text, _ = store.generate_msgdef(name, ros_version=ros)
+            found = parse_definition(Schema(name, f"ros{ros}msg", text.encode()))
         except DefinitionError as error:
             assert "no portable wire form" in str(error) or "contains itself" in str(error)  # noqa: PT017
             continue
         assert_same_type(found, (Nodetype.NAME, name), table)
         read += 1
     assert read > 100
-    assert standard_type("nobody/Knows", ros) is None
-    assert standard_type("sensor_msgs/Imu", ros) is not None
 
 
 # --- spelling
@@ -305,7 +303,7 @@ def test_msg_and_idl_may_be_mixed():
         ("struct T { long x[1 << 64]; };", "must be a number or a constant"),
         ("struct T { long x[1.5]; };", "must be a number or a constant"),
         ("const long N = 1 << 60 << 60; struct T { long x[N]; };", "found 'N'"),
-        (f"struct T {{ long x[{'(' * 17}1{')' * 17}]; }};", "must be a number or a constant"),
+        (f"struct T {{ long x[{'(' * 101}1{')' * 101}]; }};", "must be a number or a constant"),
         ("struct B; struct T { B x; }; }; };", "does not say what"),
         ("struct T { long x", "ends too early"),
         ("struct T { Other x; }; }; };", "does not say what"),

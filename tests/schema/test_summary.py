@@ -140,28 +140,3 @@ def test_no_rows() -> None:
     for dtype in DTYPES:
         assert len(of(dtype, []).n) == 0
         assert of(dtype, [[], []]).has.tolist() == [False, False]
-
-
-@pytest.mark.parametrize("dtype", ["f4", "f8"])
-def test_long_rows_of_floats(dtype: str) -> None:
-    rng = np.random.default_rng(3)
-    rows = [rng.normal(100, 30, n).astype(dtype) for n in (0, 5, 4095, 4096, 50_000, 16_384)]
-    rows += [
-        np.where(rng.random(20_000) < 0.01, bad, row)
-        for bad, row in zip(
-            (np.nan, np.inf, -np.inf), [rng.normal(size=20_000).astype(dtype)] * 3, strict=True
-        )
-    ]
-    rows += [np.full(9000, np.nan, dtype), np.full(9000, -0.0, dtype)]
-    rows.append(np.full(9000, np.finfo(dtype).max, dtype))
-    found = of(dtype, rows)
-    for i, row in enumerate(rows):
-        alone = of(dtype, [row])
-        for name in ("n", "min", "max", "mean", "has"):
-            assert getattr(found, name)[i].tobytes() == getattr(alone, name)[0].tobytes(), (i, name)
-        finite = row[np.isfinite(row)].astype(np.float64)
-        assert found.has[i] == bool(len(finite))
-        if len(finite):
-            assert (found.min[i], found.max[i]) == (finite.min(), finite.max())
-            assert found.mean[i] == pytest.approx(math.fsum(finite / len(finite)), rel=1e-9)
-            assert not np.signbit(found.mean[i]) or found.mean[i] < 0

@@ -185,9 +185,9 @@ def test_a_chunk_is_written_when_its_payloads_are_copied(tmp_path: Path) -> None
 
 @settings(max_examples=20, deadline=None)
 @given(
+    st.sampled_from([1 << 20, 2 << 20, 8 << 20]),
     st.lists(
         st.tuples(
-            st.sampled_from([1 << 20, 2 << 20, 8 << 20]),
             st.lists(
                 st.sampled_from([0, 10, 30_000, COPIED_AT_ONCE - 1, COPIED_AT_ONCE, 3_000_000]),
                 max_size=9,
@@ -195,26 +195,23 @@ def test_a_chunk_is_written_when_its_payloads_are_copied(tmp_path: Path) -> None
             st.sampled_from(["a batch", "loose", "one by one"]),
         ),
         max_size=5,
-    )
+    ),
 )
-def test_the_chunk_size_may_change_while_messages_come(
-    tmp_path_factory: pytest.TempPathFactory, steps: list[tuple[int, list[int], str]]
+def test_chunks_are_as_large_as_their_bound_however_messages_come(
+    tmp_path_factory: pytest.TempPathFactory, bound: int, steps: list[tuple[list[int], str]]
 ) -> None:
-    """No chunk exceeds the bound of when it was opened; nothing is lost or out of order."""
+    """No chunk of several messages exceeds it; nothing is lost or out of order."""
     chunks: list[StoredChunk] = []
     writer = recorder(
         tmp_path_factory.mktemp("segments"),
         chunks,
-        SegmentSettings(compression="none"),
-        next_chunk_size=lambda: chunk_size,
+        SegmentSettings(chunk_size=bound, compression="none"),
         on_written=done,
     )
     payloads: list[bytes] = []
-    opened_with: list[int] = []  # the bound when each message came
-    for chunk_size, sizes, way in steps:
+    for sizes, way in steps:
         first = len(payloads)
         payloads += [bytes([first + n + 1]) * size for n, size in enumerate(sizes)]
-        opened_with += [chunk_size] * len(sizes)
         rows = [(0, payloads[n], n, n, n) for n in range(first, len(payloads))]
         if way == "a batch":
             writer.append(batch_of(rows), CHANNELS)
@@ -236,46 +233,11 @@ def test_the_chunk_size_may_change_while_messages_come(
         (CHANNELS[0].topic, n, payload) for n, payload in enumerate(payloads)
     ]
     for number, chunk in enumerate(chunks):
-        bound = opened_with[int(chunk.seq[0])]
         size = len(chunk.batch.buffer)
         assert size <= bound or len(chunk.batch) == 1
-        # It was closed because the next message would not have found room; where chunks had
-        # just become larger, in half of it.
+        # It was closed because the next message would not have found room.
         if number + 1 < len(chunks) and size < bound:
-            assert size + 31 + len(payloads[int(chunks[number + 1].seq[0])]) > bound // 2
-
-
-def test_topics_do_not_close_large_chunks_at_one_time(tmp_path: Path) -> None:
-    """Their first ones after the change are of many sizes, those behind them are not."""
-    chunks: list[StoredChunk] = []
-    chunk_size = 100_000
-    writer = recorder(
-        tmp_path,
-        chunks,
-        SegmentSettings(compression="none"),
-        next_chunk_size=lambda: chunk_size,
-        on_written=done,
-    )
-    topics = [Channel(f"/topic{n}", "ros1", None) for n in range(20)]
-
-    def speak(times: int) -> None:
-        for n in range(times):
-            for topic in topics:
-                writer.place_one(topic, bytes(5000), n, n, n)
-
-    speak(30)
-    chunk_size = 400_000
-    speak(250)
-    writer.close()
-    of_topic: dict[int, list[int]] = {}
-    for chunk in chunks:
-        of_topic.setdefault(int(chunk.batch.channel[0]), []).append(len(chunk.batch))
-    small, full = 100_000 // 5031, 400_000 // 5031
-    begun = [sizes[2] for sizes in of_topic.values()]
-    assert all(sizes[:2] == [small] * 2 for sizes in of_topic.values())
-    assert all(set(sizes[3:-1]) == {full} for sizes in of_topic.values())
-    assert all(full // 2 <= size <= full for size in begun)
-    assert len(set(begun)) > 12
+            assert size + 31 + len(payloads[int(chunks[number + 1].seq[0])]) > bound
 
 
 @pytest.mark.parametrize(("spare", "hurried"), [(1, False), (1, True), (2, False)])
@@ -328,8 +290,7 @@ def test_packing_does_not_wait_for_who_keeps_all_processors(tmp_path: Path) -> N
 
 def test_what_says_little_holds_little_memory_however_large_chunks_are(tmp_path: Path) -> None:
     """From its second chunk on, and until one is larger than those before."""
-    chunk_size = 2 << 20
-    writer = recorder(tmp_path, next_chunk_size=lambda: chunk_size, on_written=done)
+    writer = recorder(tmp_path, setup=SegmentSettings(chunk_size=8 << 20), on_written=done)
     payloads = []
 
     def place(*sizes: int) -> int:
@@ -340,9 +301,8 @@ def test_what_says_little_holds_little_memory_however_large_chunks_are(tmp_path:
         (builder,) = writer._clusters.values()
         return len(builder._buffer)
 
-    assert place(5000) == 2 << 20
+    assert place(5000) == 8 << 20
     writer.flush()
-    chunk_size = 8 << 20
     assert place(5000) < 100_000
     assert place(*[5000] * 100) < 2_000_000
     # What is copied outside of the lock needs a place that stays.

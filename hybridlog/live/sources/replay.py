@@ -1,8 +1,8 @@
 """Replay of a log in real time, for tests, benchmarks and trials.
 
-One thread reads ahead, another keeps time. A message is due at its time since the first
-message, divided by the speed. All due messages go out at once: many small messages do not
-cost a pause each, and pauses do not accumulate errors.
+A message is due at its time since the first message, divided by the speed. Messages that are
+due go out without a pause: many small messages do not cost a pause each, and pauses do not
+accumulate errors.
 
 Messages go out in the order of log time, within a lookahead of some tens of megabytes.
 Messages that lie farther out of order, as in concatenated logs, are sent when they are read.
@@ -11,25 +11,19 @@ Messages that lie farther out of order, as in concatenated logs, are sent when t
 from __future__ import annotations
 
 import math
-import queue
 import threading
 import time
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, cast
-
-import numpy as np
+from itertools import count
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from hybridlog.formats.log_set import open_source
 from hybridlog.live.sources.base import Cause, LiveSource, Loss, Sink
-from hybridlog.live.sources.replay_order import Lookahead, Rows
 from hybridlog_storage.errors import SourceError, UsageError
 
 if TYPE_CHECKING:
     from pathlib import Path
-
-    from numpy.typing import NDArray
 
     from hybridlog.formats.reading import Damage, Source
     from hybridlog_storage.messages import Channel
@@ -38,28 +32,18 @@ _MIN_PAUSE_S: Final = 0.001  # messages that are due within it go out together
 _MAX_PAUSE_S: Final = 3600.0
 _LATE_S: Final = 0.5
 _LONG_S: Final = 60.0
-_MAX_MESSAGES: Final = 1024  # messages between two reads of the clock
-_TICK_S: Final = 0.1
 _JOIN_S: Final = 5.0
+_WINDOW: Final = 32 << 20  # payload bytes of the lookahead
+_WINDOW_ROWS: Final = 1 << 17
 
 
-@dataclass(frozen=True, slots=True)
-class _Step:
-    """Messages that the reading thread passes to the playing one.
-
-    Attributes:
-        rows: Messages, or None.
-        channels: Channels of the log, as far as it is read.
-        damage: Unreadable places.
-        end: This is the last step.
-        error: The error that ended reading.
-    """
-
-    rows: Rows | None
-    channels: list[Channel]
-    damage: list[Damage]
-    end: bool = False
-    error: BaseException | None = None
+class _Message(NamedTuple):
+    log_time: int
+    place: int  # in the log
+    channel: int
+    publish_time: int
+    sequence: int
+    payload: bytes
 
 
 class ReplaySource(LiveSource):
@@ -90,8 +74,7 @@ class ReplaySource(LiveSource):
         self._path = path
         self._speed = speed
         self._stop = threading.Event()
-        self._steps: queue.Queue[_Step] = queue.Queue(maxsize=2)
-        self._threads: list[threading.Thread] = []
+        self._thread: threading.Thread | None = None
 
     def check(self) -> None:
         """Check that the log can be opened.
@@ -108,85 +91,32 @@ class ReplaySource(LiveSource):
             SourceError: The file is not a readable log.
         """
         source = open_source(self._path)
-        player = _Player(sink, self.address, self._speed, self._stop)
-
-        def play() -> None:
-            player.play(self._received())
-
-        self._threads = [
-            threading.Thread(
-                target=self._read, args=(source,), name="hybridlog-replay-read", daemon=True
-            ),
-            threading.Thread(target=play, name="hybridlog-replay", daemon=True),
-        ]
-        for thread in self._threads:
-            thread.start()
+        player = _Player(source, sink, self.address, self._speed, self._stop)
+        self._thread = threading.Thread(target=player.run, name="hybridlog-replay", daemon=True)
+        self._thread.start()
 
     def stop(self) -> None:
         """Stop, even in a pause. All messages that are due have been sent."""
         self._stop.set()
-        for thread in self._threads:
-            if thread is not threading.current_thread():
-                thread.join(_JOIN_S)
-
-    def _received(self) -> Iterator[_Step]:
-        """Steps of the reading thread, until it ends or the source is stopped."""
-        while not self._stop.is_set():
-            try:
-                yield self._steps.get(timeout=_TICK_S)
-            except queue.Empty:
-                continue
-
-    def _put(self, step: _Step) -> bool:
-        """Pass a step on; False if the source is stopped."""
-        while not self._stop.is_set():
-            try:
-                self._steps.put(step, timeout=_TICK_S)
-            except queue.Full:
-                continue
-            return True
-        return False
-
-    # The reading thread.
-
-    def _read(self, source: Source) -> None:
-        error: BaseException | None = None
-        try:
-            self._read_all(source)
-        except BaseException as caught:  # the playing thread raises or reports it
-            error = caught
-        self._put(_Step(None, [], [], end=True, error=error))
-
-    def _read_all(self, source: Source) -> None:
-        """Read a log to its end, or until the source is stopped."""
-        lookahead = Lookahead()
-        known = 0
-        with source:
-            for batch in source.batches():
-                if self._stop.is_set():
-                    return
-                source.extras.clear()
-                rows = lookahead.add(batch)
-                if rows is None:
-                    continue
-                step = _Step(rows, list(source.channels), source.damage[known:])
-                known = len(source.damage)
-                if not self._put(step):
-                    return
-            self._put(_Step(lookahead.rest(), list(source.channels), source.damage[known:]))
+        if self._thread is not None and self._thread is not threading.current_thread():
+            self._thread.join(_JOIN_S)
 
 
 class _Player:
-    """Sends messages when they are due, on its own thread.
+    """Reads a log, and sends its messages when they are due.
 
     Args:
+        source: The log.
         sink: Takes the messages.
         name: Name of the log for messages to the user.
         speed: Seconds of the log per second.
         stop: Set to stop playing.
     """
 
-    def __init__(self, sink: Sink, name: str, speed: float, stop: threading.Event) -> None:
+    def __init__(
+        self, source: Source, sink: Sink, name: str, speed: float, stop: threading.Event
+    ) -> None:
+        self._source = source
         self._sink = sink
         self._name = name
         self._speed = speed
@@ -194,43 +124,84 @@ class _Player:
         self._is_late = False
         self._publishers: Counter[str] = Counter()
         self._channels: list[Channel | None] = []
-        self._first: int | None = None
-        self._newest = 0
+        self._told = 0  # damaged places
+        self._failure = ""
         self._waited_for = -1
-        self._start = self._last_due = 0.0
 
-    def play(self, steps: Iterator[_Step]) -> None:
-        """Play all steps."""
+    def run(self) -> None:
+        """Play the log to its end, or until it is stopped."""
         try:
-            for step in steps:
-                if step.end:
-                    self._wait_for_the_end()
-                    self._end(step.error)
-                    return
-                self._begin(step)
-                if step.rows is not None:
-                    self._play(step.rows)
+            with self._source:
+                self._play()
         except BaseException as error:
             if not self._stop.is_set():
                 self._sink.ended(f"{self._name}: playing failed ({error!r})")
             raise
+        if not self._stop.is_set():
+            for topic in self._publishers:
+                self._sink.topic_gone(topic)
+            self._sink.ended(self._failure)
 
-    def _end(self, error: BaseException | None) -> None:
-        if error is not None and not isinstance(error, SourceError):
-            raise error
-        if self._stop.is_set():
-            return
-        for topic in self._publishers:
-            self._sink.topic_gone(topic)
-        self._sink.ended("" if error is None else str(error))
+    def _play(self) -> None:
+        start, first, newest = time.monotonic(), None, 0
+        for message in self.messages():
+            if first is None:
+                start, first = time.monotonic(), message.log_time
+            due = start + (message.log_time - first) / (1e9 * self._speed)
+            while (pause := due - time.monotonic()) > 0:
+                if self._pause(pause, message.log_time):
+                    return
+            # A message in the wrong place of the log is not played late.
+            if message.log_time >= newest:
+                newest = message.log_time
+                self._check_lateness(-pause)
+            self._send(message)
+            if self._stop.is_set():
+                return
+
+    def messages(self) -> Iterator[_Message]:
+        """The messages in the order of log time, as far as one looks ahead."""
+        waiting: list[_Message] = []
+        places = count()
+        size = 0
+        try:
+            for batch in self._source.batches():
+                if self._stop.is_set():
+                    return
+                self._source.extras.clear()
+                self._begin()
+                columns = (
+                    *(batch.log_time, batch.channel, batch.publish_time, batch.sequence),
+                    *(batch.offset, batch.offset + batch.length),
+                )
+                buffer = memoryview(batch.buffer)
+                rows = zip(*(column.tolist() for column in columns), strict=True)
+                waiting += [
+                    _Message(at, next(places), channel, sent, sequence, bytes(buffer[begin:end]))
+                    for at, channel, sent, sequence, begin, end in rows
+                ]
+                waiting.sort()
+                size += batch.payload_bytes
+                out = 0
+                while size > _WINDOW or len(waiting) - out > _WINDOW_ROWS:
+                    yield waiting[out]
+                    size -= len(waiting[out].payload)
+                    out += 1
+                del waiting[:out]
+        except SourceError as error:
+            self._failure = str(error)
+        self._begin()
+        yield from waiting
 
     # Channels and damage.
 
-    def _begin(self, step: _Step) -> None:
-        for channel in step.channels[len(self._channels) :]:
+    def _begin(self) -> None:
+        """Tell the channels and the damage that the last read has found."""
+        for channel in self._source.channels[len(self._channels) :]:
             self._channels.append(self._add(channel))
-        for damage in step.damage:
+        for damage in self._source.damage[self._told :]:
             self._report(damage)
+        self._told = len(self._source.damage)
 
     def _add(self, channel: Channel) -> Channel | None:
         """The channel that the sink knows, None if it does not want the topic."""
@@ -257,47 +228,6 @@ class _Player:
 
     # The messages.
 
-    def _play(self, rows: Rows) -> None:
-        if self._first is None:
-            self._first = self._newest = int(rows.table.log_time[0])
-            self._start = time.monotonic()
-        due = self._due(rows)
-        self._last_due = max(self._last_due, float(due[-1]))
-        wanted = np.array([channel is not None for channel in self._channels])
-        rows = rows.take(np.flatnonzero(wanted[rows.table.channel]))
-        times, due = rows.table.log_time, self._due(rows)
-        at = 0
-        while at < len(rows):
-            now = time.monotonic()
-            ready = int(np.searchsorted(due, now, side="right"))
-            if ready <= at:
-                if self._pause(float(due[at]) - now, int(times[at])):
-                    return
-                continue
-            ready = min(ready, at + _MAX_MESSAGES)
-            newest = int(times[ready - 1])
-            # A message in the wrong place of the log is not played late.
-            if newest >= self._newest:
-                self._newest = newest
-                self._check_lateness(now - float(due[ready - 1]))
-            self._send(rows.take(slice(at, ready)))
-            at = ready
-            if self._stop.is_set():
-                return
-
-    def _due(self, rows: Rows) -> NDArray[np.float64]:
-        """Times at which messages are due, by the monotonic clock."""
-        elapsed = rows.table.log_time - (self._first or 0)
-        return self._start + elapsed / (1e9 * self._speed)
-
-    def _wait_for_the_end(self) -> None:
-        """Wait until the last message is due, even if its topic is not recorded."""
-        while not self._stop.is_set():
-            pause = self._last_due - time.monotonic()
-            if pause <= 0:
-                return
-            self._stop.wait(min(pause, _MAX_PAUSE_S))
-
     def _pause(self, pause: float, moment: int) -> bool:
         """Wait for the message of a log time; True if the source is stopped."""
         if pause > _LONG_S and moment != self._waited_for:
@@ -316,18 +246,13 @@ class _Player:
                 f"{behind:.1f} s late; none is skipped, but a lower speed keeps their timing"
             )
 
-    def _send(self, rows: Rows) -> None:
-        table, take, clock = rows.table, self._sink.take, time.time_ns
-        channels = cast("list[Channel]", self._channels)  # unwanted ones are gone
-        columns = (table.channel, table.publish_time, table.sequence)
-        for payload, number, publish_time, sequence in zip(
-            rows.payloads(), *(column.tolist() for column in columns), strict=True
-        ):
-            channel = channels[number]
-            take(
+    def _send(self, message: _Message) -> None:
+        channel = self._channels[message.channel]
+        if channel is not None:
+            self._sink.take(
                 channel,
-                payload,
-                received=clock(),
-                sent=publish_time if channel.has_publish_time else None,
-                sequence=sequence or None,
+                message.payload,
+                received=time.time_ns(),
+                sent=message.publish_time if channel.has_publish_time else None,
+                sequence=message.sequence or None,
             )

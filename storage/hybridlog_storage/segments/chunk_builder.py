@@ -36,7 +36,7 @@ class ChunkBuilder:
 
     def __init__(self, capacity: int) -> None:
         self.capacity = capacity
-        """Bytes at which the writer takes the chunk; may change while the builder is empty."""
+        """Bytes at which the writer takes the chunk."""
         self._buffer = np.empty(0, np.uint8)
         self._used = 0
         self._expected = capacity  # expected bytes of the next chunk

@@ -54,7 +54,6 @@ _TURN_S = 0.1  # seconds: longest wait of a chunk before it is packed
 _SHARED = -1
 _LATCHED = -2
 _MAX_SPAN = 3600 * 10**9  # ns
-_PHASE = 0.6180339887  # whose multiples, without their whole part, never lie close together
 _SMALL_SPANS = 256  # times the usual span, for a chunk that is still small
 _SYNC_STRIDE = 32 << 20  # bytes
 _WRITTEN_AT_ONCE = 16 << 20  # bytes, at most, and one chunk
@@ -65,8 +64,7 @@ class SegmentSettings:
     """Settings for the division and compression of segments.
 
     Attributes:
-        chunk_size: Bytes of uncompressed content at which a chunk closes; a live recording
-            uses larger chunks at high rates.
+        chunk_size: Bytes of uncompressed content at which a chunk closes.
         chunk_span_ns: Log time after which a chunk of a large-payload channel closes.
         span_size: Bytes of content below which such a chunk may span 256 times as much: small
             chunks compress badly, and reading one whole costs little.
@@ -133,8 +131,6 @@ class RecordingWriter:
         settings: How to divide and compress.
         skip_compression: Returns whether to compress only chunks that shrink to a fifth or
             less; None for never.
-        next_chunk_size: Returns the size in bytes of the next chunk; None for the size in
-            the settings.
         cpu_slots: Semaphore of the processors for work that can wait. Packing a chunk takes one
             if there is no skip_compression, and waits for it a tenth of a second at most.
         on_written: Called on a writer thread when less content is waiting. With it `append`
@@ -160,7 +156,6 @@ class RecordingWriter:
         settings: SegmentSettings | None = None,
         *,
         skip_compression: Callable[[], bool] | None = None,
-        next_chunk_size: Callable[[], int] | None = None,
         cpu_slots: BoundedSemaphore | None = None,
         on_written: Callable[[], None] | None = None,
         no_index: Callable[[str], bool] | None = None,
@@ -188,8 +183,6 @@ class RecordingWriter:
         self._disk = Threads(1, "hybridlog-disk")
         self._skip_compression = skip_compression or (lambda: False)
         self._cpu_slots = cpu_slots or BoundedSemaphore(PACKERS)
-        chunk_size = self.settings.chunk_size
-        self._next_chunk_size = next_chunk_size or (lambda: chunk_size)
         self._on_written = on_written
         self._no_index = no_index or (lambda _: False)
         self._latched_apart = latched_apart
@@ -404,19 +397,8 @@ class RecordingWriter:
         """The open chunk of a cluster."""
         builder = self._clusters.get(key)
         if builder is None:
-            builder = self._clusters[key] = ChunkBuilder(self._next_chunk_size())
-        elif not len(builder):
-            builder.capacity = self._next_capacity(key, builder.capacity)
+            builder = self._clusters[key] = ChunkBuilder(self.settings.chunk_size)
         return builder
-
-    def _next_capacity(self, key: int, before: int) -> int:
-        """Bytes at which the next chunk of a cluster closes.
-
-        Topics of equal rate would close large chunks at the same time. So when chunks at least
-        double in size, each cluster starts with a different size between half and full.
-        """
-        size = self._next_chunk_size()
-        return size if size < 2 * before else size - int(size / 2 * (key * _PHASE % 1))
 
     def _fill(self, key: int, batch: Batch | LooseBatch, seq: NDArray[np.int64]) -> None:
         """Append messages to a cluster's chunk, closing chunks at their bounds."""

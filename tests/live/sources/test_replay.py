@@ -9,16 +9,15 @@ from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
-import numpy as np
 import pytest
 from mcap.writer import Writer
 
+from hybridlog.formats.log_set import open_source
 from hybridlog.live.sources import replay
 from hybridlog.live.sources.base import Cause
 from hybridlog.live.sources.replay import ReplaySource
-from hybridlog.live.sources.replay_order import Lookahead, Rows
 from hybridlog_storage.errors import SourceError, UsageError
-from hybridlog_storage.messages import Batch, Channel
+from hybridlog_storage.messages import Batch
 from tests import independent
 from tests.calls import Calls
 from tests.data import DATA, needs_data
@@ -209,72 +208,48 @@ def test_the_order_is_by_time_as_far_as_one_looks_ahead(tmp_path: Path) -> None:
     assert heard.payloads() == [b"%d" % at for at in range(3000)]
 
 
-def batch(times: Sequence[int], size: int) -> Batch:
-    count = len(times)
-    column = np.array(times, np.int64)
-    return Batch(
-        bytearray(b"".join(b"%0*d" % (size, at) for at in times)),
-        np.arange(count, dtype=np.int64) * size,
-        np.full(count, size, np.int64),
-        np.zeros(count, np.int32),
-        column,
-        column,
-        np.zeros(count, np.uint32),
-    )
-
-
-def payloads(rows: Rows | None) -> list[bytes]:
-    return [] if rows is None else list(rows.payloads())
-
-
-def test_looking_ahead_is_bounded_and_loses_nothing(limit: Limit) -> None:
+def test_looking_ahead_is_bounded_and_loses_nothing(tmp_path: Path, limit: Limit) -> None:
     limit(replay_window_bytes=10_000, replay_window_rows=300)
-    lookahead = Lookahead()
     dice = random.Random(2)
     times = [*range(2000, 4000), *range(2000)]  # the second half is late
     times[::50] = [9_000_000 + at for at in times[::50]]  # a clock that is wrong
-    got: list[bytes] = []
-    for at in range(0, len(times), 40):
+    for at in range(0, 2000, 40):
         piece = times[at : at + 40]
         dice.shuffle(piece)
-        size = dice.choice([20, 50])
-        rows = lookahead.add(batch(piece, size))
-        if rows is not None:
-            assert (np.diff(rows.table.log_time) >= 0).all()
-        got += payloads(rows)
-        for waiting in lookahead._waiting:
-            held = sum(map(len, waiting.buffers))
-            assert held <= 10_000 + 2 * waiting.table.payload_bytes
-        assert lookahead._bytes <= 10_000
-        assert lookahead._rows <= 300
-    got += payloads(lookahead.rest())
-    numbers = [int(payload) for payload in got]
+        times[at : at + 40] = piece
+    times.append(5_000_000)
+    size = {time: dice.choice([20, 50]) for time in times} | {5_000_000: 20_000}
+    path = write(tmp_path / "a.mcap", [("/a", at + 5, bytes(size[at])) for at in times])
+    with open_source(path) as source:
+        player = replay._Player(source, Heard(), "log", 1.0, threading.Event())
+        read, batches = 0, source.batches
+
+        def counted() -> Iterator[Batch]:
+            nonlocal read
+            for batch in batches():
+                read += batch.payload_bytes
+                yield batch
+
+        source.batches = counted  # type: ignore[method-assign]
+        numbers, sent = [], 0
+        for message in player.messages():
+            assert read - sent < 10_000 + 20_000 + 1000
+            sent += len(message.payload)
+            numbers.append(message.log_time - 5)
     assert sorted(numbers) == sorted(times)
     for half in (range(2000), range(2000, 4000)):
         right = [number for number in numbers if number in half]
         assert right == sorted(right)
-    assert payloads(lookahead.rest()) == []
 
 
-def test_a_message_larger_than_what_is_looked_ahead(limit: Limit) -> None:
-    limit(replay_window_bytes=100)
-    lookahead = Lookahead()
-    assert len(payloads(lookahead.add(batch([5], 1000)))) == 1
-    assert lookahead.rest() is None
-
-
-def test_what_is_late_in_the_log_is_no_lateness_of_ours() -> None:
-    def step(*times: int) -> replay._Step:
-        rows = Lookahead()
-        rows.add(batch(times, 20))
-        return replay._Step(rows.rest(), [Channel("/a", "json", None)], [])
-
+def test_what_is_late_in_the_log_is_no_lateness_of_ours(tmp_path: Path, limit: Limit) -> None:
+    limit(replay_window_rows=0)
     hour = 3600 * SECOND
+    times = [BEGIN + hour, BEGIN + hour + 1, BEGIN, BEGIN + hour + 2]
+    path = write(tmp_path / "a.mcap", [("/a", at, bytes(1000)) for at in times])
     heard = Heard()
-    player = replay._Player(heard, "log", 1.0, threading.Event())
-    end = replay._Step(None, [], [], end=True)
-    player.play(iter([step(BEGIN, BEGIN + 1), step(BEGIN - hour), step(BEGIN + 2), end]))
-    assert len(heard.taken) == 4
+    play(path, heard, speed=1.0)
+    assert [taken.sent for taken in heard.taken] == [at - 5 for at in times]
     assert heard.said == []
 
 
@@ -291,7 +266,7 @@ def test_only_what_is_wanted_is_played(tmp_path: Path) -> None:
 
 
 def test_falling_behind_is_said_once(tmp_path: Path, limit: Limit) -> None:
-    limit(replay_late_s=0.0, replay_messages=10)
+    limit(replay_late_s=0.0)
     path = write(tmp_path / "a.mcap", [("/a", BEGIN + at, b"x") for at in range(100)])
     heard = Heard()
     play(path, heard)

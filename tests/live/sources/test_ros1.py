@@ -222,22 +222,6 @@ def test_a_type_that_the_master_does_not_know() -> None:
     assert ("/topic", "std_msgs/String") in sink.asked
 
 
-@pytest.mark.parametrize("after", [2, 20])
-def test_dropped_messages_are_counted(after: int) -> None:
-    """A gap that few messages follow is reported at the end, otherwise at once."""
-    header = {"type": "a/B", "message_definition": "Header header\n"}
-    numbers = [*range(1, 21), *range(25, 25 + after)]
-    payloads = [struct.pack("<I", number) + b"rest" for number in numbers]
-    with _system(FakePublisher(sends(*payloads), fields=header)) as (_, sink):
-        sink.wait_for(*payloads)
-        if after > 8:
-            sink.wait(lambda: bool(sink.losses))
-    assert [taken.sequence for taken in sink.taken] == numbers
-    (loss,) = sink.losses
-    assert (loss.topic, loss.cause, loss.count) == ("/topic", Cause.TRANSPORT, 4)
-    assert "/node" in loss.detail
-
-
 def test_a_master_that_is_not_there_yet() -> None:
     sink, port = Collector(), _free_port()
     with Ros1Source(f"http://127.0.0.1:{port}") as source:

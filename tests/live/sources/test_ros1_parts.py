@@ -186,7 +186,9 @@ def test_who_calls_while_the_server_is_stopped_is_hung_up_on(turns: int) -> None
     assert [str(warning.message) for warning in told] == []
 
 
-_NUMBERED = Channel("/topic", "ros1", Schema("a/B", "ros1msg", b"Header header\n"))
+_NUMBERED = Channel(
+    "/topic", "ros1", Schema("a/B", "ros1msg", b"Header header\n"), {"callerid": "/node"}
+)
 _PLAIN = Channel("/topic", "ros1", Schema("a/B", "ros1msg", b"string data\n"))
 
 
@@ -265,6 +267,7 @@ def test_a_gap_lies_between_the_message_before_it_and_the_one_after() -> None:
         (2, times[9], times[10]),
         (6, times[11], times[12]),
     ]
+    assert all("/node" in loss.detail for loss in pipe.sink.losses)
 
 
 @pytest.mark.parametrize(
