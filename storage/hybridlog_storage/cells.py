@@ -209,17 +209,22 @@ class Cells:
     # Cells.
 
     def read(self, kind: str, key: str, number: int = 0) -> bytes | None:
-        """A cell; None if it is missing or damaged."""
+        """A cell; None if it is missing."""
         found = self._found(f"{_SELECT} key = ? AND number = ?", kind, key, number)
         return next(iter(found.values()), None)
 
     def each(self, kind: str, containing: bytes = b"") -> dict[str, bytes]:
-        """All cells of a kind by key, or those with some bytes in them; without damaged ones."""
+        """All cells of a kind by key, or those with some bytes in them."""
         return self._found(f"{_SELECT} instr(body, ?)", kind, containing)
 
     def _found(self, query: str, *values: object) -> dict[str, bytes]:
-        rows = self._run(lambda opened: opened.execute(query, values).fetchall())
-        return {row[1].decode(errors="replace"): row[3] for row in rows if _is_whole(*row)}
+        def work(opened: sqlite3.Connection) -> dict[str, bytes]:
+            rows = opened.execute(query, values).fetchall()
+            if not all(_is_whole(*row) for row in rows):
+                raise sqlite3.DatabaseError("a cell is damaged")
+            return {row[1].decode(): row[3] for row in rows}
+
+        return self._run(work)
 
     def write(self, make: Callable[[], Iterable[Statement]], wait_s: float = 0) -> None:
         """Change cells.
