@@ -123,7 +123,7 @@ def test_no_mongod_is_none(bag: Path, tmp_path: Path, monkeypatch: pytest.Monkey
         assert store.topic("scan").where("range_max > 0").count() == store.topic("scan").count() > 0
 
 
-def test_a_mongod_that_ends_twice_is_none(
+def test_a_mongod_that_ends_at_once_is_none(
     bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     script = f'echo start >> {tmp_path}/starts; echo "Exec format error"; exit 1'
@@ -131,7 +131,7 @@ def test_a_mongod_that_ends_twice_is_none(
     with hl.open(tmp_path / "store", create=True) as store:
         report = store.record(bag)
         assert (report.failure, report.indexed) == (None, 0)
-        assert (tmp_path / "starts").read_text() == "start\n" * 2
+        assert (tmp_path / "starts").read_text() == "start\n"
         assert store.topic("scan").where("ranges.min > 0").count() > 0
 
 
