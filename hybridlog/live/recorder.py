@@ -64,7 +64,7 @@ if TYPE_CHECKING:
 
 _MAX_REPORTS = 1000
 _MAX_CACHED = 4096  # channel objects that are found without comparing their content
-_MAX_EXPECTED = 1000  # channels that get a collection before their first message
+_MAX_EXPECTED = 1000  # channels whose definitions are parsed before their first message
 _SEQUENCES = 1 << 32
 _HELD_SHARE = 8  # of the memory budget, for messages that come before `/clock`
 _CLOCK_WAIT_S = 5.0

@@ -26,6 +26,7 @@ from hybridlog.live.recorder import Recorder, RecorderOptions
 from hybridlog.live.recording import LiveOptions, LiveRecording
 from hybridlog.live.state import choose, read, running, summary_of
 from hybridlog.query.topics import matcher
+from hybridlog.record.capture import Capture
 from hybridlog.record.losses import Cause, Loss
 from hybridlog.record.marks import MARKS
 from hybridlog_storage.disk import append_file
@@ -37,7 +38,6 @@ from hybridlog_storage.errors import (
     UsageError,
 )
 from hybridlog_storage.messages import SUPPLIED, Channel, Schema
-from hybridlog_storage.mongo.collection_names import collection_of
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import places
 from tests.calls import Calls
@@ -502,16 +502,16 @@ def test_the_reserve_holds_for_what_waits_in_memory(
     assert robot.recorder.stop() == []
 
 
-def test_what_is_expected_is_ready_before_its_first_message(store: hl.Store, limit: Limit) -> None:
+def test_what_is_expected_is_ready_before_its_first_message(
+    store: hl.Store, limit: Limit, calls: Calls
+) -> None:
     limit(expected_topics=2)
-    database = store.shared.index.database_for("This")
+    prepared = calls(Capture, "expect")
     robot = Running(store)
     channels = [text_channel(topic) for topic in ("/said", "/silent", "/one_too_many")]
     for channel in channels:
         robot.recorder.expect(channel)
-    said, silent, beyond = (collection_of(channel.topic) for channel in channels)
-    wait_for(lambda: {said, silent} <= set(database.list_collections()))
-    assert beyond not in database.list_collections()
+    assert [channel.topic for _, channel in prepared] == ["/said", "/silent"]
     robot.speaker.say(channels[0], text("x"))
     (report,) = robot.recorder.stop()
     assert [channel.topic for channel in report.entry.channels] == ["/said"]
