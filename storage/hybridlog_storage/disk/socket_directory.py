@@ -94,15 +94,3 @@ def is_private(directory: Path) -> bool:
         and about.st_uid == os.geteuid()
         and not stat.S_IMODE(about.st_mode) & 0o077
     )
-
-
-def is_our_socket(path: str) -> bool:
-    """True if a path is a socket of this user in a private directory."""
-    place = Path(path)
-    if not place.is_absolute() or ".." in place.parts or not is_private(place.parent):
-        return False
-    try:
-        about = place.lstat()
-    except (OSError, ValueError):
-        return False
-    return stat.S_ISSOCK(about.st_mode) and about.st_uid == os.geteuid()
