@@ -18,7 +18,6 @@ from hybridlog.cli.options import AsJson, Choosing, InStore, Quiet, cache_size
 from hybridlog.cli.progress import Bar
 from hybridlog.cli.render import Column, numbers, print_table
 from hybridlog.cli.signals import if_stopped
-from hybridlog.cli.watching import watch
 from hybridlog.wording import listed
 from hybridlog_storage.errors import StoreError, UsageError
 
@@ -222,6 +221,8 @@ def watch_command(given: _Watch) -> None:
     For a server into whose store robots copy. While MongoDB is unavailable, it tries again.
     Several may watch one store.
     """
+    from hybridlog.cli.watching import watch
+
     with given.opened(require_database=True, quiet=given.quiet, is_lasting=True) as store:
         look = partial(_look, store, given)
         watch(store.directory.path, look, pause_s=given.every, quiet=given.quiet)

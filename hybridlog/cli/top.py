@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 from hybridlog.cli import output
 from hybridlog.cli.binder import argument, command, option
 from hybridlog.cli.completion import complete_field, complete_running
-from hybridlog.cli.live_table import LiveTable, drawn
 from hybridlog.cli.options import AsJson, InStore
 from hybridlog.cli.signals import Stopped
 from hybridlog_storage.errors import UsageError
@@ -51,6 +50,7 @@ def top_command(given: _Given) -> None:
 
     Without a terminal, and without --json, the state is shown once.
     """
+    from hybridlog.cli.live_table import LiveTable, drawn
     from hybridlog.live.state import choose, states, summary_of
     from hybridlog.query.times import parse_duration
     from hybridlog.store import store_path

@@ -198,8 +198,9 @@ def test_a_ring_in_which_nothing_comes_any_more(plain: hl.Store) -> None:
 
 def test_a_file_that_was_let_go_and_not_deleted_is_deleted_later(plain: hl.Store) -> None:
     robot = Robot(plain)
-    robot.run(0.3)
-    manifest = plain.directory.manifests.read(robot.recorder._target.id)
+    manifests, recording = plain.directory.manifests, robot.recorder._target.id
+    while (manifest := manifests.find(recording)) is None or not manifest.files:
+        robot.run(0.1)
     name = manifest.files[0].name
     kept = (robot.folder / name).read_bytes()
     robot.run(1.2)
