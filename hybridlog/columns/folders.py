@@ -47,6 +47,8 @@ MAX_SHARED_ROWS: Final = 50_000
 """Maximum number of rows of several recordings in one file."""
 MAX_SHARED_BYTES: Final = 4 << 20
 """Size from which a shared file gets no more recordings."""
+MAX_SHARED_RECORDINGS: Final = 256
+"""Maximum number of recordings in one file: each one that comes costs a look at all of them."""
 _SHARED_NAME: Final = re.compile(rf"{SHARED}(\d{{6,}}){re.escape(SUFFIX)}", re.ASCII)
 _MAX_LIST_BYTES: Final = 256 << 20
 _STABLE_NS: Final = 100_000_000  # a time of change that is older tells of every later change
@@ -223,6 +225,7 @@ class TableFolders:
             number = max(numbers) + (reader is not None)
             if (
                 reader is not None
+                and len(reader.about.recordings) < MAX_SHARED_RECORDINGS
                 and reader.size_bytes < MAX_SHARED_BYTES
                 and reader.about.rows + addition.section.rows <= MAX_SHARED_ROWS
             ):
