@@ -293,6 +293,12 @@ class TableWriter:
         self._seen: set[int] = set()  # segments
         self._cut: dict[int, str] = {}  # digests of the closed ones
 
+    @property
+    def rows_in_memory(self) -> int:
+        """Number of rows waiting to be written."""
+        pieces = (piece.rows for topic in self._topics.values() for piece in topic.pieces)
+        return sum(len(chunk.batch) for chunk in self._held) + sum(pieces)
+
     def add(self, chunk: StoredChunk, channels: Mapping[int, Channel]) -> None:
         """Add the messages of a chunk."""
         if self._has_ended:
