@@ -172,9 +172,7 @@ def _write_files(query: Query, to: Destination, directory: Path, front: Front) -
             left_out.append(error)
             continue
         _print_written(path, one, missing, quiet=to.quiet)
-        query.counters.reduced += one.counters.reduced
-        query.counters.expired += one.counters.expired
-        query.counters.not_copied += one.counters.not_copied
+        query.counters.add(one.counters)
     if len(left_out) == len(paths):
         raise left_out[0]
 

@@ -96,8 +96,8 @@ class _Choices(Asking, Tabular, Slices):
 def fetch_command(choices: _Choices) -> None:
     """Fetch messages by topic, time and content.
 
-    Without --format and -o: a table on a terminal, JSON lines elsewhere. The cost of the
-    answer, and what it may lack, is printed on standard error.
+    Without --format and -o: a table on a terminal, JSON lines elsewhere. What the answer may
+    lack is printed on standard error.
     """
     to = _destination(choices)
     started = time.monotonic()

@@ -60,8 +60,12 @@ class _Given(Choosing, InStore, AsJson, Quiet):
         shell_complete=complete_condition,
         needs=("pin",),
     )
-    before: str = option("With --pin: so much before it, too.", "TIME", default="0s")
-    after: str = option("With --pin: so much after it, too.", "TIME", default="0s")
+    before: str = option(
+        "With --at or --when: so much before it, too.", "TIME", default="0s", needs=("at", "when")
+    )
+    after: str = option(
+        "With --at or --when: so much after it, too.", "TIME", default="0s", needs=("at", "when")
+    )
     reason: str = option("With --pin: why.", "TEXT", default="", needs=("pin",))
     unpin: tuple[str, ...] = option("Remove a pin.", "PIN", excludes=("pins", "topic", *_RULES))
     pins: bool = option("List the pins.", excludes=("topic", *_RULES))

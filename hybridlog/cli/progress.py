@@ -30,13 +30,18 @@ class Bar:
         self._bar: Progress | None = None
         self._before = self._last = 0
         self._part: tuple[str, int] | None = None
+        self._over = False
 
     def __enter__(self) -> Self:
         """The bar, which does not show yet."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Remove it."""
+        """Remove it; what comes later is shown until it is complete."""
+        self._over = True
+        self._remove()
+
+    def _remove(self) -> None:
         if self._bar is not None:
             self._bar.stop()
             self._bar = None
@@ -61,6 +66,8 @@ class Bar:
             self._part = recording, total
         self._last = done
         self(done + (self._before if self._total else 0), recording, max(total, 1))
+        if self._over and done >= total:
+            self._remove()
 
 
 def _make(*, has_end: bool) -> Progress:

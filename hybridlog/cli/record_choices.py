@@ -80,6 +80,7 @@ class RecordChoices(Between, Latched, InStore, AsJson, Quiet):
         "TIME",
         type=SECONDS,
         default="60s",
+        needs=("watch",),
     )
     chunk_size: int | None = option(
         "Uncompressed size of a chunk, such as 512KiB; without, 2MiB, less where --budget is "

@@ -207,7 +207,7 @@ class Recorder:
         self._sink: Sink = self._simulated or self
         self._target = store.start(options.name, self._live_options())
         self.name = self._target.name
-        self._says = StateFile(store.directory.path, self._target.id)
+        self._says = StateFile(store.directory, self._target.id)
         self._ring = self._make_ring()
         self._triggers = Triggers(options.triggers, say)
         self._incidents = Incidents(

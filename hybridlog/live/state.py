@@ -99,16 +99,26 @@ def summary_of(state: RecorderState) -> dict[str, Any]:
 class StateFile:
     """The file with the state of a recorder.
 
+    Files that killed recorders have left are removed.
+
     Args:
-        store: The store's directory.
+        directory: The store.
         recording: Id of its recording.
     """
 
-    def __init__(self, store: Path, recording: str) -> None:
-        self._path = _path(store, recording)
+    def __init__(self, directory: StoreDirectory, recording: str) -> None:
+        self._path = _path(directory.path, recording)
+        self._over = False
+        with suppress(OSError, HybridlogError):
+            for file in files.names(self._path.parent):
+                other = file.removesuffix(_SUFFIX)
+                if other != file and not directory.is_recorded(other):
+                    files.unlink(self._path.parent / file)
 
     def write(self, state: RecorderState) -> None:
-        """Replace it; on a full disk the last one stays."""
+        """Replace it, until it is removed; on a full disk the last one stays."""
+        if self._over:
+            return
         with suppress(OSError):
             with suppress(FileExistsError):
                 files.make_folder(self._path.parent)
@@ -116,6 +126,7 @@ class StateFile:
 
     def remove(self) -> None:
         """Remove it: the recorder ends."""
+        self._over = True
         with suppress(OSError):
             files.unlink(self._path)
 

@@ -48,8 +48,8 @@ class Trigger:
             WhereError: The predicate is malformed.
         """
         topic, predicate = split_topic(text)
-        if not topic:
-            raise UsageError(f"--trigger wants TOPIC: PREDICATE, not {text!r}.")
+        if not topic or (not predicate and " " in topic):
+            raise UsageError(f"--trigger wants TOPIC, or TOPIC: PREDICATE, not {text!r}.")
         fits = matcher([topic])
         condition = parse(predicate) if predicate else None
         for path in [] if condition is None else condition.fields():

@@ -150,7 +150,7 @@ def test_messages_that_are_not_written_yet_are_counted(tmp_path: Path) -> None:
             recording.write(KEPT, PAYLOAD, log_time=BEGIN_NS + second * SECOND_NS)
         wait_for(is_known)
         nothing = RecorderState("now", 0, [], 0, 0, {}, 0, 0, 0, "", 0, 0)
-        says = StateFile(tmp_path / "store", recording.id)
+        says = StateFile(store.directory, recording.id)
         says.write(replace(nothing, taken={"/kept": 15, "/other": 100}))
         done = run("fetch", "-t", "/kept", "--count", store=tmp_path / "store")
     assert "now is being recorded: 12 messages not written yet" in done.err
