@@ -115,6 +115,8 @@ def test_all_payloads_of_a_copy_have_expired(running: Running, tmp_path: Path) -
     with hl.open(copied, mongo=NO_MONGODB) as store:
         check_expired(store, known)
         assert store.entry(LABEL).messages == len(known.of())
+    done = answer("export", tmp_path / "out", "-F", "csv", "-t", "arm", store=copied)
+    assert "no long arrays: their payloads were deleted to make room; these are null" in done.err
 
 
 def test_payloads_expire_while_it_is_recorded(tmp_path: Path) -> None:
