@@ -694,6 +694,18 @@ class Session:
                 raise
             return self._newer_segment(recording, number)
 
+    def hold(self, recording: RecordingEntry, segments: Iterable[int]) -> None:
+        """Open segments that will be read, if a ring may let them go meanwhile.
+
+        Raises:
+            ChangedError: One has been let go.
+        """
+        numbers = [*map(int, recording.digests)]
+        has_let_go = len(numbers) <= max(numbers, default=-1)
+        if recording.status in UNFINISHED and has_let_go:
+            for number in segments:
+                self.segment(recording.id, number)
+
     def _has_let_go(self, recording: str, number: int) -> bool:
         """True if a ring has let a segment go."""
         now = self.directory.manifests.find(recording)

@@ -255,10 +255,14 @@ def positions(points: NDArray[Any]) -> NDArray[np.float64]:
 
 
 def point_columns(points: NDArray[Any]) -> dict[str, NDArray[Any]]:
-    """The fields of points, each of shape (n,); those of several numbers become as many."""
+    """The fields of points, each of shape (n,); those of several numbers become as many.
+
+    Numbers have the byte order of this machine.
+    """
     columns: dict[str, NDArray[Any]] = {}
     for name in points.dtype.names or ():
         values = points[name].reshape(points.size, -1)
+        values = values.astype(values.dtype.newbyteorder("="), copy=False)
         for place in range(values.shape[1]):
             own = name + (f"_{place}" if values.shape[1] > 1 else "")
             columns[_unique(own, list(columns))] = values[:, place]

@@ -448,6 +448,7 @@ class Rows:
         chunks = (
             [] if is_empty else self.session.chunks(part.recording, list(indexes), bounds, clock)
         )
+        self.session.hold(part.recording, {chunk.segment for chunk in chunks})
         return RecordingScan(part.recording, indexes, part.bounds, chunks, part.windows)
 
     def count_in_chunks(self, parts: Sequence[Part]) -> int:

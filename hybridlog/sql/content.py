@@ -45,6 +45,7 @@ class StoreContent:
     Raises:
         TopicError: A recording does not exist any more.
         TimeError: The range of time is empty, or outside all recordings.
+        ChangedError: A ring has just let files go.
     """
 
     def __init__(self, session: Session, scope: Question) -> None:
@@ -65,6 +66,8 @@ class StoreContent:
         # DuckDB asks on threads of its own, which see a later moment.
         unfinished = (one for one in self.summaries if one.status in UNFINISHED)
         self._running = {one.id: session.entry_of(one) for one in unfinished}
+        for entry in self._running.values():
+            session.hold(entry, map(int, entry.digests))
         self.names = ViewNames(topics)
 
     def summaries_of(self, topic: str) -> list[RecordingSummary]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import threading
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from difflib import get_close_matches
 from functools import partial
@@ -23,11 +23,7 @@ from hybridlog.sql.store_tables import store_schema, store_table
 from hybridlog.sql.topic_view import Reading
 from hybridlog.sql.usage import EVERYTHING, Usage, usage_of
 from hybridlog.wording import listed
-from hybridlog_storage.errors import (
-    HybridlogError,
-    TopicError,
-    UsageError,
-)
+from hybridlog_storage.errors import ChangedError, HybridlogError, TopicError, UsageError
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -96,6 +92,12 @@ class SqlEngine:
 
     def content(self, scope: Question = EVERYWHERE) -> StoreContent:
         """Recordings and views of a scope as they are now."""
+        for _ in range(_MAX_TRIES):
+            with suppress(ChangedError):
+                return self._read(scope)
+        return self._read(scope)
+
+    def _read(self, scope: Question) -> StoreContent:
         with self._lock:
             known, session = self._content, self._source.now()
             if known is None or known.scope != scope or known.snapshot is not session.look():
@@ -478,14 +480,15 @@ class SqlAnswer:
             worker.close()
 
     def _tried(self, call: Callable[[], _T]) -> _T:
-        """The result of a call; repeated when a table was damaged, which is made again."""
+        """The result of a call; repeated when a table was damaged or files were replaced."""
         for _ in range(_MAX_TRIES):
             self._reading = self._connection.reading = Reading(self._reading.usage)
             try:
                 with self._explained():
                     return call()
-            except DamagedTableError as damaged:
-                self._connection.engine.reject(damaged)
+            except (ChangedError, DamagedTableError) as error:
+                if isinstance(error, DamagedTableError):
+                    self._connection.engine.reject(error)
                 self._connection.register(self._connection.content)
                 self._prepare()
         with self._explained():

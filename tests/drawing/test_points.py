@@ -12,11 +12,13 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
+import pyarrow as pa
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import hybridlog as hl
+from hybridlog.arrays.point_arrays import point_columns
 from hybridlog.drawing.points import Points, bounds, points
 from hybridlog.message import Message
 from hybridlog_storage.errors import PayloadError
@@ -504,3 +506,8 @@ def test_a_real_scan_and_the_cloud_that_its_driver_made_of_it() -> None:
 
 def _stamp(message: Any) -> int:
     return int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec)
+
+
+def test_columns_have_the_byte_order_of_this_machine() -> None:
+    given = np.array([(1, 2)], [("x", ">f4"), ("y", ">f8")])
+    assert [pa.array(one).to_pylist() for one in point_columns(given).values()] == [[1], [2]]

@@ -117,6 +117,8 @@ def test_questions_are_answered_while_files_go(plain: hl.Store) -> None:
             found = ids(other)
             assert found == [*range(found[0], found[0] + len(found))]
             assert other.topic("/scan").count() > 0
+            assert other.topic("/scan").where("near >= 0").to_arrow().num_rows > 0
+            assert other.sql("select count(*) as n from scan").to_pandas()["n"][0] > 0
             with hl.open(plain.directory.path, mongo="none") as newer:
                 (one,) = newer.recordings()
                 assert one.end.get("losses", []) == []
