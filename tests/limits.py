@@ -31,6 +31,7 @@ PLACES = {
     "index_group_bytes": "hybridlog.index.index_writer._GROUP_BYTES",
     "clock_wait_s": "hybridlog.live.recorder._CLOCK_WAIT_S",
     "expected_topics": "hybridlog.live.recorder._MAX_EXPECTED",
+    "full_manifest_bytes": "hybridlog.live.recorder._FULL_BYTES",
     "slow_write_s": "hybridlog.live.recorder._SLOW_WRITE_S",
     "late_times": "hybridlog.live.recording._LATE_TIMES",
     "laid_out_bytes": "hybridlog.live.recording._MAX_BATCH_BYTES",

@@ -72,7 +72,7 @@ class LiveSummary:
         if not self.reports:
             output.note("Nothing was stored.")
             return
-        report = self.reports[0]
+        report = self.reports[-1]
         fields = [("recording", report.entry.name)]
         fields += closing_rows(report, self.state, self.unreached)
         if self.recorder.reason:

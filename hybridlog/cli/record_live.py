@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from hybridlog.cli.record_choices import RecordChoices
     from hybridlog.live.recorder import Recorder
     from hybridlog.live.state import RecorderState
+    from hybridlog.record.recorder import RecordReport
     from hybridlog.store import Store
 
 _STATE_S = 1.0
@@ -56,6 +57,7 @@ def _record(choices: RecordChoices) -> None:
     sources = sources_of(choices)
     quiet = choices.quiet
     display = _Display(as_json=choices.as_json, quiet=quiet)
+    reports: list[RecordReport] = []
     with ExitStack() as held:
         for source in sources:
             held.enter_context(source).check()
@@ -65,15 +67,25 @@ def _record(choices: RecordChoices) -> None:
             recorder = Recorder(store, sources, options, display.say)
             recorder.start()
             recovery = _begin_recovery(choices, store)
-            with display.table(), _pinned_by_signal(recorder):
-                last = _watch(recorder, stop, display)
+            while True:
+                with display.table(), _pinned_by_signal(recorder):
+                    last = _watch(recorder, stop, display)
+                if stop.is_set or not recorder.is_full:
+                    break
+                reports += recorder.stop()
+                options, sources, full = recorder.rest, sources_of(choices), recorder.name
+                recorder = Recorder(
+                    store, [*map(held.enter_context, sources)], options, display.say
+                )
+                recorder.start()
+                display.say(f"the manifest of {full} is full: {recorder.name} goes on")
             notify_service("STOPPING=1", "STATUS=writing what is left")
             if quiet:
-                reports = recorder.stop()
+                reports += recorder.stop()
             else:
                 output.note("hybridlog: writing what is left; Ctrl-C leaves at once")
                 with _explain_wait(last):
-                    reports = recorder.stop()
+                    reports += recorder.stop()
             while recovery.is_alive() and not stop.wait(_RECOVERY_POLL_S):
                 pass
         rules, results = options.contract, []

@@ -48,9 +48,11 @@ from hybridlog.record.marks import CLOCK_SET, CONTRACT
 from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.completion import completed
 from hybridlog.schema.reduced_codec import reduce, reduced_channel
+from hybridlog_storage.disk import files
 from hybridlog_storage.errors import DiskFullError, HybridlogError, StoreError, UsageError
 from hybridlog_storage.manifest import Mark, new_random, with_mark
 from hybridlog_storage.manifest import replace as replaced
+from hybridlog_storage.manifests import MANIFESTS
 from hybridlog_storage.messages import Channel
 
 if TYPE_CHECKING:
@@ -64,6 +66,7 @@ if TYPE_CHECKING:
 
 _MAX_REPORTS = 1000
 _MAX_CACHED = 4096  # channel objects that are found without comparing their content
+_FULL_BYTES = 4 << 20  # of a manifest; then another recording goes on
 _MAX_EXPECTED = 1000  # channels whose definitions are parsed before their first message
 _SEQUENCES = 1 << 32
 _HELD_SHARE = 8  # of the memory budget, for messages that come before `/clock`
@@ -185,6 +188,8 @@ class Recorder:
         self._unended = len(sources)
         self._over = threading.Event()
         self.reason = ""  # for the end; empty while the recorder runs
+        self.is_full = False  # another recording goes on
+        self._goes_on = all(source.kind != "replay" for source in sources)
         self._left, self._room = options.max_messages, options.max_bytes
         self._closed = False
         self._refused: tuple[Cause, str] | None = None
@@ -336,6 +341,14 @@ class Recorder:
             for topic, count in self._target.cut_off.items():
                 self._count_lost(topic, Cause.DISK, count)
         return reports
+
+    @property
+    def rest(self) -> RecorderOptions:
+        """Options of the recording that goes on after a full one: what is left of the limits."""
+        options, left = self._options, self._options.duration_s
+        if left is not None:
+            left = max(left - (time.monotonic() - self._started), 1e-3)
+        return replace(options, duration_s=left, max_messages=self._left, max_bytes=self._room)
 
     @property
     def stopped_for_disk(self) -> bool:
@@ -731,6 +744,13 @@ class Recorder:
         if options.duration_s is not None and state.elapsed_s >= options.duration_s:
             self._end("the duration is over")
             return
+        if self._goes_on and not self._over.is_set():
+            with suppress(OSError):
+                manifest = self._directory.path / MANIFESTS / f"{self._target.id}.json"
+                self.is_full = files.status(manifest).st_size >= _FULL_BYTES
+            if self.is_full:
+                self._end("its manifest is full")
+                return
         grown, self._stored_bytes = state.stored_bytes - self._stored_bytes, state.stored_bytes
         # Messages in memory will be written, and as many new ones before the next check.
         coming = state.filled * options.budget_bytes + grown
