@@ -23,7 +23,6 @@ from hybridlog.cli.completion import (
     complete_topic,
     complete_type,
 )
-from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.render import Column, print_table
 from hybridlog.formats import formats_of
 from hybridlog.query.choice import Choice
@@ -61,6 +60,8 @@ class InStore(Place):
     def opened(self, **how: Any) -> AbstractContextManager[Store]:
         """The open store; see `opened_store`."""
         how.setdefault("quiet", getattr(self, "quiet", False) or getattr(self, "as_json", False))
+        from hybridlog.cli.open_store import opened_store
+
         return opened_store(self.store, self.mongo, **how)
 
 
