@@ -360,7 +360,7 @@ def test_a_running_recording_is_marked_while_it_runs(tmp_path: Path) -> None:
     with hl.open(tmp_path / "store", create=True) as store:
         with store.start("live") as recording:
             recording.write(channel, b"{}", log_time=SECOND)
-            wait_for(lambda: "/n" in store.topics())
+            wait_for(lambda: "/n" in store.topics() and store.entry("live").messages == 1)
             with hl.open(tmp_path / "store") as other:
                 other.mark("live", "+0s", "begun", {"by": "lab"}, until="3")
                 other.mark(recording.id, SECOND, "wrong")
