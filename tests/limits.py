@@ -12,6 +12,7 @@ PLACES = {
     "align_piece_bytes": "hybridlog.across.align._PIECE_BYTES",
     "printed_rows_at_once": "hybridlog.cli.render.ROWS_AT_ONCE",
     "column_file_open_files": "hybridlog.columns.column_file._OPEN_FILES",
+    "shared_file_recordings": "hybridlog.columns.folders.MAX_SHARED_RECORDINGS",
     "shared_file_rows": "hybridlog.columns.folders.MAX_SHARED_ROWS",
     "settled_ns": "hybridlog.columns.folders._STABLE_NS",
     "table_group_rows": "hybridlog.columns.table_writer.GROUP_ROWS",

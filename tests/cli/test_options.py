@@ -110,6 +110,14 @@ def test_ages_choose(tmp_path: Path) -> None:
         )
 
 
+def test_what_needs_another_option(store: Path) -> None:
+    for words, said in (
+        (("keep", "--pin", "-r", "*", "--before", "1s"), "--before is for --at or --when"),
+        (("record", "a.bag", "--settle", "3s"), "--settle is for --watch"),
+    ):
+        assert said in _error(*words, store=store)
+
+
 def test_what_people_read(store: Path, tmp_path: Path) -> None:
     """A contract's verdict in a comparison, and ends of marks as times."""
     rules = tmp_path / "rules.yaml"

@@ -99,6 +99,7 @@ def test_what_a_person_marks_and_pins_is_stored_at_once(store: hl.Store) -> None
     [
         ("", UsageError),
         (": x > 1", UsageError),
+        ("status > 3", UsageError),
         ("re:(: x", TopicError),
         ("/a: x >", WhereError),
         ("/a: _meta.seq > 1", WhereError),

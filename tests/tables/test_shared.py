@@ -116,8 +116,11 @@ def test_a_closed_file_that_was_replaced_is_not_believed(several: hl.Store, tmp_
         file.table()
 
 
-def test_a_full_file_gets_no_more_rows(store: hl.Store, tmp_path: Path, limit: Limit) -> None:
-    limit(shared_file_rows=70)
+@pytest.mark.parametrize("most", [{"shared_file_rows": 70}, {"shared_file_recordings": 2}])
+def test_a_full_file_gets_no_more_rows(
+    store: hl.Store, tmp_path: Path, limit: Limit, most: dict[str, int]
+) -> None:
+    limit(**most)
     for number in range(5):
         record(store, tmp_path, number)
     rows = [pq.read_metadata(path).num_rows for path in files_of(store)]
