@@ -162,7 +162,7 @@ class Inventory:
         return {} if self.manifest is None else self.manifest.logs
 
     def cure(self, misfit: Misfit, otherwise: str) -> str:
-        """What to do about a misfit: rename it, unless the segment of that name is there."""
+        """The cure of a misfit: to rename it, unless the segment of that name is there."""
         there = {self.listing.sealed[number] for number in self.summaries}
         is_renamed = misfit.own_name and misfit.own_name not in there
         return f"rename it to {misfit.own_name}" if is_renamed else otherwise
@@ -430,7 +430,7 @@ def describe(catalog: Catalog, inventory: Inventory, *, is_open: bool = False) -
 def described_of(
     entry: RecordingEntry, look: str, files: str, channels: Mapping[int, Channel] | None = None
 ) -> Described:
-    """What the catalog takes of a recording.
+    """The rows of a recording in the catalog.
 
     Args:
         entry: Its entry, without marks that somebody set.

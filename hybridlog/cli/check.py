@@ -86,17 +86,17 @@ def check_command(given: _Check) -> None:
             *([] if is_one else [Column("recording")]),
             Column("topic"),
             Column("messages", side="right"),
-            Column("Hz", lambda row: row["rate_hz"] and f"{row['rate_hz']:.2f}", "right", spare=3),
-            Column("jitter", lambda row: _duration(row["jitter_ns"]), "right", spare=2),
+            Column("Hz", lambda row: row["rate_hz"] and f"{row['rate_hz']:.2f}", "right", order=3),
+            Column("jitter", lambda row: _duration(row["jitter_ns"]), "right", order=2),
             Column("longest gap", lambda row: _duration(row["gap_ns"]), "right"),
-            Column("from", _gap_begin, "right", spare=1),
-            Column("late", lambda row: _edge(row, "late_ns"), "right", spare=6),
-            Column("early", lambda row: _edge(row, "early_ns"), "right", spare=5),
+            Column("from", _gap_begin, "right", order=1),
+            Column("late", lambda row: _edge(row, "late_ns"), "right", order=6),
+            Column("early", lambda row: _edge(row, "early_ns"), "right", order=5),
             Column(
                 "lost",
                 lambda row: "?" if row["lost"] is None else row["lost"],
                 "right",
-                spare=0 if has_losses else 4,
+                order=0 if has_losses else 4,
             ),
         ]
         given.answer(map(asdict, found), columns)

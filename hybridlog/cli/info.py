@@ -272,7 +272,7 @@ def _print_recording(
     print_fields(fields)
     if about["channels"]:
         output.say()
-        over_time = Column(_OVER_TIME, lambda c: drawn.get(c["topic"]), "whole", spare=1)
+        over_time = Column(_OVER_TIME, lambda c: drawn.get(c["topic"]), "whole", order=1)
         columns = [*_CHANNELS[:-1], *([over_time] if drawn else []), _CHANNELS[-1]]
         print_table(columns, sorted(about["channels"], key=itemgetter("topic")))
 
@@ -340,7 +340,7 @@ def _skew_text(channel: Mapping[str, Any]) -> str:
 
 
 def channel_note(channel: Mapping[str, Any]) -> str:
-    """What is special about the messages of a topic."""
+    """Remarks on the messages of a topic, such as that they are latched or expired."""
     from hybridlog.query.latching import depth_of
     from hybridlog.schema.states import State, state_of
     from hybridlog_storage.messages import SUPPLIED, Channel
@@ -378,8 +378,8 @@ _CHANNELS = [
     Column("type", _kind, short=lambda channel: _kind(channel).rpartition("/")[2]),
     Column("messages", side="right"),
     Column("Hz", lambda c: "-" if c["rate_hz"] is None else f"{c['rate_hz']:.2f}", "right"),
-    Column("payload", lambda c: output.size(c["payload_bytes"]), "right", spare=2),
-    Column("log - header", _skew_text, "right", spare=3),
+    Column("payload", lambda c: output.size(c["payload_bytes"]), "right", order=2),
+    Column("log - header", _skew_text, "right", order=3),
     Column("note", channel_note),
 ]
 

@@ -201,8 +201,8 @@ def _size_as_dict(row: Size) -> dict[str, Any]:
 
 
 _SIZES = [
-    Column("messages", side="right", spare=1),
-    bytes_of("payload", "payload_bytes", spare=2),
+    Column("messages", side="right", order=1),
+    bytes_of("payload", "payload_bytes", order=2),
     bytes_of("segments", "segment_bytes"),
     bytes_of("fields", "column_bytes"),
     bytes_of("tables", "table_bytes"),

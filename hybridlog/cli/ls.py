@@ -51,9 +51,9 @@ RECORDINGS = [
     Column("recording", lambda one: one.name),
     Column("start", lambda one: output.short_time(one.span and one.span[0]), "whole"),
     Column("duration", _duration, "right"),
-    Column("topics", lambda one: one.topic_count, "right", spare=1),
+    Column("topics", lambda one: one.topic_count, "right", order=1),
     Column("messages", lambda one: one.messages, "right"),
-    Column("stored", lambda one: output.size(one.stored_bytes), "right", spare=2),
+    Column("stored", lambda one: output.size(one.stored_bytes), "right", order=2),
     Column("note", _note, cut=12),
 ]
 """Columns of a list of recordings."""

@@ -481,7 +481,7 @@ def _print_several(reports: Sequence[RecordReport]) -> None:
 _COLUMNS = [
     Column("recording"),
     *numbers("topics", "messages"),
-    bytes_of("bytes in", "bytes_in", spare=1),
+    bytes_of("bytes in", "bytes_in", order=1),
     bytes_of("stored", "bytes_stored"),
     Column("ratio", _ratio, "right"),
     Column("indexed", "messages_indexed", "right"),

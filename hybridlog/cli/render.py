@@ -30,7 +30,7 @@ class Column:
             ones are not.
         short: Gives a shorter value, for a table that does not fit.
         cut: Cells may be cut off to so many characters; 0 for no.
-        spare: The least is left out first where there is no room; 0 never.
+        order: Columns are left out in this order where there is no room; 0 for never.
     """
 
     name: str
@@ -38,7 +38,7 @@ class Column:
     side: Literal["left", "right", "whole"] = "left"
     short: Get | None = None
     cut: int = 0
-    spare: int = 0
+    order: int = 0
 
     def cell(self, row: Any, *, short: bool = False) -> str:
         """The text for a row."""
@@ -58,13 +58,13 @@ def numbers(*names: str) -> list[Column]:
     return [Column(name, side="right") for name in names]
 
 
-def bytes_of(name: str, key: str, spare: int = 0) -> Column:
+def bytes_of(name: str, key: str, order: int = 0) -> Column:
     """A column of sizes; `-` for one that is not known."""
 
     def shown(row: Mapping[str, Any]) -> str:
         return "-" if row[key] is None else size(row[key])
 
-    return Column(name, shown, "right", spare=spare)
+    return Column(name, shown, "right", order=order)
 
 
 @dataclass(slots=True)
@@ -123,10 +123,10 @@ class _Shape:
 
 
 def _shape(columns: Sequence[Column], block: Sequence[Any]) -> _Shape | None:
-    """What fits the terminal; None if nothing does."""
-    spare = sorted((one for one in columns if one.spare), key=lambda one: one.spare)
-    for without in range(len(spare) + 1):
-        left = [one for one in columns if one not in spare[:without]]
+    """The widest table that fits the terminal; None if none does."""
+    order = sorted((one for one in columns if one.order), key=lambda one: one.order)
+    for without in range(len(order) + 1):
+        left = [one for one in columns if one not in order[:without]]
         for short in (False, True):
             found = _Shape(left, [len(one.name) for one in left], short)
             cells = found.cells(block)

@@ -67,9 +67,9 @@ def _of_rates(rows: Sequence[Mapping[str, Any]], window: str | None) -> list[Col
     is_one = len({row["recording"] for row in rows}) == 1
     return [
         Column("topic"),
-        replace(begin, spare=0 if window else 3),
-        replace(end, spare=2),
-        Column("recording", spare=int(is_one)),
+        replace(begin, order=0 if window else 3),
+        replace(end, order=2),
+        Column("recording", order=int(is_one)),
         Column("messages", side="right"),
         Column("Hz", lambda row: row["rate"] and f"{row['rate']:.2f}", "right"),
     ]
@@ -78,7 +78,7 @@ def _of_rates(rows: Sequence[Mapping[str, Any]], window: str | None) -> list[Col
 def _of_fields(rows: Sequence[Mapping[str, Any]]) -> list[Column]:
     several = len({row["topic"] for row in rows}) > 1
     # How many are no numbers is left out only where there are none.
-    spare = {name: 1 for name in ("nan", "infinite") if not any(row[name] for row in rows)}
-    spare["std"] = 2
-    shown = [Column(name, side="right", spare=spare.get(name, 0)) for name in _NAMES]
+    order = {name: 1 for name in ("nan", "infinite") if not any(row[name] for row in rows)}
+    order["std"] = 2
+    shown = [Column(name, side="right", order=order.get(name, 0)) for name in _NAMES]
     return [*([Column("topic")] if several else []), Column("field"), *shown]

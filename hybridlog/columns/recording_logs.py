@@ -72,7 +72,7 @@ class RecordingRows:
         return found
 
     def left(self, log: int, chunk: int) -> tuple[Batch, NDArray[np.int64]]:
-        """What is left of a chunk, and the arrival numbers of its messages.
+        """The rows that remain of a chunk, and the arrival numbers of its messages.
 
         Raises:
             SegmentError: It is missing or damaged.

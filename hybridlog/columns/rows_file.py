@@ -225,7 +225,7 @@ class LeftRows:
         )
 
     def errors(self, rows: NDArray[np.int64]) -> list[tuple[NDArray[np.intp], str]]:
-        """Which of these did not fit their definition, by reason."""
+        """Rows that did not fit their definition, by reason."""
         error = self._all.field("error").take(pa.array(rows))
         found = []
         for reason in pc.unique(error.drop_null()).to_pylist():
@@ -276,7 +276,7 @@ def _asks(wanted: Sequence[tuple[str, ...]], array: tuple[str, ...]) -> bool:
 
 
 def messages_left(parts: Sequence[pa.StructArray]) -> tuple[Batch, NDArray[np.int64]]:
-    """What is left of the messages of a chunk, and their arrival numbers, in its order.
+    """The rows that remain of a chunk, and their arrival numbers, in the order of arrival.
 
     Args:
         parts: Rows of each file; a struct has all columns.

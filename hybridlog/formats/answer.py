@@ -1,4 +1,4 @@
-"""What formats write: an answer in the form that they take."""
+"""Answers in the forms that formats write: lines, tables, batches, points or messages."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""What a running recorder says of itself: a file of the store, which it replaces once a second.
+"""The state of a running recorder, in a file of the store that it replaces once a second.
 
-Other processes read it. Whether the recorder runs, the lock on its recording tells.
+Other processes read the file. A recorder runs as long as its recording is locked.
 """
 
 from __future__ import annotations

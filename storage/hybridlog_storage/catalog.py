@@ -820,9 +820,9 @@ def _read(decoder: Decoder[_T], body: bytes | None) -> _T | None:
 
 
 def _indexed(body: bytes | None) -> _Indexed:
-    """What is known of the index of a recording.
+    """The state of the index of a recording, and its unreadable chunks.
 
-    It is one cell: of a list that is lost, no index is known to have all chunks.
+    Both are in one cell: without the list of chunks no index counts as complete.
     """
     return _read(_INDEX_OF, body) or ("", "", [])
 

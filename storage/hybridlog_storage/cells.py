@@ -159,7 +159,7 @@ class Cells:
         made.execute(f"PRAGMA user_version = {self._owner}")
 
     def loaded(self, content: bytes = b"") -> sqlite3.Connection:
-        """What the file or a content has, in memory; empty if that cannot be read."""
+        """A database in memory with the cells of the file or content; empty if it is unreadable."""
         made = _connected()
         with suppress(*_ERRORS):
             if content:

@@ -120,7 +120,7 @@ class _Copy:
         self._proved: dict[str, str] = {}  # digests by path
 
     def known(self) -> Copied | None:
-        """What a copy gives that has nothing to do, without a lock; None if it has."""
+        """The result if there is nothing to copy, found without a lock; None if there is."""
         here, target, there = self._here, self._target, None
         if self._must_prove:
             return None

@@ -125,7 +125,7 @@ class Sending:
         yield last
 
     def begins(self, there: int) -> list[int]:
-        """Where to begin, one after the other: behind what is there, whose end may be torn."""
+        """Bytes to begin at: behind the part that arrived; if that is damaged, at 0."""
         return [there, 0] if 0 < there <= self.size else [0]
 
     def not_arrived(self, place: Place) -> RefusedError:

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import hybridlog as hl
-from hybridlog.attachments import extras_of
+from hybridlog.attachments import Extras, extras_of
 from hybridlog.query.asked import channels_of, field_types, narrowed, spans_of
 from hybridlog.query.intervals import Intervals
 from hybridlog_storage.errors import HybridlogError, IncompleteError, PayloadError
@@ -323,6 +323,11 @@ def _lost(store: hl.Store) -> Any:
     return (said.messages, said.is_exact, arm.has_losses), str(said), refused
 
 
+def _extras(store: hl.Store) -> Extras:
+    query = store.all_topics()
+    return extras_of(query.session, query.question)
+
+
 METHODS: dict[str, Rule] = {
     "__iter__": Rule(lambda s: rows(s.all_topics()), lambda k: sent(k.of())),
     "__eq__": Rule(lambda s: s.topic("arm") == s["/arm"], lambda _: True),
@@ -613,12 +618,7 @@ STORE: dict[str, Rule] = {
         lambda s: _thrice(narrowed(s.all_topics(), "/arm")), lambda k: _right_thrice(k.of("/arm"))
     ),
     "extras": Rule(
-        lambda s: (
-            sorted(
-                c.topic for c in extras_of(s.all_topics().session, s.all_topics().question).channels
-            ),
-            len(extras_of(s.all_topics().session, s.all_topics().question).problems),
-        ),
+        lambda s: (sorted(c.topic for c in _extras(s).channels), len(_extras(s).problems)),
         lambda _: (sorted(CHANNELS), 0),
     ),
     "__repr__": Rule(lambda s: "<Store " in repr(s), lambda _: True),

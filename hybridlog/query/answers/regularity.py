@@ -1,4 +1,4 @@
-"""When messages came: rates, gaps, and how regular a topic is.
+"""Rates, gaps and regularity of topics.
 
 The times of a topic in a recording are in memory at once, 8 bytes a message.
 """

@@ -159,7 +159,7 @@ class _Reader:
             yield from self._into_list(value, parts, names)
 
     def _of_summary(self, value: Mapping[str, object], parts: Parts, names: _Names) -> object:
-        """What a summary has at a path: itself, or a number where it may also be a message."""
+        """The summary at a path, or one of its numbers where it may also be a message."""
         if "min" in value and not self.types.known and len(parts) == 1 and parts[0] in value:
             return value[str(parts[0])]
         if parts:

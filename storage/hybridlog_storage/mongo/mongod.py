@@ -348,7 +348,7 @@ class EmbeddedMongod:
         ]
 
     def _last_run(self) -> str:
-        """What the log says of the last mongod."""
+        """The lines of the log since the last start of mongod."""
         return _read_from_end(self.log).rpartition(START_LINE)[2]
 
     def _failure(self, log: str) -> HybridlogError:

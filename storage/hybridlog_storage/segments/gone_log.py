@@ -41,7 +41,7 @@ class Rows(Protocol):
     """Finds what is left of chunks. The caller checks it."""
 
     def left(self, log: int, chunk: int) -> tuple[Batch, NDArray[np.int64]]:
-        """What is left of a chunk of a log, and the arrival numbers of its messages.
+        """The rows that remain of a chunk of a log, and the arrival numbers of its messages.
 
         Raises:
             SegmentError: It is missing or damaged.

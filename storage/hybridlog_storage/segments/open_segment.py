@@ -84,7 +84,7 @@ class OpenSegment:
 
     @property
     def damaged(self) -> list[Damage]:
-        """What cannot be read, in file order."""
+        """Parts that cannot be read, in file order."""
         stopped = self._walk.stopped
         return [*self._walk.damaged, *([] if stopped is None else [stopped])]
 

@@ -129,7 +129,7 @@ def rebuild_summary(path: Path, digest: str) -> bool:
 
 
 class _Rest:
-    """What is left of a segment, and the writer that goes on behind it.
+    """The whole part of a segment, and the writer that goes on behind it.
 
     Attributes:
         messages: Number of messages in whole chunks.

@@ -496,7 +496,7 @@ class SegmentFile:
             raise durability.explain(error, self.path, "creating") from error
 
     def tail(self, at: int) -> bytes:
-        """What ends the file when it has `at` bytes: the end of the data, and the summary."""
+        """The last records of a file with `at` bytes of data: the end of data, the summary."""
         end = record_bytes(DataEnd(data_section_crc=0))
         start = at = at + len(end)
         body = self.table.build().to_bytes()

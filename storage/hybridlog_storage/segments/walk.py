@@ -94,7 +94,7 @@ class _TornError(SegmentError):
 
 
 class Walk:
-    """What a segment has so far.
+    """The records of a segment so far.
 
     Args:
         reader: Reads the file.
@@ -280,7 +280,7 @@ class Walk:
         return open_chunk(self._reader.read(at, end - at))[0]
 
     def _trailer(self, at: int, end: int, head: bytes) -> Trailer:
-        """What stands behind a chunk, also if its message indexes are damaged."""
+        """The records behind a chunk, also if its message indexes are damaged."""
         behind, opcode = end, int(Opcode.MESSAGE_INDEX)
         size = self._reader.size
         while opcode in {Opcode.MESSAGE_INDEX, DAMAGED_OPCODE} and behind + _HEAD <= size:
@@ -311,7 +311,7 @@ class Walk:
     # Behind damage
 
     def _next(self, at: int) -> int | None:
-        """Where to go on behind a damaged record; None if nothing whole follows."""
+        """Byte of the next whole record behind a damaged one; None if none follows."""
         try:
             _, behind = self._head(at)
             is_plausible = self._is_plausible(behind)
