@@ -116,7 +116,10 @@ def series(
     if pixels < 1:
         raise UsageError(f"A picture is at least one pixel wide, not {pixels}.")
     wanted = [_Wanted.of(text) for text in fields]
-    narrowed, (begin, end) = _narrowed(query, wanted, span)
+    if not wanted:
+        raise UsageError(f"Name a field, such as {listed(numbers_of(query), _MAX_NAMES)}.")
+    narrowed, (begin, end) = over_time(query, [one.path for one in wanted], span)
+    _check(wanted, field_types(narrowed) or {})
     if begin >= end:
         none = np.empty(0)
         return [Series(one.text, none.astype(np.int64), none, none, True) for one in wanted]
@@ -126,23 +129,27 @@ def series(
     return found
 
 
-def _narrowed(query: Query, wanted: Sequence[_Wanted], span: Span | None) -> tuple[Query, Span]:
-    """The query for the wanted fields, and the part of the span that it covers.
+def over_time(query: Query, fields: Sequence[str], span: Span | None) -> tuple[Query, Span]:
+    """The query for some fields of one topic in one recording, and its part of a span.
+
+    Args:
+        query: The query.
+        fields: Paths.
+        span: Log time `[begin, end)`, ns; None for that of the messages.
 
     Raises:
-        UsageError, TopicError, TimeError: see `series`.
+        UsageError: several topics or recordings, or `reverse`.
+        TopicError: no such field exists.
+        TimeError: the range of the query is outside all recordings.
     """
     if query.question.reverse:
         raise UsageError("Time runs from left to right here: leave out reverse.")
-    if not wanted:
-        raise UsageError(f"Name a field, such as {listed(numbers_of(query), _MAX_NAMES)}.")
-    narrowed = query.fields(*dict.fromkeys(one.path for one in wanted))
-    _check(wanted, field_types(narrowed) or {})
+    narrowed = query.fields(*dict.fromkeys(fields))
     spans = spans_of(query)
     if len(query.topics) != 1 or len(spans) > 1:
         raise UsageError(
-            f"A series is of one topic in one recording; these are {len(query.topics)} topics in "
-            f"{len(spans)} recordings."
+            f"A picture of fields is of one topic in one recording; these are {len(query.topics)} "
+            f"topics in {len(spans)} recordings."
         )
     recording, (begin, end) = next(iter(spans.items()), ("", (0, 0)))
     if span is not None:

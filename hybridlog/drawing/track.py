@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from hybridlog.drawing.series import over_time
 from hybridlog.frames.names import FIELD
-from hybridlog.query.asked import field_types, spans_of
-from hybridlog.query.intervals import Intervals
+from hybridlog.query.asked import field_types
 from hybridlog.query.periods import GAP_PERIODS, Steps
 from hybridlog_storage.errors import UsageError
 from hybridlog_storage.ordering import run_starts
@@ -194,40 +194,13 @@ def track(query: Query, *, pixels: int, span: Span | None = None) -> Track:
     paths = list(position.paths)
     if position.is_geographic and (known is None or _STATUS in known):
         paths.append(_STATUS)
-    narrowed, (begin, end) = _narrowed(query, paths, span)
+    narrowed, (begin, end) = over_time(query, paths, span)
     made = _Builder(begin, end, pixels, is_geographic=position.is_geographic)
     with query.counters.timed():
         for table in narrowed.to_tables() if begin < end else ():
             made.add(table, paths)
         query.counters.add(narrowed.counters)
     return made.track()
-
-
-def _narrowed(query: Query, paths: Sequence[str], span: Span | None) -> tuple[Query, Span]:
-    """The query for some fields, and the part of the span that it covers.
-
-    Raises:
-        UsageError, TimeError: see `track`.
-    """
-    if query.question.reverse:
-        raise UsageError("A track goes forward in time: leave out reverse.")
-    spans = spans_of(query)
-    if len(query.topics) != 1 or len(spans) > 1:
-        raise UsageError(
-            f"A track is of one topic in one recording; these are {len(query.topics)} topics in "
-            f"{len(spans)} recordings."
-        )
-    narrowed = query.fields(*paths)
-    recording, whole = next(iter(spans.items()), ("", (0, 0)))
-    begin, end = _common(whole, span)
-    if span is not None and recording:
-        window = np.array([[begin, max(begin, end), 0]], np.int64)
-        narrowed = narrowed.during(Intervals.of([(recording, window)]))
-    return narrowed, (begin, end)
-
-
-def _common(whole: Span, span: Span | None) -> Span:
-    return whole if span is None else (max(whole[0], span[0]), min(whole[1], span[1]))
 
 
 class _Builder:

@@ -220,7 +220,7 @@ def test_one_fix(tmp_path: Path) -> None:
 def test_topics_without_positions(store: hl.Store) -> None:
     with pytest.raises(UsageError, match="2 topics in 1 recordings"):
         track(store.topic("fix", "other"), pixels=10)
-    with pytest.raises(UsageError, match="forward in time"):
+    with pytest.raises(UsageError, match="left to right"):
         track(store.topic("fix").reverse(), pixels=10)
     with pytest.raises(UsageError, match="at least one pixel"):
         track(store.topic("fix"), pixels=0)
