@@ -2,32 +2,24 @@
 
 from __future__ import annotations
 
-import gc
 import json
-import os
-import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import psutil
 import pytest
 
 from benchmarks import usage
-from benchmarks.backends.base import Backend, BackendFailedError, BackendMissingError
+from benchmarks.backends.base import Backend
 from benchmarks.backends.nothing import Nothing
-from benchmarks.harness.counters import Counters
-from benchmarks.harness.run import Outcome, Setting, run
+from benchmarks.harness.run import Outcome, run
 from benchmarks.loads.base import PAYLOADS, Load
 from benchmarks.side import MARK
 from hybridlog_storage.messages import Channel
-from tests.imports import ROOT
-from tests.waiting import wait_for
 
 pytestmark = pytest.mark.mongo("embedded")
 
@@ -60,70 +52,11 @@ class Slow(Nothing):
         super().insert(channel, log_time, payload)
 
 
-class Flaky(Nothing):
-    def open(self, channels: Sequence[Channel]) -> None:
-        super().open(channels)
-        self.calls = [0] * len(channels)
-
-    def insert(self, channel: int, log_time: int, payload: bytes) -> None:
-        self.calls[channel] += 1
-        if self.calls[channel] % 3 == 0:
-            raise ValueError("the third one")
-        super().insert(channel, log_time, payload)
-
-
-class Dying(Nothing):
-    """Gives up after 20 messages of a topic; what it had is there."""
-
-    def insert(self, channel: int, log_time: int, payload: bytes) -> None:
-        if self._counts[channel] == 20:
-            self.finish()
-            raise BackendFailedError("the disk is full")
-        super().insert(channel, log_time, payload)
-
-
-class Crashing(Nothing):
-    def insert(self, channel: int, log_time: int, payload: bytes) -> None:
-        if self._counts[channel] == 20:
-            os.kill(os.getpid(), signal.SIGKILL)
-        super().insert(channel, log_time, payload)
-
-
-class Missing(Nothing):
-    @classmethod
-    def check(cls) -> None:
-        raise BackendMissingError("no such system; install it")
-
-
-class Buggy(Nothing):
-    def open(self, channels: Sequence[Channel]) -> None:
-        raise TypeError("a mistake of its author")
-
-
-class Unfinished(Nothing):
-    def finish(self) -> None:
-        raise BackendFailedError("cannot be synced")
-
-
 class Forgetful(Nothing):
     """Keeps one message of each topic less than it was given."""
 
     def counts(self) -> Mapping[str, int]:
         return {topic: count - 1 for topic, count in super().counts().items()}
-
-
-class Stopped(Nothing):
-    """Refuses a message while the collector looks at what is older than the run."""
-
-    def insert(self, channel: int, log_time: int, payload: bytes) -> None:
-        if gc.get_freeze_count() < 1000:
-            raise ValueError("all objects of the modules may be looked at")
-        super().insert(channel, log_time, payload)
-
-
-class Liar(Nothing):
-    def counts(self) -> Mapping[str, int]:
-        return {topic: count + 1 for topic, count in super().counts().items()}
 
 
 class Served(Nothing):
@@ -145,24 +78,21 @@ class Served(Nothing):
 def make_load(
     directory: Path,
     *,
-    topics: int = 3,
     messages: int = 30,
-    rate: float = 200.0,
-    names: Sequence[str] | None = None,
 ) -> Load:
     """Messages of different lengths, one topic after the other, each at `rate` Hz."""
     directory.mkdir(parents=True)
     rng = np.random.default_rng(1)
+    topics, rate = 3, 200.0
     rows = topics * messages
     length = rng.integers(1, 3000, rows)
     offset = np.cumsum(length) - length
     (directory / PAYLOADS).write_bytes(rng.bytes(int(length.sum())))
     due = np.rint(np.arange(rows) * 1e9 / rate / topics).astype(np.int64)
-    names = names or [f"/topic/{n}" for n in range(topics)]
     load = Load(
         name="test",
         seed=1,
-        channels=tuple(Channel(name, "ros1", None) for name in names),
+        channels=tuple(Channel(f"/topic/{n}", "ros1", None) for n in range(topics)),
         channel=(np.arange(rows) % topics).astype(np.int32),
         due=due,
         log_time=due,
@@ -181,10 +111,10 @@ Runner = Callable[..., Outcome]
 def start(tmp_path: Path) -> Iterator[Runner]:
     """Runs a backend in a directory of its own; looks afterwards whether anybody is left."""
 
-    def go(backend: type[Backend], load: Load | None = None, **setting: Any) -> Outcome:
+    def go(backend: type[Backend], load: Load) -> Outcome:
         directory = tmp_path / "run"
         directory.mkdir()
-        return run(load or make_load(tmp_path / "load"), backend, directory, Setting(**setting))
+        return run(load, backend, directory)
 
     yield go
     assert usage.marked(MARK, str((tmp_path / "run").resolve())) == []
@@ -248,120 +178,6 @@ def test_a_full_queue_drops_and_only_its_own_messages(tmp_path: Path, start: Run
     assert values["persisted_bytes"] == pytest.approx(expected, abs=1)
 
 
-def test_inserts_that_raise_are_counted(start: Runner) -> None:
-    found = start(Flaky)
-    assert found.status == "ok"
-    values = found.values
-    assert (values["errors"], values["persisted"], values["lost"]) == (30, 60, 0)
-    assert values["insert_error"] == "ValueError: the third one"
-
-
-def test_lost_messages_are_seen_by_who_counts(start: Runner) -> None:
-    values = start(Forgetful).values
+def test_lost_messages_are_seen_by_who_counts(tmp_path: Path, start: Runner) -> None:
+    values = start(Forgetful, make_load(tmp_path / "load")).values
     assert (values["persisted"], values["lost"], values["dropped"]) == (87, 3, 0)
-
-
-def test_channels_of_one_topic_are_counted_together(tmp_path: Path, start: Runner) -> None:
-    load = make_load(tmp_path / "load", names=["/a", "/b", "/a"])
-    topics = start(Nothing, load).values["topics"]
-    assert {topic: published for topic, (published, _, _) in topics.items()} == {"/a": 60, "/b": 30}
-    assert all(published == dropped + kept for published, dropped, kept in topics.values())
-
-
-def test_speed(tmp_path: Path, start: Runner) -> None:
-    load = make_load(tmp_path / "load", rate=20)
-    values = start(Nothing, load, speed=10).values
-    assert values["due_s"] == pytest.approx(load.duration_s / 10)
-    assert load.duration_s / 10 <= values["publish_s"] < load.duration_s / 2
-    assert values["persisted"] == 90
-
-
-def test_nonsense_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="speed"):
-        Setting(speed=0)
-    load = make_load(tmp_path / "load", messages=0)
-    with pytest.raises(ValueError, match="no messages"):
-        run(load, Nothing, tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("backend", "status", "reason"),
-    [
-        (Missing, "missing", "no such system; install it"),
-        (Buggy, "failed", "TypeError: a mistake of its author"),
-        (Liar, "failed", "more than"),
-        (Unfinished, "failed", "cannot be synced"),
-        (Stopped, "ok", ""),
-    ],
-)
-def test_how_a_run_ends(start: Runner, backend: type[Backend], status: str, reason: str) -> None:
-    found = start(backend)
-    assert found.status == status
-    assert reason in found.reason
-    assert found.values.get("errors", 0) == 0
-
-
-def test_a_backend_that_gives_up(tmp_path: Path, start: Runner) -> None:
-    found = start(Dying, make_load(tmp_path / "load", messages=400))
-    assert (found.status, found.reason) == ("failed", "the disk is full")
-    values = found.values
-    assert 20 < values["published"] < 1200
-    assert values["persisted"] <= 60
-    assert values["publish_s"] > 0
-    assert values["cpu_s"] > 0
-
-
-def test_a_backend_that_crashes(tmp_path: Path, start: Runner) -> None:
-    found = start(Crashing, make_load(tmp_path / "load", messages=400))
-    assert found.status == "failed"
-    assert "SIGKILL" in found.reason
-    assert 20 < found.values["published"] < 1200
-    assert "persisted" not in found.values
-
-
-_ONE_RUN = """
-import sys
-from pathlib import Path
-from benchmarks.harness.run import run
-from benchmarks.loads.base import Load
-from benchmarks.studies.runs import run_directory
-from tests.benchmarks.test_harness import Served
-from tests.waiting import wait_for
-with run_directory(Path(sys.argv[1])) as directory:
-    run(Load.open(Path(sys.argv[2])), Served, directory)
-"""
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
-def test_who_is_interrupted_leaves_nobody(tmp_path: Path, number: signal.Signals) -> None:
-    make_load(tmp_path / "load", messages=6000)
-    work = tmp_path / "work"
-    work.mkdir()
-    process = subprocess.Popen(
-        [sys.executable, "-c", _ONE_RUN, str(work), str(tmp_path / "load")],
-        cwd=ROOT,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    below = psutil.Process(process.pid)
-    wait_for(lambda: len(_runs(work)) == 1 and _published(_runs(work)[0]) > 0)
-    started = below.children(recursive=True)
-    assert len(started) >= 3  # the logger, the publisher, the server
-    process.send_signal(number)
-    _, said = process.communicate(timeout=60)
-    wait_for(lambda: not any(child.is_running() for child in started))
-    if number == signal.SIGINT:
-        assert "KeyboardInterrupt" in said
-        assert _runs(work) == []
-
-
-def _runs(work: Path) -> list[Path]:
-    return list((work / "runs").glob("*"))
-
-
-def _published(directory: Path) -> int:
-    path = directory / "counters"
-    return sum(Counters(path).published()) if path.is_file() and path.stat().st_size else 0
-
-
-# The parts.

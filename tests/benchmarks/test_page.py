@@ -9,7 +9,6 @@ import pytest
 
 from benchmarks import page
 from benchmarks.machine import describe
-from benchmarks.numbers import number, ordered, percent, size
 from benchmarks.questions.base import QUESTIONS
 from benchmarks.samples import Journal, Sample
 from benchmarks.studies import record
@@ -138,41 +137,3 @@ def test_what_is_not_to_be_cited_says_so(tmp_path: Path, scale: str, words: str)
     made = journal(tmp_path, samples(), scale)
     assert words in page.page(made)
     assert f"`python -m benchmarks --{scale}` makes them again" in page.readme(made)
-
-
-def test_what_is_missing_or_failed_is_told_and_the_rest_is_shown(tmp_path: Path) -> None:
-    made = journal(
-        tmp_path,
-        [
-            Sample("record", {"size": 5000, "rate": 64}, "postgres", 0, "missing", {}, "pip | it"),
-            Sample("record", {"size": 5000, "rate": 64}, "mongo", 0, "failed", {}, "<b>full</b>"),
-            Sample("tasks", {"group": "sql"}, "hybridlog", 0, "failed", {}, "no duckdb"),
-        ],
-    )
-    text = page.page(made)
-    assert r"PostgreSQL is missing: pip \| it" in text
-    assert r"\<b\>full\</b\>" in text
-    assert "no duckdb" in text
-    assert page.readme(made).count("\n|") == 12
-
-
-def test_revisions_that_differ_are_told(tmp_path: Path) -> None:
-    made = journal(tmp_path, samples()[:1])
-    made.begin({**made.headers[0], "revision": "another"})
-    made.add(samples()[1])
-    assert "figures are of 2 revisions" in page.page(made)
-
-
-def test_numbers_for_people() -> None:
-    shown = [number(value) for value in (0, 0.01234, 1.0, 9.999, 123.4, 12345.0)]
-    assert shown == ["0", "0.0123", "1", "10", "123", "12,300"]
-    assert [percent(value) for value in (100.0, 99.999, 98.24, 0.0)] == [
-        "100",
-        "99.999",
-        "98.2",
-        "0",
-    ]
-    assert [size(count) for count in (640_000, 1.5e9, 12)] == ["640 kB", "1.5 GB", "12 B"]
-    assert ordered(["mcap", "unknown", "sqlite", "hybridlog"]) == [
-        *("hybridlog", "sqlite", "mcap", "unknown"),
-    ]
