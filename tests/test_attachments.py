@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import shutil
 import tracemalloc
 from collections.abc import Iterator
@@ -191,16 +190,6 @@ def test_commands(store: hl.Store, tmp_path: Path) -> None:
     assert "späte Karte.png" in missing.err
 
 
-def test_info(store: hl.Store) -> None:
-    done = run("info", "drive", store=store.directory.path)
-    assert "attachment  späte Karte.png (image/png, 76.8 kB)" in done.out
-    assert "metadata    robot (id)" in done.out
-    about = run("info", "drive", "--json", store=store.directory.path).json
-    assert [a["name"] for a in about["attachments"]] == [a[1] for a in ATTACHMENTS]
-    assert [(m["name"], m["values"]) for m in about["metadata_records"]] == METADATA
-    assert len(about["channels"]) == 4
-
-
 def test_nothing_is_lost_on_the_way(log: Path, tmp_path: Path) -> None:
     """In many segments, packed, with another name, without derived data, in another store."""
     packed = tmp_path / "drive.mcap.zstd"
@@ -359,9 +348,3 @@ def test_large_attachments_are_never_in_memory(tmp_path: Path) -> None:
     assert hashlib.sha256((tmp_path / "large").read_bytes()).hexdigest() == want
     (found,) = contents(tmp_path / "out.mcap")["attachments"]
     assert hashlib.sha256(found[4]).hexdigest() == want
-
-
-def test_numbers_of_attachments_are_in_the_answer_of_record(log: Path, tmp_path: Path) -> None:
-    done = run("record", log, "--json", store=tmp_path / "s")
-    about = json.loads(done.out)
-    assert (about["attachments"], about["metadata_records"], about["topics"]) == (5, 3, 3)

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-import random
 import time
 from collections.abc import Iterator
-from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -264,27 +262,6 @@ def test_recordings_are_deleted_by_choice(tmp_path: Path) -> None:
         assert store.recordings() == []
 
 
-def test_who_is_asked_sees_what_goes(
-    store: hl.Store, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    from hybridlog.cli import edit
-
-    shown: list[str] = []
-    monkeypatch.setattr(edit.output, "note", shown.append)
-    monkeypatch.setattr(edit.sys, "stdin", type("T", (), {"isatty": staticmethod(lambda: True)}))
-    monkeypatch.setattr(edit.click, "confirm", lambda text, err: shown.append(text) or False)
-    many = [summary(n, (START, START), ["/a"])[0] for n in range(25)]
-    with pytest.raises(edit.click.exceptions.Exit):
-        edit._confirm(many, ["a talk"])
-    assert shown[0] == "1 pin would go, too (a talk)."
-    assert shown[1].startswith("Delete 25 recordings (r0, r1, ")
-    assert shown[2] == "Nothing is deleted."
-    rows = capsys.readouterr().out.splitlines()[1:]
-    assert [row.split()[:2] for row in rows] == [
-        [f"r{n}", "2025-06-03T00:00:00Z"] for n in range(25)
-    ]
-
-
 def test_queries_of_chosen_recordings(store: hl.Store) -> None:
     found = store.recordings(tag="robot=7")
     assert isinstance(found, Recordings)
@@ -425,16 +402,6 @@ def test_a_running_recording_reaches_until_now() -> None:
     assert chosen(60, 70) == {"r1", "r2"}
     assert chosen(8, 9) == {"r1", "r3"}
     assert chosen(100, 200) == set()
-
-
-def test_globs_mean_what_fnmatch_says() -> None:
-    dice = random.Random(3)
-    names = ["".join(dice.choices("ab[]-*?", k=3)) for _ in range(40)]
-    made = [summary(n, (n, n), ["/a"], name=name) for n, name in enumerate(names)]
-    snapshot = Snapshot([one for one, _ in made], {made[0][0].topics: ()})
-    for pattern in ("*", "a*", "[ab]*", "?-?", "[!a]*", "*]", "[", "a[", "l1?"):
-        found = [snapshot.summaries[place] for place in snapshot.matching(pattern)]
-        assert [one.name for one in found] == [n for n in names if fnmatchcase(n, pattern)]
 
 
 def test_lists_say_how_many_they_leave_out() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import socket
 import stat
 import threading
@@ -30,11 +29,6 @@ def state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "state" / "hybridlog"
 
 
-def test_the_embedded_one_needs_no_consent(state: Path) -> None:
-    assert consent.trusted_uri(StoreSettings("a"), STORE) == "embedded"
-    assert not state.exists()
-
-
 def test_a_server_has_to_be_agreed_to(state: Path) -> None:
     settings = StoreSettings("a", URI)
     with pytest.raises(DatabaseError, match=r"mongodb://lab-server/robots\b.*") as caught:
@@ -56,16 +50,6 @@ def test_what_is_agreed_to_is_kept_private_and_without_a_password(state: Path) -
     assert stat.S_IMODE(file.stat().st_mode) == 0o600
     assert stat.S_IMODE(state.stat().st_mode) == 0o700
     assert [p.name for p in state.iterdir()] == ["trusted.json"]
-
-
-def test_several_stores_and_several_servers() -> None:
-    consent.trust("a", URI)
-    consent.trust("a", "mongodb://other/")
-    consent.trust("a", URI)
-    consent.trust("b", URI)
-    assert consent.is_trusted("a", URI)
-    assert consent.is_trusted("a", "mongodb://other/")
-    assert consent.is_trusted("b", URI)
 
 
 def test_nothing_is_lost_when_many_agree_at_once() -> None:
@@ -97,17 +81,6 @@ def test_a_file_that_others_may_write_trusts_nothing(state: Path) -> None:
     file.rename(state / "other.json")
     file.symlink_to("other.json")
     assert not consent.is_trusted("a", URI)
-
-
-def test_where_it_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("HOME", str(tmp_path / "home"))
-    for name in ("", "relative/path"):
-        monkeypatch.setenv("XDG_STATE_HOME", name)
-        assert consent.state_directory() == tmp_path / "home/.local/state/hybridlog"
-    consent.trust("a", URI)
-    assert json.loads((tmp_path / "home/.local/state/hybridlog/trusted.json").read_text()) == {
-        "stores": {"a": [URI]}
-    }
 
 
 def test_a_home_that_cannot_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

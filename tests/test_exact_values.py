@@ -439,14 +439,6 @@ def frame(request: pytest.FixtureRequest, store: hl.Store) -> pd.DataFrame:
     return found
 
 
-def test_duckdb_reads_a_frame(frame: pd.DataFrame) -> None:
-    rows = frame.reset_index()
-    assert duckdb.connect().sql("select count(*) from rows").fetchall() == [(len(rows),)]
-    for name in rows.columns:
-        found = duckdb.connect().sql(f'select count("{name}") from rows').fetchall()
-        assert found == [(int(rows[name].notna().sum()),)]
-
-
 def test_duckdb_reads_arrow_and_parquet(store: hl.Store, tmp_path: Path) -> None:
     for number, topic in enumerate(EVERY):
         rows = store.topic(topic).to_arrow()
@@ -469,26 +461,6 @@ def test_a_frame_comes_back_from_parquet(frame: pd.DataFrame) -> None:
         assert back[name].isna().tolist() == frame[name].isna().tolist()
         if not isinstance(frame[name].iloc[0], np.ndarray | list):
             assert str(back[name].tolist()) == str(frame[name].tolist())
-
-
-def test_frames_are_merged(frame: pd.DataFrame) -> None:
-    other = frame.iloc[1:].copy()
-    merged = pd.merge_asof(
-        frame,
-        other,
-        left_index=True,
-        right_index=True,
-        suffixes=("", ".other"),
-        direction="forward",
-    )
-    assert len(merged) == len(frame)
-
-
-def test_frames_are_resampled(frame: pd.DataFrame) -> None:
-    with np.errstate(invalid="ignore"):  # infinities of both signs have no mean
-        mean = frame.resample("1s").mean(numeric_only=True)
-    numbers = frame.select_dtypes("number", exclude="timedelta").columns
-    assert set(numbers) <= set(mean.columns)
 
 
 def test_arrays_explode_and_stack(store: hl.Store) -> None:

@@ -11,7 +11,7 @@ import subprocess
 import sys
 import threading
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,16 +28,14 @@ from benchmarks.simulator.topics import RobotConfig
 from benchmarks.simulator.write import write_bag
 from hybridlog_storage.catalog import CATALOG, RecordingEntry
 from hybridlog_storage.errors import DatabaseError, IndexChangedError, SegmentError, StoreError
-from hybridlog_storage.manifest import replace as changed
 from hybridlog_storage.mongo.database import Database
-from hybridlog_storage.mongo.index_state import RECORDINGS, STORE, IndexState
+from hybridlog_storage.mongo.index_state import RECORDINGS, STORE
 from hybridlog_storage.mongo.mongod import EmbeddedMongod
-from hybridlog_storage.segments.segment_reader import ChunkPlace, SegmentReader
+from hybridlog_storage.segments.segment_reader import SegmentReader
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import independent, places
 from tests.calls import Calls
 from tests.cli import running
-from tests.some import in_turn
 from tests.storage.chunk_entries import chunk_entries
 from tests.waiting import wait_for
 
@@ -212,82 +210,6 @@ def test_what_was_cut_short_can_be_recorded_again(path: Path, robot: Path) -> No
         assert store.verify().findings == []
 
 
-def unsealed(store: hl.Store, number: int, size: int, *, listed: bool) -> None:
-    """A segment of the last group as power found it: written so far, and not sealed.
-
-    Args:
-        store: With the recording `short`.
-        number: Number of the segment.
-        size: Bytes of the segment that are on the disk.
-        listed: Whether the manifest had listed it already, whole.
-    """
-    (entry,) = store.select(["short"])
-    path = places.segment(store.directory.path, "short", number)
-    path.with_name(path.name + ".open").write_bytes(path.read_bytes()[:size])
-    path.unlink()
-    if not listed:
-        places.change_in(
-            path.parent,
-            lambda now: changed(
-                now, status="open", files=tuple(one for one in now.files if one.number != number)
-            ),
-        )
-    assert store.database is not None
-    state = IndexState(store.database)
-    # All chunks are in the index, and it is not done.
-    state.begin(entry)
-    others = {n: digest for n, digest in entry.digests.items() if n != str(number)}
-    state.put_segments(entry.key, others)
-
-
-def last_with_chunks(store: hl.Store, least: int) -> tuple[int, Sequence[ChunkPlace]]:
-    """The last segment of `short` with so many chunks, and these."""
-    recording = places.id_of(store.directory.path, "short")
-    for number, path in reversed(store.directory.segments(recording)):
-        with SegmentReader(path, number) as reader:
-            chunks = reader.summary().chunks
-        if len(chunks) >= least:
-            return number, chunks
-    pytest.fail("no segment has so many")
-
-
-@pytest.mark.parametrize("listed", [False, True])
-def test_the_index_may_be_ahead_of_the_file(
-    store: hl.Store, said: Counter[Message], listed: bool
-) -> None:
-    """Power fails: the system had not written the file yet, but MongoDB its documents."""
-    number, chunks = last_with_chunks(store, 4)
-    unsealed(store, number, chunks[-2].offset + 20, listed=listed)
-    with reopened(store) as opened:
-        assert list(opened.repairs.recovered) == ["short"]
-        messages = fetched(opened, "short")
-        (entry,) = opened.select(["short"])
-        assert 0 < len(messages) < said.total()
-        assert not content(messages) - said
-        assert entry.messages == len(messages)
-        # Of what the manifest had listed nothing goes missing without a word.
-        assert entry.status == ("damaged" if listed else "recovered")
-        assert lost(entry) == (topics_of(said - content(messages)) if listed else Counter())
-        topics = sorted({m.topic for m in messages})
-        assert opened.query(topics).where("_meta.seq >= 0").count() == len(messages)
-        assert opened.verify().findings == []
-
-
-def test_a_chunk_without_arrival_numbers_is_cut(store: hl.Store, said: Counter[Message]) -> None:
-    number, path = store.directory.segments(places.id_of(store.directory.path, "short"))[-1]
-    assert number > 0
-    before = {m.seq for m in fetched(store, "short")}
-    with SegmentReader(path, number) as reader:
-        first = reader.summary().chunks[0]
-        rest = {int(s) for c in reader.summary().chunks for s in reader.read_chunk(c).seq}
-    unsealed(store, number, first.offset + first.length + 3, listed=False)
-    with reopened(store) as opened:
-        messages = fetched(opened, "short")
-        assert not content(messages) - said
-        assert {m.seq for m in messages} == before - rest
-        assert opened.verify().findings == []
-
-
 # MongoDB that is killed.
 
 
@@ -411,27 +333,6 @@ def data_end(segment: bytes) -> int:
     return at
 
 
-def test_a_disk_that_is_full_when_a_crash_is_mended(
-    path: Path, short: Path, said: Counter[Message]
-) -> None:
-    run("record", short, "--quiet", store=path, code=0)
-    segment = places.segment(path, "short")
-    sealed = segment.read_bytes()
-    end = data_end(sealed)
-    segment.unlink()
-    segment.with_name("000000.mcap.open").write_bytes(sealed[:end])
-    for limit in (end + 1, (end + len(sealed)) // 2):
-        # It waits for room, and what lies there can be looked at all the same.
-        done = run("ls", store=path, code=0, before=at_most(limit))
-        assert "short" in done.stdout
-        assert "No space left" in done.stderr
-        assert not segment.exists()
-    run("ls", store=path, code=0)
-    with hl.open(path, require_database=True) as store:
-        assert content(fetched(store, "short")) == said
-        assert store.verify().findings == []
-
-
 # Segments that are lost or altered after sealing.
 
 
@@ -467,21 +368,6 @@ def topics_of(messages: Counter[Message]) -> Counter[str]:
     for message, count in messages.items():
         found[message.topic] += count
     return found
-
-
-def check_what_is_missing(store: hl.Store, said: Counter[Message], segments: set[int]) -> None:
-    """Whole segments cannot be read: that is told by all that answers, and the rest is there."""
-    (entry,) = store.select(["short"])
-    assert entry.status == "damaged"
-    messages = content(fetched(store, "short"))
-    assert not messages - said
-    assert lost(entry) == topics_of(said - messages)
-    assert lost(entry).total() > 0
-    assert entry.messages == messages.total()
-    files = {row["file"] for row in entry.end["losses"]}
-    assert files == {f"{segment:06d}.mcap" for segment in segments}
-    for topic, count in topics_of(messages).items():
-        assert store.topic(topic).where("_meta.seq >= 0").count() == count
 
 
 def check_the_rest(store: hl.Store, said: Counter[Message], lost: set[tuple[int, int]]) -> None:
@@ -530,78 +416,11 @@ def test_a_flipped_bit(store: hl.Store, said: Counter[Message]) -> None:
     assert place.path.name in done.stdout
 
 
-@pytest.mark.parametrize(
-    ("harm", "which"), in_turn(["truncated", "deleted", "zeros", "summary"], [1, -1])
-)
-def test_a_segment_that_is_lost(
-    store: hl.Store, said: Counter[Message], harm: str, which: int
-) -> None:
-    number, path = store.directory.segments(places.id_of(store.directory.path, "short"))[which]
-    size = path.stat().st_size
-    if harm == "truncated":
-        os.truncate(path, size - 1)
-    elif harm == "deleted":
-        path.unlink()
-    elif harm == "zeros":
-        path.write_bytes(bytes(size))
-    else:
-        damage_summary(path)
-    with reopened(store) as opened:
-        check_what_is_missing(opened, said, {number})
-        findings = opened.verify().findings
-        assert {f.recording for f in findings} == {"short"}
-        assert any(path.name in f.place + f.problem for f in findings)
-        # And it does not become right by making the index again.
-        opened.index.rebuild()
-        check_what_is_missing(opened, said, {number})
-        assert opened.verify().findings
-    run("verify", store=store.directory.path, code=1)
-
-
-def test_a_recording_without_any_segment_is_told(store: hl.Store, said: Counter[Message]) -> None:
-    segments = store.directory.segments(places.id_of(store.directory.path, "short"))
-    for _, path in segments:
-        path.unlink()
-    findings = store.verify().findings
-    assert {f.recording for f in findings} == {"short"}
-    assert {path.name for _, path in segments} <= {
-        word for f in findings for word in f"{f.place} {f.problem}".split()
-    }
-    done = run("ls", store=store.directory.path, code=0)
-    assert "stored data lost" in done.stdout
-    with reopened(store) as opened:
-        (entry,) = opened.recordings()
-        assert (entry.status, entry.messages) == ("damaged", 0)
-        assert lost(entry) == topics_of(said)
-        opened.index.rebuild()
-        (entry,) = opened.recordings()
-        assert (entry.status, lost(entry)) == ("damaged", topics_of(said))
-
-
 def damage_summary(path: Path) -> None:
     whole = path.read_bytes()
     data = bytearray(whole)
     data[data_end(whole) + 40] ^= 1
     path.write_bytes(data)
-
-
-def test_a_summary_is_made_again(store: hl.Store, said: Counter[Message]) -> None:
-    """Nothing of it is believed, and nothing is lost by that."""
-    place = place_in_the_middle(store)
-    damage_summary(place.path)
-    with reopened(store) as opened:
-        check_what_is_missing(opened, said, {place.segment})
-    run("index", "rebuild", store=store.directory.path, code=0)
-    run("verify", store=store.directory.path, code=1)
-    done = run("verify", "--repair", store=store.directory.path, code=0)
-    assert place.path.name in done.stdout
-    run("verify", store=store.directory.path, code=0)
-    with reopened(store) as opened:
-        (entry,) = opened.recordings()
-        assert (entry.status, lost(entry)) == ("complete", Counter())
-        assert content(fetched(opened, "short")) == said
-        topics = sorted(topics_of(said))
-        assert opened.query(topics).where("_meta.seq >= 0").count() == said.total()
 
 
 @pytest.mark.parametrize("part", ["summary", "chunk"])
@@ -683,32 +502,6 @@ def test_a_chunk_that_is_listed_otherwise_than_it_is(
         assert opened.verify().findings == []
 
 
-def test_segments_that_changed_places_are_found_and_named(
-    store: hl.Store, said: Counter[Message]
-) -> None:
-    (_, one), (_, other), *_ = store.directory.segments(places.id_of(store.directory.path, "short"))
-    first, second = one.read_bytes(), other.read_bytes()
-    one.write_bytes(second)
-    other.write_bytes(first)
-    with reopened(store) as opened:
-        check_what_is_missing(opened, said, {0, 1})
-        findings = opened.verify().findings
-        assert {name for f in findings for name in (one.name, other.name) if name in f.place} == {
-            one.name,
-            other.name,
-        }
-        assert any("segment 1 of this recording" in f.problem for f in findings)
-        assert {f"rename it to {name}" for name in (one.name, other.name)} <= {
-            f.cure for f in findings
-        }
-    one.write_bytes(first)
-    other.write_bytes(second)
-    run("verify", "--repair", store=store.directory.path, code=0)
-    run("verify", store=store.directory.path, code=0)
-    with reopened(store) as opened:
-        assert content(fetched(opened, "short")) == said
-
-
 # An index that is altered behind our back.
 
 
@@ -787,20 +580,6 @@ def shared(tmp_path_factory: pytest.TempPathFactory, short: Path) -> Iterator[hl
 
 
 # Stores and databases that are not what they should be.
-
-
-def test_the_database_of_another_store_is_refused(
-    path: Path, store: hl.Store, short: Path, tmp_path: Path
-) -> None:
-    with EmbeddedMongod(path / "mongod") as mongod:
-        uri = mongod.start()
-        other = tmp_path / "other"
-        with pytest.raises(StoreError, match="another store"):
-            hl.open(other, create=True, mongo=uri, require_database=True)
-        run("record", short, "--quiet", "--mongo", uri, store=other, code=5)
-    assert store.verify().findings == []
-    assert store.database is not None
-    assert store.database.count("imu__data", {}) == store.topic("/imu/data").count()
 
 
 # Several at once.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import resource
 import shutil
@@ -42,6 +41,7 @@ from tests.calls import Calls
 from tests.cli.running import run
 from tests.damage import WAYS
 from tests.indexed import EVERYTHING
+from tests.some import in_turn
 from tests.waiting import wait_for
 
 pytestmark = pytest.mark.mongo("embedded")
@@ -203,16 +203,46 @@ def other_mongod(tmp_path: Path, *options: str, port: int | None = None) -> Iter
         process.wait(30)
 
 
-def test_a_killed_mongod_is_started_again(store: Path) -> None:
+def edited(store: hl.Store, _log: Path) -> None:
+    assert store.edit("one", name="first").name == "first"
+    assert store.edit("first", tag={"place": "lab"}).tags == {"place": "lab"}
+
+
+def recorded(store: hl.Store, log: Path) -> None:
+    report = store.record(log, again=True, name="three")
+    assert report.indexed == report.entry.messages > 0
+
+
+WORK: dict[str, Callable[[hl.Store, Path], object]] = {
+    "ask": lambda store, _: documents(store),
+    "list": lambda store, _: store.index.list(),
+    "rebuild": lambda store, _: store.index.rebuild(),
+    "verify": lambda store, _: store.verify(),
+    "remove": lambda store, _: store.remove("one"),
+    "edit": edited,
+    "record": recorded,
+}
+
+
+@pytest.mark.parametrize(("work", "waits"), in_turn([*WORK], [False, True]))
+def test_work_goes_on_though_its_mongod_was_killed(
+    template: Path, store: Path, work: str, waits: bool
+) -> None:
     with hl.open(store, require_database=True) as opened:
-        want = documents(opened)
-        imu = opened.topic(IMU)
-        counts = imu.count(), imu.where(WHERE).count()
+        imu, want = opened.topic(IMU), documents(opened)
         kill_mongod(store)
-        assert (imu.count(), imu.where(WHERE).count()) == counts
-        assert documents(opened) == want
+        if waits:
+            ended(store)
+        WORK[work](opened, template.parent / "one.bag")
+        verified = opened.verify()
+        assert verified.index
+        assert not verified.findings
+        assert opened.shared.index.unavailable is None
         assert not opened.repairs.damage
         assert not opened.repairs.indexed
+        if work == "ask":
+            assert documents(opened) == want
+            assert imu.where(WHERE).count() > 0
 
 
 def test_an_unreachable_server_is_not_waited_for_by_each_question(
@@ -288,51 +318,6 @@ def test_an_index_deleted_under_an_open_store(store: Path, name: str) -> None:
         opened.connect()
         assert documents(opened) == want
         assert sorted(opened.repairs.indexed) == ["one", "two"]
-
-
-def test_a_recording_is_removed_from_an_index_that_ends(store: Path) -> None:
-    with hl.open(store, require_database=True) as opened:
-        kill_mongod(store)
-        opened.remove("one")
-        assert [r.name for r in opened.recordings()] == ["two"]
-        assert not opened.verify().findings
-
-
-@pytest.mark.parametrize("work", ["rebuild", "list"])
-def test_work_on_an_index_that_ends_is_done_again(store: Path, work: str) -> None:
-    with hl.open(store, require_database=True) as opened:
-        kill_mongod(store)
-        getattr(opened.index, work)()
-        assert not opened.verify().findings
-
-
-def test_a_connection_to_the_index_as_it_is_is_made_again(store: Path) -> None:
-    """Bringing the index up to date finds that its mongod has ended."""
-    with hl.open(store) as opened:
-        assert sum(documents(opened)) > 0
-        kill_mongod(store)
-        assert opened.verify().index
-        assert opened.shared.index.unavailable is None
-
-
-@pytest.mark.parametrize("waits", [False, True])
-def test_a_recording_is_made_and_edited_though_its_mongod_ended(
-    store: Path, tmp_path: Path, *, waits: bool
-) -> None:
-    log = tmp_path / "three.bag"
-    write_bag(log, duration_s=1, seed=3, topics=TOPICS)
-    with hl.open(store, require_database=True) as opened:
-        kill_mongod(store)
-        if waits:
-            ended(store)
-        report = opened.record(log)
-        assert report.indexed == report.entry.messages > 0
-        kill_mongod(store)
-        assert opened.edit("one", name="first").name == "first"
-        assert opened.edit("first", tag={"place": "lab"}).tags == {"place": "lab"}
-        verified = opened.verify()
-        assert verified.index
-        assert not verified.findings
 
 
 # --- handles, roles ---
@@ -457,15 +442,6 @@ OF_CATALOG: dict[str, Callable[[Path], object]] = {
     "cut": lambda path: os.truncate(path, 5000),
     "a folder": lambda path: (path.unlink(), path.mkdir()),
 }
-
-
-@pytest.mark.parametrize("way", OF_CATALOG)
-def test_a_damaged_catalog_is_made_again(store: Path, way: str) -> None:
-    listed = json.loads(run("ls", "--json", store=store).out)
-    OF_CATALOG[way](store / CATALOG)
-    done = run("ls", "--json", store=store)
-    assert (json.loads(done.out), done.err) == (listed, "")
-    assert run("verify", store=store).err == ""
 
 
 @pytest.mark.parametrize("way", [*OF_CATALOG, "locked"])

@@ -156,55 +156,6 @@ def test_a_recording_that_was_copied_from_another_store_answers(
         assert answers(store) == right()
 
 
-def test_import(place: Path, uri: str, tmp_path: Path) -> None:
-    with hl.open(place, mongo=uri) as store:
-        store.record(make_log(tmp_path / "second.mcap", 500), name="second")
-    with hl.open(tmp_path / "mine", create=True) as mine:
-        mine.record(make_log(tmp_path / "third.mcap", 900), name="one")
-        report = bring(mine, place, ["one"])
-        assert (report.copied, report.known) == (["one-2"], [])
-        assert answers(mine, "one-2") == right()
-        again = bring(mine, place)
-        assert (again.copied, again.known) == (["second"], ["one-2"])
-        assert mine.topic("/n").count() == 3 * COUNT
-        assert not mine.verify().findings
-        assert mine.select(["one-2"])[0].status == "complete"
-    with hl.open(place, mongo=uri) as store:
-        assert len(store.recordings()) == 2
-
-
-def test_an_import_goes_on_where_it_was_stopped(place: Path, uri: str, tmp_path: Path) -> None:
-    with hl.open(place, mongo=uri) as store:
-        (entry,) = store.recordings()
-    with hl.open(tmp_path / "mine", create=True) as mine:
-        begun = places.root(tmp_path / "mine") / entry.id
-        begun.mkdir()
-        source = places.folder(place, "one")
-        shutil.copy(source / "000000.mcap", begun)
-        half = (source / "000001.mcap").read_bytes()
-        listed = places.manifest(place, "one").logs[1]
-        (begun / f".{listed.digest[:32]}.part").write_bytes(half[: len(half) // 2])
-        assert not mine.recordings()
-        report = bring(mine, place)
-        left = entry.stored_bytes - (source / "000000.mcap").stat().st_size - len(half) // 2
-        assert (report.copied, report.bytes_copied) == (["one"], left)
-        assert answers(mine) == right()
-        assert not [path for path in begun.iterdir() if path.name.endswith(".part")]
-
-
-def test_what_is_damaged_is_not_imported(place: Path, tmp_path: Path) -> None:
-    path = places.segment(place, "one", 1)
-    data = bytearray(path.read_bytes())
-    data[data.index(b"xxxx")] ^= 1  # in a payload: nothing but the copy is checked for that
-    path.write_bytes(data)
-    with hl.open(tmp_path / "mine", create=True) as mine:
-        assert "do not have the digest" in bring(mine, place).refused["one"]
-        assert not mine.recordings()
-        path.unlink()
-        assert "000001.mcap" in bring(mine, place).refused["one"]
-        assert not mine.recordings()
-
-
 def documents(uri: str) -> dict[str, int]:
     with Database.connect(uri) as database:
         return {c: database.count(c, {}) for c in database.list_collections()}

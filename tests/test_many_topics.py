@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -37,36 +35,6 @@ def test_few_commands_verify_many_topics(tmp_path: Path, calls: Calls) -> None:
         assert sent.total() <= 40, sent
         assert database_of(store).delete(collection_of(topic(7)), {}) == 5
         assert "messages in the segments" in store.verify().findings[-1].problem
-
-
-class Walked(list[Any]):
-    """A list that counts how often somebody walks through it."""
-
-    walks = 0
-
-    def __iter__(self) -> Iterator[Any]:
-        self.walks += 1
-        return super().__iter__()
-
-
-def test_no_question_about_all_topics_walks_through_them_once_a_topic(tmp_path: Path) -> None:
-    log = write_log(tmp_path / "log.mcap", 40)
-    with hl.open(tmp_path / "store", create=True, require_database=True) as store:
-        store.record(log)
-        store.all_topics().where(least(3)).count()  # everything is open now
-        store.shared.channels.clear()
-        store.session.tables.invalidate()
-        (entry,) = store.recordings()
-        channels = entry.channels = Walked(entry.channels)
-        everything = store.all_topics()
-        for query in (everything, everything.where(least(3)), everything.where("data < 1")):
-            query.count()
-            list(query)
-            len(query.to_pandas())
-        assert 0 < channels.walks < 40
-        channels.walks = 0
-        assert everything.where(least(2)).count() == 120
-        assert channels.walks < 10
 
 
 def commands_of(calls: Calls) -> Counter[str]:

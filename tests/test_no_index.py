@@ -88,19 +88,6 @@ def test_every_rebuild_keeps_it(store: hl.Store) -> None:
         assert index.bring(entry) is None
 
 
-def test_documents_that_should_not_be_there_are_found(store: hl.Store) -> None:
-    database = store.shared.index.database_for("this test")
-    (entry,) = store.recordings()
-    stray = {"_id": b"x" * 24, "_meta": {"rec": entry.key}}
-    database.ensure_collection(collection_of(LEFT_OUT[0]))
-    database.replace(collection_of(LEFT_OUT[0]), {"_id": stray["_id"]}, stray)
-    (finding,) = store.verify().findings
-    assert "1 index documents, 0 messages" in finding.problem
-    store.index.rebuild()
-    assert documents(store) == INDEXED
-    assert store.verify().findings == []
-
-
 @pytest.mark.mongo("embedded")
 def test_copies_and_other_readers(store: hl.Store, tmp_path: Path) -> None:
     (segment,) = places.folder(store.directory.path, "log").glob("*.mcap")

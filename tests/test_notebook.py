@@ -17,7 +17,7 @@ from PIL import Image
 
 import hybridlog as hl
 from hybridlog.drawing.notebook import message_html, recordings_html, shown
-from hybridlog.drawing.pixels import SIDE, thumbnail
+from hybridlog.drawing.pixels import SIDE
 from hybridlog.message import Message
 from hybridlog_storage.errors import TopicError
 from tests.limits import Limit
@@ -189,27 +189,6 @@ def test_what_is_no_picture_has_none(store: hl.Store, topic: str) -> None:
 def test_a_large_image_is_not_decoded(store: hl.Store, limit: Limit) -> None:
     limit(shown_bytes=1000)
     assert Parsed(only(store, "/image")._repr_html_()).images == []
-
-
-def seen(array: np.ndarray, encoding: str) -> np.ndarray:
-    with Image.open(io.BytesIO(thumbnail(array, encoding))) as picture:
-        return np.asarray(picture)
-
-
-def test_thumbnails_of_all_encodings() -> None:
-    ramp = np.arange(12, dtype=np.uint8).reshape(3, 4)
-    assert np.array_equal(seen(ramp, "mono8"), ramp)
-    colours = np.stack([ramp, ramp + 50, ramp + 100, ramp + 150], axis=2)
-    assert np.array_equal(seen(colours, "rgba8"), colours[:, :, :3])
-    assert np.array_equal(seen(colours, "BGRA8 "), colours[:, :, 2::-1])
-    depth = np.array([[np.nan, 1.0, 2.0, np.inf]], np.float32)
-    assert seen(depth, "32FC1").tolist() == [[0, 0, 255, 0]]
-    assert seen(np.array([[0, 500, 1000]], ">u2"), "16UC1").tolist() == [[0, 127, 255]]
-    assert seen(np.full((2, 2), np.nan), "64FC1").tolist() == [[0, 0], [0, 0]]
-    huge = np.array([[-1.7e308, 1.7e308]])
-    assert seen(huge, "64FC1").tolist() == [[0, 255]]
-    assert seen(np.zeros((1, 1000), np.uint8), "mono8").shape == (1, 143)
-    assert thumbnail(np.empty((0, 5), np.uint8), "mono8") == b""
 
 
 def test_topics_and_labels_are_completed(store: hl.Store) -> None:

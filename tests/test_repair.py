@@ -11,7 +11,6 @@ import pytest
 
 import hybridlog as hl
 from hybridlog_storage.errors import SegmentError, TopicError
-from hybridlog_storage.manifest import replace
 from hybridlog_storage.manifests import MANIFEST_OLD
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings
@@ -157,29 +156,6 @@ def test_damage_that_only_a_copy_mends_is_said(store: Path) -> None:
         assert finding.cure == "restore the file from a copy"
 
 
-def test_a_missing_segment_is_said_again_and_again(store: Path) -> None:
-    file(store, 2).unlink()
-    for _ in range(2):
-        assert repair(store) == {("one", "segment 2"): False}
-        status, messages, lost = look(store)
-        assert (status, messages + lost) == ("damaged", COUNT)
-        assert lost
-
-
-def test_a_segment_of_another_recording_is_not_believed(store: Path) -> None:
-    shutil.copy(places.segment(store, "two", 1), file(store, 1))
-    assert repair(store) == {("one", "000001.mcap"): False}
-    status, messages, lost = look(store)
-    assert (status, messages + lost) == ("damaged", COUNT)
-
-
-def test_a_duplicate_is_told_and_the_original_answers(store: Path) -> None:
-    shutil.copy(file(store, 1), file(store, 77))
-    assert look(store) == ("complete", COUNT, 0)
-    assert repair(store) == {("one", "000077.mcap"): False}
-    assert look(store) == ("complete", COUNT, 0)
-
-
 def test_what_a_kill_has_left_is_sealed_before_its_manifest_is_made(store: Path) -> None:
     folder = places.folder(store, "one")
     for segment in [*folder.glob("*.mcap")]:
@@ -236,33 +212,6 @@ def test_a_manifest_that_is_made_again_takes_no_name_of_another(store: Path) -> 
     assert places.name_of(folder) == "one-2"
 
 
-def test_a_recording_without_a_manifest_is_named(store: Path) -> None:
-    places.manifest_of(places.folder(store, "one")).unlink()
-    recording = places.id_of(store, "one")
-    options = ("--mongo", "none")
-    for command in (("ls",), ("fetch", "-t", "/n", "--count"), ("verify",)):
-        said = answer(*command, *options, store=store, code=None)
-        assert recording in said.out + said.err, command
-        assert "manifest" in said.out + said.err, command
-    assert file(store, 0).exists()
-
-
-def test_segments_that_the_manifest_does_not_list(store: Path) -> None:
-    """The manifest is an older one, from a backup."""
-    folder = places.folder(store, "one")
-    places.change_in(
-        folder, lambda now: replace(now, files=tuple(f for f in now.files if f.number != 3))
-    )
-    assert places.read_in(folder).logs.keys().isdisjoint({3})  # type: ignore[union-attr]
-    assert look(store) == ("complete", COUNT, 0)
-    # The opening has listed it.
-    assert 3 in places.read_in(folder).logs  # type: ignore[union-attr]
-    assert repair(store) == {}
-    file(store, 3).unlink()
-    status, messages, lost = look(store)
-    assert (status, messages + lost) == ("damaged", COUNT)
-
-
 @pytest.mark.mongo("embedded")
 def test_a_segment_that_was_restored_is_answered_from_again(store: Path) -> None:
     whole = file(store, 1).read_bytes()
@@ -285,16 +234,6 @@ def test_a_segment_that_was_restored_is_answered_from_again(store: Path) -> None
         assert opened.entry("one").status == "complete"
         assert opened.topic("/n").where("n >= 0").count() == 2 * COUNT
         assert not opened.verify().findings
-
-
-def test_a_recording_without_its_end_gets_one(store: Path) -> None:
-    """The crash came between two segments."""
-    folder = places.folder(store, "one")
-    manifest = places.read_in(folder)
-    assert manifest is not None
-    places.write_in(folder, replace(manifest, status="open"))
-    assert look(store) == ("complete", COUNT, 0)  # the last segment says it
-    assert places.read_in(folder).status == "complete"  # type: ignore[union-attr]
 
 
 def test_a_mark_beside_a_lost_segment_takes_nothing_of_it(store: Path) -> None:

@@ -107,29 +107,6 @@ def test_recordings_are_chosen_by_topic_and_time(
     assert len(examples) == len({frozenset(found[n][1]) for n in wanted})
 
 
-def test_a_name_means_an_id_before_all_else() -> None:
-    one = f"20261128-run-{1:016x}"
-    made = [
-        summary(1, (0, 1), ["/a"], name="x"),
-        summary(2, (1, 2), ["/a"], name="y"),
-        summary(3, (2, 3), ["/a"], name="yard"),
-        summary(4, (3, 4), ["/a"], name=one),
-        summary(5, (4, 5), ["/a"], name="yard"),
-    ]
-    snapshot = Snapshot([each for each, _ in made], {made[0][0].topics: ()})
-    assert snapshot.named("x") == [0]
-    assert snapshot.named("ya") == [2, 4]
-    assert snapshot.named("yard") == [2, 4]
-    assert snapshot.named("y") == [1]
-    assert snapshot.named(one) == [0]
-    assert snapshot.named(f"{2:016x}") == [1]
-    assert snapshot.named("20261128-run") == [3]
-    assert snapshot.named("0000") == [0, 1, 2, 3, 4]
-    assert snapshot.named("000") == snapshot.named("no") == []
-    ids = [each.id for each in snapshot.summaries]
-    assert snapshot.ids_called() == {"x": ids[0], "y": ids[1]} | {each: each for each in ids}
-
-
 KINDS = st.lists(st.sampled_from(TOPICS), unique=True)
 STATUS = st.sampled_from(["open", "unfinished", "complete"])
 TAGS = st.dictionaries(st.sampled_from("kl"), st.sampled_from("vw"))

@@ -18,7 +18,6 @@ from PIL import Image as Pillow
 from hybridlog.arrays.message_arrays import IMAGES, VIDEOS, to_numpy
 from hybridlog.drawing.images import Picture, picture
 from hybridlog.drawing.pixels import pixels, png, thumbnail
-from hybridlog.formats.pictures import suffix_of
 from hybridlog_storage.errors import MissingDependencyError, PayloadError, UsageError
 from tests.calls import Calls
 from tests.cli.within import Answer, answer
@@ -464,24 +463,3 @@ def test_no_pictures_leave_nothing(
 ) -> None:
     fetch(drive, *arguments, "-F", "png", "-o", tmp_path / "x", code=code)
     assert [*tmp_path.iterdir()] == []
-
-
-def test_only_our_directories_are_overwritten(drive: Drive, tmp_path: Path) -> None:
-    out = tmp_path / "pictures"
-    ask = ("-t", "rear/*", "-F", "png", "-o", out)
-    fetch(drive, *ask)
-    fetch(drive, *ask, code=2)
-    fetch(drive, *ask, "--force", "-n", 1)
-    assert len([*out.glob("*/*")]) == 1
-    (out / "rear__compressed" / "notes.txt").write_text("mine")
-    fetch(drive, *ask, "--force", code=2)
-    (tmp_path / "file").write_text("mine")
-    fetch(drive, "-t", "rear/*", "-F", "png", "-f", "-o", tmp_path / "file", code=2)
-    assert (tmp_path / "file").read_text() == "mine"
-
-
-def test_suffixes() -> None:
-    assert suffix_of("a/b.JPEG") == ".jpg"
-    assert suffix_of("b.tiff") == ".tif"
-    assert suffix_of("pictures") is None
-    assert suffix_of("2025-06-03T08.00.00") is None

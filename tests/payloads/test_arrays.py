@@ -457,31 +457,6 @@ def _loop(
     return found
 
 
-def test_clouds_of_several_layouts(tmp_path: Path) -> None:
-    """Fields that a cloud lacks are null, and malformed clouds do not hurt the others."""
-    clouds = [
-        cloud([("x", 0, 7, 1)], 4, np.arange(40, dtype="<f4").tobytes()),
-        cloud([("x", 0, 8, 1), ("ring", 8, 4, 1)], 10, bytes(20)),
-        cloud([("x", 90, 7, 1)], 4, bytes(8)),
-        cloud([("x", 0, 5, 2)], 8, np.arange(4, dtype="<i4").tobytes()),
-        cloud([("x", 0, 7, 1), ("X", 0, 7, 1)], 4, np.ones(1, "<f4").tobytes()),
-    ]
-    rows = [("/cloud", CLOUD, BASE + n * STEP, one) for n, one in enumerate(clouds * 3)]
-    log = write_log(tmp_path / "log.mcap", rows)
-    with hl.open(tmp_path / "store", mongo="none", create=True) as store:
-        store.index.arrays("/cloud")
-        store.record(log, name="log")
-        (file,) = files_of(store, "PointCloud2")
-        points = pq.read_table(file)["points"].to_pylist()
-        assert store.topic("cloud").fields("width").to_arrow()["width"].to_pylist()[:2] == [40, 2]
-        assert not store.verify().findings
-    assert [one is None for one in points[:5]] == [False, False, True, False, False]
-    assert points[0]["x"] == [float(n) for n in range(40)]
-    assert points[1] == points[1] | {"x": [0.0, 0.0], "ring": [0, 0]}
-    assert points[3]["x"] == [0.0, 1.0, 2.0, 3.0]
-    assert points[4]["X_2"] == [1.0]
-
-
 def test_points_in_sql(copy: Path) -> None:
     """From tables where these have them, and from messages elsewhere."""
     query = "select t, points.x[2] as x, len(points.ring) as n from cloud where seq % 3 = 1"

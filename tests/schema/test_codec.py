@@ -20,7 +20,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 
-from hybridlog.schema.codec import Codec, OpaqueCodec, plain_message
+from hybridlog.schema.codec import Codec, plain_message
 from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.index_bodies import index_bodies, index_fields
 from hybridlog_storage.errors import DefinitionError, PayloadError
@@ -79,32 +79,6 @@ def test_payloads_that_do_not_fit_are_errors_and_the_others_are_read() -> None:
         codec.decode(b"short")
     decoded = codec.columns(*joined([good, b"short"]))
     assert decoded.rows.tolist() == [0]
-
-
-def test_a_document_past_8_mib_is_an_error() -> None:
-    codec = ros1("string s\nint32 v")
-    huge = (9 << 20).to_bytes(4, "little") + b"x" * (9 << 20) + bytes(4)
-    small = (1).to_bytes(4, "little") + b"x" + bytes(4)
-    bodies = bodies_of(codec, [huge, small])
-    assert "8 MiB" in str(bodies[0])
-    check(bodies[1], {"s": "x", "v": 0})
-    assert index_fields(codec, huge) == {}
-
-
-def test_no_rows_at_all() -> None:
-    nothing = joined([])
-    for codec in (ros1("string s"), codec_for(Channel("/t", "json", None)), OpaqueCodec("x")):
-        assert list(index_bodies(codec, *nothing)) == []
-    decoded = ros1("string s\nfloat64 x").columns(*nothing)
-    assert [field.name for field in decoded.arrow().type] == ["s", "x"]
-    assert len(codec_for(Channel("/t", "json", None)).columns(*nothing).records) == 0
-
-
-def test_big_arrays_of_objects_are_views() -> None:
-    payload = (1000).to_bytes(4, "little") + bytes(1000)
-    message: Any = ros1("uint8[] data").decode(payload)
-    assert message.data.base is not None
-    assert not message.data.flags.owndata
 
 
 @pytest.mark.parametrize("surplus", [b"\0", b"\xff" * 20])
@@ -178,13 +152,6 @@ def test_what_cannot_be_read_is_opaque_and_says_why(
         codec.decode(b"abc")
     with pytest.raises(DefinitionError):
         codec.columns(*joined([b"abc"]))
-
-
-def test_codecs_are_shared() -> None:
-    schema = Schema("pkg/T", "ros1msg", b"int32 x")
-    one = codec_for(Channel("/a", "ros1", schema))
-    two = codec_for(Channel("/b", "ros1", Schema("pkg/T", "ros1msg", b"int32 x")))
-    assert one is two
 
 
 def test_objects_of_hostile_definitions() -> None:
@@ -533,11 +500,3 @@ def test_protobuf_without_its_package(monkeypatch: pytest.MonkeyPatch) -> None:
     codec = codec_for(Channel("/p", "protobuf", schema))
     assert not codec.indexed
     assert "pip install 'hybridlog[protobuf]'" in str(codec.reason)
-
-
-def test_rosbags_own_errors_are_mapped() -> None:
-    codec = codec_for(Channel("/t", "cdr", Schema("p/msg/T", "ros2msg", b"string s")))
-    with pytest.raises(PayloadError):
-        codec.decode(b"\0\x07\0\0abc")
-    with pytest.raises(PayloadError):
-        codec.decode(b"")

@@ -5,8 +5,6 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import subprocess
-import sys
 from collections import defaultdict
 from pathlib import Path
 from typing import Any
@@ -16,9 +14,8 @@ import pytest
 from PIL import Image
 
 from benchmarks.simulator.robot import Robot
-from benchmarks.simulator.topics import TOPICS, RobotConfig, Types
+from benchmarks.simulator.topics import RobotConfig, Types
 from benchmarks.simulator.write import write_bag, write_demo
-from hybridlog_storage.errors import TopicError, UsageError
 
 ROOT = Path(__file__).parents[2]
 SMALL = RobotConfig(image_size=(48, 32), cloud_columns=40, scan_beams=180)
@@ -94,63 +91,6 @@ def test_ros2_says_the_same(tmp_path: Path, storage: Any) -> None:
     assert [m.level for _, m in second["/rosout"]] == [20, 20]
 
 
-@pytest.mark.parametrize("compression", ["lz4", "bz2"])
-def test_compressed_chunks_hold_the_same(tmp_path: Path, compression: Any) -> None:
-    topics = ["/odom", "/base/scan"]
-    plain = write_bag(tmp_path / "a.bag", duration_s=2, topics=topics, config=SMALL)
-    small = write_bag(
-        tmp_path / "b.bag", duration_s=2, topics=topics, config=SMALL, compression=compression
-    )
-    assert small.size < plain.size
-    assert small.messages == plain.messages
-    read(small.path, 1)
-
-
-def test_settings_are_honoured(tmp_path: Path) -> None:
-    config = RobotConfig(image_size=(64, 40), scan_beams=1081, cloud_columns=30)
-    summary = write_bag(tmp_path / "x.bag", duration_s=1, config=config)
-    messages, _ = read(summary.path, 1)
-    rear = messages["/camera/rear/image_raw"][0][1]
-    assert (rear.width, rear.height, rear.encoding, rear.step) == (64, 40, "mono8", 64)
-    assert len(messages["/base/scan"][0][1].ranges) == 1081
-    cloud = messages["/lidar/points"][0][1]
-    assert (cloud.width, cloud.height) == (30, 16)
-    assert len(cloud.data) == cloud.height * cloud.row_step == 16 * 30 * cloud.point_step
-    assert list(summary.messages) == [topic.name for topic in TOPICS]
-
-
-def test_a_second_does_not_depend_on_what_follows(tmp_path: Path) -> None:
-    short = write_bag(tmp_path / "a.bag", duration_s=2, config=SMALL)
-    long = write_bag(tmp_path / "b.bag", duration_s=3, config=SMALL)
-    whole, _ = read(long.path, 1)
-    for topic, messages in read(short.path, 1)[0].items():
-        assert [t for t, _ in messages] == [t for t, _ in whole[topic][: len(messages)]], topic
-
-
-def test_unknown_topics_and_taken_names_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(TopicError, match="/nonsense"):
-        write_bag(tmp_path / "x.bag", duration_s=1, topics=["/nonsense"])
-    taken = tmp_path / "taken.bag"
-    taken.write_bytes(b"precious")
-    with pytest.raises(UsageError, match="exists"):
-        write_bag(taken, duration_s=1)
-    assert taken.read_bytes() == b"precious"
-    with pytest.raises(UsageError, match="compression"):
-        write_bag(tmp_path / "y", duration_s=1, ros=2, compression="lz4")
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["taken.bag"]
-
-
-def test_the_writer_as_a_command(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "benchmarks.simulator", str(tmp_path / "r.bag")]
-    command += ["--duration", "1"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stderr) == (0, "")
-    assert "MB" in done.stdout
-    again = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert again.returncode == 2
-    assert again.stderr.endswith("r.bag exists already; remove it or choose another name\n")
-
-
 def differs(found: Any, wanted: Any) -> bool:
     """Whether messages differ by more than processors and versions of libjpeg do."""
     if hasattr(wanted, "__dataclass_fields__"):
@@ -186,25 +126,3 @@ def test_the_bag_in_the_package_is_what_the_simulator_writes(tmp_path: Path) -> 
         assert [t for t, _ in found[topic]] == [t for t, _ in messages], topic
         pairs = zip(found[topic], messages, strict=True)
         assert not any(differs(one, other) for (_, one), (_, other) in pairs), topic
-
-
-@pytest.mark.parametrize("seed", range(8))
-def test_every_seed_drives_clear_and_stands_at_its_stops(seed: int) -> None:
-    robot = Robot(70.0, seed)
-    state = robot.at(np.arange(0.0, min(robot.duration_s, robot.period), 0.02))
-    assert robot.plan.clearance(state.x, state.y).min() > 0.3
-    for stop in robot.stops:
-        middle = (stop.start + stop.end) / 2
-        assert robot.at(np.array([middle])).speed[0] < 1e-9
-    assert 3 <= sum(c.position == 0 for c in robot.gripper_commands) <= 6
-    for braked in (stop.start for stop in robot.stops if stop.kind == "brake"):
-        near = np.array([braked - 0.15, braked, braked + 0.1])
-        assert robot.at(near).acceleration.min() < -1.5
-
-
-@pytest.mark.parametrize(
-    ("duration_s", "seed"), [(0, 1), (-1, 1), (float("nan"), 1), (float("inf"), 1), (5, -1)]
-)
-def test_impossible_robots_are_refused(duration_s: float, seed: int) -> None:
-    with pytest.raises(UsageError):
-        Robot(duration_s, seed)

@@ -1,11 +1,7 @@
 from __future__ import annotations
 
 import logging
-import os
-import signal
-import subprocess
 import tempfile
-import threading
 import time
 from collections.abc import Iterator
 from itertools import count
@@ -16,20 +12,19 @@ import bson
 import numpy as np
 import pymongo
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from pymongo import MongoClient, monitoring
 
+from hybridlog_storage.catalog import RecordingEntry, channel_entry
 from hybridlog_storage.errors import DatabaseError, DiskFullError, UsageError, WhereError
-from hybridlog_storage.mongo import database as module
+from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.mongo.database import (
     CollectionStats,
     Database,
-    _batches,
     _mapped,
     without_secrets,
 )
-from hybridlog_storage.mongo.mongod import EmbeddedMongod, find_mongod
+from hybridlog_storage.mongo.index_state import IndexState
+from hybridlog_storage.mongo.mongod import EmbeddedMongod
 from tests.calls import Calls
 from tests.limits import Limit
 from tests.waiting import wait_for
@@ -116,14 +111,6 @@ def test_bytes_arrive_and_come_back_as_they_are(
     assert plain[name].find_one(sort=[("x", -1)])["x"] == 12_344
 
 
-@pytest.mark.parametrize("kind", [bytes, bytearray, memoryview])
-def test_any_buffer_will_do(database: Database, name: str, kind: type) -> None:
-    documents = encoded(10)
-    raw = b"".join(documents)
-    assert database.insert_raw(name, kind(raw), lengths_of(documents)) == 10
-    assert raw_of(database, name) == raw
-
-
 def test_more_than_one_message_can_hold(database: Database, name: str) -> None:
     documents = encoded(60, size=500_000)  # 1 MB each
     assert put(database, name, documents) == 60
@@ -145,36 +132,11 @@ def test_documents_that_are_there_are_passed_over(database: Database, name: str)
     assert raw_of(database, name) == b"".join(documents)
 
 
-def test_nothing_to_insert(database: Database, name: str) -> None:
-    assert put(database, name, []) == 0
-    assert raw_of(database, name) == b""
-    with pytest.raises(ValueError, match="end at byte 0 of 5"):
-        database.insert_raw(name, bson.encode({}), np.zeros(0, np.int64))
-
-
 def test_a_document_the_server_refuses(database: Database, name: str) -> None:
     bad = bson.encode({"_id": [1]})  # an array cannot be a key
     good = bson.encode({"_id": 1})
     with pytest.raises(DatabaseError, match="refuses"):
         put(database, name, [bad, good])
-
-
-@settings(max_examples=200, deadline=None)
-@given(st.lists(st.integers(5, 400), max_size=60), st.integers(400, 1000), st.integers(1, 12))
-def test_batches_are_a_partition_within_the_limits(
-    sizes: list[int], most_bytes: int, most_documents: int
-) -> None:
-    ends = np.array([0, *np.cumsum(sizes, dtype=int).tolist()])
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "BATCH_BYTES", most_bytes)
-        patch.setattr(module, "BATCH_DOCUMENTS", most_documents)
-        batches = list(_batches(ends))
-    assert [row for first, last in batches for row in range(first, last)] == list(range(len(sizes)))
-    for (first, last), following in zip(batches, [*batches, None][1:], strict=True):
-        assert 0 < last - first <= most_documents
-        assert ends[last] - ends[first] <= most_bytes
-        if following and last - first < most_documents:
-            assert ends[last + 1] - ends[first] > most_bytes, "as full as it can be"
 
 
 def test_the_drivers_own_log_and_monitors_cope(
@@ -262,17 +224,6 @@ def test_collections_are_clustered(
     assert database.stats(name).index_bytes == 0
 
 
-def test_dropping_all_leaves_other_databases(
-    mongod: EmbeddedMongod, plain: pymongo.database.Database
-) -> None:
-    with Database.connect(mongod.start(), "other") as other:
-        other.ensure_collection("a")
-        assert other.list_collections() == ["a"]
-        other.drop_all()
-        assert other.list_collections() == []
-    assert "other" not in plain.client.list_database_names()
-
-
 def nested(depth: int) -> dict[str, object]:
     result: dict[str, object] = {}
     for _ in range(depth):
@@ -305,12 +256,6 @@ def test_a_wrong_predicate_is_the_users_error(
         database.count(name, predicate)
     with pytest.raises(WhereError):
         list(database.each([(name, {}), (name, predicate)], lambda _: {"$project": {"x": 1}}))
-
-
-@pytest.mark.parametrize("bad", ["", "a$b", "a\0b", ".a", "x" * 300])
-def test_names_that_no_collection_can_have(database: Database, bad: str) -> None:
-    with pytest.raises(DatabaseError):
-        database.ensure_collection(bad)
 
 
 def test_a_full_disk_is_told_apart() -> None:
@@ -384,55 +329,21 @@ def test_an_old_server_is_refused(mongod: EmbeddedMongod, calls: Calls) -> None:
         Database.connect(mongod.start(), timeout_s=5)
 
 
-def test_a_server_of_somebody_elses(runtime: Path) -> None:
-    """By URI: a plain mongod, started by hand, which then goes away."""
-    data = runtime / "plain"
-    data.mkdir()
-    path = runtime / "plain.sock"
-    command = [str(find_mongod()), "--dbpath", str(data), "--bind_ip", str(path), "--nounixsocket"]
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL) as server:
-        try:
-            uri = f"mongodb://{quote(str(path), safe='')}/theirs?directConnection=true"
-            Database.connect(uri, timeout_s=20).close()
-            with Database.connect(uri, timeout_s=1) as connected:
-                connected.ensure_collection("a")
-                assert put(connected, "a", encoded(10)) == 10
-                assert connected.ping()
-                server.kill()
-                server.wait()
-                assert not connected.ping()
-            with pytest.raises(DatabaseError, match="does not answer"):
-                Database.connect(uri, timeout_s=0.3)
-        finally:
-            server.kill()
-
-
-def test_killed_in_the_middle_of_inserting(
-    tmp_path: Path, runtime: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("HYBRIDLOG_RUNTIME_DIR", str(runtime))
-    directory = tmp_path / "mongod"
-    documents = encoded(40_000, 200)
-    raw, lengths = b"".join(documents), lengths_of(documents)
-    with EmbeddedMongod(directory, linger_s=0) as user:
-        with Database.connect(user.start(), timeout_s=0.5) as database:
-            database.ensure_collection("a")
-            # What was written before a checkpoint outlives a kill.
-            assert put(database, "a", documents[:10]) == 10
-            database._client.admin.command("fsync")
-            pid = int((directory / "data/mongod.lock").read_text())
-            threading.Timer(0.05, os.kill, (pid, signal.SIGKILL)).start()
-
-            def insert_for_ever() -> None:
-                while True:
-                    database.insert_raw("a", raw, lengths)
-                    database.delete("a", {"x": {"$gte": 10}})
-
-            with pytest.raises(DatabaseError, match="does not answer"):
-                insert_for_ever()
-        with Database.connect(user.start()) as database:
-            there = database.count("a", {"x": {"$gte": 0}})
-            assert 10 <= there <= len(documents)
-            assert there + database.insert_raw("a", raw, lengths) == len(documents)
-            assert raw_of(database, "a") == raw
-    wait_for_end(directory)
+def test_the_mirror_of_many_topics_fits_into_a_document(database: Database) -> None:
+    schema = Schema("x/msg/Y", "ros2msg", b"int8 x")
+    channels = [
+        channel_entry(n, Channel(f"/robot/part{n}", "cdr", schema), None) for n in range(65_535)
+    ]
+    entry = RecordingEntry(
+        id="0123456789abcdef" * 2,
+        name="run",
+        tags={},
+        source={},
+        created=0,
+        status="complete",
+        channels=channels,
+        digests={"0": "a"},
+    )
+    state = IndexState(database)
+    state.begin(entry, entry.digests)
+    assert state.of()[entry.key].is_whole(entry)

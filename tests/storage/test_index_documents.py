@@ -112,46 +112,6 @@ def test_documents_say_what_the_chunk_says(rows: list[tuple[int, int, int]], pub
         assert document["_id"] == struct.pack(">QQQ", time, 0xFEDCBA9876543210, seq)
 
 
-@given(
-    st.lists(
-        st.tuples(
-            st.tuples(st.integers(0, 2**31 - 1), st.integers(0, 2**62)),
-            st.lists(st.tuples(TIMES, st.integers(0, 9)), min_size=1, max_size=5),
-        ),
-        min_size=1,
-        max_size=5,
-    )
-)
-def test_documents_of_several_chunks_are_those_of_each(
-    parts: list[tuple[tuple[int, int], list[tuple[int, int]]]],
-) -> None:
-    chunks = []
-    for number, (at, rows) in enumerate(parts):
-        lengths = [length for _, length in rows]
-        content = bytes(100 + number for _ in range(sum(lengths) + 31 * len(rows)))
-        chunk = chunk_of([time for time, _ in rows], None, lengths, at=at, content=content)
-        chunks.append(chunk)
-    placed = Placed.of(chunks)
-    assembler = DocumentAssembler(ORIGIN)
-    every = np.arange(len(placed.batch))
-    made = assembler.assemble(placed, every, np.empty((len(every), 0), np.uint8))
-    assert made.tobytes() == np.concatenate([assembled(chunk) for chunk in chunks]).tobytes()
-    assert placed.number.tolist() == [n for n, (_, rows) in enumerate(parts) for _ in rows]
-    payloads = [bytes(placed.batch.payload(row)) for row in every]
-    assert payloads == [
-        bytes(chunk.batch.payload(row)) for chunk in chunks for row in range(len(chunk.batch))
-    ]
-
-
-@given(st.lists(st.tuples(TIMES, st.integers(0, 2**62)), min_size=2))
-def test_the_order_of_keys_is_the_order_of_messages(rows: list[tuple[int, int]]) -> None:
-    chunk = chunk_of([r[0] for r in rows], [r[1] for r in rows])
-    keys = [d["_id"] for d in documents(assembled(chunk))]
-    assert sorted(range(len(rows)), key=lambda i: keys[i]) == sorted(
-        range(len(rows)), key=lambda i: rows[i]
-    )
-
-
 @given(TIMES, TIMES)
 def test_a_bound_parts_the_keys_at_its_time(time: int, bound: int) -> None:
     (made,) = documents(assembled(chunk_of([time])))

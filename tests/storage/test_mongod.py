@@ -309,19 +309,6 @@ def test_a_killed_keeper_takes_mongod_along_and_the_next_start_brings_another(
         assert kept(uri) == 1
 
 
-def test_a_killed_mongod_comes_up_again_with_what_was_written(directory: Path) -> None:
-    with EmbeddedMongod(directory, linger_s=LINGER_S) as user:
-        keep(user.start())
-        first = pids(directory)
-        os.kill(first[0], signal.SIGKILL)
-        gone(first[0])
-        uri = user.start()
-        second = pids(directory)
-        assert not set(first) & set(second)
-        assert kept(uri) == 1
-    assert "killed by signal 9" in user.log.read_text()
-
-
 def test_everything_killed_and_a_stale_socket(directory: Path) -> None:
     with EmbeddedMongod(directory, linger_s=LINGER_S) as user:
         path = socket_of(user.start())
@@ -378,11 +365,6 @@ def test_a_directory_that_cannot_be_written(runtime: Path) -> None:
     finally:
         os.seteuid(user)
         store.chmod(0o755)
-
-
-def test_no_store_at_all(tmp_path: Path) -> None:
-    with pytest.raises(StoreError, match="No such file"):
-        EmbeddedMongod(tmp_path / "none" / "mongod").start()
 
 
 def test_a_program_that_fails_at_once(directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -454,17 +436,6 @@ def test_what_mongod_says_before_it_dies_is_told(
         EmbeddedMongod(directory, linger_s=LINGER_S).start()
 
 
-def test_a_program_that_is_none(
-    directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    garbage = tmp_path / "garbage"
-    garbage.write_bytes(b"\x7fELF nonsense")
-    garbage.chmod(0o755)
-    monkeypatch.setenv("HYBRIDLOG_MONGOD", str(garbage))
-    with pytest.raises(DatabaseError, match=r"cannot run .*does not run on this machine"):
-        EmbeddedMongod(directory, linger_s=LINGER_S).start()
-
-
 def test_a_mongod_that_never_answers(
     directory: Path, fake: Callable[[str], None], limit: Limit
 ) -> None:
@@ -473,19 +444,6 @@ def test_a_mongod_that_never_answers(
     with pytest.raises(DatabaseError, match="did not answer within 1 s"):
         EmbeddedMongod(directory, linger_s=LINGER_S).start()
     wait_for(lambda: not processes_on(directory))
-
-
-def test_data_that_another_mongod_has_open(directory: Path, runtime: Path) -> None:
-    (directory / "data").mkdir(parents=True)
-    path = runtime / "m.sock"
-    command = [str(find_mongod()), "--dbpath", str(directory / "data"), "--bind_ip", str(path)]
-    with subprocess.Popen([*command, "--nounixsocket"], stdout=subprocess.DEVNULL) as other:
-        try:
-            wait_for(path.exists)
-            with pytest.raises(DatabaseError, match=r"Another mongod has .*data open"):
-                EmbeddedMongod(directory, linger_s=LINGER_S).start()
-        finally:
-            other.kill()
 
 
 def marked(directory: Path) -> Path:
@@ -659,12 +617,6 @@ def test_the_wheel_then_the_path_then_an_error_with_every_way(
     assert find_mongod() == wheel
     wheel.chmod(0o644)
     assert find_mongod() == on_path
-
-
-def test_a_named_one_that_is_not_there(monkeypatch: pytest.MonkeyPatch, directory: Path) -> None:
-    monkeypatch.setenv("HYBRIDLOG_MONGOD", "/nowhere/mongod")
-    with pytest.raises(MissingDependencyError, match=r"'/nowhere/mongod'.*HYBRIDLOG_MONGO_URI"):
-        EmbeddedMongod(directory).start()
 
 
 def test_linger_time_of_the_environment(monkeypatch: pytest.MonkeyPatch, directory: Path) -> None:

@@ -17,14 +17,12 @@ from hypothesis import strategies as st
 
 import hybridlog as hl
 from hybridlog.columns import topic_table as reader
-from hybridlog.columns.fields import FieldShape, UnfitError, alike, joined, records_of
-from hybridlog.columns.parquet_file import ParquetFileReader
+from hybridlog.columns.fields import FieldShape, joined, records_of
 from hybridlog.columns.tables import Tables
 from hybridlog.columns.topic_table import TopicTable, _merged
 from hybridlog.maintenance import tables as making
 from hybridlog_storage.cache import Cache
 from hybridlog_storage.errors import StoreError
-from tests.calls import Calls
 from tests.some import in_turn
 from tests.tables.conftest import SMALL_CHUNKS
 from tests.tables.logs import decoded
@@ -232,18 +230,6 @@ def test_a_segment_more_or_less_is_noticed(recorded: hl.Store, tables: Tables) -
     assert tables.of(entry, entry.channels[0].topic) is None
 
 
-def test_what_is_found_is_remembered(recorded: hl.Store, tables: Tables, calls: Calls) -> None:
-    (entry,) = recorded.recordings()
-    table = tables.of(entry, "/large")
-    assert table is not None
-    assert tables.of(entry, "/large") is table
-    before = list(table.scan(["i8"]))
-    calls.fail(ParquetFileReader, "read", AssertionError)
-    assert [b.records.equals(a.records) for a, b in zip(before, table.scan(["i8"]), strict=True)]
-    tables.invalidate()
-    assert tables.of(entry, "/large") is not table
-
-
 def test_memory_of_columns_is_bounded(recorded: hl.Store) -> None:
     (entry,) = recorded.recordings()
     cache = Cache(30_000)
@@ -364,77 +350,3 @@ def test_arrays_over_the_limit_are_summaries() -> None:
         None,
         *summaries,
     ]
-
-
-def test_a_field_called_as_a_summary() -> None:
-    array = struct([{"a": [1], "a_summary": "x"}], a=pa.list_(pa.int8()), a_summary=pa.string())
-    columns = FieldShape().columns(array)
-    assert [field.name for field in columns.type] == ["a", "a_summary", "a_summary_2"]
-    assert records_of(columns).to_pylist() == array.to_pylist()
-
-
-NESTED = pa.list_(pa.list_(pa.int8()))
-OTHERS = [pa.string(), pa.struct([("x", pa.int8())]), pa.list_(pa.int8()), pa.binary()]
-
-
-@pytest.mark.parametrize(
-    ("kind", "values", "found"),
-    [
-        (NESTED, [[[1], [2] * 40], [[3]], None], [(None, 2), ([[3]], None), (None, None)]),
-        (pa.binary(), [b"x" * 33, None, b"x" * 32], [(None, 33), (None, None), (b"x" * 32, None)]),
-        *((pa.list_(kind), [[None] * 40], [(None, 40)]) for kind in OTHERS),
-    ],
-)
-def test_long_arrays_of_other_things_have_a_length(
-    kind: Any, values: list[Any], found: list[tuple[Any, int | None]]
-) -> None:
-    array = struct([{"a": value} for value in values], a=kind)
-    assert FieldShape().columns(array).to_pylist() == [
-        {"a": value, "a_summary": count and {"n": count}} for value, count in found
-    ]
-
-
-@pytest.mark.parametrize(
-    ("kind", "most"),
-    [
-        (pa.uint64(), 2**64 - 1),
-        (pa.int64(), 2**63 - 1),
-        (pa.bool_(), True),
-        (pa.timestamp("ns", "UTC"), 2**63 - 1),
-    ],
-)
-def test_summaries_of_integers_are_exact(kind: Any, most: int) -> None:
-    values = pa.array([type(most)(0), most] * 20, kind)
-    lists = pa.ListArray.from_arrays(pa.array([0, 40], pa.int32()), values)
-    array = pa.StructArray.from_arrays([lists], names=["a"])
-    found = FieldShape().columns(array).field("a_summary")[0].as_py()
-    assert (found["n"], found["min"], found["max"]) == (40, 0, int(most))
-
-
-def test_columns_that_a_piece_lacks_are_null() -> None:
-    one = struct([{"a": 1, "s": {"x": 1}}], a=pa.int64(), s=pa.struct([("x", pa.int64())]))
-    two = struct([{"b": "x", "s": {"y": 2}}], b=pa.string(), s=pa.struct([("y", pa.int64())]))
-    none = struct([{"a": None}], a=pa.null())
-    assert joined([one, two, none]).to_pylist() == [
-        {"a": 1, "s": {"x": 1, "y": None}, "b": None},
-        {"a": None, "s": {"x": None, "y": 2}, "b": "x"},
-        {"a": None, "s": None, "b": None},
-    ]
-
-
-@pytest.mark.parametrize("other", [pa.string(), pa.float64(), pa.uint64(), pa.list_(pa.int64())])
-def test_types_without_a_common_one(other: Any) -> None:
-    one = struct([{"a": 1}], a=pa.int64())
-    two = pa.StructArray.from_arrays([pa.nulls(0, other)], names=["a"])
-    with pytest.raises(UnfitError):
-        alike([one, two], by_type=True)
-
-
-def test_values_without_a_common_type_are_json() -> None:
-    one = struct([{"a": 1}], a=pa.int64())
-    two = struct([{"a": "x"}, {"a": None}], a=pa.string())
-    found = joined([one, two]).field("a")
-    assert found.type == pa.json_()
-    assert found.storage.to_pylist() == ["1", '"x"', None]
-    wide = joined([struct([{"a": 1}], a=pa.int8()), one])
-    assert wide.type.field("a").type == pa.int64()

@@ -11,13 +11,9 @@ import pyarrow.parquet as pq
 import pytest
 
 import hybridlog as hl
-from hybridlog.columns import folders, parquet_file
-from hybridlog.columns.parquet_file import ParquetFileReader
-from hybridlog.columns.tables import Tables
+from hybridlog.columns import folders
 from hybridlog.maintenance import tables as making
-from hybridlog.query.predicate import to_mask as deciding
 from hybridlog_storage.disk import files
-from hybridlog_storage.errors import StoreError
 from hybridlog_storage.messages import Schema
 from tests.calls import Calls
 from tests.limits import Limit
@@ -68,13 +64,6 @@ def test_a_file_is_opened_once_for_all_its_recordings_and_topics(
     assert not opened
 
 
-def test_a_predicate_is_evaluated_once_for_a_file(several: hl.Store, calls: Calls) -> None:
-    decided: list[int] = []
-    calls(deciding, "to_mask", lambda _, __, records: decided.append(len(records)))
-    assert several.query(["/a", "/b"]).where("i8 > 0").count() == COUNT * 12
-    assert decided == [COUNT * 30]
-
-
 def test_long_arrays_of_another_recording_change_no_count(
     several: hl.Store, tmp_path: Path
 ) -> None:
@@ -105,15 +94,6 @@ def test_more_files_than_may_be_open(
     assert not opened
     assert several.query(["/a", "/b"]).where("f64 < 5").count() > 0
     assert len(opened) <= 13
-
-
-def test_a_closed_file_that_was_replaced_is_not_believed(several: hl.Store, tmp_path: Path) -> None:
-    (path,) = files_of(several)
-    file = ParquetFileReader(path)
-    file.release()
-    record(several, tmp_path, COUNT)
-    with pytest.raises(StoreError, match="replaced"):
-        file.table()
 
 
 @pytest.mark.parametrize("most", [{"shared_file_rows": 70}, {"shared_file_recordings": 2}])
@@ -183,26 +163,6 @@ def test_lists_of_shared_files_that_are_lost_or_damaged(
     assert {one.id for one in apart.recordings()} == folders.recordings_of(apart.directory.path)
 
 
-def test_lists_go_with_their_folders(several: hl.Store) -> None:
-    assert lists_of(several)
-    for one in list(several.recordings()):
-        several.remove(one.name)
-    assert not list((several.directory.path / "tables").iterdir())
-
-
-def test_folders_are_read_once_for_all_recordings_without_tables(
-    several: hl.Store, calls: Calls, limit: Limit
-) -> None:
-    (path,) = files_of(several)
-    path.unlink()
-    limit(settled_ns=-1)
-    entries = list(several.recordings())
-    read = calls(files, "names_in")
-    tables = Tables(several.directory.path)
-    assert all(tables.of(one, topic) is None for one in entries for topic in ("/a", "/b"))
-    assert len(read) == 2  # all folders, and this one
-
-
 def test_rows_are_by_recording_topic_and_time(several: hl.Store, tmp_path: Path) -> None:
     record(several, tmp_path, -3)
     (path,) = files_of(several)
@@ -230,20 +190,6 @@ def test_several_writers_lose_no_rows(store: hl.Store, tmp_path: Path) -> None:
     assert pq.read_metadata(files_of(store)[0]).num_rows == 12 * 30
     assert all(not making.missing(store.directory, entry) for entry in store.recordings())
     assert compare(store) == 12 * 30
-
-
-def test_footers_do_not_grow_with_each_merge(several: hl.Store) -> None:
-    (path,) = files_of(several)
-    assert set(pq.read_metadata(path).metadata) == {
-        b"ARROW:schema",
-        b"hybridlog",
-        parquet_file._SEALED_BY.encode(),
-    }
-
-
-def test_listing_views_makes_none(several: hl.Store) -> None:
-    assert ("a",) in several.sql("SHOW tables;").rows()
-    assert not several.sql_engine.content()._views
 
 
 def test_rows_of_a_topic_with_two_definitions_are_made_again(

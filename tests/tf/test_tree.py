@@ -12,8 +12,6 @@ import numpy as np
 import pytest
 
 import hybridlog as hl
-from hybridlog.tf.reader import frames_and_stamps
-from hybridlog.tf.transform import Transform
 from hybridlog.tf.tree import FrameTree
 from hybridlog_storage.errors import TopicError, TransformError, UsageError
 from hybridlog_storage.messages import Channel, Schema
@@ -227,15 +225,6 @@ def test_no_transforms(tmp_path: Path) -> None:
             store.tf("x")
 
 
-def test_the_times_of_a_topic_without_headers(log: Log) -> None:
-    """Its log times, and no frame."""
-    log.tree(*(said(n, "a", "b") for n in range(3)))
-    query = log.store.recordings(log.store.summaries()[-1].id).topic("/tf")
-    frames, times = frames_and_stamps(query.session, query.question, query.counters)
-    assert frames == []
-    assert times.tolist() == [message.log_time_ns for message in query]
-
-
 def test_a_running_recording(tmp_path: Path) -> None:
     with hl.open(tmp_path / "store", create=True, mongo="none") as store:
         with store.start("x", flush_interval_s=0.01) as recording:
@@ -253,8 +242,3 @@ def test_gaps_and_rates(log: Log) -> None:
     rows = tree.to_arrow().to_pylist()
     assert [row["frame"] for row in rows] == ["a", "b"]
     assert rows[1]["longest_gap_ns"] == 3 * S
-
-
-def test_a_transform_alone() -> None:
-    one = Transform(np.array([1.0, 2, 3]), np.array(TURNED))
-    np.testing.assert_allclose((one @ one.inverse()).translation, 0, atol=1e-12)

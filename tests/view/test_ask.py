@@ -62,32 +62,6 @@ def test_a_predicate_is_counted(client: TestClient, demo_store: hl.Store) -> Non
     assert printed_by(both["python"]).split()[0] == str(want)
 
 
-def test_matches_by_pixel(client: TestClient, demo_store: hl.Store, start: int) -> None:
-    asked = {**NEAR, "begin": 2 * S, "end": 19 * S, "pixels": 400}
-    answer = client.get("matches", params=asked).json()
-    seen = [t - start for t in times(near(demo_store)) if 2 * S <= t - start < 19 * S]
-    assert (sum(answer["counts"]), answer["first"][0]) == (len(seen), seen[0])
-    assert answer["pixels"] == sorted({(t - 2 * S) // answer["width"] for t in seen})
-    held = near(demo_store).between(start + 2 * S, start + 19 * S).intervals()
-    assert answer["bands"] == [[i.begin_ns - start, i.end_ns - start] for i in held]
-    none = client.get("matches", params={**asked, "begin": 100 * S, "end": 101 * S}).json()
-    assert none["counts"] == none["bands"] == []
-
-
-def test_matches_are_stepped_through(client: TestClient, demo_store: hl.Store, start: int) -> None:
-    want = [str(t - start) for t in times(near(demo_store))]
-    page = client.get("match-list", params={**NEAR, "at": 0, "count": 5}).json()
-    assert ([at for at, _ in page["rows"]], page["before"]) == (want[:5], 0)
-    at, seq = page["rows"][-1]
-    page = client.get("match-list", params={**NEAR, "at": at, "seq": seq, "count": 3}).json()
-    assert ([at for at, _ in page["rows"]], page["before"]) == (want[5:8], 5)
-    asked = {**NEAR, "at": want[5], "count": 2, "direction": "earlier"}
-    page = client.get("match-list", params=asked).json()
-    assert ([at for at, _ in page["rows"]], page["before"]) == (want[3:5], 3)
-    page = client.get("match-list", params={**NEAR, "at": 100 * S}).json()
-    assert page == {"rows": [], "before": None}
-
-
 @pytest.mark.parametrize(
     ("path", "changes", "problem"),
     [

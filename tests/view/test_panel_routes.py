@@ -29,7 +29,7 @@ from tests.every_image import (
     SAMPLES,
     WIDTH,
 )
-from tests.odd_messages import HOSTILE, LOGS, MS, START, log_time, write_odd
+from tests.odd_messages import HOSTILE, MS, START, write_odd
 from tests.view.conftest import Asking
 
 S = 10**9
@@ -97,26 +97,6 @@ def test_fields_that_can_be_drawn_can_be_drawn(client: TestClient, odd: TestClie
     loose = {f["path"]: f["type"] for f in got(odd, "fields", "/loose")["fields"]}
     assert loose["n"] == "integer"
     assert not any("`" in path for path in loose)
-
-
-def test_lines_of_a_log_around_the_cursor(odd: TestClient) -> None:
-    at = log_time(100) - START
-    found = got(odd, "log", "/rosout", at=at, before=10, after=10)
-    numbers = range(95, 115)
-    assert [line["text"] for line in found["lines"]] == [LOGS[n][2] for n in numbers]
-    times = [str(log_time(n) - START) for n in numbers]
-    assert [line["time"] for line in found["lines"]] == times
-    assert (found["first"], found["last"]) == (False, False)
-    # From a line on: those of its own time that came after it, too.
-    line = found["lines"][2]
-    asked = {"at": line["time"], "seq": line["seq"], "before": 3, "after": 3}
-    beside = got(odd, "log", "/rosout", **asked)["lines"]
-    assert [one["text"] for one in beside] == [LOGS[n][2] for n in (94, 95, 96, 98, 99, 100)]
-    last = got(odd, "log", "/rosout", at=60 * S, before=2, after=2)
-    assert last["lines"][-1]["problem"]
-    assert last["last"]
-    none = got(odd, "log", HOSTILE, at=-S, before=2, after=2)
-    assert (len(none["lines"]), none["first"], none["last"]) == (2, True, False)
 
 
 @pytest.mark.parametrize("topic", [RAW, COMPRESSED])

@@ -14,11 +14,9 @@ import pytest
 from PIL import Image
 
 import hybridlog as hl
-from hybridlog.drawing.points import points
-from hybridlog.drawing.track import track
 from hybridlog_storage.messages import Channel, Schema
 from tests.ros_values import ROS1
-from tests.view.conftest import Asking, opened, printed_by, served, unpacked
+from tests.view.conftest import Asking, opened, printed_by, served
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
@@ -88,80 +86,6 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
 @pytest.fixture(scope="module")
 def asked(store: hl.Store, asking: Asking) -> TestClient:
     return asking(store)
-
-
-def points_at(client: TestClient, **parameters: Any) -> tuple[dict[str, Any], dict[str, Any]]:
-    response = client.get("points", params={"recording": "yard", **parameters})
-    assert response.status_code == 200, response.text
-    return unpacked(response.content)
-
-
-def test_points_of_a_scan(asked: TestClient) -> None:
-    found, arrays = points_at(asked, topic="/scan", at=int(1.5 * S), value="intensity")
-    assert (found["time"], found["until"]) == (str(S), str(2 * S))
-    kept = [(0, 2.0), (1, 2.0), (5, 4.0)]
-    wanted = [(r * math.cos(n * math.pi / 6), r * math.sin(n * math.pi / 6), 0) for n, r in kept]
-    assert np.allclose(arrays["xyz"].reshape(-1, 3), wanted, atol=1e-6)
-    assert arrays["value"].tolist() == [0, 10, 50]
-    assert (found["shown"], found["total"]) == (3, 6)
-    assert found["dropped"] == {"not finite": 2, "out of range": 1}
-    assert (found["frame"], found["flat"], found["every"]) == ("laser", True, 1)
-    assert found["names"] == ["range", "intensity", "angle"]
-    assert found["bounds"]["value"][:2] == [0, 50]
-    assert found["bounds"]["x"][:2] == pytest.approx([4 * math.cos(5 * math.pi / 6), 2])
-
-
-def test_points_of_a_cloud(asked: TestClient, store: hl.Store) -> None:
-    found, arrays = points_at(asked, topic="/cloud", at=S, value="rgb")
-    wanted = points(store.topic("cloud").at("+1s"))
-    assert np.array_equal(arrays["xyz"].reshape(-1, 3), wanted.xyz)
-    assert set(arrays["value"].tolist()) == {BLUE}
-    assert (found["names"], found["flat"], found["until"]) == (["rgb", "ring"], False, None)
-    found, arrays = points_at(asked, topic="/cloud", at=S, value="ring", limit=100)
-    assert (found["shown"], found["total"], found["every"]) == (100, 800, 8)
-    assert arrays["value"].tolist() == [n % 7 for n in range(0, 800, 8)]
-    found, arrays = points_at(asked, topic="/cloud", at=S, value="nothing")
-    assert list(arrays) == ["xyz"]
-
-
-def test_points_that_are_not_there(asked: TestClient) -> None:
-    found, arrays = points_at(asked, topic="/scan", at=-1)
-    assert (found["time"], found["until"], arrays) == (None, "0", {})
-    found, arrays = points_at(asked, topic="/broken", at=0)
-    assert "needs 14400 bytes and has 14397" in found["problem"]
-    assert (found["time"], arrays) == ("0", {})
-    found, _ = points_at(asked, topic="/fix", at=0)
-    assert "NavSatFix has no points" in found["problem"]
-
-
-def test_a_track(asked: TestClient, store: hl.Store) -> None:
-    parameters = {"recording": "yard", "topic": "/fix", "pixels": 100}
-    found, arrays = unpacked(asked.get("track", params=parameters).content)
-    wanted = track(store.topic("fix"), pixels=100)
-    assert arrays["times"].tolist() == (wanted.times - BASE).tolist() == [n * S for n in range(31)]
-    there = arrays["xy"].reshape(-1, 2)
-    assert np.array_equal(there, wanted.xy.astype(np.float32), equal_nan=True)
-    assert np.flatnonzero(np.isnan(there[:, 0])).tolist() == [10, 11, 12]
-    assert (found["messages"], found["fixes"], found["exact"]) == (31, 28, True)
-    assert (found["grid"]["latitude"], found["grid"]["longitude"]) == (48.0, 11.0)
-    parameters |= {"begin": 3 * S, "end": 8 * S, "pixels": 1}
-    found, arrays = unpacked(asked.get("track", params=parameters).content)
-    assert arrays["times"].tolist() == [n * S for n in range(3, 8)]
-    found, arrays = unpacked(
-        asked.get("track", params={**parameters, "begin": 50 * S, "end": 51 * S}).content
-    )
-    assert (found["grid"], len(arrays["xy"])) == (None, 0)
-
-
-def test_a_fix(asked: TestClient) -> None:
-    parameters = {"recording": "yard", "topic": "/fix"}
-    found = asked.get("fix", params={**parameters, "at": 2 * S}).json()
-    assert (found["latitude"], found["longitude"], found["altitude"]) == (48.0, 11.0002, 500.0)
-    assert (found["time"], found["until"], found["has_fix"]) == (str(2 * S), str(3 * S), True)
-    assert found["ellipse"] == pytest.approx([4.895, 2.4477, 0], abs=1e-3)
-    found = asked.get("fix", params={**parameters, "at": 11 * S}).json()
-    assert (found["has_fix"], found["status"]) == (False, -1)
-    assert asked.get("fix", params={**parameters, "at": -5}).json() == {"time": None, "until": "0"}
 
 
 @pytest.mark.parametrize(

@@ -75,28 +75,6 @@ def counted(store: hl.Store, topic: str, begin: int, end: int) -> int:
         return 0
 
 
-@pytest.mark.parametrize(
-    ("begin", "end", "pixels"),
-    [(0, 20 * SECOND, 7), (-SECOND, 2 * SECOND, 13), (3 * SECOND, 3 * SECOND + 400_000_000, 9)],
-)
-def test_bins_have_what_queries_count(
-    client: TestClient, demo_store: hl.Store, begin: int, end: int, pixels: int
-) -> None:
-    topics = ["/imu/data", "/base/scan", "/map", "/r_cart/command_pose"]
-    found = picture(client, topics, begin, end, pixels)
-    head = found.head
-    start = int(head["start"])
-    assert head["begin"] <= begin
-    assert head["begin"] + head["width"] * head["bins"] >= end
-    assert pixels / 2 < head["bins"] <= pixels + 1
-    for topic, lane in zip(topics, found.lanes, strict=True):
-        assert lane.exact
-        edges = [start + head["begin"] + n * head["width"] for n in range(head["bins"] + 1)]
-        assert lane.counts.tolist() == [
-            counted(demo_store, topic, *edges[n : n + 2]) for n in range(head["bins"])
-        ]
-
-
 def test_an_answer_is_as_large_as_the_picture(client: TestClient) -> None:
     topics = ["/imu/data", "/odom"]
     for pixels in (100, 1000, 4000):

@@ -29,13 +29,6 @@ from tests.live.sources.ros1_peers import Collector, framed
 # Headers
 
 
-def test_a_header_comes_back_as_it_was() -> None:
-    fields = {"callerid": "/nöde", "topic": "/a=b", "message_definition": "string data\n", "x": ""}
-    data = encode_header(fields)
-    assert int.from_bytes(data[:4], "little") == len(data) - 4
-    assert decode_header(data[4:]) == fields
-
-
 @pytest.mark.parametrize(
     ("body", "words"),
     [
@@ -81,12 +74,6 @@ def test_a_channel_looks_as_if_it_came_from_a_bag() -> None:
     assert channel.schema == Schema("a_msgs/B", "ros1msg", "uint8 x # ü\n".encode())
     assert channel.metadata == {"callerid": "/camera", "latching": "1", "md5sum": "abc"}
     assert not channel.has_publish_time
-
-
-def test_a_type_without_definition_and_none_at_all() -> None:
-    assert channel_of("/t", {"type": "a/B"}).schema == Schema("a/B", "", b"")
-    assert channel_of("/t", {"type": "*", "message_definition": "x"}).schema is None
-    assert channel_of("/t", {}).schema is None
 
 
 @pytest.mark.parametrize(
@@ -255,34 +242,6 @@ def test_messages_come_out_as_they_went_in(seed: int, channel: Channel) -> None:
         expected = [n if len(payload) >= 4 else None for n, payload in enumerate(payloads)]
         assert numbers == expected
     assert pipe.ends == [""]
-
-
-def test_a_gap_lies_between_the_message_before_it_and_the_one_after() -> None:
-    pipe = _Pipe(_NUMBERED)
-    for number in [*range(10), 12, 13, 20]:
-        pipe.send(framed(struct.pack("<I", number)))
-    pipe.hang_up()
-    times = [taken.received for taken in pipe.sink.taken]
-    assert [(loss.count, loss.first, loss.last) for loss in pipe.sink.losses] == [
-        (2, times[9], times[10]),
-        (6, times[11], times[12]),
-    ]
-    assert all("/node" in loss.detail for loss in pipe.sink.losses)
-
-
-@pytest.mark.parametrize(
-    "cut", [b"\1", b"\1\0\0", b"\5\0\0\0", b"\5\0\0\0abcd", b"\0\0\x10\0" + bytes(500_000)]
-)
-def test_a_publisher_that_dies_in_a_message(cut: bytes) -> None:
-    pipe = _Pipe()
-    pipe.send(framed(b"whole") + cut)
-    pipe.hang_up()
-    assert pipe.payloads() == [b"whole"]
-    (loss,) = pipe.sink.losses
-    assert (loss.topic, loss.cause, loss.count) == ("/topic", Cause.CONNECTION, 1)
-    assert loss.first <= loss.last
-    assert "in the middle of a message" in loss.detail
-    assert pipe.ends == [pipe.stream.failure]
 
 
 @pytest.mark.parametrize("size", [0xFFFFFFFF, 1001])

@@ -20,7 +20,6 @@ from hybridlog.live.sources.ros2.child.child import Child
 from hybridlog.live.sources.ros2.child.definitions import (
     Definitions,
     UnknownTypeError,
-    parse_type,
 )
 from hybridlog.live.sources.ros2.child.event_sender import EventSender
 from hybridlog.live.sources.ros2.child.middleware import Offer
@@ -30,8 +29,6 @@ from hybridlog.live.sources.ros2.child.qos import Profile
 from hybridlog.live.sources.ros2.child.topics import Topics
 from hybridlog.live.sources.ros2.child.wire import MAX_PAYLOAD
 from hybridlog.live.sources.ros2.receiver import Receiver
-from hybridlog.schema.definition import parse_definition
-from hybridlog_storage.messages import Schema
 from tests.imports import ROOT, imports_of
 from tests.limits import Limit
 from tests.live.sources.heard import Heard
@@ -142,61 +139,6 @@ def packages(folder: Path, files: dict[str, str]) -> Definitions:
     return Definitions([folder / "missing", folder / "share"])
 
 
-def test_a_definition_has_all_that_it_needs_once(tmp_path: Path) -> None:
-    definitions = packages(
-        tmp_path,
-        {
-            "a/msg/Top.msg": "b/Part[<=3] parts # c/Nothing\nOther[] more\nb/msg/Part one\n"
-            'uint8 X=1\nstring<=5 s "d/Nothing"\n\n',
-            "a/msg/Other.msg": "float32 f\nb/Part p",
-            "b/msg/Part.msg": "int8 i\n",
-        },
-    )
-    found = definitions.find("a/msg/Top")
-    assert found.encoding == "ros2msg"
-    assert not found.has_bytes
-    line = "=" * 80
-    assert found.text.decode().partition(line)[2] == (
-        f"\nMSG: b/Part\nint8 i\n\n{line}\nMSG: a/Other\nfloat32 f\nb/Part p"
-    )
-    read = parse_definition(Schema("a/msg/Top", found.encoding, found.text))
-    assert [name for name, _ in read.fields] == ["parts", "more", "one", "s"]
-
-
-def test_a_type_that_only_idl_defines(tmp_path: Path) -> None:
-    definitions = packages(
-        tmp_path,
-        {
-            "a/msg/Top.msg": "b/Part part",
-            "a/msg/Top.idl": '#include "b/msg/Part.idl"\nmodule a { module msg { struct Top {\n'
-            "b::msg::Part part; }; }; };",
-            "b/msg/Part.idl": "module b { module msg { struct Part {\nsequence<octet> d; }; }; };",
-        },
-    )
-    found = definitions.find("a/msg/Top")
-    assert found.encoding == "ros2idl"
-    assert found.has_bytes
-    assert found.text.count(b"IDL: a/msg/Top\n") == found.text.count(b"IDL: b/msg/Part\n") == 1
-    read = parse_definition(Schema("a/msg/Top", found.encoding, found.text))
-    assert [name for name, _ in read.fields] == ["part"]
-
-
-def test_events_of_services_and_feedback_of_actions(tmp_path: Path) -> None:
-    definitions = packages(
-        tmp_path,
-        {
-            "a/srv/Add.srv": "int64 a\n---\nint64 sum\n",
-            "a/action/Go.action": "int8 far\n---\nbool ok\n---\na/Step step\n",
-            "a/msg/Step.msg": "uint8[] data",
-        },
-    )
-    assert definitions.find("a/srv/Add_Event").text == b"int64 a\n---\nint64 sum\n"
-    feedback = definitions.find("a/action/Go_FeedbackMessage")
-    assert b"MSG: a/Step\n" in feedback.text
-    assert feedback.has_bytes
-    assert parse_type("a/action/Go_FeedbackMessage").part == "FeedbackMessage"
-
-
 @pytest.mark.parametrize(
     ("name", "reason"),
     [
@@ -218,11 +160,6 @@ def test_types_that_cannot_be_said(tmp_path: Path, name: str, reason: str) -> No
     )
     with pytest.raises(UnknownTypeError, match=reason):
         definitions.find(name)
-
-
-def test_types_that_need_each_other_end(tmp_path: Path) -> None:
-    definitions = packages(tmp_path, {"a/msg/X.msg": "Y y", "a/msg/Y.msg": "X x"})
-    assert definitions.find("a/msg/X").text.count(b"MSG: ") == 1
 
 
 def drained(peer: socket.socket, outbox: Outbox) -> Heard:
@@ -251,27 +188,6 @@ def channel_event(number: int, topic: str) -> dict[str, Any]:
         "offered": "",
         "hash": "",
     }
-
-
-def test_small_and_large_messages_keep_their_order() -> None:
-    ours, theirs = socket.socketpair()
-    with ours, theirs:
-        outbox = Outbox(theirs)
-        outbox.event(channel_event(7, "/x"))
-        sizes = [0, 3, 40_000, 5, 1 << 20, 1, 2, 33_000] * 20
-        payloads = [bytes([at % 256]) * size for at, size in enumerate(sizes)]
-        for at, payload in enumerate(payloads):
-            outbox.message(7, payload, 1000 + at, 0 if at % 2 else 500, -1 if at % 3 else at)
-        heard = drained(ours, outbox)
-    assert [taken.payload for taken in heard.taken] == payloads
-    assert [taken.received for taken in heard.taken] == list(range(1000, 1000 + len(sizes)))
-    assert [taken.sent for taken in heard.taken[:2]] == [500, None]
-    assert [taken.sequence for taken in heard.taken[:4]] == [0, None, None, 3]
-    assert len({id(taken.channel) for taken in heard.taken}) == 1
-    schema = heard.taken[0].channel.schema
-    assert schema is not None
-    assert schema.data == b"caf\xff"
-    assert outbox.waiting == 0
 
 
 def test_what_finds_no_room_is_counted() -> None:
@@ -417,28 +333,6 @@ def live_topic(
     rig.topics.subscribe("/t", kind)
     rig.topics.look()
     return rig
-
-
-def test_a_topic_is_subscribed_to_when_it_is_wanted(tmp_path: Path) -> None:
-    rig = Rig(tmp_path)
-    rig.ros.graph = {
-        ("/t", "a/msg/T"): [offer(durability=qos.TRANSIENT_LOCAL)],
-        ("/u", "a/msg/T"): [],
-    }
-    rig.topics.look()
-    rig.topics.look()
-    assert [event["topic"] for event in rig.told("candidate")] == ["/t", "/u"]
-    assert not rig.ros.made
-    rig.topics.subscribe("/t", "a/msg/T")
-    rig.topics.subscribe("/t", "a/msg/T")
-    rig.topics.subscribe("/nothing", "a/msg/T")
-    [made] = rig.ros.made
-    assert made.profile == Profile(depth=qos.DEPTH, durability=qos.TRANSIENT_LOCAL)
-    [channel] = rig.told("channel")
-    assert (channel["topic"], channel["definition"]) == ("/t", "int8 i")
-    assert "durability: 1" in channel["offered"]
-    [came] = rig.told("topic")
-    assert came["publishers"] == 1
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,7 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 import hybridlog as hl
-from hybridlog.view.playback.played import PlaybackClock, PlayedLog
+from hybridlog.view.playback.played import PlayedLog
 from hybridlog_storage.errors import TimeError, UsageError
 from hybridlog_storage.messages import Channel
 from tests.independent import Seen, read_mcap
@@ -465,27 +465,3 @@ def test_a_port_that_is_taken(one: PlayedLog) -> None:
         port = taken.getsockname()[1]
         with pytest.raises(UsageError, match="--port"), served(one, port=port):
             pass
-
-
-def test_the_clock() -> None:
-    now = [0]
-    clock = PlaybackClock(1000, 2.0, lambda: now[0])
-    now[0] = 50
-    assert clock.position == 1000
-    clock.play()
-    now[0] = 150
-    assert clock.position == 1200
-    assert clock.seconds_until(1400) == 100e-9
-    assert clock.seconds_until(0) == 0
-    clock.wait_for(1100, 50e-9)
-    assert clock.position == 1200, "it is not too far ahead"
-    clock.wait_for(1050, 50e-9)
-    assert clock.position == 1050
-    clock.set_speed(0.5)
-    now[0] = 250
-    assert clock.position == 1100
-    clock.pause()
-    now[0] = 999
-    assert clock.position == 1100
-    clock.wait_for(0, 0)
-    assert clock.position == 1100, "a clock that stands still waits for nobody"
