@@ -172,31 +172,6 @@ def test_modules_are_found() -> None:
     assert all(i.typing for i in typed)
 
 
-def test_the_reader_of_imports_sees_all_kinds(tmp_path: Path) -> None:
-    path = tmp_path / "sample.py"
-    path.write_text(
-        "import a.b\n"
-        "from c import d\n"
-        "from . import e\n"
-        "from ..f import g\n"
-        "if TYPE_CHECKING:\n    import h\nelse:\n    import i\n"
-        "def run():\n    try:\n        import j\n    except ImportError:\n        pass\n"
-    )
-    found = {i.module: (i.typing, i.lazy) for i in imports_of(path, "top.package.sample")}
-    assert found == {
-        "a.b": (False, False),
-        "c": (False, False),
-        "c.d": (False, False),
-        "top.package": (False, False),
-        "top.package.e": (False, False),
-        "top.f": (False, False),
-        "top.f.g": (False, False),
-        "h": (True, False),
-        "i": (False, False),
-        "j": (False, True),
-    }
-
-
 def test_storage_never_imports_hybridlog() -> None:
     for name in MODULES:
         if _is(name, "hybridlog_storage"):
@@ -303,11 +278,6 @@ def test_no_cycle_of_imports() -> None:
         for name, imports in all_imports().items()
     }
     assert _cycles(graph) == []
-
-
-def test_a_cycle_is_found() -> None:
-    graph = {"a": {"b"}, "b": {"c"}, "c": {"b", "d"}, "d": set(), "e": {"a"}}
-    assert _cycles(graph) == [["b", "c"]]
 
 
 @pytest.mark.parametrize(

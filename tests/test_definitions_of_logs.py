@@ -11,13 +11,12 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
-from rosbags.highlevel import AnyReader
 from rosbags.rosbag1 import Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 import hybridlog as hl
-from hybridlog_storage.messages import SUPPLIED, Channel, Schema
+from hybridlog_storage.messages import SUPPLIED
 from tests.cli.running import run
 from tests.every_output import compare_every_output
 from tests.ros_values import ROS1, ROS2, message_of, plain_of
@@ -151,22 +150,6 @@ def test_bags_with_odd_definitions(
     compare_every_output(store.topic(topic), *decoded(CASES / log, topic, name, text), tmp_path)
 
 
-def test_a_definition_without_newlines_before_separators(store: hl.Store, tmp_path: Path) -> None:
-    path = CASES / "mcap404_no_newline.mcap"
-    with path.open("rb") as stream:
-        found = list(make_reader(stream).iter_messages())
-    types = get_typestore(Stores.ROS2_HUMBLE)
-    schema = found[0][0]
-    assert schema is not None
-    text = schema.data.decode().replace("=" * 80, "\n" + "=" * 80)
-    types.register(get_types_from_msg(text, schema.name))
-    raw = [message.data for _, _, message in found]
-    wanted = [
-        plain_of(types, schema.name, types.deserialize_cdr(data, schema.name)) for data in raw
-    ]
-    compare_every_output(store.topic("/t"), wanted, raw, tmp_path)
-
-
 def test_one_byte_too_many(tmp_path: Path) -> None:
     path = CASES / "rosserial_trailing.bag"
     topic = "/ros_car/left_wheel_cmd"
@@ -187,17 +170,6 @@ def test_one_byte_too_many(tmp_path: Path) -> None:
         compare_every_output(query, [{"data": value} for value in values], raw, tmp_path)
         assert [message.decode().data for message in query] == values
         assert query.where("data >= 2").count() == sum(value >= 2 for value in values)
-
-
-def test_the_definition_of_the_source_stays_if_it_has_one(tmp_path: Path) -> None:
-    text = b"float32 mine\n"
-    with hl.open(tmp_path / "store", create=True) as store:
-        channel = Channel("/t", "ros1", Schema("std_msgs/Float32", "ros1msg", text))
-        with store.start("x") as recorder:
-            recorder.write(channel, b"\0\0\x80?", log_time=1)
-        (entry,) = store.entry("x").channels
-        assert SUPPLIED not in entry.metadata
-        assert store.topic("/t").to_arrow()["mine"].to_pylist() == [1.0]
 
 
 @pytest.mark.parametrize("form", ["export.mcap", "slice.mcap", "export.bag", "slice.bag"])
@@ -245,12 +217,3 @@ def test_exports_have_the_nested_definitions(tmp_path: Path, encoding: str, form
         read = "deserialize_cdr" if encoding == "cdr" else "deserialize_ros1"
         found = plain_of(types, name, getattr(types, read)(payload, name))
         assert repr(found) == repr(plain_of(store, name, message))
-
-
-def test_an_export_that_rosbags_reads(tmp_path: Path) -> None:
-    run("record", CASES / "mcap223_missing_nested.mcap", "-q", store=tmp_path / "store")
-    run("export", tmp_path / "whole.mcap", "-q", store=tmp_path / "store")
-    with AnyReader([tmp_path / "whole.mcap"]) as reader:
-        found = [reader.deserialize(raw, c.msgtype) for c, _, raw in reader.messages()]
-    assert len(found) == 2
-    assert found[0].transforms[0].child_frame_id == "b"

@@ -265,22 +265,6 @@ def test_unsigned_extremes(store: hl.Store) -> None:
     assert summary["arr.n"].tolist() == [len(message.arr) for message in messages]
 
 
-def test_floats_that_are_no_numbers(store: hl.Store) -> None:
-    row = json_lines(store.topic("/plain"))[2]
-    assert row["r"] == [2.0, "Infinity", "NaN"]
-    assert row["s"] == ""
-    table = parquet(store.topic("/plain"))
-    assert math.isnan(table["r"][0].as_py()[2])
-
-
-def test_empty_clouds(store: hl.Store) -> None:
-    frame = store.topic("/c").to_pandas()
-    sizes = [len(cell) for cell in frame["data"]]
-    assert sizes[0] == 0
-    assert max(sizes) > 0
-    assert frame["data"].iloc[0].dtype == np.uint8
-
-
 def test_one_odd_message_hides_no_others(store: hl.Store) -> None:
     arrays = store.topic("/c").to_numpy()
     sizes = [len(data) for data in store.topic("/c").to_pandas()["data"]]
@@ -461,14 +445,3 @@ def test_a_frame_comes_back_from_parquet(frame: pd.DataFrame) -> None:
         assert back[name].isna().tolist() == frame[name].isna().tolist()
         if not isinstance(frame[name].iloc[0], np.ndarray | list):
             assert str(back[name].tolist()) == str(frame[name].tolist())
-
-
-def test_arrays_explode_and_stack(store: hl.Store) -> None:
-    frame = store.topic("/plain").to_pandas()
-    exploded = frame["r"].explode()
-    assert len(exploded) == 30
-    assert exploded.iloc[3] == 1.0
-    assert np.stack(frame["r"]).shape == (10, 3)
-    assert np.stack(frame["r"]).dtype == np.float32
-    points = store.topic("/zoo").to_pandas()["points"].explode()
-    assert points.iloc[0]["x"] == 1.0

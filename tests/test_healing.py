@@ -36,11 +36,11 @@ from hybridlog_storage.errors import (
     StoreError,
 )
 from hybridlog_storage.mongo.database import Database
-from hybridlog_storage.mongo.mongod import find_mongod
 from tests.calls import Calls
 from tests.cli.running import run
 from tests.damage import WAYS
 from tests.indexed import EVERYTHING
+from tests.servers.mongods import Mongod
 from tests.some import in_turn
 from tests.waiting import wait_for
 
@@ -183,24 +183,11 @@ def test_a_foreign_mongodb_is_only_told_about(store: Path, tmp_path: Path) -> No
 @contextlib.contextmanager
 def other_mongod(tmp_path: Path, *options: str, port: int | None = None) -> Iterator[str]:
     """The URI of a mongod that is not the store's own, on the loopback interface."""
-    data = tmp_path / "other"
-    data.mkdir(exist_ok=True)
-    if port is None:
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            port = free.getsockname()[1]
-    command = [str(find_mongod()), "--dbpath", str(data), "--port", str(port), "--bind_ip",
-               "127.0.0.1", "--nounixsocket", "--wiredTigerCacheSizeGB", "0.25",
-               *options]  # fmt: skip
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
-    try:
-        uri = f"mongodb://127.0.0.1:{port}/healing?directConnection=true"
+    with Mongod(tmp_path / "other", *options, port=port) as server:
+        uri = f"mongodb://{server.address}/healing?directConnection=true"
         with MongoClient(uri, serverSelectionTimeoutMS=30000) as client:
             client.admin.command("ping")
         yield uri
-    finally:
-        process.terminate()
-        process.wait(30)
 
 
 def edited(store: hl.Store, _log: Path) -> None:

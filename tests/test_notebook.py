@@ -23,8 +23,6 @@ from hybridlog_storage.errors import TopicError
 from tests.limits import Limit
 from tests.test_snapshot import summary
 
-pytestmark = pytest.mark.mongo("embedded")
-
 HOSTILE = "<script>alert('x')</script>&\"\x1b[31m"
 IMAGE = b"""std_msgs/Header header
 uint32 height

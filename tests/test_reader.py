@@ -7,7 +7,6 @@ import gc
 import json
 import os
 import shutil
-import struct
 import subprocess
 import sys
 import threading
@@ -25,10 +24,7 @@ from rosbags.typesys import Stores, get_typestore
 
 import hybridlog as hl
 from benchmarks.simulator.write import write_bag
-from hybridlog.query.counters import Counters
-from hybridlog.query.planner import Planner
 from hybridlog.record.recorder import RecordOptions
-from hybridlog_storage.catalog import Catalog
 from hybridlog_storage.errors import (
     DefinitionError,
     HybridlogError,
@@ -39,10 +35,8 @@ from hybridlog_storage.errors import (
 )
 from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.segments.segment_writer import SegmentSettings
-from tests.calls import Calls
 from tests.data import DATA
 from tests.indexed import documents_of
-from tests.limits import Limit
 from tests.other_user import User, open_place
 
 pytestmark = pytest.mark.mongo
@@ -202,26 +196,6 @@ def test_one_message_reads_one_chunk(store: hl.Store, robot: Truth) -> None:
 
 
 # What it answers.
-
-
-def test_small_chunks_make_the_same_table_together(store: hl.Store, limit: Limit) -> None:
-    query = store.topic("/base/scan").in_recording("robot")
-    planner = Planner(store.session, query.question, Counters())
-    chunks = [task.chunk for task in planner.plan(planner.parts()).tasks()]
-    reader = store.session.segment("robot", chunks[0].segment)
-    sizes = sorted(len(reader.read_chunk(chunk.place).batch.buffer) for chunk in chunks)
-    whole, half = sizes[-1], sizes[len(sizes) // 2]
-    tables, pieces = [], []
-    # Each by itself; the smaller half together, between larger ones; three; all.
-    for small, most in ((0, 0), (half, whole * 9), (whole, whole * 3), (whole, sum(sizes))):
-        limit(small_chunk_bytes=small, merged_bytes=most)
-        pieces.append(len(list(planner.unordered())))
-        tables.append(query.to_arrow())
-        assert query.counters.chunks_read == len(chunks)
-    assert pieces[0] == len(chunks) > pieces[1] > 1
-    assert pieces[0] > pieces[2] > pieces[3] == 1
-    assert tables[0].num_rows == query.count()
-    assert all(table.equals(tables[0]) for table in tables)
 
 
 def test_a_table_without_rows_has_all_columns(store: hl.Store) -> None:
@@ -514,19 +488,3 @@ def test_words_mean_what_is_in_the_store_now(tmp_path: Path) -> None:
             with pytest.raises(TopicError, match="/b/talk"):
                 store.topic("talk")
             assert store.topic("/a/talk").where("data == 'seven'").count() == 1
-
-
-def test_a_schema_of_many_recordings_is_asked_for_once(tmp_path: Path, calls: Calls) -> None:
-    asked = []
-    with hl.open(tmp_path / "store", create=True) as store:
-        for number in range(5):
-            own = Schema("std_msgs/Int32", "ros1msg", b"int32 data\n")
-            with store.start(f"run-{number}") as recording:
-                recording.write(Channel("/talk", "ros1", own), struct.pack("<i", number))
-    calls(Catalog, "schemas", lambda _, hashes: asked.append(len(hashes)))
-    with hl.open(tmp_path / "store") as store:
-        assert [store.topic("talk").where(f"data == {n}").count() for n in range(5)] == [1] * 5
-        assert asked == [1]
-        store.refresh()
-        assert store.topic("talk").where("data < 3").count() == 3
-        assert asked == [1]  # it is known by its content

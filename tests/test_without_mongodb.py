@@ -31,7 +31,6 @@ from hybridlog_storage.settings import (
 from tests.calls import Calls
 from tests.cli.within import answer
 from tests.running.running import NO_MONGODB
-from tests.storage.test_mongod import fake_mongod
 
 pytestmark = pytest.mark.mongo("embedded")
 
@@ -121,18 +120,6 @@ def test_no_mongod_is_none(bag: Path, tmp_path: Path, monkeypatch: pytest.Monkey
     assert "/nowhere/mongod" in line
     with hl.open(tmp_path / "store") as store:
         assert store.topic("scan").where("range_max > 0").count() == store.topic("scan").count() > 0
-
-
-def test_a_mongod_that_ends_at_once_is_none(
-    bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    script = f'echo start >> {tmp_path}/starts; echo "Exec format error"; exit 1'
-    monkeypatch.setenv("HYBRIDLOG_MONGOD", str(fake_mongod(tmp_path / "fake", script)))
-    with hl.open(tmp_path / "store", create=True) as store:
-        report = store.record(bag)
-        assert (report.failure, report.indexed) == (None, 0)
-        assert (tmp_path / "starts").read_text() == "start\n"
-        assert store.topic("scan").where("ranges.min > 0").count() > 0
 
 
 def test_a_server_that_is_away_gets_its_index_later(bag: Path, tmp_path: Path) -> None:

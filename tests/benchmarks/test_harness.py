@@ -21,8 +21,6 @@ from benchmarks.loads.base import PAYLOADS, Load
 from benchmarks.side import MARK
 from hybridlog_storage.messages import Channel
 
-pytestmark = pytest.mark.mongo("embedded")
-
 # Backends of the tests. The logger, another process, imports them from here.
 
 

@@ -12,8 +12,6 @@ import pytest
 from hybridlog.demo import tour
 from hybridlog_storage.errors import DiskFullError, UsageError
 
-pytestmark = pytest.mark.mongo("embedded")
-
 # Stands in for each command: answers as told, so that the tour alone is under test.
 FAKE = """\
 import pathlib, sys

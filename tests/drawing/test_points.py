@@ -352,11 +352,6 @@ def test_scans_with_several_echoes() -> None:
     assert points_of("sensor_msgs/MultiEchoLaserScan", message).total == 0
 
 
-def test_an_empty_scan() -> None:
-    got = points_of("sensor_msgs/LaserScan", scan([]))
-    assert (got.total, got.dropped, got.is_flat) == (0, {}, True)
-
-
 POSE = {
     "position": {"x": 10.0, "y": 20.0, "z": 0.5},
     # A quarter to the left, not normalised.
@@ -478,14 +473,6 @@ def test_other_types() -> None:
         points_of("", SimpleNamespace())
     with pytest.raises(PayloadError, match="unusual fields"):
         points_of("sensor_msgs/LaserScan", SimpleNamespace(ranges=[]))
-
-
-def test_bounds() -> None:
-    values = np.concatenate([np.linspace(0, 100, 1001), [math.nan, 1e30]]).astype(np.float32)
-    least, greatest, low, high = bounds(values) or ()
-    assert (least, greatest) == (0, np.float32(1e30))
-    assert 0 < low < 2
-    assert 98 < high <= 100
 
 
 @needs_data

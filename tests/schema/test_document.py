@@ -254,12 +254,6 @@ def test_message_without_fields() -> None:
     check(("message", {"e": ("message", {})}), [{"e": {}}])
 
 
-def test_no_rows() -> None:
-    assert list(bodies(Records({}, 0))) == []
-    kind = ("message", {"s": ("string",), "l": ("list", ("message", {"x": ("number", "f8")}))})
-    assert list(bodies(column_of(kind, []))) == []  # type: ignore[arg-type]
-
-
 def test_names_that_the_index_uses_itself() -> None:
     assert top_level_names(["_id", "x", "_meta"]) == ["_id_", "x", "_meta_"]
     assert top_level_names(["_id", "_id_"]) == ["_id__", "_id_"]
@@ -273,12 +267,6 @@ def test_names_that_the_index_uses_itself() -> None:
 def test_invalid_utf8_is_mended_in_its_row_only() -> None:
     texts = [b"plain", "süß".encode(), b"\xff\xfeab", b"cut \xc3", b"\xa9 and on", b"\xed\xa0\x80"]
     check(("message", {"s": ("string",), "z": ("number", "i4")}), [{"s": s, "z": 1} for s in texts])
-
-
-def test_long_and_short_strings_together() -> None:
-    texts = [b"", b"x" * 100_000, "ü".encode() * 5_000, b"\xff" * 300, b"y"]
-    kind = ("message", {"s": ("string",), "l": ("list", ("string",))})
-    check(kind, [{"s": s, "l": [s, b"-"]} for s in texts])
 
 
 def test_too_large_rows_are_named_and_the_others_are_made() -> None:

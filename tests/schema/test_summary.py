@@ -128,15 +128,3 @@ def test_zero_has_one_sign() -> None:
 def test_a_sum_past_the_largest_double_has_a_mean() -> None:
     assert of("f8", [[1e308] * 40]).mean[0] == pytest.approx(1e308)
     assert of("f8", [[1e308, -1e308] * 40, [1.0]]).mean.tolist() == [0.0, 1.0]
-
-
-def test_offsets_need_not_begin_at_zero() -> None:
-    found = summarise(Scalars(np.arange(10.0)), np.array([2, 5, 5, 9]))
-    assert found.min.tolist() == [2, 0, 5]
-    assert found.has.tolist() == [True, False, True]
-
-
-def test_no_rows() -> None:
-    for dtype in DTYPES:
-        assert len(of(dtype, []).n) == 0
-        assert of(dtype, [[], []]).has.tolist() == [False, False]

@@ -15,7 +15,6 @@ from hybridlog.schema.definition import (
     ArrayOf,
     MessageType,
     Primitive,
-    Text,
     parse_definition,
     paths,
 )
@@ -453,21 +452,6 @@ def test_arrays_within_elements_without_bytes_are_refused():
         read(text, [])
 
 
-@pytest.mark.parametrize("wire", ["ros1", "cdr"])
-def test_no_rows(wire):
-    text = (
-        "uint8 a\nstring b\nfloat64[] c\nfloat64[9] d\nP[] e\nP f\nstring[] g\n"
-        f"{'=' * 80}\nMSG: pkg/P\nint16 x\nstring[2] y\n"
-    )
-    decoded = read(text, [], wire=wire)
-    assert decoded.unreadable == []
-    assert decoded.rows.tolist() == []
-    encoding = "ros1msg" if wire == "ros1" else "ros2msg"
-    message_type = parse_definition(Schema("pkg/T", encoding, text.encode()))
-    assert_same(decoded.records, message_type, [], wire)
-    assert decoded.records.fields["e"].values.fields["x"].values.dtype == np.int16
-
-
 def test_rows_outside_of_the_buffer_are_refused():
     message_type = MessageType("T", (("a", Primitive("uint8", "u1")),))
     decoded = WireReader(message_type, "ros1").read(
@@ -475,16 +459,6 @@ def test_rows_outside_of_the_buffer_are_refused():
     )
     assert decoded.rows.tolist() == [0, 3]
     assert reasons(decoded) == {"lies outside of the chunk": [1, 2]}
-
-
-@pytest.mark.parametrize("kind", [bytes, bytearray, memoryview])
-def test_every_kind_of_buffer(kind):
-    message_type = MessageType("T", (("a", Text()), ("b", ArrayOf(Text()))))
-    payload = u4(2) + b"hi" + u4(1, 3) + b"you"
-    buffer = kind(b"??" + payload)
-    decoded = WireReader(message_type, "ros1").read(buffer, np.array([2]), np.array([len(payload)]))
-    assert decoded.records.fields["a"].data.tobytes() == b"hi"
-    assert decoded.records.fields["b"].values.data.tobytes() == b"you"
 
 
 def test_long_arrays_of_one_row_are_aligned():

@@ -226,18 +226,6 @@ def test_what_is_no_file_of_the_recording_is_not_opened(tmp_path: Path) -> None:
     assert not list((tmp_path / "folder").iterdir())
 
 
-@pytest.mark.parametrize(("mask", "mode"), [(0o022, 0o644), (0o002, 0o664), (0o077, 0o600)])
-def test_the_umask_decides_who_may_read_a_file(tmp_path: Path, mask: int, mode: int) -> None:
-    before = os.umask(mask)
-    try:
-        AppendFile.create(tmp_path / "file").close()
-        durability.write_new(tmp_path / "small", b"x")
-    finally:
-        os.umask(before)
-    assert (tmp_path / "file").stat().st_mode & 0o777 == mode
-    assert (tmp_path / "small").stat().st_mode & 0o777 == mode
-
-
 def test_a_small_file_is_there_whole_or_not_at_all(tmp_path: Path) -> None:
     """At each step that fails; and nothing else is left."""
     steps = Steps()

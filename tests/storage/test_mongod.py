@@ -212,18 +212,6 @@ def test_comes_up_private_and_without_a_port_and_goes_with_its_user(directory: P
     assert not path.exists()
 
 
-def test_a_user_within_the_linger_time_finds_the_same_mongod(directory: Path) -> None:
-    with EmbeddedMongod(directory, linger_s=1.0):
-        first = pids(directory)
-    time.sleep(0.3)
-    with EmbeddedMongod(directory) as again:
-        assert pids(directory) == first
-        time.sleep(1.1)
-        assert ping(again.start()), "the time counts from the last user, not the first"
-        assert pids(directory) == first
-    gone(*first)
-
-
 def test_processes_share_one_and_the_last_ends_it(directory: Path) -> None:
     with other_user(directory) as (first, first_uri):
         started = pids(directory)
@@ -248,12 +236,6 @@ def test_users_that_come_all_at_once_start_one(directory: Path) -> None:
     assert mongods == [pids(directory)[0]]
     for user in users:
         user.stop()
-
-
-def test_users_that_come_while_it_is_ended_wait_and_start_it_anew(directory: Path) -> None:
-    for _ in range(3):
-        with EmbeddedMongod(directory, linger_s=0) as user:
-            assert ping(user.start())
 
 
 @pytest.mark.usefixtures("directory")
@@ -283,15 +265,6 @@ def test_a_long_log_is_emptied(directory: Path) -> None:
 
 
 # --- faults ---
-
-
-def test_a_killed_user_counts_as_gone(directory: Path) -> None:
-    with other_user(directory) as (process, uri):
-        assert ping(uri)
-        started = pids(directory)
-        process.kill()
-        process.wait()
-        gone(*started)
 
 
 def test_a_killed_keeper_takes_mongod_along_and_the_next_start_brings_another(

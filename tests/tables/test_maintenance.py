@@ -15,12 +15,10 @@ from hybridlog.columns.parquet_file import ParquetFileReader
 from hybridlog.columns.tables import Tables
 from hybridlog.maintenance import tables as making
 from hybridlog.record.marks import MARKS
-from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import places
-from tests.copies import bring
 from tests.faults import logs
 from tests.limits import Limit
-from tests.tables.logs import BASE, channel, varied, write_log
+from tests.tables.logs import BASE, varied, write_log
 from tests.tables.test_writer import compare, topics_of
 
 FEW = [(BASE + n, "/a" if n % 3 else "/b", varied(n)) for n in range(90)]
@@ -60,39 +58,6 @@ def test_a_topic_that_ends_before_its_recording(store: hl.Store, tmp_path: Path)
     assert store.verify().findings == []
 
 
-def test_a_removed_recording_has_no_tables(few: hl.Store) -> None:
-    assert folders(few)
-    few.remove("few")
-    assert not folders(few)
-    assert not unfinished(few)
-
-
-def test_a_recording_that_is_taken_back_has_none(store: hl.Store) -> None:
-    settings = SegmentSettings(chunk_size=1024, segment_size=8192)
-    recording = store.start("live", settings=settings, flush_interval_s=0.01)
-    for n in range(500):
-        recording.write(channel("/a"), varied(n))
-    recording.abort()
-    assert not folders(store)
-    assert not unfinished(store)
-
-
-def test_tables_keep_their_place_when_a_recording_is_renamed(few: hl.Store) -> None:
-    before = contents(few)
-    few.edit("few", name="another", tag={"place": "yard"})
-    assert contents(few) == before
-    assert compare(few, "another") == 90
-
-
-def test_tables_of_an_imported_recording(few: hl.Store, tmp_path: Path, server: str) -> None:
-    mongo = server.replace("/?", "/imported?")
-    with hl.open(tmp_path / "other", create=True, mongo=mongo) as other:
-        bring(other, few.directory.path)
-        assert compare(other) == 90
-        assert not other.repairs.tables  # they were made at once, for other readers
-        assert contents(other).keys() == contents(few).keys()
-
-
 def test_a_mark_changes_no_table(few: hl.Store) -> None:
     before = contents(few)
     few.mark("few", BASE + 5, "here")
@@ -125,15 +90,6 @@ def test_what_is_left_of_recordings_that_are_gone(few: hl.Store, tmp_path: Path)
     few.connect()
     assert not unfinished(few)
     assert compare(few) == 90
-
-
-def test_reindex_makes_what_is_missing_and_the_same(few: hl.Store) -> None:
-    before = contents(few)
-    few.index.rebuild()
-    assert contents(few) == before
-    shutil.rmtree(few.directory.path / TABLES)
-    few.index.rebuild()
-    assert contents(few) == before
 
 
 def test_only_what_is_missing_is_made(few: hl.Store, tmp_path: Path, limit: Limit) -> None:

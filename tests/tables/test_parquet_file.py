@@ -12,12 +12,10 @@ import pytest
 
 import hybridlog as hl
 from hybridlog.columns.layout import (
-    About,
     Section,
     TopicCounts,
     column_names,
     shape_folder,
-    type_prefix,
 )
 from hybridlog.columns.parquet_file import ParquetFileReader, ParquetFileWriter, leaves
 from hybridlog_storage.errors import StoreError
@@ -58,15 +56,6 @@ def path(tmp_path: Path) -> Path:
     place = tmp_path / "1" / "2" / "3"
     place.mkdir(parents=True)
     return place / "a.parquet"
-
-
-def test_a_discarded_file_is_let_go_in_silence(path: Path, table: pa.Table) -> None:
-    """When pyarrow's writer is collected, it writes a footer to the file that is gone."""
-    writer = ParquetFileWriter(path, table.schema)
-    writer.write(table)
-    writer.discard()
-    writer._writer.close()
-    assert not path.exists()
 
 
 def test_what_is_written_is_read(path: Path, table: pa.Table) -> None:
@@ -202,12 +191,6 @@ def test_names_of_columns(names: list[str], columns: list[str]) -> None:
     assert [name for name, _ in column_names(names)] == names
 
 
-def test_names_of_files() -> None:
-    assert type_prefix("std_msgs/msg/String") == "std_msgs_msg_String~"
-    assert type_prefix("../../x") == "______x~"
-    assert type_prefix("") == "untyped~"
-
-
 def test_a_folder_is_named_by_its_exact_schema(tmp_path: Path) -> None:
     inner = pa.struct([("x", pa.float64()), ("y", pa.list_(pa.int8()))])
     columns = [("a", pa.int64()), ("s", inner), ("f", pa.list_(pa.int8(), 3))]
@@ -228,11 +211,3 @@ def test_a_folder_is_named_by_its_exact_schema(tmp_path: Path) -> None:
     # A file has the schema of which it is named.
     pq.write_table(pa.schema(columns).empty_table(), tmp_path / "a.parquet")
     assert shape_folder("T", pq.read_schema(tmp_path / "a.parquet")) == name
-
-
-@pytest.mark.parametrize(
-    "text", [b"", b"{}", b"[]", b"null", b'{"version": 3}', b'{"version": 2}', b"\xff"]
-)
-def test_descriptions_that_are_none(text: bytes) -> None:
-    with pytest.raises(StoreError):
-        About.from_json(text)

@@ -111,17 +111,6 @@ def test_points_go_from_source_to_target(log: Log) -> None:
     assert same.is_known.all()
 
 
-def test_between_two_branches(log: Log) -> None:
-    """Up to the frame that both hang on, and down; a time has one reason, however many lack."""
-    tree = log.tree(
-        *(said(n, "base", "arm", (1, 0, 0), TURNED) for n in range(2)),
-        *(said(n, "base", "eye", (0, 2, 5), TURNED) for n in range(2)),
-    )
-    found = tree.transform("arm", "eye", BEGIN)
-    np.testing.assert_allclose(found.apply([1, 0, 0]), (3, 1, 5), atol=1e-12)
-    assert [*tree.lookup("arm", "eye", at(9)).missing.values()] == [1]
-
-
 def test_there_is_no_transform_outside(log: Log) -> None:
     tree = log.tree(said(1, "odom", "base"), said(3, "odom", "base", (2, 0, 0)))
     times = at(0.999999999, 1, 3, 3.000000001)
