@@ -1,17 +1,17 @@
-"""What processes and the machine have used, as `/proc` tells; nothing where there is none."""
+"""What processes and the machine have used."""
 
 from __future__ import annotations
 
 import os
 import re
-import resource
-import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
-_PROC = Path("/proc")
+import psutil
+
 _MONGOD_END_S = 60.0
 _SPIN = 250_000
 
@@ -28,42 +28,30 @@ class Machine(NamedTuple):
     stolen: float
 
 
-def machine() -> Machine | None:
-    """What the machine has used; None when the system does not tell."""
-    try:
-        first = (_PROC / "stat").read_text().split("\n", 1)[0].split()
-    except OSError:
-        return None
-    user, nice, system, _idle, _wait, irq, softirq, stolen = map(int, first[1:9])
-    tick = _tick()
-    return Machine((user + nice + system + irq + softirq) / tick, stolen / tick)
+def machine() -> Machine:
+    """What the machine has used."""
+    used = psutil.cpu_times()
+    busy = used.user + used.nice + used.system + used.irq + used.softirq
+    return Machine(busy, used.steal)
 
 
 def with_children(pids: Iterable[int]) -> set[int]:
     """Processes that are there, and all that descend from them."""
-    children: dict[int, list[int]] = {}
-    for pid in _pids():
-        fields = _stat(pid)
-        if fields is not None:
-            children.setdefault(int(fields[1]), []).append(pid)
     found: set[int] = set()
-    waiting = [pid for pid in pids if _stat(pid) is not None]
-    while waiting:
-        pid = waiting.pop()
-        if pid not in found:
-            found.add(pid)
-            waiting += children.get(pid, ())
+    for pid in pids:
+        with suppress(psutil.NoSuchProcess):
+            process = psutil.Process(pid)
+            found |= {pid, *(child.pid for child in process.children(recursive=True))}
     return found
 
 
 def cpu_s(pids: Iterable[int]) -> float:
     """Seconds of CPU, user and system, of processes and of their children that have ended."""
-    ticks = 0
+    total = 0.0
     for pid in pids:
-        fields = _stat(pid)
-        if fields is not None:
-            ticks += sum(map(int, fields[11:15]))
-    return ticks / _tick()
+        with suppress(psutil.NoSuchProcess):
+            total += sum(psutil.Process(pid).cpu_times()[:4])
+    return total
 
 
 def peak_rss(pids: Iterable[int]) -> int:
@@ -85,24 +73,17 @@ def rss(pids: Iterable[int]) -> int:
 def own_peak() -> int:
     """Most bytes of memory that this process has had resident since it was started."""
     # getrusage would include the parent's memory, which a fork shares for a moment.
-    kilobytes = _kilobytes(os.getpid()).get("VmHWM")
-    if kilobytes is None:
-        used = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        kilobytes = used // 1024 if sys.platform == "darwin" else used
-    return kilobytes * 1024
+    return 1024 * _kilobytes(os.getpid())["VmHWM"]
 
 
 def working_below(directory: Path, program: str) -> tuple[int, ...]:
     """Processes whose command line names a program and a directory, or what lies below it."""
-    name = str(directory.resolve()).encode()
+    name = str(directory.resolve())
     found = []
-    for pid in _pids():
-        try:
-            command = (_PROC / str(pid) / "cmdline").read_bytes()
-        except OSError:
-            continue  # it has just ended
-        if name in command and program.encode() in command:
-            found.append(pid)
+    for process in psutil.process_iter(["cmdline"]):
+        command = "\0".join(process.info["cmdline"] or ())
+        if name in command and program in command:
+            found.append(process.pid)
     return tuple(found)
 
 
@@ -117,14 +98,7 @@ def wait_for_mongods(directory: Path) -> None:
 
 def mapped_rss(path: Path) -> int:
     """Bytes of a file that this process has mapped and resident."""
-    try:
-        text = (_PROC / "self" / "smaps").read_text()
-    except OSError:
-        return 0
-    name = re.escape(str(path))
-    return 1024 * sum(
-        int(found[1]) for found in re.finditer(rf" {name}\n(?:.*\n)*?Rss:\s+(\d+) kB", text)
-    )
+    return sum(each.rss for each in psutil.Process().memory_maps() if each.path == str(path))
 
 
 def disk_bytes(directory: Path) -> int:
@@ -151,49 +125,19 @@ def spin_ms() -> float:
 
 def marked(variable: str, value: str) -> list[int]:
     """Processes that were given an environment variable of a value, ourselves left out."""
-    entry = f"{variable}={value}".encode()
     found = []
-    for pid in _pids():
-        try:
-            given = (_PROC / str(pid) / "environ").read_bytes()
-        except OSError:
-            continue  # it has ended, or belongs to somebody else
-        if pid != os.getpid() and entry in given.split(b"\0") and not _is_dead(pid):
-            found.append(pid)
+    for process in psutil.process_iter():
+        with suppress(psutil.Error):  # it has ended, or belongs to somebody else
+            is_given = process.pid != os.getpid() and process.environ().get(variable) == value
+            if is_given and process.status() != psutil.STATUS_ZOMBIE:
+                found.append(process.pid)
     return found
-
-
-def _is_dead(pid: int) -> bool:
-    """Whether a process has ended and only waits for its parent to notice."""
-    fields = _stat(pid)
-    return fields is None or fields[0] == "Z"
-
-
-def _pids() -> Iterator[int]:
-    if _PROC.is_dir():
-        for entry in os.listdir(_PROC):  # noqa: PTH208 - thousands of names, no paths
-            if entry.isdigit():
-                yield int(entry)
 
 
 def _kilobytes(pid: int) -> dict[str, int]:
     """What a process's status gives in kB, by name; nothing when there is no such process."""
     try:
-        text = (_PROC / str(pid) / "status").read_text()
+        text = Path(f"/proc/{pid}/status").read_text()
     except OSError:
         return {}
     return {n: int(v) for n, v in re.findall(r"^(\w+):\s+(\d+) kB", text, re.MULTILINE)}
-
-
-def _stat(pid: int) -> list[str] | None:
-    """Fields of a process from its state on; None when there is no such process."""
-    try:
-        text = (_PROC / str(pid) / "stat").read_text(errors="replace")
-    except OSError:
-        return None
-    # The name stands in brackets and may hold anything, brackets too.
-    return text[text.rindex(")") + 2 :].split()
-
-
-def _tick() -> int:
-    return os.sysconf("SC_CLK_TCK")

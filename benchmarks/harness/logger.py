@@ -200,10 +200,8 @@ class _Meter:
         pids = self._pids()
         self._servers = max(usage.cpu_s(pids) - self._servers, 0.0)
         self._server_peak = usage.peak_rss(pids)
-        self._busy = self._stolen = 0.0
-        if machine is not None and self._machine is not None:
-            self._busy = machine.busy - self._machine.busy
-            self._stolen = max(machine.stolen - self._machine.stolen, 0.0)
+        self._busy = machine.busy - self._machine.busy
+        self._stolen = max(machine.stolen - self._machine.stolen, 0.0)
 
     def note(self, values: Values, published: dict[str, Any]) -> None:
         """Note what was used.

@@ -294,9 +294,7 @@ def _steal() -> Iterator[list[float]]:
     before = machine()
     found = [0.0]
     yield found
-    after = machine()
-    if before is not None and after is not None:
-        found[0] = after.stolen - before.stolen
+    found[0] = machine().stolen - before.stolen
 
 
 def _size(size: int) -> str:

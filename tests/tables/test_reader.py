@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 import hybridlog as hl
-from hybridlog.columns import topic_table as reader
 from hybridlog.columns.fields import FieldShape, joined, records_of
 from hybridlog.columns.tables import Tables
-from hybridlog.columns.topic_table import TopicTable, _merged
+from hybridlog.columns.topic_table import TopicTable
 from hybridlog.maintenance import tables as making
 from hybridlog_storage.cache import Cache
 from hybridlog_storage.errors import StoreError
@@ -46,16 +44,6 @@ def file_of(store: hl.Store, topic: str = "/large") -> Path:
     return file.path
 
 
-def all_of(blocks: Iterator[reader.TableRows], path: str) -> list[Any]:
-    found = []
-    for block in blocks:
-        column = block.records
-        for name in path.split("."):
-            column = column.field(name)
-        found += column.to_pylist()
-    return found
-
-
 # --- scanning -------------------------------------------------------------------------
 
 
@@ -80,35 +68,6 @@ def test_only_what_is_wanted_is_read(recorded: hl.Store) -> None:
     assert table.has("points[].X")
     assert not table.has("seq")
     assert not table.has("header.stamp.sec")
-
-
-def rows_of(t: list[int], seq: list[int]) -> reader.TableRows:
-    records = pa.array([{"n": n} for n in seq], pa.struct([("n", pa.int64())]))
-    return reader.TableRows(np.array(t, np.int64), np.array(seq, np.int64), {}, records)
-
-
-keys = st.lists(st.tuples(st.integers(0, 9), st.integers(0, 99)), max_size=20, unique=True)
-
-
-@given(runs=st.lists(keys.map(sorted), max_size=4), size=st.integers(1, 5))
-def test_sequences_are_merged(runs: list[list[tuple[int, int]]], size: int) -> None:
-    seen: set[tuple[int, int]] = set()
-    for run in runs:
-        run[:] = [key for key in run if key not in seen]
-        seen.update(run)
-    streams = [
-        iter(
-            [
-                rows_of(*map(list, zip(*run[at : at + size], strict=True)))
-                for at in range(0, len(run), size)
-            ]
-        )
-        for run in runs
-    ]
-    found = list(_merged(streams))
-    have = [key for rows in found for key in zip(rows.t.tolist(), rows.seq.tolist(), strict=True)]
-    assert have == sorted(seen)
-    assert all_of(iter(found), "n") == [seq for _, seq in sorted(seen)]
 
 
 # --- what is believed -----------------------------------------------------------------
