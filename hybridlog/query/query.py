@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from hybridlog.query.answers.regularity import TopicCheck
     from hybridlog.query.choice import During, Tags, Texts
     from hybridlog.query.intervals import Intervals
-    from hybridlog.query.predicate.across import Near
+    from hybridlog.query.predicate.tree import Near
     from hybridlog.query.question import RecordedChannel
     from hybridlog.query.times import DurationLike, TimeLike
     from hybridlog.session import Asked, Session
@@ -208,7 +208,7 @@ class Query:
         """
         if isinstance(predicate, str):
             if ":" in predicate:
-                from hybridlog.query.predicate.across import names_topics
+                from hybridlog.query.predicate.parser import names_topics
 
                 if names_topics(predicate):
                     return self._near(predicate, within)
@@ -788,7 +788,9 @@ class Query:
     ) -> Query:
         """The query with the conditions on other topics as intervals."""
         from hybridlog.query.near import everything, intervals_of, question_about, split_own
-        from hybridlog.query.predicate.across import parse_across
+        from hybridlog.query.predicate.parser import parse
+        from hybridlog.query.predicate.tree import And, Predicate
+        from hybridlog.query.predicate.types import check
 
         if within is None:
             raise UsageError(
@@ -798,10 +800,15 @@ class Query:
         if not isinstance(within, tuple):  # the message that is exactly so far away belongs to it
             within = within, f"{parse_duration(within) + 1}ns"
         before, after = within
-        own, others = split_own(parse_across(text))
-        query = now = of_now(self)
-        for predicate in own:
-            query = query.where(predicate)
+        own, others = split_own(parse(text, across=True).root)
+        query = self
+        if own:
+            checked = Predicate(And(tuple(own)), text)
+            check(checked, self.session.field_types(self.topics, self.question.recordings))
+            if self.question.predicate is not None:
+                checked = self.question.predicate & checked
+            query = self._with(predicate=checked)
+        query = now = of_now(query)
         conditions: list[Query] = []
 
         def windows(condition: Near) -> Intervals:

@@ -31,6 +31,7 @@ from hybridlog.query.predicate.tree import (
     Match,
     Member,
     MongoFilter,
+    Near,
     Node,
     Not,
     Or,
@@ -163,7 +164,7 @@ class _Columns:
             case Exists(target, present):
                 found = self._exists(target)
                 return found if present else ~found
-            case MongoFilter():
+            case MongoFilter() | Near():
                 raise _UnfitError
             case Compare(order="!=") | Member(negated=True) | Match(negated=True):
                 return self._exists(node.field) & ~self._holds(node)
