@@ -496,14 +496,10 @@ class Query:
             self.counters.reset()
             framed = replace(self.question, frame=frame)
             return _stacked([one.points for one in points_of(self.session, framed, self.counters)])
-        now = of_now(self)
-        scans = _scans_of(now)
-        if scans is not None:
-            return scans
         arrays: list[NDArray[Any]] = []
         refused: PayloadError | DefinitionError | None = None
         unreadable = 0
-        for message in now:
+        for message in of_now(self):
             try:
                 arrays.append(message.to_numpy())
             except (PayloadError, DefinitionError) as error:
@@ -896,15 +892,3 @@ def _message_at(query: Query, moment: TimeLike) -> Message:
     if found is None:
         raise TopicError(f"No message of {', '.join(query.topics)} is at or before {moment}.")
     return found
-
-
-def _scans_of(query: Query) -> NDArray[Any] | None:
-    """Laser scans of one length as an array, from columns; None for everything else."""
-    from hybridlog.frames.answer import FIELDS, are_scans, scans_in
-
-    if not are_scans(Planner(query.session, query.question, query.counters).channels()):
-        return None
-    query.counters.reset()
-    question = replace(query.question, fields=FIELDS, tags=())
-    found = scans_in(Planner(query.session, question, query.counters))
-    return None if query.counters.unreadable or query.counters.reduced else found
