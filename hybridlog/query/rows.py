@@ -299,7 +299,7 @@ class Rows:
                 for rows, holds in self._in_table(found, own=("ref",))
             ]
             self._places[part] = (
-                _offsets_by_chunk(part.recording.id, np.concatenate(places)) if places else {}
+                offsets_by_chunk(part.recording.id, np.concatenate(places)) if places else {}
             )
         return self._places[part]
 
@@ -575,7 +575,7 @@ def places_of(references: Any) -> NDArray[np.int64]:
     return np.stack(columns, axis=1).astype(np.int64)
 
 
-def _offsets_by_chunk(
+def offsets_by_chunk(
     recording: str, places: NDArray[np.int64]
 ) -> dict[ChunkKey, NDArray[np.int64]]:
     """Payload offsets of messages by chunk, sorted.
