@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from itertools import chain
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -63,20 +62,31 @@ def to_pandas(planner: Planner) -> pd.DataFrame:
 def _collected(planner: Planner) -> TableBuilder:
     question = planner.question
     builder = _builder(question)
-    decoder = Decoder(planner)
-    for block in decoder.empty():
-        builder.append(block)
-    parts = planner.parts()
-    found = _values_of_tables(planner, parts)
-    if found is not None:
-        for part, values in zip(parts, found, strict=True):
-            for block in _table_blocks(planner, part, values):
-                builder.append(block)
-        return builder
-    for run in planner.unordered() if question.returns_all else planner.runs():
-        for block in decoder.blocks(run):
+    for group in _groups(planner, planner.parts(), in_order=not question.returns_all):
+        for block in group:
             builder.append(block)
     return builder
+
+
+def _groups(
+    planner: Planner, parts: Sequence[Part] | None, *, in_order: bool
+) -> Iterator[Iterable[Block]]:
+    """The blocks of an answer, those that overlap in time together; the first have no rows.
+
+    Args:
+        planner: Planner of the question.
+        parts: Parts that tables may answer; None to read messages.
+        in_order: The groups are in order.
+    """
+    decoder = Decoder(planner)
+    yield decoder.empty()
+    found = None if parts is None else _values_of_tables(planner, parts)
+    if parts is not None and found is not None:
+        for part, values in zip(parts, found, strict=True):
+            yield from ([block] for block in _table_blocks(planner, part, values))
+        return
+    for run in planner.runs() if in_order else planner.unordered():
+        yield decoder.blocks(run)
 
 
 def stream(planner: Planner, *, at_once: bool = False) -> Iterator[pa.Table]:
@@ -89,18 +99,9 @@ def stream(planner: Planner, *, at_once: bool = False) -> Iterator[pa.Table]:
         at_once: True for a table of the columns, and one of what is read at a time.
     """
     question = planner.question
-    groups: Iterator[Iterable[Block]]
-    decoder = Decoder(planner)
-    part = planner.only_part()
-    found = None if question.reverse or part is None else _values_of_tables(planner, [part])
-    if part is not None and found is not None:
-        groups = ([block] for block in _table_blocks(planner, part, found[0]))
-    else:
-        groups = (decoder.blocks(run) for run in planner.runs())
-    groups = chain([decoder.empty()], groups)
-    builder, size = _builder(question), 0
-    given = False
-    for group in groups:
+    part = None if question.reverse else planner.only_part()
+    builder, size, given = _builder(question), 0, False
+    for group in _groups(planner, None if part is None else [part], in_order=True):
         for block in group:
             builder.append(block)
             size += block.size
