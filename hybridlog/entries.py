@@ -31,8 +31,6 @@ from hybridlog_storage.catalog import (
     RecordingEntry,
     channel_entry,
     channel_totals,
-    content_hash,
-    content_of,
     spans_of,
 )
 from hybridlog_storage.errors import (
@@ -551,7 +549,6 @@ def summary_by(
         expired=gone[EXPIRED],
         not_copied=gone[NOT_COPIED],
         notes=_said(manifest)["notes"],
-        content=content_hash({str(file.number): file.digest for file in logs}),
         look=look,
     )
     return summary, types
@@ -597,7 +594,6 @@ def summary_of(entry: RecordingEntry, look: str = "") -> RecordingSummary:
         expired=gone.get(State.EXPIRED, 0),
         not_copied=gone.get(State.NOT_COPIED, 0),
         notes=entry.notes,
-        content=content_of(entry),
         look=look,
     )
 

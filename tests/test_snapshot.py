@@ -61,7 +61,6 @@ def summary(number: int, span: tuple[int, int] | None, topics: list[str], **othe
         "expired": 0,
         "notes": [],
         "not_copied": 0,
-        "content": "",
         "look": "",
         **other,
     }

@@ -31,36 +31,6 @@ def _laser_scan(message: Any) -> NDArray[Any]:
     return _scan(angles, message.ranges, message.intensities)
 
 
-def scans_of(
-    start: NDArray[np.float32],
-    step: NDArray[np.float32],
-    ranges: NDArray[np.float32],
-    intensities: NDArray[np.float32] | None,
-) -> NDArray[Any]:
-    """Scans of one length, each as `Message.to_numpy` makes it.
-
-    Args:
-        start: (n,), the first angle of each, rad.
-        step: (n,), the angle from one range to the next, rad.
-        ranges: (n, m), m.
-        intensities: (n, m); None if the scans have none.
-
-    Returns:
-        Shape (n, m).
-    """
-    names = ["range", "angle"] if intensities is None else ["range", "intensity", "angle"]
-    scans = np.empty(ranges.shape, [(name, np.float32) for name in names])
-    place = np.arange(ranges.shape[1], dtype=np.float64)
-    with np.errstate(over="ignore", invalid="ignore"):
-        scans["angle"] = (
-            start.astype(np.float64)[:, None] + place * step.astype(np.float64)[:, None]
-        )
-    scans["range"] = ranges
-    if intensities is not None:
-        scans["intensity"] = intensities
-    return scans
-
-
 def _foxglove_scan(message: Any) -> NDArray[Any]:
     count = len(message.ranges)
     step = (float(message.end_angle) - float(message.start_angle)) / max(count - 1, 1)

@@ -239,7 +239,7 @@ def _near(choices: _Choices) -> str | tuple[str, str] | None:
 
 
 def _names_topics(predicate: str) -> bool:
-    from hybridlog.query.predicate.across import names_topics
+    from hybridlog.query.predicate.parser import names_topics
 
     return names_topics(predicate)
 

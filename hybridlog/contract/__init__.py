@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from hybridlog.formats.yaml_values import YamlError, parse_yaml, read_yaml
 from hybridlog.query.periods import GAP_PERIODS
-from hybridlog.query.predicate.across import names_topics
-from hybridlog.query.predicate.parser import parse
+from hybridlog.query.predicate.parser import names_topics, parse
 from hybridlog.query.times import format_duration, parse_duration
 from hybridlog.record.marks import MARKS
 from hybridlog.wording import listed

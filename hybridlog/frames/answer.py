@@ -1,19 +1,13 @@
-"""Conversion of answers to tables, from payloads or from the tables of topics.
-
-Laser scans become one numpy array.
-"""
+"""Conversion of answers to tables, from payloads or from the tables of topics."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from itertools import chain
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
 
-from hybridlog.arrays.message_arrays import plain_type
-from hybridlog.arrays.point_arrays import scans_of
 from hybridlog.frames.builder import Block, TableBuilder
 from hybridlog.frames.names import is_summary, own_columns, summary_of, tag_columns
 from hybridlog.index.indexing import rows_by_channel
@@ -45,9 +39,6 @@ _SEQ_BITS = 44
 FIXED = {"ros1", "cdr"}
 """Encodings whose definition fixes the fields."""
 
-FIELDS: Final = ("angle_min", "angle_increment", "ranges", "intensities")
-"""The fields of a scan that its array is made of."""
-
 
 def to_arrow(planner: Planner) -> pa.Table:
     """The whole answer as an Arrow table, in order.
@@ -71,20 +62,31 @@ def to_pandas(planner: Planner) -> pd.DataFrame:
 def _collected(planner: Planner) -> TableBuilder:
     question = planner.question
     builder = _builder(question)
-    decoder = Decoder(planner)
-    for block in decoder.empty():
-        builder.append(block)
-    parts = planner.parts()
-    found = _values_of_tables(planner, parts)
-    if found is not None:
-        for part, values in zip(parts, found, strict=True):
-            for block in _table_blocks(planner, part, values):
-                builder.append(block)
-        return builder
-    for run in planner.unordered() if question.returns_all else planner.runs():
-        for block in decoder.blocks(run):
+    for group in _groups(planner, planner.parts(), in_order=not question.returns_all):
+        for block in group:
             builder.append(block)
     return builder
+
+
+def _groups(
+    planner: Planner, parts: Sequence[Part] | None, *, in_order: bool
+) -> Iterator[Iterable[Block]]:
+    """The blocks of an answer, those that overlap in time together; the first have no rows.
+
+    Args:
+        planner: Planner of the question.
+        parts: Parts that tables may answer; None to read messages.
+        in_order: The groups are in order.
+    """
+    decoder = Decoder(planner)
+    yield decoder.empty()
+    found = None if parts is None else _values_of_tables(planner, parts)
+    if parts is not None and found is not None:
+        for part, values in zip(parts, found, strict=True):
+            yield from ([block] for block in _table_blocks(planner, part, values))
+        return
+    for run in planner.runs() if in_order else planner.unordered():
+        yield decoder.blocks(run)
 
 
 def stream(planner: Planner, *, at_once: bool = False) -> Iterator[pa.Table]:
@@ -97,18 +99,9 @@ def stream(planner: Planner, *, at_once: bool = False) -> Iterator[pa.Table]:
         at_once: True for a table of the columns, and one of what is read at a time.
     """
     question = planner.question
-    groups: Iterator[Iterable[Block]]
-    decoder = Decoder(planner)
-    part = planner.only_part()
-    found = None if question.reverse or part is None else _values_of_tables(planner, [part])
-    if part is not None and found is not None:
-        groups = ([block] for block in _table_blocks(planner, part, found[0]))
-    else:
-        groups = (decoder.blocks(run) for run in planner.runs())
-    groups = chain([decoder.empty()], groups)
-    builder, size = _builder(question), 0
-    given = False
-    for group in groups:
+    part = None if question.reverse else planner.only_part()
+    builder, size, given = _builder(question), 0, False
+    for group in _groups(planner, None if part is None else [part], in_order=True):
         for block in group:
             builder.append(block)
             size += block.size
@@ -383,50 +376,3 @@ def _check(channels: Sequence[RecordedChannel]) -> None:
                 f"{channel.channel.topic} cannot be made a table: {channel.codec.reason}. "
                 "Its payloads can be fetched as they are (--format raw or mcap)."
             )
-
-
-def are_scans(channels: Sequence[RecordedChannel]) -> bool:
-    """True if all messages are laser scans of one topic, with the usual fields."""
-    return (
-        bool(channels)
-        and len({c.channel.topic for c in channels}) == 1
-        and all(
-            channel.encoding in FIXED
-            and channel.channel.schema is not None
-            and plain_type(channel.channel.schema.name) == "sensor_msgs/LaserScan"
-            and channel.codec.reason is None
-            and {path.path for path in channel.codec.paths()}.issuperset(FIELDS)
-            for channel in channels
-        )
-    )
-
-
-def scans_in(planner: Planner) -> NDArray[Any] | None:
-    """The scans of an answer, in order.
-
-    Args:
-        planner: Planner of a question about the `FIELDS`.
-
-    Returns:
-        Shape (messages, ranges), rows as of `Message.to_numpy`; None if lengths differ, or
-        there are no scans.
-    """
-    found = []
-    for batch in to_arrow(planner).to_batches():
-        start, step = (batch.column(name).to_numpy() for name in FIELDS[:2])
-        arrays = [batch.column(name) for name in FIELDS[2:]]
-        if not all(hasattr(array, "offsets") for array in arrays):
-            return None
-        (ranges, sizes), (intensities, given) = (
-            (array.flatten().to_numpy(), np.diff(array.offsets.to_numpy())) for array in arrays
-        )
-        is_even = bool((sizes == sizes[0]).all() and ((given == sizes).all() or not given.any()))
-        if not is_even:
-            return None
-        shape = len(sizes), int(sizes[0])
-        measured = intensities.reshape(shape) if len(intensities) else None
-        found.append(scans_of(start, step, ranges.reshape(shape), measured))
-    alike = {(block.shape[1], block.dtype) for block in found}
-    if len(alike) != 1:
-        return None
-    return found[0] if len(found) == 1 else np.concatenate(found)

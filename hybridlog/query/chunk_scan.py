@@ -14,7 +14,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Protocol, TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
@@ -234,25 +234,25 @@ class ChunkScan:
         tasks = self._plan.tasks()
         size = sum(task.chunk.place.length for task in tasks)
         if size < _MIN_THREADED_BYTES or not self._reads_ahead:
-            yield from self._ahead(tasks, lambda *item: _Deferred(partial(self._load, *item)))
+            yield from self._ahead(tasks, lambda *item: partial(self._load, *item))
             return
         with ThreadPoolExecutor(2, thread_name_prefix="hybridlog-read") as pool:
             try:
-                yield from self._ahead(tasks, lambda *item: pool.submit(self._load, *item))
+                yield from self._ahead(tasks, lambda *item: pool.submit(self._load, *item).result)
             finally:
                 pool.shutdown(cancel_futures=True)
 
     def _ahead(
         self,
         tasks: list[ChunkTask],
-        start: Callable[[ChunkTask, Offsets | None], _Loading],
+        start: Callable[[ChunkTask, Offsets | None], Callable[[], _Loaded]],
     ) -> Iterator[tuple[ChunkTask, MessageRun, ChunkTask | None]]:
         counters = self._plan.counters
         if tasks and self._session.segment(*tasks[0].key[:2]).is_fetched:
             upcoming = self._announced(self._selected(tasks))
         else:
             upcoming = self._selected(tasks)
-        loading: deque[tuple[ChunkTask, _Loading]] = deque()
+        loading: deque[tuple[ChunkTask, Callable[[], _Loaded]]] = deque()
         while True:
             while len(loading) < _LOOK_AHEAD:
                 item = next(upcoming, None)
@@ -262,8 +262,8 @@ class ChunkScan:
             if not loading:
                 return
             check_wanted()
-            task, chunk = loading.popleft()
-            run, size, unreadable, expired = chunk.result()
+            task, loaded = loading.popleft()
+            run, size, unreadable, expired = loaded()
             counters.chunks_read += 1
             counters.bytes_read += size
             counters.unreadable += unreadable
@@ -405,22 +405,6 @@ def _up_to(
 
 _Loaded = tuple[MessageRun, int, int, int]
 """Messages, bytes read, messages unreadable for the predicate, those of them that expired."""
-
-
-class _Loading(Protocol):
-    """A chunk that is being read."""
-
-    def result(self) -> _Loaded: ...
-
-
-@dataclass(slots=True)
-class _Deferred:
-    """A chunk that is read when its result is requested."""
-
-    load: Callable[[], _Loaded]
-
-    def result(self) -> _Loaded:
-        return self.load()
 
 
 def _merged(runs: list[MessageRun]) -> MessageRun:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import reduce
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from hybridlog.query.answers.marks import mark_topics
 from hybridlog.query.intervals import Intervals
-from hybridlog.query.predicate.across import All, AnyOf, Condition, Near, NoneOf, Own
+from hybridlog.query.predicate.tree import And, Near, Node, Not, Or, nodes, spelled
 from hybridlog.query.question import Question
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import TIME_LIMIT
@@ -67,58 +67,40 @@ def question_about(
     return Question(found.topics, found.recordings, during=near)
 
 
-def split_own(condition: Condition) -> tuple[list[str], list[Condition]]:
-    """The predicates about the message itself, and the conditions on other topics.
-
-    All of both must hold.
+def split_own(node: Node) -> tuple[list[Node], list[Node]]:
+    """The conditions on the message itself, and those on other topics. All of both must hold.
 
     Raises:
-        WhereError: a predicate about the message itself is joined by `or` or negated
-            together with a condition on another topic.
+        WhereError: a condition on the message itself is joined by `or` or negated together
+            with one on another topic.
     """
-    parts: Sequence[Condition] = condition.parts if isinstance(condition, All) else (condition,)
-    own, others = [], []
-    for part in parts:
-        if isinstance(part, Own):
-            own.append(part.predicate)
-        elif isinstance(part, All):
-            inner = split_own(part)
-            own += inner[0]
-            others += inner[1]
-        else:
-            _check(part)
-            others.append(part)
-    return own, others
+    if not any(isinstance(inner, Near) for inner in nodes(node)):
+        return [node], []
+    if isinstance(node, And):
+        found = [split_own(item) for item in node.items]
+        return [one for own, _ in found for one in own], [one for _, far in found for one in far]
+    for inner in nodes(node):
+        if not isinstance(inner, And | Or | Not | Near):
+            raise WhereError(
+                f"{spelled(inner)!r} is about the message itself, and can only be joined by "
+                "`and` with conditions on other topics. Name its topic to let any message near "
+                "in time satisfy it."
+            )
+    return [], [node]
 
 
-def intervals_of(condition: Condition, windows: Windows, whole: Intervals) -> Intervals:
+def intervals_of(node: Node, windows: Windows, whole: Intervals) -> Intervals:
     """The log time in which a condition on other topics holds.
 
     Args:
-        condition: Without a predicate about the message itself.
+        node: The condition.
         windows: Gives the intervals around the messages of a topic.
         whole: All log time of the recordings asked about.
     """
-    if isinstance(condition, Near):
-        return windows(condition).merged()
-    if isinstance(condition, NoneOf):
-        return whole.without(intervals_of(condition.part, windows, whole))
-    assert isinstance(condition, All | AnyOf)
-    found = [intervals_of(part, windows, whole) for part in condition.parts]
-    if isinstance(condition, All):
-        return reduce(Intervals.common, found)
-    return reduce(Intervals.union, found)
-
-
-def _check(condition: Condition) -> None:
-    if isinstance(condition, Own):
-        raise WhereError(
-            f"{condition.predicate!r} is about the message itself, and can only be joined by "
-            "`and` with conditions on other topics. Name its topic to let any message near in "
-            "time satisfy it."
-        )
-    if isinstance(condition, NoneOf):
-        _check(condition.part)
-    elif isinstance(condition, All | AnyOf):
-        for part in condition.parts:
-            _check(part)
+    if isinstance(node, Near):
+        return windows(node).merged()
+    if isinstance(node, Not):
+        return whole.without(intervals_of(node.item, windows, whole))
+    assert isinstance(node, And | Or)
+    found = [intervals_of(item, windows, whole) for item in node.items]
+    return reduce(Intervals.common if isinstance(node, And) else Intervals.union, found)

@@ -12,12 +12,10 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from hybridlog.query.bounds import MIN_RECORDINGS, BoundsFinder, within_bounds
 from hybridlog.query.chunk_scan import ChunkKey, ChunkScan, MessageRun
 from hybridlog.query.question import Part
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.rows import TABLE_ERRORS, Rows, filter_of
-from hybridlog.record.marks import MARKS
 from hybridlog.schema.column import STAMP
 from hybridlog.schema.states import GONE
 from hybridlog_storage.errors import ChangedError, TopicError
@@ -31,7 +29,6 @@ if TYPE_CHECKING:
     from hybridlog.query.index_reader import IndexReader
     from hybridlog.query.message_filter import MessageFilter
     from hybridlog.query.question import Question, RecordedChannel, Span
-    from hybridlog.query.ranges import Ranges
     from hybridlog.query.rows import MatchColumns, Objects, Tabled, Values
     from hybridlog.schema.states import State
     from hybridlog.session import Session
@@ -56,7 +53,6 @@ class Planner:
         self._decidable: dict[Part, Part] = {}  # with what MongoDB has found
         self._counted: set[Part] = set()  # parts whose messages without fields are counted
         self._ranges = RangeResolver(session, question)
-        self._has_many_recordings = False  # recordings
 
     @lazy
     def _index(self) -> IndexReader:
@@ -67,10 +63,7 @@ class Planner:
 
     @lazy
     def _rows(self) -> Rows:
-        predicate, bounds = self.question.predicate, None
-        if predicate is not None and self._has_many_recordings:
-            bounds = BoundsFinder(self.session.catalog, predicate)
-        return Rows(self.session, self.counters, bounds)
+        return Rows(self.session, self.counters)
 
     def parts(self) -> list[Part]:
         """The question, split by recording and topic; recordings oldest first.
@@ -79,19 +72,8 @@ class Planner:
             TimeError: the time range is empty, or outside all recordings.
             TopicError: a topic does not have the requested clock.
         """
-        found = self._matching_ranges()
-        return self.batch_hint([part for one in found for part in self.parts_in(*one)])
-
-    def _matching_ranges(self) -> Ranges:
-        """The recordings to ask, without those whose bounds of fields tell that nothing matches."""
         found = self._ranges.resolve()
-        predicate = self.question.predicate
-        if predicate is None or predicate.filters or len(found) < MIN_RECORDINGS:
-            return found
-        if MARKS in self.question.topics:
-            return found  # those that somebody set are not among what bounds are known of
-        self._has_many_recordings = True
-        return within_bounds(self.session, self.question, found)
+        return self.batch_hint([part for one in found for part in self.parts_in(*one)])
 
     def only_part(self) -> Part | None:
         """The only part of the question; None if it has several, or none.
@@ -100,7 +82,7 @@ class Planner:
             TimeError: as for `parts`.
             TopicError: as for `parts`.
         """
-        found = self._matching_ranges()
+        found = self._ranges.resolve()
         parts = [*self.parts_in(*found[0])] if len(found) == 1 else []
         return self.batch_hint(parts)[0] if len(parts) == 1 else None
 
@@ -263,7 +245,7 @@ class Planner:
 
         The first group is small, so that the first message needs few recordings.
         """
-        found = self._matching_ranges()
+        found = self._ranges.resolve()
         # In the order of the answer; going back, a recording begins with its last message.
         first, last = found.first, found.last
         if self.question.reverse:
@@ -306,7 +288,8 @@ class Planner:
         return self._again(self._plan, parts)
 
     def _plan(self, parts: Sequence[Part]) -> ScanPlan:
-        parts, rows = self._decided(parts), self._rows
+        rows = self._rows
+        parts = rows.fitting(self._decided(parts))
         plan = rows.plan(parts, filtered=False)
         plan.reverse = self.question.reverse
         if self.question.predicate is None or not parts:

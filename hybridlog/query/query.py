@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from hybridlog.query.answers.regularity import TopicCheck
     from hybridlog.query.choice import During, Tags, Texts
     from hybridlog.query.intervals import Intervals
-    from hybridlog.query.predicate.across import Near
+    from hybridlog.query.predicate.tree import Near
     from hybridlog.query.question import RecordedChannel
     from hybridlog.query.times import DurationLike, TimeLike
     from hybridlog.session import Asked, Session
@@ -208,7 +208,7 @@ class Query:
         """
         if isinstance(predicate, str):
             if ":" in predicate:
-                from hybridlog.query.predicate.across import names_topics
+                from hybridlog.query.predicate.parser import names_topics
 
                 if names_topics(predicate):
                     return self._near(predicate, within)
@@ -496,14 +496,10 @@ class Query:
             self.counters.reset()
             framed = replace(self.question, frame=frame)
             return _stacked([one.points for one in points_of(self.session, framed, self.counters)])
-        now = of_now(self)
-        scans = _scans_of(now)
-        if scans is not None:
-            return scans
         arrays: list[NDArray[Any]] = []
         refused: PayloadError | DefinitionError | None = None
         unreadable = 0
-        for message in now:
+        for message in of_now(self):
             try:
                 arrays.append(message.to_numpy())
             except (PayloadError, DefinitionError) as error:
@@ -788,7 +784,9 @@ class Query:
     ) -> Query:
         """The query with the conditions on other topics as intervals."""
         from hybridlog.query.near import everything, intervals_of, question_about, split_own
-        from hybridlog.query.predicate.across import parse_across
+        from hybridlog.query.predicate.parser import parse
+        from hybridlog.query.predicate.tree import And, Predicate
+        from hybridlog.query.predicate.types import check
 
         if within is None:
             raise UsageError(
@@ -798,10 +796,15 @@ class Query:
         if not isinstance(within, tuple):  # the message that is exactly so far away belongs to it
             within = within, f"{parse_duration(within) + 1}ns"
         before, after = within
-        own, others = split_own(parse_across(text))
-        query = now = of_now(self)
-        for predicate in own:
-            query = query.where(predicate)
+        own, others = split_own(parse(text, across=True).root)
+        query = self
+        if own:
+            checked = Predicate(And(tuple(own)), text)
+            check(checked, self.session.field_types(self.topics, self.question.recordings))
+            if self.question.predicate is not None:
+                checked = self.question.predicate & checked
+            query = self._with(predicate=checked)
+        query = now = of_now(query)
         conditions: list[Query] = []
 
         def windows(condition: Near) -> Intervals:
@@ -889,15 +892,3 @@ def _message_at(query: Query, moment: TimeLike) -> Message:
     if found is None:
         raise TopicError(f"No message of {', '.join(query.topics)} is at or before {moment}.")
     return found
-
-
-def _scans_of(query: Query) -> NDArray[Any] | None:
-    """Laser scans of one length as an array, from columns; None for everything else."""
-    from hybridlog.frames.answer import FIELDS, are_scans, scans_in
-
-    if not are_scans(Planner(query.session, query.question, query.counters).channels()):
-        return None
-    query.counters.reset()
-    question = replace(query.question, fields=FIELDS, tags=())
-    found = scans_in(Planner(query.session, question, query.counters))
-    return None if query.counters.unreadable or query.counters.reduced else found

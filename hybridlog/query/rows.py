@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.columns.topic_table import TableRows, TopicTable
-    from hybridlog.query.bounds import BoundsFinder
     from hybridlog.query.chunk_counts import Parts
     from hybridlog.query.chunk_scan import MessageRun
     from hybridlog.query.counters import Counters
@@ -117,15 +116,11 @@ class Rows:
     Args:
         session: The open store.
         counters: Count what is read.
-        bounds: Gets the bounds of the columns that are read; None to leave them.
     """
 
-    def __init__(
-        self, session: Session, counters: Counters, bounds: BoundsFinder | None = None
-    ) -> None:
+    def __init__(self, session: Session, counters: Counters) -> None:
         self.session = session
         self._counters = counters
-        self._bounds = bounds
         self._candidates: dict[Part, Tabled | None] = {}
         self._tabled: dict[Part, Tabled | None] = {}
         self._counts: dict[Part, _Count] = {}
@@ -243,6 +238,11 @@ class Rows:
                 in_chunks.append(found.rest)
         return total + (self.count_in_chunks(in_chunks) if in_chunks else 0)
 
+    def fitting(self, parts: Sequence[Part]) -> list[Part]:
+        """The parts without those of which a file of tables tells that nothing matches."""
+        self._count_by_file([part for part in parts if part.predicate is not None])
+        return [part for part in parts if self._counts.get(part) != _Count(0, 0)]
+
     def outcomes(self, part: Part) -> Iterator[MatchColumns]:
         """For each message of the part's topic and time, whether it matches."""
         found = self.tabled(part)
@@ -299,7 +299,7 @@ class Rows:
                 for rows, holds in self._in_table(found, own=("ref",))
             ]
             self._places[part] = (
-                _offsets_by_chunk(part.recording.id, np.concatenate(places)) if places else {}
+                offsets_by_chunk(part.recording.id, np.concatenate(places)) if places else {}
             )
         return self._places[part]
 
@@ -315,16 +315,10 @@ class Rows:
         part = found.part
         if part not in self._counts:
             matched = unreadable = 0
-            is_bounding = self._bounds is not None and found.segments is None and part.is_unbounded
-            bounds = self._bounds.of([part]) if self._bounds is not None and is_bounding else None
             for rows, holds in self._in_table(found):
                 matched += int(holds.sum())
                 unreadable += int(rows.is_unreadable().sum())
-                if bounds is not None:
-                    bounds.add(rows.records, [(part, 0, len(rows))])
             self._counts[part] = _Count(matched, unreadable)
-            if bounds is not None and not unreadable:
-                bounds.note(part)
         return self._counts[part]
 
     def _accepted(self, found: Tabled) -> _Count:
@@ -360,13 +354,7 @@ class Rows:
         whole = self.session.tables.whole(file, arrays=first.table.has_arrays)
         matched, unreadable, before = [np.zeros(1, np.int64)], [np.zeros(1, np.int64)], [0]
         alike = [(one.part, one.table) for one in group if one.part.field_types == types]
-        bounds = None if self._bounds is None else self._bounds.of([part for part, _ in alike])
-        own = [(part, one) for part, table in alike for one in table.parts]
         for rows, holds in self._in_table(first, whole=whole):
-            if bounds is not None:
-                here = [pair for pair in own if pair[1].group == len(before) - 1]
-                spans = [(part, one.begin, one.begin + one.rows) for part, one in here]
-                bounds.add(rows.records, spans)
             before.append(before[-1] + len(rows))
             for found, mask in ((matched, holds), (unreadable, rows.is_unreadable())):
                 found.append(found[-1][-1] + np.cumsum(mask))
@@ -377,8 +365,6 @@ class Rows:
                 sum(int(sums[begin + rows] - sums[begin]) for begin, rows in places),
                 sum(int(bad[begin + rows] - bad[begin]) for begin, rows in places),
             )
-            if bounds is not None and not self._counts[part].unreadable:
-                bounds.note(part)
 
     def _in_table(
         self,
@@ -589,7 +575,7 @@ def places_of(references: Any) -> NDArray[np.int64]:
     return np.stack(columns, axis=1).astype(np.int64)
 
 
-def _offsets_by_chunk(
+def offsets_by_chunk(
     recording: str, places: NDArray[np.int64]
 ) -> dict[ChunkKey, NDArray[np.int64]]:
     """Payload offsets of messages by chunk, sorted.

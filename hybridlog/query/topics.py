@@ -16,6 +16,7 @@ The full name of an existing topic always means that topic, whatever characters 
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Collection, Iterable, Sequence
 
 from hybridlog.query.predicate.regex import Regex, RegexError, compile_regex
@@ -27,6 +28,8 @@ from hybridlog_storage.errors import TopicError
 _MAX_NAMES = 10
 _LONGEST_PATTERN = 1_000
 _LONGEST_REGEX = 200
+_SPAN = re.compile("(.)-(.)|(.)", re.DOTALL)
+_NOTHING = r"[^\x00-\x{10FFFF}]"
 
 
 def resolve(patterns: Sequence[str], topics: Collection[str]) -> list[str]:
@@ -171,9 +174,8 @@ def _matches(pattern: str) -> Callable[[str], bool]:
         if pattern.startswith("/"):
             return lambda topic: topic == pattern
         return lambda topic: topic == pattern or topic.endswith(tail)
-    tokens = _glob_tokens(pattern)
-    anchored = pattern.startswith("/")
-    return lambda topic: topic == pattern or _glob_match(tokens, topic, anchored=anchored)
+    compiled = _glob(repaired_text(pattern))
+    return lambda topic: topic == pattern or compiled.fullmatch(repaired_text(topic)) is not None
 
 
 def _is_plain(pattern: str) -> bool:
@@ -198,91 +200,37 @@ def _regex(pattern: str) -> Regex:
         ) from None
 
 
-# A glob is a list of tokens: a test for one character, and a flag for repetition.
-_Token = tuple[Callable[[str], bool], bool]
-
-
-def _glob_tokens(pattern: str) -> list[_Token]:
-    tokens: list[_Token] = []
+def _glob(pattern: str) -> Regex:
+    """A glob as a regular expression; the class of a bracket has no slash."""
+    found = ["(?s)" if pattern.startswith("/") else "(?s)(?:.*/)?"]
     at = 0
     while at < len(pattern):
-        char = pattern[at]
-        if pattern.startswith("**", at):
-            tokens.append((lambda _char: True, True))
-            at += 2
-        elif char == "*":
-            tokens.append((_in_part, True))
-            at += 1
-        elif char == "?":
-            tokens.append((_in_part, False))
-            at += 1
-        elif char == "[":
-            test, at = _glob_class(pattern, at)
-            tokens.append((test, False))
+        if pattern[at] == "[":
+            text, at = _glob_class(pattern, at)
         else:
-            tokens.append((char.__eq__, False))
-            at += 1
-    return tokens
+            text = "**" if pattern.startswith("**", at) else pattern[at]
+            at += len(text)
+            text = {"**": ".*", "*": "[^/]*", "?": "[^/]"}.get(text) or re.escape(text)
+        found.append(text)
+    return compile_regex("".join(found), 100 * _LONGEST_PATTERN)
 
 
-def _in_part(char: str) -> bool:
-    return char != "/"
-
-
-def _glob_class(pattern: str, at: int) -> tuple[Callable[[str], bool], int]:
-    """The test of a `[...]` that opens at `at`, and the index after it."""
+def _glob_class(pattern: str, at: int) -> tuple[str, int]:
+    """The class of a `[...]` that opens at `at`, and the index after it."""
     close = pattern.find("]", at + (3 if pattern[at + 1 : at + 2] in {"!", "^"} else 2))
     if close < 0:
         raise TopicError(f"the glob {_shown(pattern)} has a '[' that is not closed")
     body = pattern[at + 1 : close]
     negated = body[:1] in {"!", "^"}
+    spans = [(low or one, high or one) for low, high, one in _SPAN.findall(body[negated:])]
     if negated:
-        body = body[1:]
-    singles: set[str] = set()
-    ranges: list[tuple[str, str]] = []
-    index = 0
-    while index < len(body):
-        if index + 2 < len(body) and body[index + 1] == "-":
-            ranges.append((body[index], body[index + 2]))
-            index += 3
-        else:
-            singles.add(body[index])
-            index += 1
-
-    def test(char: str) -> bool:
-        inside = char in singles or any(low <= char <= high for low, high in ranges)
-        return char != "/" and inside != negated
-
-    return test, close + 1
-
-
-def _glob_match(tokens: list[_Token], name: str, *, anchored: bool) -> bool:
-    """True if the tokens match the name or, unless anchored, whole parts at its end.
-
-    All paths through the glob are followed in parallel, which limits the time to the length
-    of the name times the length of the glob.
-    """
-    states = _skip_repeats(tokens, {0})
-    for index, char in enumerate(name):
-        after: set[int] = set()
-        for state in states:
-            if state < len(tokens) and tokens[state][0](char):
-                after.add(state if tokens[state][1] else state + 1)
-        if not anchored and char == "/" and index + 1 < len(name):
-            after.add(0)
-        states = _skip_repeats(tokens, after)
-    return len(tokens) in states
-
-
-def _skip_repeats(tokens: list[_Token], states: set[int]) -> set[int]:
-    """Add the states that are reachable because a repetition may be empty."""
-    reached = set(states)
-    for state in states:
-        following = state
-        while following < len(tokens) and tokens[following][1]:
-            following += 1
-            reached.add(following)
-    return reached
+        spans.append(("/", "/"))
+    else:
+        spans = [
+            cut for low, high in spans for cut in ((low, min(high, ".")), (max(low, "0"), high))
+        ]
+    text = "".join(f"\\x{{{ord(a):x}}}-\\x{{{ord(b):x}}}" for a, b in spans if a <= b)
+    return (f"[^{text}]" if negated else f"[{text}]" if text else _NOTHING), close + 1
 
 
 def _unknown(pattern: str, known: list[str]) -> str:

@@ -18,6 +18,7 @@ import pyarrow.compute as pc
 
 from hybridlog.columns.clouds import NEEDED, PointColumns, is_cloud
 from hybridlog.columns.fields import without
+from hybridlog.columns.layout import POINTS
 from hybridlog.columns.rows import Messages, Piece, own_columns
 from hybridlog.query.question import RecordedChannel
 from hybridlog.query.rows import places_of
@@ -237,6 +238,10 @@ class TopicOfRecording:
                 return PointColumns().points(decoded.arrow()).type
         return None
 
+    def chunk_rows(self, segment: int, number: int) -> _ChunkRows:
+        """The messages in a chunk, with all arrays."""
+        return _ChunkRows(self, segment, self.places[segment, number], None)
+
     def chunk(self, segment: int, number: int, counts: ScanCounts) -> StoredChunk:
         """A chunk; see `Session.chunk`."""
         return self.session.chunk(
@@ -319,7 +324,8 @@ class _ChunkRows:
     """The messages of a topic in a chunk."""
 
     is_whole = True
-    has_summaries = has_points = False
+    has_summaries = False
+    has_points = True
 
     def __init__(
         self,
@@ -340,12 +346,23 @@ class _ChunkRows:
     def _kinds(self) -> Sequence[Any]:
         return [rows.records.type for rows in self.read(None, (), ScanCounts())]
 
-    def read(self, paths: Paths, own: Collection[str], counts: ScanCounts) -> Iterator[Rows]:
+    def read(
+        self,
+        paths: Paths,
+        own: Collection[str],
+        counts: ScanCounts,
+        offsets: NDArray[np.int64] | None = None,
+    ) -> Iterator[Rows]:
         chunk = self._source.chunk(self._segment, self._place.number, counts)
+        chosen = np.ones(len(chunk.batch), np.bool_)
+        if offsets is not None:
+            chosen = np.isin(chunk.batch.places[0], offsets)
         for number, channel in self._source.channels.items():
-            rows = np.flatnonzero(chunk.batch.channel == number)
+            rows = np.flatnonzero(chosen & (chunk.batch.channel == number))
             if len(rows):
-                yield self._rows(chunk, channel, Messages.of(chunk).take(rows), paths, counts)
+                messages = Messages.of(chunk).take(rows)
+                counts.payload_bytes += int(messages.length.sum()) * channel.codec.indexed
+                yield self._rows(chunk, channel, messages, paths, own)
 
     def _rows(
         self,
@@ -353,20 +370,25 @@ class _ChunkRows:
         channel: RecordedChannel,
         messages: Messages,
         paths: Paths,
-        counts: ScanCounts,
+        own: Collection[str],
     ) -> Rows:
         count = len(messages.seq)
         piece = Piece(self._segment, messages, None, state=channel.state)
-        records = pa.nulls(count, pa.struct([]))
+        records, points = pa.nulls(count, pa.struct([])), None
         if channel.codec.indexed and not channel.is_reduced:
             wanted = None if paths is None else {*paths, "header.stamp"}
+            if wanted is not None and POINTS in own:
+                wanted.update(NEEDED)
             data = chunk.batch.buffer
             decoded = channel.codec.columns(data, messages.at, messages.length, wanted)
-            counts.payload_bytes += int(messages.length.sum())
             piece.errors += [(bad.rows, bad.reason) for bad in decoded.unreadable]
             if len(decoded.rows):
                 records = without(decoded.arrow(), decoded.rows, count)
+                points = PointColumns().points(decoded.arrow()) if POINTS in own else None
         segment = np.full(count, self._segment, np.int32)
         publishes = {channel.channel_id: channel.channel.has_publish_time}
         fields = records if records.type.num_fields else None
-        return Rows(own_columns([piece], messages, segment, fields, publishes), records, count)
+        columns = dict(own_columns([piece], messages, segment, fields, publishes))
+        if points is not None:
+            columns[POINTS] = without(points, decoded.rows, count)
+        return Rows(columns, records, count)

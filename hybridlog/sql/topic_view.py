@@ -15,9 +15,8 @@ import pyarrow.compute as pc
 import pyarrow.dataset as ds
 from pyarrow import acero, fs
 
-from hybridlog.columns.clouds import NEEDED, PointColumns
-from hybridlog.columns.fields import without
 from hybridlog.columns.layout import POINTS
+from hybridlog.query.rows import offsets_by_chunk, places_of
 from hybridlog.schema.states import State
 from hybridlog.sql.columns import (
     OWN,
@@ -38,7 +37,6 @@ if TYPE_CHECKING:
 
     from hybridlog_storage.catalog import RecordingEntry
 
-_BATCH_BYTES: Final = 16 << 20  # of payloads whose arrays are in memory together
 _TABLE_OWN: Final = frozenset({"log_time", "t", "seq", "pub", "stamp", "state", "error"})
 _FORMAT: Final = ds.ParquetFileFormat()
 _PLACES: Final = fs.LocalFileSystem()
@@ -300,17 +298,16 @@ class _Plan:
         held = [
             leaf for key, leaf in self._leaves.items() if key not in absent or len(leaf.source) > 1
         ]
-        own = self._own | ({"ref", "channel"} if absent else set())
+        own = self._own | ({"ref"} if absent else set())
         own |= {POINTS for leaf in held if leaf.is_points}
         held = [leaf for leaf in held if not leaf.is_points]
-        for rows in source.read(
-            _paths(held, summaries=source.has_summaries), own, self._reading.counts
-        ):
+        paths = _paths(held, summaries=source.has_summaries)
+        for rows in source.read(paths, own, self._reading.counts):
             self._remark(recording.topic, rows, lacks_arrays=bool(absent))
             if absent:
                 yield from self._with_payloads(recording, rows, absent)
             else:
-                yield from self._finished(recording, rows, {}, self.where)
+                yield from self._finished(recording, rows, self.where)
 
     def _with_payloads(
         self,
@@ -318,33 +315,41 @@ class _Plan:
         rows: Rows,
         absent: Mapping[tuple[str, ...], ViewColumn],
     ) -> Iterator[pa.RecordBatch]:
-        """Rows with arrays from payloads, which are read of as few messages as possible."""
-        chosen = np.arange(rows.size)
-        where = self.where
-        tests_them = _named(str(where), [leaf.name for leaf in absent.values()])
-        if where is not None and not tests_them:
-            known = self._batch(recording, rows, dict.fromkeys(absent), self._tested)
-            chosen = np.flatnonzero(_mask(known, where).to_numpy(zero_copy_only=False))
+        """Rows with arrays from payloads; of these as few as possible are decoded."""
+        where, chosen = self.where, np.ones(rows.size, np.bool_)
+        if where is not None and not _named(str(where), [one.name for one in absent.values()]):
+            known = self._batch(recording, rows, self._tested, absent)
+            chosen = _mask(known, where).to_numpy(zero_copy_only=False)
             where = None
-        for some in _split(chosen, rows.own["ref"]):
-            part = _taken(rows, some)
-            values = _from_payloads(recording, part, absent, self._reading.counts)
-            yield from self._finished(recording, part, values, where)
+        is_whole = chosen
+        if "state" in rows.own:
+            states = pc.equal(rows.own["state"], State.WHOLE.value)
+            is_whole = chosen & states.to_numpy(zero_copy_only=False)
+            gone = np.flatnonzero(chosen & ~is_whole)
+            if len(gone):
+                yield from self._finished(recording, _taken(rows, gone), where, absent)
+        places = offsets_by_chunk(recording.entry.id, places_of(rows.own["ref"])[is_whole])
+        paths = _paths(self._leaves.values())
+        own = {POINTS for leaf in self._leaves.values() if leaf.is_points}
+        for (_, segment, chunk), offsets in places.items():
+            source = recording.chunk_rows(segment, chunk)
+            for part in source.read(paths, own, self._reading.counts, offsets):
+                yield from self._finished(recording, part, where)
 
     def _finished(
         self,
         recording: TopicOfRecording,
         rows: Rows,
-        payloads: Mapping[tuple[str, ...], Any],
         where: Any,
+        absent: Collection[tuple[str, ...]] = (),
     ) -> Iterator[pa.RecordBatch]:
         """Rows for which an expression holds, with the columns to return."""
         mask = None
         if where is not None:
-            mask = _mask(self._batch(recording, rows, payloads, self._tested), where)
+            mask = _mask(self._batch(recording, rows, self._tested, absent), where)
             if not mask.true_count:
                 return
-        batch = self._batch(recording, rows, payloads, self._columns)
+        batch = self._batch(recording, rows, self._columns, absent)
         found = batch if mask is None or mask.true_count == len(mask) else batch.filter(mask)
         if found.num_rows:
             yield found
@@ -353,20 +358,17 @@ class _Plan:
         self,
         recording: TopicOfRecording,
         rows: Rows,
-        payloads: Mapping[tuple[str, ...], Any],
         names: Sequence[str],
+        absent: Collection[tuple[str, ...]],
     ) -> pa.RecordBatch:
-        """Columns of some rows."""
+        """Columns of some rows; those of absent fields are null."""
 
         def leaf(column: ViewColumn) -> Any:
             key = column.source + (("",) if column.is_summary else ())
-            if key not in self._leaves:
+            if key not in self._leaves or key in absent:
                 return None
-            if key in payloads:
-                return payloads[key]
-            array = _at(rows.records, column.source)
-            if column.is_points:
-                array = rows.own[POINTS]
+            is_points = column.is_points
+            array = rows.own.get(POINTS) if is_points else _at(rows.records, column.source)
             if array is None:
                 return None
             return (summary_values if column.is_summary else fitted)(array, column.kind)
@@ -472,66 +474,7 @@ def _constant(name: str, entry: RecordingEntry, rows: int) -> Any:
     return tags.take(pa.array(np.zeros(rows, np.int64)))
 
 
-def _taken(rows: Rows, chosen: NDArray[np.int64]) -> Rows:
-    if len(chosen) == rows.size:
-        return rows
+def _taken(rows: Rows, chosen: NDArray[np.intp]) -> Rows:
     places = pa.array(chosen)
     own = {name: column.take(places) for name, column in rows.own.items()}
     return Rows(own, rows.records.take(places), len(chosen))
-
-
-def _split(chosen: NDArray[np.int64], ref: Any) -> Iterator[NDArray[np.int64]]:
-    """Rows in parts whose payloads are in memory together."""
-    if not len(chosen):
-        return
-    sizes = ref.field("len").to_numpy(zero_copy_only=False)[chosen].astype(np.int64)
-    part = np.cumsum(sizes) // _BATCH_BYTES
-    yield from np.split(chosen, np.flatnonzero(np.diff(part)) + 1)
-
-
-def _from_payloads(
-    recording: TopicOfRecording,
-    rows: Rows,
-    leaves: Mapping[tuple[str, ...], ViewColumn],
-    counts: ScanCounts,
-) -> dict[tuple[str, ...], Any]:
-    """Arrays of some messages, decoded from their payloads."""
-    ref = {
-        name: rows.own["ref"].field(name).to_numpy(zero_copy_only=False).astype(np.int64)
-        for name in ("seg", "chunk", "off", "len")
-    }
-    channel = rows.own["channel"].to_numpy(zero_copy_only=False)
-    wanted = np.arange(rows.size)
-    if "state" in rows.own:
-        is_whole = pc.equal(rows.own["state"], State.WHOLE.value).to_numpy(zero_copy_only=False)
-        wanted = np.flatnonzero(is_whole)
-    order = wanted[np.lexsort((ref["off"][wanted], ref["chunk"][wanted], ref["seg"][wanted]))]
-    keys = np.stack([ref["seg"][order], ref["chunk"][order], channel[order]])
-    edges = np.flatnonzero((keys[:, 1:] != keys[:, :-1]).any(axis=0)) + 1
-    found: dict[tuple[str, ...], list[Any]] = {key: [] for key in leaves}
-    paths = _paths([leaf for leaf in leaves.values() if not leaf.is_points])
-    if paths is not None and any(leaf.is_points for leaf in leaves.values()):
-        paths += NEEDED
-    for group in np.split(order, edges) if len(order) else ():
-        place = int(ref["seg"][group[0]]), int(ref["chunk"][group[0]])
-        own = recording.channels[int(channel[group[0]])]
-        chunk = recording.chunk(*place, counts)
-        buffer, at, length = chunk.batch.buffer, ref["off"][group], ref["len"][group]
-        decoded = own.codec.columns(buffer, at, length, paths)
-        counts.payload_bytes += int(length.sum())
-        records, good = decoded.arrow(), decoded.rows
-        for key, leaf in leaves.items():
-            points = PointColumns().points(records) if leaf.is_points else None
-            values = _at(records, leaf.source) if points is None else points
-            if values is None:
-                made = pa.nulls(len(group), leaf.type)
-            else:
-                made = without(fitted(values, leaf.kind), good, len(group))
-            found[key].append(made)
-    places = np.full(rows.size, -1, np.int64)
-    places[order] = np.arange(len(order))
-    back = pa.array(places, mask=places < 0)
-    return {
-        key: (pa.concat_arrays(arrays) if arrays else pa.nulls(0, leaves[key].type)).take(back)
-        for key, arrays in found.items()
-    }

@@ -8,8 +8,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from hybridlog.query.predicate.across import Near, names_topics, parse_across
+from hybridlog.query.predicate.parser import names_topics, parse
 from hybridlog.query.predicate.tokens import MAX_TEXT
+from hybridlog.query.predicate.tree import Near
 from hybridlog.query.times import format_time
 from hybridlog_storage.errors import UsageError, WhereError
 
@@ -132,7 +133,7 @@ class PageQuestion:
 def _topic_of(where: str) -> str | None:
     """The topic of a predicate that is one condition on another topic."""
     try:
-        condition = parse_across(where)
+        condition = parse(where, across=True).root
     except WhereError:
         return None
     return condition.topic if isinstance(condition, Near) else None

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Callable, Collection, Container, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -60,21 +60,15 @@ _STAMPS: Final = "stamps"
 _TOPICS: Final = "topics"
 _SCHEMA: Final = "schema"
 """Kinds of the cells of sets of topics and of schemas, by hash; nothing removes them."""
-_BOUNDS: Final = "bounds"
-"""Kind of the cells of bounds, by what they are bounds of."""
 _RECORDINGS: Final = "recordings"
 _RECORDINGS_FILE: Final = Path("tables/recordings.parquet")
 _BUSY_S: Final = 1.0
 _NOTING_S: Final = 0.1
 _MAX_TABLES: Final = 64 << 20  # bytes of chunk tables in memory
-_MAX_NOTED: Final = 1 << 17  # recordings with bounds of one kind
-_MAX_KINDS: Final = 256  # of bounds
 _MAX_SOUGHT: Final = 200  # bytes of a name; of long ones, a number takes the place of the end
 _FEW: Final = 100  # cells that are read one by one
 _TRIES: Final = 3  # to read it, while it is lost
 _T = TypeVar("_T")
-Ends = tuple[float | None, float | None]
-"""The least and the greatest of some numbers; None twice without any."""
 _STAMP = RowType(
     ("unreadable", "<u4"),
     ("surplus", "<u4"),
@@ -440,7 +434,6 @@ class Catalog:
         self._store = store
         self._cells = cells or Cells(store / CATALOG, store_id, writes=not in_memory)
         self._topics: dict[str, tuple[TopicType, ...]] = {}
-        self._bounds: dict[str, dict[str, Ends]] = defaultdict(dict)  # to be written, by kind
         self._tables = Cache(_MAX_TABLES)
         self.filled = 0
 
@@ -456,10 +449,7 @@ class Catalog:
         return self._store / _RECORDINGS_FILE
 
     def close(self) -> None:
-        """Write bounds that were noted, and close the file."""
-        if self._bounds:
-            self._cells.write(self._with_bounds, _NOTING_S)
-            self._bounds.clear()
+        """Close the file."""
         self._tables.drop("table")
         self._cells.close()
 
@@ -690,31 +680,6 @@ class Catalog:
                 return rows
         return None
 
-    # Bounds.
-
-    def bounds(self, kind: str) -> dict[str, Ends]:
-        """Known bounds of one kind, by content; see `note_bounds`."""
-        return {**_ends(self._cells.read(_BOUNDS, kind)), **self._bounds.get(kind, {})}
-
-    def note_bounds(self, kind: str, entry: RecordingEntry, ends: Ends) -> None:
-        """Note the bounds of numbers of a recording; they are written when this is closed.
-
-        Args:
-            kind: What they are bounds of, in a word.
-            entry: The recording; bounds hold for the content of its segments.
-            ends: The bounds, without NaN.
-        """
-        if sum(map(len, self._bounds.values())) >= _MAX_NOTED:
-            self._bounds.clear()
-        self._bounds[kind][content_of(entry)] = ends
-
-    def _with_bounds(self) -> Iterator[Statement]:
-        held = {*self._cells.each(_BOUNDS)} - self._bounds.keys()
-        for kind in [*held][max(_MAX_KINDS - len(self._bounds), 0) :]:
-            yield drop(_BOUNDS, kind)
-        for kind in [*self._bounds][-_MAX_KINDS:]:
-            yield put(_BOUNDS, kind, _body(dict([*self.bounds(kind).items()][-_MAX_NOTED:])))
-
     # Schemas.
 
     def schemas(self, hashes: Collection[str]) -> dict[str, Schema]:
@@ -827,30 +792,8 @@ def _indexed(body: bytes | None) -> _Indexed:
     return _read(_INDEX_OF, body) or ("", "", [])
 
 
-def _ends(body: bytes | None) -> dict[str, Ends]:
-    """Bounds by content, without those that are none."""
-    with suppress(TypeError, ValueError, RecursionError, AttributeError):
-        # Numbers of any size stay exact, which `msgspec` makes floats.
-        return {
-            content: (low, high)
-            for content, (low, high) in json.loads(body or b"{}").items()
-            if {type(low), type(high)} <= {int, float} or low is high is None
-        }
-    return {}
-
-
 def _schema_body(schema: Schema) -> bytes:
     return _body([schema.name, schema.encoding]) + b"\n" + bytes(schema.data)
-
-
-def content_of(entry: RecordingEntry) -> str:
-    """A hash of the content of a recording's segments, by their digests."""
-    return content_hash(entry.digests)
-
-
-def content_hash(digests: Mapping[str, str]) -> str:
-    """The same, by the digests alone: of each segment, by its number as text."""
-    return hash_of(json.dumps(sorted(digests.items())))
 
 
 def file_of(entry: RecordingEntry, number: int) -> str:

@@ -54,7 +54,6 @@ class RecordingSummary(NamedTuple):
         expired: Number of messages whose payloads were deleted to make room.
         not_copied: Number of messages whose payloads were not copied yet.
         notes: See there.
-        content: Hash of the content of its segments; see `content_of`.
         look: State of its directory and its manifest when its files were read.
         indexed_by: The id of the index that is known to be complete for it; empty if none is.
     """
@@ -77,7 +76,6 @@ class RecordingSummary(NamedTuple):
     expired: Int
     not_copied: Int
     notes: list[dict[str, Any]]
-    content: str
     look: str
     indexed_by: str = ""
 

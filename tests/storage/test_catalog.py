@@ -36,7 +36,6 @@ from hybridlog_storage.catalog import (
     RecordingEntry,
     channel_entry,
     channel_totals,
-    content_of,
     stamps_of,
 )
 from hybridlog_storage.cells import put
@@ -378,36 +377,6 @@ def test_damage_is_replaced(catalog: Catalog) -> None:
     assert (catalog.damage("r"), catalog.damage("other")) == ({}, {(9, 9): "c"})
 
 
-def test_bounds_are_of_one_content(tmp_path: Path) -> None:
-    models = [Model(number, f"run{number}") for number in range(3)]
-    ends = [(1, 2.5), (None, None), (-math.inf, 2**70)]
-    known = {content_of(model.entry): own for model, own in zip(models, ends, strict=True)}
-    with closing(Catalog(tmp_path, STORE)) as one, closing(Catalog(tmp_path, STORE)) as other:
-        for model, own in zip(models, ends, strict=True):
-            other.note_bounds("x", model.entry, own)
-        assert other.bounds("x") == known
-        other.close()
-        assert one.bounds("x") == known
-        models[1].entry.digests["1"] = "1"
-        one.note_bounds("x", models[1].entry, (1, 1))
-    with closing(Catalog(tmp_path, STORE)) as one:
-        assert one.bounds("x") == {**known, content_of(models[1].entry): (1, 1)}
-        assert one.bounds("z") == {}
-
-
-def test_bounds_take_little_room(tmp_path: Path) -> None:
-    models = [Model(number, f"run{number}", segments=1, chunks=3) for number in range(20)]
-    for turn in range(3):
-        with closing(Catalog(tmp_path, STORE)) as catalog:
-            for kind in range(200):
-                for model in models:
-                    catalog.note_bounds(f"{turn}-{kind}", model.entry, (0.1, 0.2))
-    with closing(Catalog(tmp_path, STORE)) as catalog:
-        known = [len(catalog.bounds(f"{turn}-{kind}")) for turn in range(3) for kind in range(200)]
-    assert sum(map(bool, known)) == 256
-    assert known[400:] == [20] * 200
-
-
 def test_schemas(catalog: Catalog, model: Model) -> None:
     model.put(catalog)
     known = {schema_hash(s): s for s in SCHEMAS.values() if s is not None}
@@ -514,7 +483,6 @@ class Truth:
             model.put(catalog)
             catalog.put_damage(model.id, self.damage)
             catalog.put_indexed([model.id], "an index")
-            catalog.note_bounds("x", model.entry, (-1.5, 2))
 
     def check(self, catalog: Catalog) -> bool:
         """That nothing that it says is wrong; returns whether it says all."""
@@ -539,12 +507,10 @@ class Truth:
         assert not summaries
         for one in catalog.summaries():  # or unreadable chunks would be forgotten
             assert one.indexed_by == ("an index" if catalog.damage(one.id) else "")
-        bounds = catalog.bounds("x")
-        assert bounds.items() <= {content_of(m.entry): (-1.5, 2) for m in self.models}.items()
         known = {schema_hash(s): s for s in SCHEMAS.values() if s is not None}
         found_schemas = catalog.schemas(known)
         assert found_schemas.items() <= known.items()
-        return complete and found_schemas == known and len(bounds) == len(self.models)
+        return complete and found_schemas == known
 
 
 @pytest.fixture(scope="module")
@@ -677,7 +643,7 @@ def changed_anywhere(value: Any) -> Iterator[Any]:
             yield dict(found) if isinstance(value, dict) else [it for _, it in found]
 
 
-@pytest.mark.parametrize("kind", ["summary", "entry", "index", "topics", "stamps", "bounds"])
+@pytest.mark.parametrize("kind", ["summary", "entry", "index", "topics", "stamps"])
 def test_a_forged_cell_is_no_error(truth: Truth, tmp_path: Path, kind: str) -> None:
     """Its checksum is right. Of types that do not fit nothing is believed."""
     recording = truth.models[0].id
@@ -715,8 +681,6 @@ def test_a_forged_cell_is_no_error(truth: Truth, tmp_path: Path, kind: str) -> N
                     assert type(channel.stats.messages) is type(channel.id) is int
                     assert type(channel.topic) is type(channel.message_encoding) is str
             opened.damage(recording)
-            for ends in opened.bounds("x").values():
-                assert ends == (None, None) or {*map(type, ends)} <= {int, float}
             decoded = decoded_of(opened, truth.models[0])
             wanted = decoded_in(truth.models[0])
             assert all(one in (None, it) for one, it in zip(decoded, wanted, strict=True))

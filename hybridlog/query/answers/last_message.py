@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Collection
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,7 +17,6 @@ from hybridlog_storage.times import END, earlier, span_of
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog.query.chunk_columns import Chunk
     from hybridlog.query.counters import Counters
     from hybridlog.query.question import Question, Span
     from hybridlog.session import Session
@@ -101,74 +100,32 @@ def _last_of(
         counters.chunks_read += 1
         counters.bytes_read += chunk.length + chunk.trailer
 
-    def read(entry: Chunk) -> StoredChunk:
-        return session.chunk(recording, entry.segment, entry.place, count)
-
-    chunks = session.chunks_before(recording, list(channels), span[1])
-    found = last_message(chunks, channels, span[1], read)
-    if found is None:
+    best: tuple[int, int, Batch] | None = None
+    for entry, last in session.chunks_before(recording, list(channels), span[1]):
+        if best is not None and last < best[0]:
+            break
+        chunk = session.chunk(recording, entry.segment, entry.place, count)
+        others = not all(channel in channels for channel in entry.place.channels)
+        row = _last_row(chunk.batch, channels if others else None, span[1])
+        if row is not None:
+            place = int(chunk.batch.log_time[row]), int(chunk.seq[row])
+            if best is None or place > best[:2]:
+                best = *place, chunk.batch.take(slice(row, row + 1))
+    if best is None:
         return None
-    batch = found.batch.take(slice(found.row, found.row + 1))
+    log_time, seq, batch = best
     counters.add_messages(batch)
     return Message(
         channels[batch.channel.item()],
-        log_time=found.log_time,
+        log_time=log_time,
         publish_time=batch.publish_time.item(),
         sequence=batch.sequence.item(),
-        seq=found.seq,
+        seq=seq,
         view=batch.payload(0),
         documents=Documents(channels, batch),
         row=0,
         picture_of=picture_of(session),
     )
-
-
-@dataclass(frozen=True, slots=True)
-class Found:
-    """A message in a chunk.
-
-    Attributes:
-        log_time: ns.
-        seq: Arrival number in the recording.
-        batch: The messages of its chunk; `channel` holds channel ids.
-        row: Index of the message in the batch.
-    """
-
-    log_time: int
-    seq: int
-    batch: Batch
-    row: int
-
-
-def last_message(
-    chunks: Iterable[tuple[Chunk, int]],
-    channels: Collection[int],
-    latest: int,
-    read: Callable[[Chunk], StoredChunk],
-) -> Found | None:
-    """The message with the greatest log time; of equal times, the one that arrived last.
-
-    Args:
-        chunks: Chunks of one recording that may hold it, see `Session.chunks_before`.
-        channels: Ids of the channels in question.
-        latest: The time, ns.
-        read: Returns the content of a chunk.
-
-    Raises:
-        SegmentError: a chunk is missing or damaged.
-    """
-    best: Found | None = None
-    for entry, last in chunks:
-        if best is not None and last < best.log_time:
-            break
-        chunk = read(entry)
-        others = not all(channel in channels for channel in entry.place.channels)
-        row = _last_row(chunk.batch, channels if others else None, latest)
-        if row is not None:
-            place = int(chunk.batch.log_time[row]), int(chunk.seq[row])
-            if best is None or place > (best.log_time, best.seq):
-                best = Found(*place, chunk.batch, row)
-    return best
 
 
 def _last_row(batch: Batch, channels: Collection[int] | None, latest: int) -> int | None:

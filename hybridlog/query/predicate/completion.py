@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Final, Literal
 
 from hybridlog.frames.names import is_summary
-from hybridlog.query.predicate.across import Token, tokens
-from hybridlog.query.predicate.tokens import MAX_TEXT
+from hybridlog.query.predicate.tokens import MAX_TEXT, TOPIC
 from hybridlog.query.predicate.types import STATS
 
 Kind = Literal["field", "topic", "word"]
@@ -18,7 +17,13 @@ _WORD: Final = re.compile(r"""[^\s()!&|<>=~,"'{}]*\Z""")
 _COMPARISON: Final = re.compile(r"[<>=~]\Z")
 _BEHIND: Final = ("and", "or", "between", "exists", "in", "missing", "not in")
 _VALUES: Final = ("false", "inf", "nan", "null", "true")
-_BEGINS: Final = frozenset({"and", "or", "not", "(", "topic"})
+_BEGINS: Final = frozenset({"and", "&&", "or", "||", "not", "!", "("})
+_TOKEN: Final = re.compile(
+    rf"""(?:"(?:\\.|[^"\\])*"|'(?:\\.|[^'\\])*'|`[^`]*`)"""
+    rf"""|(?P<topic>{TOPIC})|(?P<word>[^\W\d][\w.]*|&&|\|\||!(?![=~])|[()]|["'])|\S""",
+    re.DOTALL,
+)
+"""A part of a predicate, whether that can be parsed or not; a quote that is not closed is one."""
 _PLAIN: Final = re.compile(r"[^\W\d]\w*")
 _META: Final = ("_meta.t", "_meta.pub", "_meta.seq", "_meta.rec", "_meta.topic")
 
@@ -72,7 +77,7 @@ def complete(
     if len(text) > MAX_TEXT or _is_in_string(before):
         return Completion(place, ())
     word, earlier = before[begin:], before[:begin]
-    known = tokens(earlier)
+    known = [*_TOKEN.finditer(earlier)]
     offered = [*_offered(earlier, known, topics, fields)]
     folded = word.casefold()
     fitting = [one for one in offered if folded in one.text.casefold()]
@@ -81,11 +86,11 @@ def complete(
 
 
 def _offered(
-    earlier: str, known: list[Token], topics: Collection[str], fields: Fields
+    earlier: str, known: list[re.Match[str]], topics: Collection[str], fields: Fields
 ) -> Iterator[Candidate]:
     if _COMPARISON.search(earlier.rstrip()):
         yield from (Candidate(word, "word") for word in _VALUES)
-    elif not known or known[-1].kind in _BEGINS:
+    elif not known or known[-1]["topic"] or (known[-1]["word"] or "").lower() in _BEGINS:
         yield from _fields_of(fields(_topic_at(known)))
         yield Candidate("not", "word")
         yield from (Candidate(f"{topic}: ", "topic") for topic in sorted(topics))
@@ -115,20 +120,20 @@ def _quoted(part: str) -> str:
     return part if _PLAIN.fullmatch(name) else f"`{name}`{bracket}{rest}"
 
 
-def _topic_at(known: Iterable[Token]) -> str | None:
+def _topic_at(known: list[re.Match[str]]) -> str | None:
     """The topic that a predicate behind some tokens is about; None for the message itself."""
     outer: list[str | None] = []
     topic: str | None = None
     for token in known:
-        if token.kind == "(":
+        if token["word"] == "(":
             outer.append(topic)
-        elif token.kind == ")" and outer:
+        elif token["word"] == ")" and outer:
             topic = outer.pop()
-        elif token.kind == "topic":
-            topic = token.text
+        elif token["topic"]:
+            topic = token["topic"].removesuffix(":")
     return topic
 
 
 def _is_in_string(before: str) -> bool:
     """True behind a quote that is not closed."""
-    return any(token.kind == "text" and token.text in {'"', "'"} for token in tokens(before))
+    return any(token["word"] in {'"', "'"} for token in _TOKEN.finditer(before))

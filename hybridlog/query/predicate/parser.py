@@ -2,7 +2,8 @@ r"""Predicates over message fields: `ranges.min < 0.5 and header.frame_id == "la
 
     expression  = term { ("or" | "||") term }
     term        = factor { ("and" | "&&") factor }
-    factor      = ("not" | "!") factor | "(" expression ")" | condition
+    factor      = ("not" | "!") factor | "(" expression ")" | condition | near
+    near        = TOPIC ":" [ expression ]                  a message of another topic
     condition   = field ("==" | "=" | "!=" | "<" | "<=" | ">" | ">=") value
                 | value order field [ order value ]             0 < x < 5
                 | field [ "not" ] "in" "[" value { "," value } "]"
@@ -28,6 +29,10 @@ greater than anything. `== null` finds a stored null, not a missing field.
 
 The pattern of `~` is found anywhere in the string unless anchored; its backslashes have no
 escaping of their own. It has RE2's syntax and takes linear time.
+
+`TOPIC: expression` holds for a message if another one, of that topic and near in time,
+satisfies the expression. That reaches to the next topic, or to the end of the brackets; what
+joins it to the next topic is the last `and` or `or` before that. A space follows the colon.
 
 `x.min`, `x.max`, `x.mean` and `x.n` of an array are its least and greatest finite element,
 their mean, and the number of elements. Where the types of the fields are unknown, a
@@ -56,12 +61,14 @@ from hybridlog.query.predicate.tree import (
     Field,
     Match,
     Member,
+    Near,
     Node,
     Not,
     Or,
     Order,
     Predicate,
     Value,
+    nodes,
 )
 from hybridlog_storage.errors import WhereError
 
@@ -93,8 +100,23 @@ _ONLY_INDEXED = frozenset({"inserted_at", "error", "ref"})
 """Fields of `_meta` that index documents have and messages do not."""
 
 
-def parse(text: str) -> Predicate:
+def names_topics(text: str) -> bool:
+    """True if a predicate has conditions on other topics; a MongoDB filter has none.
+
+    Raises:
+        WhereError: as for `parse`.
+    """
+    if ":" not in text or is_filter(text):
+        return False
+    return any(isinstance(node, Near) for node in nodes(parse(text, across=True).root))
+
+
+def parse(text: str, *, across: bool = False) -> Predicate:
     """Parse a predicate.
+
+    Args:
+        text: The predicate.
+        across: It may have conditions on other topics.
 
     Raises:
         WhereError: a syntax error, too long, too deep, or a refused pattern.
@@ -103,12 +125,12 @@ def parse(text: str) -> Predicate:
         raise WhereError(f"a predicate is text, not {type(text).__name__}")
     if is_filter(text):
         raise WhereError("MongoDB filters are not possible here: write a predicate, such as x > 1")
-    return _parsed(text)
+    return _parsed(text, across)
 
 
 @lru_cache(maxsize=128)  # for a small topic, parsing takes as long as the answer
-def _parsed(text: str) -> Predicate:
-    found = _Parser(text).parse()
+def _parsed(text: str, across: bool) -> Predicate:  # noqa: FBT001
+    found = _Parser(text, across=across).parse()
     for condition in found.conditions():
         name = condition.field.path.split(".")
         if name[0] == "_meta" and not _ONLY_INDEXED.isdisjoint(name[1:2]):
@@ -122,11 +144,15 @@ def _parsed(text: str) -> Predicate:
 
 
 class _Parser:
-    def __init__(self, text: str) -> None:
+    def __init__(self, text: str, *, across: bool) -> None:
         self._text = text
         self._tokens = tokenize(text)
         self._at = 0
         self._depth = 0
+        self._takes_topics = across
+        self._is_of_topic = False  # what is parsed is about another topic
+        self._has_or = False  # what was parsed last is joined by `or`, without brackets
+        self._groups = self._find_groups()
 
     def parse(self) -> Predicate:
         if self._peek().kind == "end":
@@ -138,13 +164,14 @@ class _Parser:
 
     def _or(self) -> Node:
         items = [self._and()]
-        while self._take("or", "||"):
+        while not self._is_at_topic() and self._take("or", "||"):
             items.append(self._and())
+        self._has_or = len(items) > 1
         return items[0] if len(items) == 1 else Or(tuple(items))
 
     def _and(self) -> Node:
         items = [self._factor()]
-        while self._take("and", "&&"):
+        while not self._is_at_topic() and self._take("and", "&&"):
             items.append(self._factor())
         return items[0] if len(items) == 1 else And(tuple(items))
 
@@ -160,10 +187,55 @@ class _Parser:
             node = self._or()
             if not self._take(")"):
                 raise self._fail(self._peek(), "expected ')' here")
+            self._has_or = False
         else:
-            node = self._condition()
+            node = self._near() if token.kind == "topic" else self._condition()
         self._depth -= 1
         return node
+
+    def _find_groups(self) -> set[int]:
+        """Places of opening brackets with a topic inside."""
+        found: set[int] = set()
+        opened: list[int] = []
+        for place, token in enumerate(self._tokens):
+            if token.kind == "topic":
+                found.update(opened)
+            elif token.kind == "operator" and token.text == "(":
+                opened.append(place)
+            elif token.kind == "operator" and token.text == ")" and opened:
+                opened.pop()
+        return found
+
+    def _is_at_topic(self) -> bool:
+        """True where a topic ends what is about another one: behind the next `and` or `or`."""
+        place = self._at + 1
+        if not self._is_of_topic or self._peek().kind == "end":
+            return False
+        while (self._tokens[place].keyword or self._tokens[place].text) in {"not", "!"}:
+            place += 1
+        return self._tokens[place].kind == "topic" or place in self._groups
+
+    def _near(self) -> Near:
+        topic, first = self._tokens[self._at : self._at + 2]
+        if self._is_of_topic or not self._takes_topics:
+            raise self._fail(topic, "a condition on another topic cannot stand here")
+        before = self._tokens[self._at - 1] if self._at else topic
+        self._at += 1
+        name = topic.text.removesuffix(":")
+        is_any = first.kind == "end" or first.text == ")" or first.keyword in {"and", "or"}
+        if is_any or first.text in {"&&", "||"}:
+            return Near(name, "")
+        self._is_of_topic = True
+        self._or()
+        self._is_of_topic = False
+        beside = {(token.keyword or token.text) for token in (before, self._peek())}
+        if self._has_or and not beside.isdisjoint({"and", "&&"}):
+            raise self._fail(
+                topic,
+                "`or` stands beside `and`: put brackets around what belongs together, such as "
+                "/odom: (a > 1 or b > 1) and /imu: c > 1",
+            )
+        return Near(name, self._text[first.position : self._tokens[self._at - 1].end])
 
     def _condition(self) -> Node:
         token = self._peek()

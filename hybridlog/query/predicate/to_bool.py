@@ -23,6 +23,7 @@ from hybridlog.query.predicate.tree import (
     Match,
     Member,
     MongoFilter,
+    Near,
     Node,
     Not,
     Or,
@@ -32,6 +33,7 @@ from hybridlog.query.predicate.tree import (
     Test,
     Value,
     root_of,
+    spelled,
 )
 from hybridlog.query.predicate.types import STATS, FieldTypes, Stat
 from hybridlog.schema.text import repaired_text
@@ -261,8 +263,8 @@ def _node(node: Node, reader: _Reader) -> Test:
             return partial(_joined, [_node(item, reader) for item in items], False)
         case Or(items):
             return partial(_joined, [_node(item, reader) for item in items], True)
-        case MongoFilter():
-            raise WhereError(f"{node.to_filter()} is for MongoDB; write a predicate here.")
+        case MongoFilter() | Near():
+            raise WhereError(f"{spelled(node)} is no predicate on the message itself.")
         case Exists(target, present):
             exists = partial(_exists, reader, target)
             return exists if present else partial(_negated, exists)

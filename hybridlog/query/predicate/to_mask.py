@@ -31,6 +31,7 @@ from hybridlog.query.predicate.tree import (
     Match,
     Member,
     MongoFilter,
+    Near,
     Node,
     Not,
     Or,
@@ -102,37 +103,6 @@ def to_mask(
     return np.concatenate(masks) if masks else np.zeros(0, np.bool_)
 
 
-def numbers_at(
-    target: Field, types: FieldTypes | Mapping[str, str] | None, records: pa.StructArray
-) -> list[tuple[NDArray[Any], Rows]] | None:
-    """The numbers that conditions on a field compare.
-
-    Args:
-        target: The field.
-        types: As for `to_mask`.
-        records: As for `to_mask`.
-
-    Returns:
-        Numbers and the row of each, in order of rows; None if there may be anything else.
-    """
-    found = []
-    try:
-        for leaves in _Columns(FieldTypes.of(types), records).leaves(target):
-            for each in _elements(leaves):
-                values = _as_integers(each.values)
-                is_number = pa.types.is_integer(values.type) or pa.types.is_floating(values.type)
-                if each.is_summary:
-                    return None
-                if is_number:
-                    some, rows = _some(values, each.rows, _valid(values))
-                    found.append((_numpy(some), rows))
-                elif not pa.types.is_null(values.type):
-                    return None
-    except (_UnfitError, pa.ArrowNotImplementedError):
-        return None
-    return found
-
-
 def _parts(records: Records) -> Iterator[pa.StructArray]:
     """The records in pieces."""
     if isinstance(records, pa.Table):
@@ -194,7 +164,7 @@ class _Columns:
             case Exists(target, present):
                 found = self._exists(target)
                 return found if present else ~found
-            case MongoFilter():
+            case MongoFilter() | Near():
                 raise _UnfitError
             case Compare(order="!=") | Member(negated=True) | Match(negated=True):
                 return self._exists(node.field) & ~self._holds(node)

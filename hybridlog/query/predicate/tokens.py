@@ -31,6 +31,12 @@ _NUMBER_WORD = re.compile(r"\.?[0-9](?:[eE][+-](?=[0-9])|[0-9A-Za-z_.µμ])*")
 _HEX = re.compile(r"0[xX][0-9a-fA-F]+")
 _INTEGER = re.compile(r"[0-9]+")
 _FLOAT = re.compile(r"(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
+TOPIC = (
+    r"""(?<![^\s(!])(?:re:\S*[^\s:]"""
+    r"""|(?!\S*\[[^\s\]]*:|[0-9]+:)[^\s()"'`:!&|][^\s()"'`:]*):(?=\s|$)"""
+)
+"""The name of another topic with its colon."""
+_TOPIC = re.compile(TOPIC)
 _OPERATOR = re.compile(r"==|!=|<=|>=|&&|\|\||!~|=~|[<>=~!()\[\],+-]")
 _HINTS = {
     "&": "; write and",
@@ -54,7 +60,7 @@ _ESCAPES = {
     "0": "\0",
 }
 
-Kind = Literal["path", "number", "time", "string", "operator", "end"]
+Kind = Literal["path", "number", "time", "string", "operator", "topic", "end"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +83,11 @@ class Token:
     number: int | float = 0
     path: Parts = ()
     keyword: str = ""
+
+    @property
+    def end(self) -> int:
+        """Index behind its last character."""
+        return self.position + len(self.text) + 2 * (self.kind == "string")
 
 
 def is_filter(text: str) -> bool:
@@ -152,6 +163,8 @@ def regex_text(token: Token) -> str:
 
 def _next(text: str, at: int) -> tuple[Token, int]:
     char = text[at]
+    if topic := _TOPIC.match(text, at):
+        return Token("topic", topic[0], at), topic.end()
     if char in "\"'":
         return _string(text, at)
     if char in "tT" and text[at + 1 : at + 2] in {'"', "'"}:

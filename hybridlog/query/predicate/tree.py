@@ -150,6 +150,19 @@ class Not(_Node):
     item: Node
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Near(_Node):
+    """A message of another topic near in time, as `Query.where` answers it.
+
+    Attributes:
+        topic: As written.
+        predicate: What it satisfies, as written; empty for any message.
+    """
+
+    topic: str
+    predicate: str
+
+
 Reach: TypeAlias = Literal["exists", "value", "whole"]
 """How a MongoDB filter asks for a path: whether there is one, for its value, for all below it."""
 
@@ -179,7 +192,7 @@ class MongoFilter(_Node):
 
 
 Condition: TypeAlias = Compare | Member | Exists | Match
-Node: TypeAlias = Condition | And | Or | Not | MongoFilter
+Node: TypeAlias = Condition | And | Or | Not | Near | MongoFilter
 
 
 @dataclass(frozen=True, repr=False)
@@ -264,6 +277,8 @@ def spelled(node: Node) -> str:
             return f"not ({spelled(item)})"
         case MongoFilter():
             return str(node.to_filter())
+        case Near(topic, predicate):
+            return f"{topic}: {predicate}"
         case And(items):
             return " and ".join(map(_bracketed, items)) or "anything"
         case Or(items):
