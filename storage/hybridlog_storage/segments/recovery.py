@@ -17,7 +17,7 @@ from mcap.records import ChunkIndex
 from hybridlog_storage.disk import durability, files
 from hybridlog_storage.disk.append_file import BLOCK, AppendFile
 from hybridlog_storage.errors import SegmentError, StoreError
-from hybridlog_storage.mcap.mcap_content import parse_content
+from hybridlog_storage.mcap.mcap_content import Damage, parse_content
 from hybridlog_storage.messages import Schema
 from hybridlog_storage.segments.chunk_table import parts_of
 from hybridlog_storage.segments.segment_file import (
@@ -40,7 +40,7 @@ from hybridlog_storage.segments.segment_format import (
     trailer_of,
 )
 from hybridlog_storage.segments.segment_reader import SegmentReader, check_format, open_chunk
-from hybridlog_storage.segments.walk import Damage, Walk, WalkedChunk
+from hybridlog_storage.segments.walk import Walk, WalkedChunk
 
 
 @dataclass(slots=True)
