@@ -158,28 +158,22 @@ class WalkedSegment:
 def walk(
     recording: Path,
     names: Mapping[int, str],
-    rows: RecordingRows | None = None,
     report: Callable[[int], None] = lambda _: None,
-    *,
-    known: Mapping[int, SegmentSummary] | None = None,
 ) -> Iterator[WalkedSegment]:
     """Open sealed segments of a recording, one after the other.
 
     Args:
         recording: The recording's directory.
         names: Names of the segments, or of their first files of rows, by number.
-        rows: What is left of those that are gone; None for what the manifest lists.
         report: As for `WalkedSegment`; told at the end of each segment, too.
-        known: Footers that were read before.
 
     Raises:
         SegmentError: One cannot be opened.
     """
-    rows = rows or RecordingRows(recording)
+    rows = RecordingRows(recording)
     begin = 0
     for number, name in names.items():
         with open_log(recording / name, number, rows) as reader:
-            summary = (known or {}).get(number) or reader.summary()
-            yield WalkedSegment(number, reader, summary, begin, report)
+            yield WalkedSegment(number, reader, reader.summary(), begin, report)
             begin += reader.size
             report(begin)

@@ -122,7 +122,7 @@ def _damage(path: Path, inventory: Inventory) -> Iterator[Repaired]:
         if problems and rebuild_summary(path / name, digest):
             yield Repaired(inventory.name, name, "its summary was rebuilt")
         else:
-            for offset, problem in problems:
+            for offset, problem, _ in problems:
                 what = f"{problem}; {RESTORE}"
                 yield Repaired(inventory.name, f"{name} byte {offset}", what, is_cured=False)
 

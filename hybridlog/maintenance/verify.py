@@ -1,4 +1,4 @@
-"""Checks every byte of segments and manifests, and compares catalog and index with them."""
+"""Compares every byte of a store with its manifests, and catalog and index with both."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from shlex import quote
 from typing import TYPE_CHECKING
 
 from hybridlog.columns import rows_file
-from hybridlog.columns.recording_logs import RecordingRows, walk
 from hybridlog.entries import describe, steady_inventory
 from hybridlog.maintenance import tables
 from hybridlog_storage.disk.directory import LOCK
@@ -30,7 +29,6 @@ if TYPE_CHECKING:
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.manifest import Manifest
     from hybridlog_storage.mongo.database import Database
-    from hybridlog_storage.segments.segment_reader import ChunkPlace, SegmentSummary
 
 _REPAIR = "run `hybridlog verify --repair`"
 RESTORE = "restore the file from a copy"
@@ -62,8 +60,8 @@ class Verification:
 
     Attributes:
         recordings: Number of recordings read.
-        chunks: Number of chunks read.
-        messages: Number of messages in them.
+        chunks: Number of chunks that are whole.
+        messages: Number of messages in them, and of marks.
         bytes_read: Bytes read from segments and manifests.
         findings: All problems.
         index: True if the index was compared, too; MongoDB may be unavailable.
@@ -185,7 +183,6 @@ class _Check:
         self._recording = self._name = recording
         self._result = result
         self._path = directory.recording(recording)
-        self._rows = RecordingRows(self._path)
         self._lost: Counter[str] = Counter()  # messages of chunks that cannot be read
         self._is_damaged = False
         self._has_index = False
@@ -264,50 +261,37 @@ class _Check:
         self._result.bytes_read += sum(file.bytes for file in inventory.rows)
 
     def _segment(
-        self,
-        inventory: Inventory,
-        number: int,
-        name: str,
-        tell: Callable[[int], None],
+        self, inventory: Inventory, number: int, name: str, tell: Callable[[int], None]
     ) -> None:
-        """Check every byte of a segment, and every chunk as a reader reads it."""
+        """Compare a segment with its digest; if that differs, find what is lost."""
         summary = inventory.summaries.get(number)
+        lost: list[int] = []
         try:
-            log = inventory.logs.get(number)
             if not is_rows(name):
-                self._check_bytes(name, "" if log is None else log.digest, tell)
-            if summary is None:
-                return
-            known = {number: summary}
-            for segment in walk(self._path, {number: name}, self._rows, known=known):
-                for place, chunk in segment.chunks():
-                    if isinstance(chunk, SegmentError):
-                        self._unreadable(summary, place)
-                        if not self._is_damaged:
-                            self.found(f"{name} byte {place.offset}", str(chunk), RESTORE)
-                        continue
-                    self._result.chunks += 1
-                    self._result.messages += len(chunk.batch)
-                self._result.bytes_read += segment.reader.bytes_read
+                log = inventory.logs.get(number)
+                digest = "" if log is None else log.digest
+                found, has_summary = damage_of(self._path / name, digest, tell)
+                self._is_damaged |= bool(found)
+                for at, problem, chunk in found:
+                    cure = RESTORE if has_summary else _REPAIR
+                    self.found(f"{name} byte {at}", problem, cure)
+                    lost += [] if chunk is None else [chunk]
         except SegmentError as error:
             now = self._directory.manifests.find(self._recording)
-            if now is not None and now.has_let_go(number):
-                return
-            self._is_damaged = True
-            self.found(name, str(error), RESTORE)
-
-    def _unreadable(self, summary: SegmentSummary, place: ChunkPlace) -> None:
-        """Note messages that the index may lack."""
-        bounds = summary.table.part_bounds()
-        for part in summary.table.parts[bounds[place.number] : bounds[place.number + 1]]:
-            topic = summary.channels[int(part["channel"])].topic
-            self._lost[collection_of(topic)] += int(part["messages"])
-
-    def _check_bytes(self, name: str, digest: str, tell: Callable[[int], None]) -> None:
-        found, has_summary = damage_of(self._path / name, digest, tell)
-        self._is_damaged |= bool(found)
-        for offset, problem in found:
-            self.found(f"{name} byte {offset}", problem, RESTORE if has_summary else _REPAIR)
+            if now is None or not now.has_let_go(number):
+                self._is_damaged = True
+                self.found(name, str(error), RESTORE)
+            return
+        if summary is None:
+            return
+        for chunk in lost:  # messages that the index may lack
+            for part in summary.table.chunk_parts(chunk):
+                topic = summary.channels[int(part["channel"])].topic
+                self._lost[collection_of(topic)] += int(part["messages"])
+                self._result.messages -= int(part["messages"])
+        self._result.chunks += len(summary.table.chunks) - len(lost)
+        self._result.messages += sum(summary.counts.values())
+        self._result.bytes_read += summary.size
 
     @property
     def _rebuild(self) -> str:

@@ -22,7 +22,7 @@ SOME: list[tuple[str, Fault, str, int, bool]] = [
     ("mark", "die", "rename .<id>.new", 0, False),
     ("mark", "ENOSPC", "sync .<id>.new", 0, False),
     ("import", "torn", "write .<digest>.part", 0, False),
-    ("repair", "die", "rename .000002.mcap.rebuilt", 0, True),
+    ("repair", "torn", "write 000002.mcap", 0, False),
     ("record", "die", "rename 000000.mcap.open", 0, True),
     ("open after a crash", "EIO", "sync .<id>.new", 0, True),
     ("open with an unlisted segment", "torn", "write .<id>.new", 0, False),

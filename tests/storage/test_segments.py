@@ -121,7 +121,7 @@ def recorder(
 
 
 def problems(path: Path, digest: str = "") -> list[tuple[int, str]]:
-    return damage_of(path, digest)[0]
+    return [(at, problem) for at, problem, _ in damage_of(path, digest)[0]]
 
 
 def summary_of(path: Path, number: int) -> SegmentSummary:
@@ -1250,8 +1250,8 @@ def test_all_that_is_wrong_is_told_at_once(tmp_path: Path) -> None:
     path.write_bytes(damaged)
     read: list[int] = []
     found, has_summary = damage_of(path, progress=read.append)
-    assert [start for start, _ in found] == [chunks[0].offset]
-    assert "chunk 0" in found[0][1]
+    assert [(one.offset, one.chunk) for one in found] == [(chunks[0].offset, 0)]
+    assert found[0].problem.startswith("chunk 0 is lost (messages: /large 1): ")
     assert read == sorted(read)
     assert has_summary
     # Without its summary, what has a checksum of its own is still looked at.
@@ -1260,4 +1260,4 @@ def test_all_that_is_wrong_is_told_at_once(tmp_path: Path) -> None:
     path.write_bytes(damaged)
     found, has_summary = damage_of(path)
     assert not has_summary
-    assert chunks[0].offset in [start for start, _ in found]
+    assert chunks[0].offset in [one.offset for one in found]

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import chain
 from typing import TYPE_CHECKING
 
 import numpy as np
 from mcap import records
-from mcap.opcode import Opcode
 
 from hybridlog.formats.reading import (
     MAX_CHUNK,
@@ -19,17 +19,10 @@ from hybridlog.formats.reading import (
     split,
 )
 from hybridlog.wording import listed
-from hybridlog_storage.errors import SegmentError, SourceError
-from hybridlog_storage.mcap.mcap_content import ChunkContent, ScanDamage
-from hybridlog_storage.mcap.mcap_scan import (
-    MAGIC,
-    End,
-    Item,
-    Loose,
-    ScannedChunk,
-    read_summary,
-    scan,
-)
+from hybridlog_storage.errors import SourceError
+from hybridlog_storage.mcap import mcap_content
+from hybridlog_storage.mcap.mcap_content import ChunkContent
+from hybridlog_storage.mcap.mcap_scan import MAGIC, Item, Scan
 from hybridlog_storage.messages import MAX_CHANNELS, Channel, Schema
 from hybridlog_storage.ordering import distinct
 from hybridlog_storage.segments.attachments import Attachment, FileHandle
@@ -69,7 +62,7 @@ class McapSource(Source):
         except OSError as error:
             raise cannot_open(path, error) from error
         try:
-            self._summary = self._open()
+            self._items = self._open()
         except OSError as error:
             self._file.close()
             raise cannot_open(path, error) from error
@@ -77,33 +70,32 @@ class McapSource(Source):
             self._file.close()
             raise
         self._handle: FileHandle | None = None  # for attachments, which outlive this reader
-        self._definitions = _Definitions(self.channels, self._summary)
         self._given = 0
         self._lost = 0
         self._uncounted: list[Damage] = []  # what the totals at the end may count
-        self._end_is_noted = False
         self._too_many = 0
         self._unpublished = 0
-        # Channels of the message indexes since the last chunk, None before the first.
-        self._indexed: set[int] | None = None
 
-    def _open(self) -> Summary | None:
+    def _open(self) -> Iterator[tuple[int, Item]]:
         if self._file.read(len(MAGIC)) != MAGIC:
             raise SourceError(
                 f"{self.path}: not an MCAP file, it does not start with the bytes of one; "
                 "check that the file was copied whole"
             )
-        summary = read_summary(self._file, self.size_bytes)
-        # With the summary known, this reads only the first record.
-        first = next(scan(self._file, size=self.size_bytes, limit=MAX_CHUNK, summary=summary), None)
-        if first is not None and isinstance(first[1], records.Header):
+        scan = Scan(self._file, self.size_bytes, MAX_CHUNK)
+        self._definitions = _Definitions(self.channels, scan.summary)
+        if scan.summary is not None and scan.summary.statistics is not None:
+            self.message_count = scan.summary.statistics.message_count
+            self.time_range = _time_range(scan.summary)
+        items = scan.items()
+        first = next(items, None)
+        if first is None:
+            return items
+        if isinstance(first[1], records.Header):
             self.profile = first[1].profile
             if self.profile == "ros2":
                 self.kind = "ROS 2 bag (mcap)"
-        if summary is not None and summary.statistics is not None:
-            self.message_count = summary.statistics.message_count
-            self.time_range = _time_range(summary)
-        return summary
+        return chain([first], items)
 
     def close(self) -> None:
         """Close the file."""
@@ -116,24 +108,23 @@ class McapSource(Source):
         Raises:
             SourceError: The file cannot be read any more.
         """
-        scanned = scan(self._file, size=self.size_bytes, limit=MAX_CHUNK, summary=self._summary)
         try:
-            for offset, item in scanned:
+            for offset, item in self._items:
                 self.bytes_read = max(self.bytes_read, offset)
                 yield from self._take(offset, item)
         except OSError as error:
             raise cannot_open(self.path, error) from error
+        self._end()
 
     def _take(self, offset: int, item: Item) -> Iterator[Batch]:
-        if isinstance(item, records.MessageIndex):
-            self._index(offset, item)
-        elif isinstance(item, ScannedChunk):
-            self._indexed = set()
-            yield from self._chunk(item)
-        elif isinstance(item, Loose):
-            yield from self._content(item.content, offset, relative=True)
-        elif isinstance(item, ScanDamage):
-            yield from self._damaged(item)
+        if isinstance(item, ChunkContent):
+            yield from self._content(item, offset)
+        elif isinstance(item, mcap_content.Damage):
+            damage = Damage(self.path, item.offset, item.length, item.reason, item.messages)
+            if item.messages is None and self.message_count is not None:
+                self._uncounted.append(damage)
+            else:
+                self._note(damage)
         elif isinstance(item, records.Schema | records.Channel):
             self._definitions.add(item)
         elif isinstance(item, records.Metadata):
@@ -141,64 +132,10 @@ class McapSource(Source):
         elif isinstance(item, Attachment):
             self._handle = self._handle or FileHandle(self._file.fileno())
             self.extras.append(replace(item, data=item.data.through(self._handle)))
-        elif isinstance(item, End):
-            self._end(item)
 
-    def _index(self, offset: int, item: records.MessageIndex) -> None:
-        """Tell that a chunk was missed: it has one index for each channel."""
-        if not item.records or self.message_count is not None:
-            return  # totals tell it, too
-        if self._indexed is None or item.channel_id in self._indexed:
-            self._note(offset, 0, "the chunk of these message indexes is missing", None)
-            self._indexed = set()
-        self._indexed.add(item.channel_id)
-
-    def _chunk(self, chunk: ScannedChunk) -> Iterator[Batch]:
-        before = self._given
-        try:
-            for content in chunk.contents():
-                yield from self._content(content, chunk.offset)
-        except SegmentError as error:
-            reason = f"a chunk is damaged: {error}"
-            got = self._given - before
-            if got:
-                reason += f"; {got} messages before that were read"
-            self._note_uncounted(chunk.offset, chunk.length, reason)
-
-    def _damaged(self, item: ScanDamage) -> Iterator[Batch]:
-        reason = item.reason
-        if item.opcode == Opcode.DATA_END and (self.damage or self._uncounted):
-            return  # the checksum of all data adds nothing to known damage
-        if item.torn is not None:
-            before = self._given
-            for content in item.torn.contents():
-                yield from self._content(content, item.offset)
-            reason += f"; {self._given - before} messages of its beginning were read"
-        if item.length is not None and item.offset + item.length >= self.size_bytes:
-            self._end_is_noted = True
-        if item.opcode == Opcode.CHUNK:
-            self._indexed = set()
-        if item.messages is None:
-            self._note_uncounted(item.offset, item.length, reason)
-        else:
-            self._note(item.offset, item.length, reason, item.messages)
-
-    def _content(
-        self, content: ChunkContent, offset: int, *, relative: bool = False
-    ) -> Iterator[Batch]:
+    def _content(self, content: ChunkContent, offset: int) -> Iterator[Batch]:
         """Yield the messages of one chunk or run, split where a definition changes."""
         self._unpublished += content.unpublished
-        for damage in content.damage:
-            self._note(offset, None, damage.reason, damage.messages)
-        if len(content.invalid):
-            first = int(content.invalid[0])
-            self._note(
-                offset + first if relative else offset,
-                None,
-                f"{len(content.invalid)} messages have a log time beyond 2^63 - 1 ns or no head "
-                f"(the first at byte {first} of the content)",
-                len(content.invalid),
-            )
         batch = content.batch
         found = np.empty(len(batch), np.int32)
         row = 0
@@ -220,7 +157,7 @@ class McapSource(Source):
         for number in numbers:
             reason = self._definitions.use(number)
             if reason:
-                self._note(offset, None, reason, 0)
+                self._tell(reason, 0, offset)
         found[rows] = self._definitions.table[wanted]
 
     def _rows(self, rows: Batch, found: NDArray[np.int32], offset: int) -> Iterator[Batch]:
@@ -234,36 +171,33 @@ class McapSource(Source):
                 undefined = distinct(rows.channel[found == _UNDEFINED]).tolist()
                 names = listed(map(str, undefined), 5)
                 reason = f"{lost} messages on channels that are not defined ({names})"
-                self._note(offset, None, reason, lost)
+                self._tell(reason, lost, offset)
             rows, found = rows.take(known), found[known]
         if not len(rows):
             return
         self._given += len(rows)
         yield from split(replace(rows, channel=found))
 
-    def _note(self, offset: int | None, length: int | None, reason: str, lost: int | None) -> None:
-        self.note(Damage(self.path, offset, length, reason, lost))
-        self._lost += lost or 0
+    def _note(self, damage: Damage) -> None:
+        self.note(damage)
+        self._lost += damage.messages_lost or 0
 
-    def _note_uncounted(self, offset: int, length: int | None, reason: str) -> None:
-        if self.message_count is None:
-            self._note(offset, length, reason, None)
-        else:
-            self._uncounted.append(Damage(self.path, offset, length, reason, None))
+    def _tell(self, reason: str, lost: int, offset: int | None = None) -> None:
+        self._note(Damage(self.path, offset, None, reason, lost))
 
-    def _end(self, end: End) -> None:
+    def _end(self) -> None:
         self.bytes_read = self.size_bytes
         if left_out := self._definitions.use_rest():
-            self._note(None, None, f"{left_out} {TOO_MANY_SILENT}", 0)
+            self._tell(f"{left_out} {TOO_MANY_SILENT}", 0)
         if self._too_many:
-            self._note(None, None, TOO_MANY_CHANNELS, self._too_many)
+            self._tell(TOO_MANY_CHANNELS, self._too_many)
         if self._unpublished:
             reason = (
                 f"{self._unpublished} messages have a publish time beyond 2^63 - 1 ns; their log "
                 "time is stored in its place"
             )
-            self._note(None, None, reason, 0)
-        missing = None
+            self._tell(reason, 0)
+        missing = 0
         if self.message_count is not None:
             missing = max(self.message_count - self._given - self._lost, 0)
         if len(self._uncounted) == 1:
@@ -271,17 +205,8 @@ class McapSource(Source):
             missing = 0
         for damage in self._uncounted:
             self.note(damage)
-        self._uncounted.clear()
         if missing:
-            self._note(
-                None,
-                None,
-                f"{missing} more messages are counted in the summary than found",
-                missing,
-            )
-        if not end.clean and not self._end_is_noted:
-            reason = "the file was not closed: its end is missing; all before it was read"
-            self._note(end.offset, 0, reason, 0)
+            self._tell(f"{missing} more messages are counted in the summary than found", missing)
 
 
 def _time_range(summary: Summary) -> tuple[int, int] | None:

@@ -84,6 +84,11 @@ class ChunkTable:
         np.cumsum(self.chunks["parts"], out=bounds[1:])
         return bounds
 
+    def chunk_parts(self, number: int) -> NDArray[np.void]:
+        """The rows of `parts` of one chunk."""
+        end = int(self.chunks["parts"][: number + 1].sum())
+        return self.parts[end - int(self.chunks["parts"][number]) : end]
+
     def with_added(self, added: int) -> ChunkTable:
         """The table with all messages on channels whose ids are greater by a number."""
         parts = self.parts.copy()

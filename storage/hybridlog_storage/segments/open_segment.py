@@ -16,11 +16,12 @@ from hybridlog_storage.segments.chunk_table import ChunkTable, TableBuilder
 from hybridlog_storage.segments.segment_file import OPEN_SUFFIX, sealed_name
 from hybridlog_storage.segments.segment_format import CHUNK_HEAD, OUR_NAMES, START
 from hybridlog_storage.segments.segment_reader import SegmentReader
-from hybridlog_storage.segments.walk import Damage, Walk
+from hybridlog_storage.segments.walk import Walk
 
 if TYPE_CHECKING:
     from mcap.records import AttachmentIndex, MetadataIndex
 
+    from hybridlog_storage.mcap.mcap_content import Damage
     from hybridlog_storage.messages import Channel
 
 _WRITING_S: Final = 0.02  # the time that a writer may take for the rest of a record

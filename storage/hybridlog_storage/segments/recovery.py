@@ -6,7 +6,6 @@ skip. Then the summary is written, as the recorder would have done.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -17,7 +16,8 @@ from mcap.records import ChunkIndex
 from hybridlog_storage.disk import durability, files
 from hybridlog_storage.disk.append_file import BLOCK, AppendFile
 from hybridlog_storage.errors import SegmentError, StoreError
-from hybridlog_storage.mcap.mcap_content import parse_content
+from hybridlog_storage.manifest import hasher
+from hybridlog_storage.mcap.mcap_content import Damage, parse_content
 from hybridlog_storage.messages import Schema
 from hybridlog_storage.segments.chunk_table import parts_of
 from hybridlog_storage.segments.segment_file import (
@@ -40,7 +40,9 @@ from hybridlog_storage.segments.segment_format import (
     trailer_of,
 )
 from hybridlog_storage.segments.segment_reader import SegmentReader, check_format, open_chunk
-from hybridlog_storage.segments.walk import Damage, Walk, WalkedChunk
+from hybridlog_storage.segments.walk import Walk, WalkedChunk
+
+_PIECE = 4 << 20  # bytes read at once for a digest
 
 
 @dataclass(slots=True)
@@ -99,31 +101,20 @@ def recover_segment(
 
 
 def rebuild_summary(path: Path, digest: str) -> bool:
-    """Rebuild the damaged summary of a sealed segment, if its digest comes out unchanged.
+    """Write the damaged summary of a sealed segment again, if the file then has its digest.
 
-    The summary is a function of the data before it. It is rebuilt in a copy, which replaces
-    the segment only if it has the original digest.
+    The summary is a function of the data before it.
 
     Returns:
         Whether the segment was repaired; otherwise it is unchanged.
 
     Raises:
-        StoreError: It cannot be read, or the copy cannot be written.
-        DiskFullError: No room for the copy.
+        StoreError: It cannot be read or written; it can be repaired again.
+        DiskFullError: No room for the summary.
     """
-    number = int(path.name.partition(".")[0])
-    copy = path.with_name(f".{path.name}.rebuilt")
     try:
-        try:
-            _copy(path, copy)
-            with _Rest.of(copy, number) as rest:
-                if not rest.is_complete or rest.complete() != digest:
-                    return False
-            durability.publish(copy, path)
-            return True
-        finally:
-            with suppress(FileNotFoundError):
-                files.unlink(copy)
+        with _Rest.of(path, int(path.name.partition(".")[0])) as rest:
+            return rest.seal_again(digest)
     except OSError as error:
         raise durability.explain(error, path, "rebuilding") from error
 
@@ -248,34 +239,37 @@ class _Rest:
                 segment.rewrite(0, START)
             elif one.offset < walk.end:
                 segment.rewrite(one.offset, damaged_head(one.length))
-        self.complete(is_new=is_new)
+        if not is_new:
+            self._note_summary()
         on_sealing(segment.prepare(sync=True))
         return segment.publish()
 
-    def complete(self, *, is_new: bool = False) -> str:
-        """Write the summary, unless it is there; return the digest of the file.
-
-        Args:
-            is_new: Records were added that need another summary.
-        """
+    def seal_again(self, digest: str) -> bool:
+        """Write the summary of a sealed file, if the file then has its digest."""
         segment, end = self._segment, self._walk.end
-        if not is_new:
-            tail = segment.tail(end)
-            there = bytes(self._reader.read(end, min(len(tail), self._reader.size - end)))
-            segment.cut(end + len(tail) if there == tail else end)
-            if there == tail:
-                segment.note_complete()
-        return segment.complete().digest
+        if not self.is_complete:
+            return False
+        found = hasher()
+        for at in range(0, end, _PIECE):
+            found.update(self._reader.read(at, min(_PIECE, end - at)))
+        tail = segment.tail(end)
+        found.update(tail)
+        if found.hexdigest() != digest:
+            return False
+        if self._reader.size < end + len(tail):
+            segment.cut(end)
+        else:
+            segment.rewrite(end, tail)
+            segment.cut(end + len(tail))
+            segment.note_complete()
+        segment.prepare(sync=True)
+        return True
 
-
-def _copy(source: Path, target: Path) -> None:
-    fd = files.open_file(source, os.O_RDONLY)
-    try:
-        out = files.open_file(target, os.O_RDWR | os.O_CREAT | os.O_TRUNC)
-        try:
-            while piece := os.read(fd, 8 << 20):
-                durability.write_all(out, [piece])
-        finally:
-            os.close(out)
-    finally:
-        os.close(fd)
+    def _note_summary(self) -> None:
+        """Note the summary if it is there, or cut what is left of it."""
+        segment, end = self._segment, self._walk.end
+        tail = segment.tail(end)
+        there = bytes(self._reader.read(end, min(len(tail), self._reader.size - end)))
+        segment.cut(end + len(tail) if there == tail else end)
+        if there == tail:
+            segment.note_complete()

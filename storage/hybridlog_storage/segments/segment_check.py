@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.segments.segment_reader import SegmentReader
@@ -15,10 +15,24 @@ if TYPE_CHECKING:
     from hybridlog_storage.segments.segment_reader import SegmentSummary
 
 
+class SegmentDamage(NamedTuple):
+    """A damaged place of a segment.
+
+    Attributes:
+        offset: Byte where it starts.
+        problem: What is wrong with it.
+        chunk: Number of the chunk that cannot be read; None for something else.
+    """
+
+    offset: int
+    problem: str
+    chunk: int | None = None
+
+
 def damage_of(
     path: Path, digest: str = "", progress: Callable[[int], None] | None = None
-) -> tuple[list[tuple[int, str]], bool]:
-    """All damage in a sealed segment.
+) -> tuple[list[SegmentDamage], bool]:
+    """All damage in a sealed segment. Its chunks are read only if the digest differs.
 
     Args:
         path: The file.
@@ -26,8 +40,8 @@ def damage_of(
         progress: Called with the number of bytes read so far.
 
     Returns:
-        Byte and description of each, in file order, but for a damaged summary, which comes
-        first; and whether the summary is whole.
+        The damage in file order, but for a damaged summary, which comes first; and whether the
+        summary is whole.
 
     Raises:
         SegmentError: It cannot be read.
@@ -38,30 +52,35 @@ def damage_of(
         except SegmentError as error:
             walk = Walk(reader)
             walk.go_on()
-            damaged = [(one.offset, one.reason) for one in walk.damaged]
-            return [(max(reader.size - 1, 0), str(error)), *damaged], False
+            damaged = [SegmentDamage(one.offset, one.reason) for one in walk.damaged]
+            return [SegmentDamage(max(reader.size - 1, 0), str(error)), *damaged], False
         if reader.digest(progress) == digest:
             return [], True
         found = sorted(_unreadable(reader, summary))
     if digest and not found:
-        found = [(0, "it is not the file that the manifest lists: their digests differ")]
+        problem = "it is not the file that the manifest lists: their digests differ"
+        found = [SegmentDamage(0, problem)]
     return found, True
 
 
-def _unreadable(reader: SegmentReader, summary: SegmentSummary) -> Iterator[tuple[int, str]]:
+def _unreadable(reader: SegmentReader, summary: SegmentSummary) -> Iterator[SegmentDamage]:
     """Chunks, attachments and metadata records that are lost."""
     for place in summary.chunks:
         try:
             reader.read_chunk(place)
         except SegmentError as error:
-            yield place.offset, f"chunk {place.number}: {error}"
+            parts = summary.table.chunk_parts(place.number)[["channel", "messages"]].tolist()
+            lost = [f"{summary.channels[channel].topic} {count}" for channel, count in parts]
+            topics = ", ".join(lost[:5]) + (f" and {len(lost) - 5} more" if lost[5:] else "")
+            problem = f"chunk {place.number} is lost (messages: {topics}): {error}"
+            yield SegmentDamage(place.offset, problem, place.number)
     for attachment in summary.attachments:
         try:
             reader.attachment(attachment)
         except SegmentError as error:
-            yield attachment.offset, str(error)
+            yield SegmentDamage(attachment.offset, str(error))
     for record in summary.metadata:
         try:
             reader.metadata(record)
         except SegmentError as error:
-            yield record.offset, str(error)
+            yield SegmentDamage(record.offset, str(error))

@@ -7,7 +7,6 @@ goes on where the damaged record ends, or at the next record that proves itself.
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
@@ -17,7 +16,8 @@ from mcap.records import Schema as SchemaRecord
 
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.errors import SegmentError
-from hybridlog_storage.mcap.mcap_content import MESSAGE_HEAD, RECORD_HEAD, parse_content
+from hybridlog_storage.mcap.mcap_content import MESSAGE_HEAD, RECORD_HEAD, Damage, parse_content
+from hybridlog_storage.mcap.record_file import HEAD, RecordFile
 from hybridlog_storage.segments.attachments import MAX_HEAD, parse_attachment
 from hybridlog_storage.segments.chunk_table import PART, parts_of
 from hybridlog_storage.segments.compression import FilePart
@@ -55,22 +55,6 @@ _MAX_PADDING: Final = 2 * _WINDOW  # bytes
 _CHUNK_HEAD_SIZE: Final = CHUNK_HEAD.size + 16  # with the longest name of a compression
 _UNKNOWN: Final = np.iinfo(np.int64)  # publish times stand in the messages only
 _ORPHAN: Final = "it belongs to no chunk"
-_HEAD: Final = RECORD_HEAD.size
-
-
-@dataclass(frozen=True, slots=True)
-class Damage:
-    """A part of a segment that cannot be read.
-
-    Attributes:
-        offset: Byte of the file where it starts.
-        length: Its bytes.
-        reason: The damage.
-    """
-
-    offset: int
-    length: int
-    reason: str
 
 
 class WalkedChunk(NamedTuple):
@@ -116,8 +100,7 @@ class Walk:
 
     def __init__(self, reader: SegmentReader) -> None:
         self._reader = reader
-        self._window = memoryview(b"")
-        self._start = 0  # of the window
+        self._bytes = RecordFile(reader.read, reader.size, _WINDOW)
         self.recording: dict[str, Any] | None = None
         self.channels: dict[int, tuple[int, Channel]] = {}
         self.schemas: dict[int, SchemaRecord] = {}
@@ -137,7 +120,9 @@ class Walk:
         Raises:
             SegmentError: The file cannot be read, or has another format.
         """
-        self.stopped, self.is_complete, self._window = None, False, memoryview(b"")
+        self.stopped, self.is_complete = None, False
+        self._bytes.size = self._reader.size
+        self._bytes.forget()
         while not self.is_complete and self.end < self._reader.size:
             at = self.end
             try:
@@ -162,25 +147,20 @@ class Walk:
 
     def _peek(self, at: int, size: int) -> memoryview:
         """Bytes of the file, fewer at its end."""
-        begin = at - self._start
-        if begin < 0 or begin + size > len(self._window):
-            left = max(self._reader.size - at, 0)
-            self._start, begin = at, 0
-            self._window = self._reader.read(at, min(max(size, _WINDOW), left))
-        return self._window[begin : begin + size]
+        return self._bytes.at(at, size, move=True)
 
     def _head(self, at: int) -> tuple[int, int]:
         """Opcode of a record, and where it ends."""
-        head = self._peek(at, _HEAD)
-        if len(head) < _HEAD:
+        head = self._peek(at, HEAD)
+        if len(head) < HEAD:
             raise _TornError("the file ends in the middle of a record")
         opcode, length = RECORD_HEAD.unpack(head)
-        return opcode, at + _HEAD + length
+        return opcode, at + HEAD + length
 
     def _record(self, at: int) -> int:
         """Take a record; return where it ends, with what belongs to it."""
         opcode, end = self._head(at)
-        if opcode == Opcode.DATA_END and end - at == _HEAD + 4:
+        if opcode == Opcode.DATA_END and end - at == HEAD + 4:
             self.is_complete = True
             return at
         if opcode == Opcode.CHUNK:
@@ -200,7 +180,7 @@ class Walk:
                 self._take_attachment(at, end)
             elif opcode == DAMAGED_OPCODE:
                 self._damage(at, end, "it was damaged when the recording was recovered")
-            elif end - at > _MAX_PADDING or any(self._reader.read(at, end - at)[_HEAD:]):
+            elif end - at > _MAX_PADDING or any(self._reader.read(at, end - at)[HEAD:]):
                 raise SegmentError("padding has other bytes than zeros")
             return end
         if opcode in {Opcode.MESSAGE_INDEX, ARRIVAL_OPCODE}:
@@ -220,7 +200,7 @@ class Walk:
         self.metadata.append(MetadataIndex(offset=at, length=end - at, name=record.name))
 
     def _take_attachment(self, at: int, end: int) -> None:
-        start, size = at + _HEAD, end - at - _HEAD
+        start, size = at + HEAD, end - at - HEAD
         head = self._reader.read(start, min(size, MAX_HEAD))
         with self._reader.stream() as file:
             found, used = parse_attachment(head, FilePart(file, start, size), needs_crc=True)
@@ -283,7 +263,7 @@ class Walk:
         """The records behind a chunk, also if its message indexes are damaged."""
         behind, opcode = end, int(Opcode.MESSAGE_INDEX)
         size = self._reader.size
-        while opcode in {Opcode.MESSAGE_INDEX, DAMAGED_OPCODE} and behind + _HEAD <= size:
+        while opcode in {Opcode.MESSAGE_INDEX, DAMAGED_OPCODE} and behind + HEAD <= size:
             opcode, behind = self._head(behind)
         is_whole = opcode == ARRIVAL_OPCODE and behind <= size
         if not is_whole:
@@ -317,7 +297,7 @@ class Walk:
             is_plausible = self._is_plausible(behind)
         except _TornError:
             return None
-        found = self._search(at + _HEAD, behind if is_plausible else self._reader.size)
+        found = self._search(at + HEAD, behind if is_plausible else self._reader.size)
         return behind if found is None and is_plausible else found
 
     def _is_plausible(self, at: int) -> bool:
@@ -332,24 +312,14 @@ class Walk:
 
     def _is_room(self, at: int) -> bool:
         """True if zeros follow, as a writer leaves behind its last block."""
-        if any(self._peek(at, _HEAD)):
+        if any(self._peek(at, HEAD)):
             return False
         rest = self._reader.read(at, min(self._reader.size - at, _SEARCHED))
         return not np.frombuffer(rest, np.uint8).any()
 
     def _search(self, start: int, end: int) -> int | None:
         """The first byte of a range where a chunk or a metadata record proves itself."""
-        for block in range(start, end - _HEAD, _SEARCHED):
-            raw = self._reader.read(block, min(_SEARCHED + _HEAD, end - block))
-            data = np.frombuffer(raw, np.uint8)
-            # No length reaches 2^40, which excludes nearly all positions.
-            kind = data[: 1 - _HEAD]
-            is_start = (kind == int(Opcode.CHUNK)) | (kind == int(Opcode.METADATA))
-            is_start &= (data[6:-2] == 0) & (data[7:-1] == 0) & (data[8:] == 0)
-            for place in np.flatnonzero(is_start).tolist():
-                if self._proves_itself(block + place):
-                    return block + int(place)
-        return None
+        return self._bytes.search(start, end, _PROVABLE, self._proves_itself)
 
     def _proves_itself(self, at: int) -> bool:
         try:
@@ -366,6 +336,7 @@ class Walk:
             return False
 
 
+_PROVABLE: Final = frozenset({Opcode.CHUNK, Opcode.METADATA})
 _KINDS: Final = frozenset(
     {
         Opcode.CHUNK,
