@@ -95,15 +95,7 @@ def tag_command(given: _Tag) -> None:
 
 
 def _named_or_chosen(store: Store, given: _Tag) -> tuple[Recordings, Sequence[str], bool]:
-    """The recordings of a command that names one in its first word, or chooses by options.
-
-    Returns:
-        The recordings, the other words, and whether one recording is named.
-
-    Raises:
-        UsageError: There is neither a word nor an option.
-        TopicError: No recording satisfies the choice.
-    """
+    """The recordings, by the first word or options; the other words; whether one is named."""
     from hybridlog.query.choosing import is_one
 
     choice, words = given.choice, given.words
@@ -225,16 +217,13 @@ def rm_command(given: _Remove) -> None:
 
 def _confirm(chosen: Sequence[RecordingSummary], pins: Sequence[str]) -> None:
     """Ask for consent, with what would be lost."""
-    why = f" ({listed([one for one in dict.fromkeys(pins) if one])})" if any(pins) else ""
-    pinned = f" {output.counted(len(pins), 'pin')} would go, too{why}." if pins else ""
-    names = chosen[0].name
-    if len(chosen) > 1:
-        names = f"{len(chosen)} recordings ({listed(one.name for one in chosen)})"
+    what = f"{listed(one.name for one in chosen)} for good"
+    if pins:
+        reasons = listed(filter(None, dict.fromkeys(pins)))
+        what += f", with {output.counted(len(pins), 'pin')} ({reasons})"
     if not sys.stdin.isatty():
-        raise UsageError(f"Deleting {names} for good needs --yes.{pinned}")
+        raise UsageError(f"Deleting {what} needs --yes.")
     print_table(RECORDINGS, chosen)
-    if pinned:
-        output.note(pinned.strip())
-    if not click.confirm(f"Delete {names} for good?", err=True):
+    if not click.confirm(f"Delete {what}?", err=True):
         output.note("Nothing is deleted.")
         raise click.exceptions.Exit(1)

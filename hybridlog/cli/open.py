@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 
     from hybridlog.query.query import Query
     from hybridlog.store import Store
-    from hybridlog.view.playback.played import PlayedLog
     from hybridlog.view.playback.server import PlaybackServer
 
 _WEBSOCKET: Final = "websocket"
@@ -128,11 +127,7 @@ def _written(store: Store, query: Query, given: _Given) -> Path:
 
 
 def _find(viewer: str) -> str:
-    """The path of the program.
-
-    Raises:
-        MissingDependencyError: It is not installed.
-    """
+    """The path of the program."""
     import shutil
 
     programs, _, cure = _VIEWERS[viewer]
@@ -148,11 +143,7 @@ _MAX_SHOWN = 5  # topics
 
 
 def _play(given: _Given) -> None:
-    """Play to viewers, until a signal ends it.
-
-    Raises:
-        MissingDependencyError: The package for it is missing.
-    """
+    """Play to viewers, until a signal ends it."""
     import asyncio
 
     try:
@@ -178,7 +169,6 @@ def _play(given: _Given) -> None:
         if not given.quiet:
             output.notes(query.remarks(is_empty=False))
             print_unplayed(query)
-            _print_undefined(log)
         asyncio.run(_until_signal(server, quiet=given.quiet))
 
 
@@ -218,20 +208,6 @@ def print_unplayed(query: Query) -> None:
     if topics:
         found = listed(sorted(topics), _MAX_SHOWN)
         output.note(f"Messages without their payload are not played; there are some of {found}.")
-
-
-def _print_undefined(log: PlayedLog) -> None:
-    """Print the topics that a viewer cannot show, since nothing defines their messages."""
-    topics = {
-        each.channel.topic
-        for each in log.channels
-        if each.channel.message_encoding != "json"
-        and (each.channel.schema is None or not each.channel.schema.data)
-    }
-    if topics:
-        output.note(
-            f"Viewers cannot show {listed(sorted(topics), _MAX_SHOWN)}: there is no definition."
-        )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -106,12 +106,12 @@ def test_fetch_near_events(store: Path, seen: list[Seen]) -> None:
     ("arguments", "said"),
     [
         (("fetch", "-t", "odom", "--before", "5s"), "--before is for --where: add that"),
-        (("fetch", "-t", "odom", "--where", "rosout: level > 1"), "--before or --after"),
+        (("fetch", "-t", "odom", "--where", "rosout: level > 1"), "needs a time within"),
         (("fetch", "-t", "odom", "--where", "rosout: levl > 1", "--after", "1s"), "levl"),
         (("fetch", "-t", "odom", "--where", "rosout: level > 1", "--after", "x"), "duration"),
         (
             ("fetch", "-t", "odom", "--where", "rosout: level > 1", "--after", "1s", "--at", "0"),
-            "leave out --where",
+            "cannot be combined with it",
         ),
         (
             ("fetch", "-t", "odom", "--count", "-o", "x.csv"),

@@ -298,7 +298,7 @@ def test_frames_without_those_that_they_refer_to(videos: hl.Store, tmp_path: Pat
     out = tmp_path / "pictures"
     asked = ("fetch", "-t", "/gap", "-r", "h264", "-F", "jpg", "-o", out)
     done = answer(*asked, store=videos.directory.path)
-    assert "2 messages are left out; the first: a frame of video cannot be decoded" in done.err
+    assert "2 messages left out; the first: a frame of video cannot be decoded" in done.err
     assert len(list((out / "gap").iterdir())) == COUNT - 3
     before = answer("info", "h264", store=videos.directory.path).out
     assert "2 frames of no known video" in before or "h264, 0 key frames" in before
