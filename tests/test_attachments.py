@@ -195,7 +195,7 @@ def test_info(store: hl.Store) -> None:
     done = run("info", "drive", store=store.directory.path)
     assert "attachment  späte Karte.png (image/png, 76.8 kB)" in done.out
     assert "metadata    robot (id)" in done.out
-    about = run("info", "drive", "--json", store=store.directory.path).json
+    (about,) = run("info", "drive", "--json", store=store.directory.path).json
     assert [a["name"] for a in about["attachments"]] == [a[1] for a in ATTACHMENTS]
     assert [(m["name"], m["values"]) for m in about["metadata_records"]] == METADATA
     assert len(about["channels"]) == 4

@@ -227,8 +227,7 @@ def test_all_commands_choose_alike(store: hl.Store) -> None:
 
 
 def test_names_of_commands_may_be_globs(store: hl.Store) -> None:
-    # JSON is a list unless one recording is named, however many fit.
-    assert json.loads(call(store, "info", "run[1]", "--json").out)["name"] == "run[1]"
+    assert json.loads(call(store, "info", "run[1]", "--json").out)[0]["name"] == "run[1]"
     found = json.loads(call(store, "info", "tues*", "--json").out)
     assert [one["name"] for one in found] == ["tuesday"]
     assert call(store, "verify", "mon*", "-r", "run1").out.startswith("3 recordings,")
@@ -268,15 +267,15 @@ def test_recordings_are_deleted_by_choice(tmp_path: Path) -> None:
 def test_who_is_asked_sees_what_goes(
     store: hl.Store, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from hybridlog.cli import edit
+    from hybridlog.cli import rm
 
     shown: list[str] = []
-    monkeypatch.setattr(edit.output, "note", shown.append)
-    monkeypatch.setattr(edit.sys, "stdin", type("T", (), {"isatty": staticmethod(lambda: True)}))
-    monkeypatch.setattr(edit.click, "confirm", lambda text, err: shown.append(text) or False)
+    monkeypatch.setattr(rm.output, "note", shown.append)
+    monkeypatch.setattr(rm.sys, "stdin", type("T", (), {"isatty": staticmethod(lambda: True)}))
+    monkeypatch.setattr(rm.click, "confirm", lambda text, err: shown.append(text) or False)
     many = [summary(n, (START, START), ["/a"])[0] for n in range(25)]
-    with pytest.raises(edit.click.exceptions.Exit):
-        edit._confirm(many, ["a talk"])
+    with pytest.raises(rm.click.exceptions.Exit):
+        rm._confirm(many, ["a talk"])
     assert re.fullmatch(r"Delete r0, r1, .* for good, with 1 pin \(a talk\)\?", shown[0])
     assert shown[1] == "Nothing is deleted."
     rows = capsys.readouterr().out.splitlines()[1:]

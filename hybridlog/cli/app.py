@@ -40,49 +40,28 @@ def of_os_error(error: OSError) -> int:
 
 
 GROUPS: Final = {
-    "Record": {
-        "record": "record",
-        "mark": "edit",
-        "top": "top",
-    },
-    "Look": {"ls": "ls", "info": "info", "view": "open", "open": "open", "plot": "plot"},
-    "Ask": {
-        "fetch": "fetch",
-        "intervals": "intervals",
-        "stats": "stats",
-        "align": "align",
-        "sql": "sql",
-        "tf": "tf",
-        "check": "check",
-        "diff": "check",
-    },
-    "Export": {"export": "export", "copy": "copy", "mcp": "open"},
-    "Maintain": {
-        "tag": "edit",
-        "edit": "edit",
-        "keep": "keep",
-        "index": "index",
-        "verify": "maintain",
-        "rm": "edit",
-        "demo": "record",
-    },
+    "Record": ["record", "mark", "top"],
+    "Look": ["ls", "info", "view", "open", "plot"],
+    "Ask": ["fetch", "intervals", "stats", "align", "sql", "tf", "check", "diff"],
+    "Export": ["export", "copy", "mcp"],
+    "Maintain": ["tag", "edit", "keep", "index", "verify", "rm", "demo"],
 }
-"""Names of the commands by group, in the order of the help text, and their modules."""
+"""Names of the commands by group, in the order of the help text."""
 
-COMMANDS: Final = {name: module for group in GROUPS.values() for name, module in group.items()}
-"""Names of all commands, and their modules."""
+COMMANDS: Final = [name for group in GROUPS.values() for name in group]
+"""Names of all commands, each of which lies in the module of its name."""
 
 
 class _LazyGroup(click.Group):
     """A group whose command `name` is the function `name_command` in the module of its name."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        return list(COMMANDS)
+        return COMMANDS
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name not in COMMANDS:
             return None
-        module = import_module(f"hybridlog.cli.{COMMANDS[cmd_name]}")
+        module = import_module(f"hybridlog.cli.{cmd_name}")
         command: click.Command = getattr(module, f"{cmd_name}_command")
         return command
 

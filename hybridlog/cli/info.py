@@ -34,7 +34,6 @@ from hybridlog.cli.options import (
 )
 from hybridlog.cli.render import Column, numbers, print_fields, print_table
 from hybridlog.query.answers.completeness import coverage, line_of
-from hybridlog.query.choice import Choice
 from hybridlog.query.topics import resolve
 from hybridlog.record.losses import losses_of
 from hybridlog.wording import listed
@@ -133,17 +132,13 @@ def _show_part(store: Store, given: _Given) -> bool:
 
 
 def _show(store: Store, given: _Given) -> None:
-    from hybridlog.query.choosing import is_one
-
-    choice = given.choice
     entries = [with_misfits(store, entry) for entry in given.recordings_in(store)]
     found = [
         _as_dict(store, entry, _videos(store, entry) if number < _MAX_DRAWN else {})
         for number, entry in enumerate(entries)
     ]
     if given.as_json:
-        is_single = choice == Choice.of(choice.name[:1]) and is_one(store.session, choice.name)
-        output.print_json(found[0] if is_single else found)
+        output.print_json(found)
         return
     if not entries:
         output.note(store.session.when_empty)

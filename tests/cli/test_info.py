@@ -39,7 +39,7 @@ def test_ls(logs: Path, store: Path) -> None:
 
 def test_info(logs: Path, store: Path) -> None:
     seen = read_bag(logs / "robot.bag")
-    found = run("info", "robot", "--json", store=store).json
+    (found,) = run("info", "robot", "--json", store=store).json
     counted = {c["topic"]: (c["messages"], c["payload_bytes"]) for c in found["channels"]}
     for topic in {m.topic for m in seen}:
         mine = [m for m in seen if m.topic == topic]
@@ -81,7 +81,7 @@ def test_info_of_a_segment(logs: Path, store: Path) -> None:
     path = places.segment(store, "robot")
     found = run("info", path, "--json").json
     assert found["recording"]["name"] == "robot"
-    assert found["recording"]["id"] == run("info", "robot", "--json", store=store).json["id"]
+    assert found["recording"]["id"] == run("info", "robot", "--json", store=store).json[0]["id"]
     paths = places.folder(store, "robot").glob("*.mcap")
     channels = [c for one in paths for c in run("info", one, "--json").json["channels"]]
     assert sum(c["messages"] for c in channels) == len(read_bag(logs / "robot.bag"))
@@ -115,7 +115,7 @@ def test_stamps_that_were_not_set_are_no_delay(tmp_path: Path) -> None:
     assert "  2s" in told["/late"]
     assert told["/late"].endswith("  1 stamp not set")
     assert "  2s" in told["/all"]
-    found = run("info", "mine", "--json", store=tmp_path / "s").json["channels"]
+    found = run("info", "mine", "--json", store=tmp_path / "s").json[0]["channels"]
     given = {one["topic"]: (one["skew_ns"] and one["skew_ns"]["mean"]) for one in found}
     assert given == {"/never": None, "/late": 2e9, "/all": 2e9}
     assert {one["topic"]: one["unset_stamps"] for one in found}["/late"] == 1
@@ -201,7 +201,7 @@ def test_control_characters_are_shown_not_obeyed(store: Path) -> None:
     assert "/\\x1b[31mred\\x07\\x0a/x" in shown
     assert "\\x1b[2Jboo" in shown
     found = run("info", "odd", "--json", store=store)
-    assert HOSTILE_NAME in {c["topic"] for c in found.json["channels"]}
+    assert HOSTILE_NAME in {c["topic"] for c in found.json[0]["channels"]}
     assert "\x1b" not in found.out
 
 

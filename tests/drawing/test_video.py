@@ -208,7 +208,7 @@ def test_pictures_as_files(videos: hl.Store, form: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("form", ENCODERS)
 def test_info_counts_key_frames(videos: hl.Store, form: str) -> None:
     encoded(form)
-    found = answer("info", form, "--json", store=videos.directory.path).json["channels"]
+    found = answer("info", form, "--json", store=videos.directory.path).json[0]["channels"]
     about = {channel["topic"]: channel["video"] for channel in found}
     wanted = {"formats": [form], "frames": COUNT, "key_frames": len(KEYS), "unreadable": 0}
     for encoding in ENCODINGS:
