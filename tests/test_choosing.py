@@ -3,6 +3,11 @@
 from __future__ import annotations
 
 import json
+<<<<<<< HEAD
+=======
+import random
+import re
+>>>>>>> cli
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -209,7 +214,7 @@ def test_all_commands_choose_alike(store: hl.Store) -> None:
     assert call(store, "intervals", "-t", "scan", "--count", "-q", *chosen).out == "1\n"
     assert call(store, "intervals", "scan", "--changes", "n", "--count", "-q", *chosen).out
     assert "/left/scan" in call(store, "info", "-t", "scan", *chosen).out
-    assert "from 1 recording," in call(store, "info", "--losses", *chosen).out
+    assert "from 1 recording," in call(store, "info", "--losses", *chosen).err
     rows = json.loads(call(store, "info", "--sizes", "recording", *chosen, "--json").out)["rows"]
     assert [row["recording"] for row in rows] == ["tuesday"]
     assert call(store, "verify", *chosen).out.startswith("1 recording,")
@@ -228,8 +233,7 @@ def test_the_index_of_chosen_recordings_is_made_anew(store: hl.Store) -> None:
 
 
 def test_names_of_commands_may_be_globs(store: hl.Store) -> None:
-    # JSON is a list unless one recording is named, however many fit.
-    assert json.loads(call(store, "info", "run[1]", "--json").out)["name"] == "run[1]"
+    assert json.loads(call(store, "info", "run[1]", "--json").out)[0]["name"] == "run[1]"
     found = json.loads(call(store, "info", "tues*", "--json").out)
     assert [one["name"] for one in found] == ["tuesday"]
     assert call(store, "verify", "mon*", "-r", "run1").out.startswith("3 recordings,")
@@ -266,6 +270,29 @@ def test_recordings_are_deleted_by_choice(tmp_path: Path) -> None:
         assert store.recordings() == []
 
 
+<<<<<<< HEAD
+=======
+def test_who_is_asked_sees_what_goes(
+    store: hl.Store, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from hybridlog.cli import rm
+
+    shown: list[str] = []
+    monkeypatch.setattr(rm.output, "note", shown.append)
+    monkeypatch.setattr(rm.sys, "stdin", type("T", (), {"isatty": staticmethod(lambda: True)}))
+    monkeypatch.setattr(rm.click, "confirm", lambda text, err: shown.append(text) or False)
+    many = [summary(n, (START, START), ["/a"])[0] for n in range(25)]
+    with pytest.raises(rm.click.exceptions.Exit):
+        rm._confirm(many, ["a talk"])
+    assert re.fullmatch(r"Delete r0, r1, .* for good, with 1 pin \(a talk\)\?", shown[0])
+    assert shown[1] == "Nothing is deleted."
+    rows = capsys.readouterr().out.splitlines()[1:]
+    assert [row.split()[:2] for row in rows] == [
+        [f"r{n}", "2025-06-03T00:00:00Z"] for n in range(25)
+    ]
+
+
+>>>>>>> cli
 def test_queries_of_chosen_recordings(store: hl.Store) -> None:
     found = store.recordings(tag="robot=7")
     assert isinstance(found, Recordings)

@@ -50,7 +50,7 @@ TOPICS = ["/imu/data", "/base/scan", "/joint_states"]
 IMU, SCAN = TOPICS[:2]
 WHERE = "header.seq >= 100"
 NOWHERE = "mongodb://127.0.0.1:1/none?serverSelectionTimeoutMS=1"
-REPLACED = "The data files of the embedded MongoDB were damaged, and were replaced: "
+REPLACED = "The data files of the embedded MongoDB were damaged, and were replaced.\n"
 
 
 @pytest.fixture(scope="module")
@@ -128,10 +128,10 @@ def heal(store: Path, way: str) -> str:
 def test_a_damaged_index_is_made_again(store: Path, way: str) -> None:
     said = heal(store, way)
     if way == "a file for the directory":
-        assert said.count("added to the index") == 2
+        assert said.count("added to the index") == 1
     else:
         assert said.startswith(REPLACED)
-        assert len(said.splitlines()) == 1
+        assert len(said.splitlines()) == 2
 
 
 @pytest.mark.exhaustive

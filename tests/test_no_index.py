@@ -127,7 +127,7 @@ def test_as_a_command(tmp_path: Path, log: Path) -> None:
     assert "no topic fits 'nothing'" in done.err
     assert done.json["messages_indexed"] == 40
     assert done.json["not_indexed"] == dict.fromkeys(LEFT_OUT, "recorded with --no-index")
-    channels = run("info", "log", "--json", store=place).json["channels"]
+    channels = run("info", "log", "--json", store=place).json[0]["channels"]
     shown = {channel["topic"]: channel["not_indexed"] for channel in channels}
     assert [name for name in FOUR if shown[name]] == LEFT_OUT
     assert run("info", "log", store=place).out.count("not indexed: recorded with --no-index") == 2
@@ -143,6 +143,6 @@ def test_as_a_command(tmp_path: Path, log: Path) -> None:
         store=place,
     )
     assert replayed.out == ""
-    channels = run("info", "live", "--json", store=place).json["channels"]
+    channels = run("info", "live", "--json", store=place).json[0]["channels"]
     assert len(channels) == 4
     assert all(channel["not_indexed"] for channel in channels)

@@ -115,7 +115,7 @@ def _resample(
     if given.fields:
         query = query.fields(*parse_fields(",".join(given.fields)))
     rows = query.resample(given.step or 0, given.how, given.tolerance)
-    answer_tables(rows.to_tables(to.shown), rows.schema, to)
+    answer_tables(rows.to_tables(to.shown), to, rows.schema)
     return rows.counters, rows.remarks()
 
 
@@ -127,9 +127,14 @@ def _align(
         raise UsageError(f"--how {given.how} is for --step, not for --to.")
     base = given.base or ""
     queries = _queries(store, [base, *topics], given.choice, given.beside)
-    for predicates, add in ((given.where, _where), (given.fields, _fields)):
-        for text in predicates:
-            add(store, queries, text)
+    for text in given.where:
+        places, predicate = _named(store, queries, text, "--where wants TOPIC: PREDICATE")
+        for place in places:
+            queries[place] = queries[place].where(predicate)
+    for text in given.fields:
+        places, names = _named(store, queries, text, "--fields wants TOPIC: A,B.C")
+        for place in places:
+            queries[place] = queries[place].fields(*parse_fields(names))
     if given.frame is not None:
         from hybridlog.query.planner import Planner
         from hybridlog.tf.in_frame import has_places
@@ -153,7 +158,7 @@ def _align(
     )
     # That there is a transform shows only at the end.
     completeness = aligned.completeness if given.strict else None
-    answer_tables(aligned.to_tables(to.shown), aligned.schema, to, completeness)
+    answer_tables(aligned.to_tables(to.shown), to, aligned.schema, completeness)
     return aligned.counters, aligned.remarks()
 
 
@@ -168,18 +173,6 @@ def _queries(
         query_of(store, [name], others if n else choice) for n, name in enumerate(topics)
     )
     return [base, *(narrowed(q, topic) for q in found for topic in q.topics)]
-
-
-def _where(store: Store, queries: list[Query], text: str) -> None:
-    places, predicate = _named(store, queries, text, "--where wants TOPIC: PREDICATE")
-    for place in places:
-        queries[place] = queries[place].where(predicate)
-
-
-def _fields(store: Store, queries: list[Query], text: str) -> None:
-    places, names = _named(store, queries, text, "--fields wants TOPIC: A,B.C")
-    for place in places:
-        queries[place] = queries[place].fields(*parse_fields(names))
 
 
 def _named(store: Store, queries: list[Query], text: str, form: str) -> tuple[list[int], str]:

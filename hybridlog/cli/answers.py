@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Sized
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
@@ -39,7 +39,6 @@ if TYPE_CHECKING:
     from hybridlog.query.answers.follow import Following
     from hybridlog.query.counters import Counters
     from hybridlog.query.query import Query
-    from hybridlog.sql.engine import SqlAnswer
     from hybridlog.store import Store
     from hybridlog_storage.messages import Buffer
 
@@ -59,16 +58,7 @@ _T = TypeVar("_T")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Destination:
-    """Format and place of an answer.
-
-    Attributes:
-        form: A name of `OUTPUTS`, or `SCREEN`.
-        path: The file or directory; None for standard output.
-        force: Overwrite it.
-        limit: Maximum number of rows of a table; None for all.
-        quiet: No progress bar.
-        settings: Further arguments of the writer.
-    """
+    """Format (a name of `OUTPUTS`, or `SCREEN`) and place of an answer; no path is stdout."""
 
     form: str
     path: Path | None
@@ -95,15 +85,10 @@ class Destination:
             yield self.path
 
     def check(self) -> None:
-        """Refuse what cannot be written, before a store is opened.
-
-        Raises:
-            UsageError: The file exists, or the format does not fit the place.
-        """
+        """Refuse what cannot be written, before a store is opened."""
         if self.path is None:
             if self.form != SCREEN and not OUTPUTS[self.form].is_text and sys.stdout.isatty():
-                what = "a file" if OUTPUTS[self.form].content != "pictures" else "a directory"
-                raise UsageError(f"{self.form} is no text for a terminal: name {what} with -o.")
+                raise UsageError(f"{self.form} is no text for a terminal: name its place with -o.")
         elif self.form == SCREEN:
             raise UsageError("A table is for the screen: use --format csv or parquet with -o.")
         else:
@@ -112,14 +97,11 @@ class Destination:
 
 
 def format_option(formats: Sequence[str], piped: str = " on a terminal, else jsonl") -> Any:
-    """The option `--format`.
-
-    Args:
-        formats: Formats that the command has.
-        piped: What it does without this option, behind `else a table`.
-    """
+    """The option `--format` of a command with these formats."""
     return option(
-        f"Without: by the suffix of -o, else a table{piped}.",
+        f"Without: by the suffix of -o, else a table{piped}. One of "
+        f"{', '.join([SCREEN, *formats])}.",
+        "FORMAT",
         name="--format",
         short="-F",
         type=click.Choice([SCREEN, *formats]),
@@ -141,12 +123,7 @@ def output_option(what: str) -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class Tabular(Forced, AsJson):
-    """Options of commands that answer with rows.
-
-    Attributes:
-        formats: Formats that the command has.
-        usual: The format on a terminal, and elsewhere.
-    """
+    """Options of commands that answer with rows: `usual` is for a terminal, and for others."""
 
     formats: ClassVar[Sequence[str]] = TABLE_FORMATS
     usual: ClassVar[tuple[str, str]] = SCREEN, "jsonl"
@@ -156,38 +133,29 @@ class Tabular(Forced, AsJson):
 
     @property
     def to(self) -> Destination:
-        """Format and place of the answer.
-
-        Raises:
-            UsageError: The file exists, or the format does not fit the place.
-        """
+        """Format and place of the answer, which can be written."""
         to = self.destination()
         to.check()
         return to
 
     def destination(self) -> Destination:
-        """Format and place, which are yet to be checked.
-
-        Raises:
-            UsageError: The name does not give the format.
-        """
-        form, path = "json" if self.as_json else self.form, self.output
-        if form is None and path is None:
+        """Format and place, which are yet to be checked."""
+        form = "json" if self.as_json else self.form
+        if form is None and self.output is None:
             form = self.usual[not sys.stdout.isatty()]
-        elif form is None and path is not None:
-            form = form_of(path, suffixes_of(self.formats))
-        quiet = getattr(self, "quiet", False)
+        elif form is None and self.output is not None:
+            form = form_of(self.output, suffixes_of(self.formats))
         return Destination(
-            form=form or SCREEN, path=path, force=self.force, limit=self.limit, quiet=quiet
+            form=form or SCREEN,
+            path=self.output,
+            force=self.force,
+            limit=self.limit,
+            quiet=getattr(self, "quiet", False),
         )
 
 
 def form_of(path: Path, suffixes: Mapping[str, str]) -> str:
-    """The format that the name of an output gives.
-
-    Raises:
-        UsageError: It gives none.
-    """
+    """The format that the name of an output gives."""
     if path.suffix.lower() not in suffixes:
         raise UsageError(
             f"The name {path} does not give the format: add --format, or end it in "
@@ -207,16 +175,10 @@ class Listing(Tabular):
     def answer(
         self, rows: Iterable[Mapping[str, Any]], columns: Sequence[Column], titles: int = 1
     ) -> None:
-        """Print or write rows.
-
-        Args:
-            rows: The rows.
-            columns: Of the table for people.
-            titles: See `print_table`.
-        """
+        """Print or write rows; see `print_table`."""
         to, limited = self.to, islice(rows, self.limit)
         if to.form != SCREEN:
-            answer_tables(_tables_of(limited), lambda: None, to)
+            answer_tables(_tables_of(limited), to)
         elif first := list(islice(limited, 1)):
             print_table(columns, chain(first, limited), titles=titles)
 
@@ -224,19 +186,14 @@ class Listing(Tabular):
 def _tables_of(rows: Iterable[Mapping[str, Any]]) -> Iterator[pa.Table]:
     import pyarrow as pa
 
-    block = list(islice(rows, ROWS_AT_ONCE))
-    yield pa.Table.from_pylist(block)
+    yield pa.Table.from_pylist(list(islice(rows, ROWS_AT_ONCE)))
     while block := list(islice(rows, ROWS_AT_ONCE)):
         yield pa.Table.from_pylist(block)
 
 
 @dataclass
 class Answering:
-    """A question that is being answered.
-
-    Attributes:
-        is_empty: Whether the answer is; None to tell by the counters of the query.
-    """
+    """A question; `is_empty` is None where the counters of the query tell it."""
 
     store: Store
     query: Query
@@ -250,27 +207,19 @@ def answering(given: Topics) -> Iterator[Answering]:
     with given.opened(snapshot=True) as store:
         asked = Answering(store, given.query(store))
         yield asked
-        query = asked.query
-        print_end(given, query.counters, started, count=True)
+        print_end(given, asked.query.counters, started, count=True)
         if not given.quiet:
-            output.notes(query.remarks(is_empty=asked.is_empty))
+            output.notes(asked.query.remarks(is_empty=asked.is_empty))
 
 
 def answer_query(query: Query, to: Destination, *, front: Front, strict: bool = False) -> Query:
-    """Print or write the messages of a query.
+    """Print the first messages of a query, or write all; gives the query that was answered.
 
-    Args:
-        query: The query; on the screen and without a limit, its first messages are shown.
-        to: Format and place.
-        front: The latched messages in front of the answer.
-        strict: Write no file if a pose has no transform, which shows only at the end.
-
-    Returns:
-        The query that was answered, with its counters.
+    Strict: nothing is written if a pose has no transform, which shows only at the end.
     """
     if to.form != SCREEN:
+        quiet = to.quiet or to.path is None
         with to.opened() as target:
-            quiet = to.quiet or to.path is None
             write_answer(
                 query,
                 to.form,
@@ -281,16 +230,14 @@ def answer_query(query: Query, to: Destination, *, front: Front, strict: bool = 
                 settings=to.settings,
             )
         return query
+    from hybridlog.record.marks import MARKS
+
     limit = query.question.limit
     answered = query if limit is not None else query.limit(SCREEN_ROWS + 1)
     tables = _checked(answered.to_tables(), answered.completeness if strict else None)
-    from hybridlog.record.marks import MARKS
-
     if answered.topics == (MARKS,):
         tables = map(_with_times, tables)
-    _print_rows(tables, limit, answered.topics)
-    counters = answered.counters
-    counters.messages = _shown(counters.messages, limit, "message")
+    answered.counters.messages = _print_rows(tables, limit, "message", answered.topics)
     return answered
 
 
@@ -306,39 +253,22 @@ def _with_times(marks: pa.Table) -> pa.Table:
 
 def answer_tables(
     tables: Iterable[pa.Table],
-    schema: Callable[[], pa.Schema | None],
     to: Destination,
+    schema: Callable[[], pa.Schema | None] = lambda: None,
     completeness: Callable[[], Completeness] | None = None,
 ) -> None:
-    """Print or write tables that are no messages, all rows or nothing.
-
-    Args:
-        tables: The rows, at least one table.
-        schema: Gives the columns; None where only the rows tell them.
-        to: Format and place.
-        completeness: Gives what the rows lack, after the last one; they must not lack anything.
-    """
+    """Print or write tables that are no messages, at least one, all rows or nothing."""
+    limit = SCREEN_ROWS + 1 if to.limit is None and to.form == SCREEN else to.limit
+    limited = _checked(tables if limit is None else _limited(tables, limit), completeness)
     if to.form == SCREEN:
-        # One more than is shown tells whether there is more.
-        some = _limited(tables, SCREEN_ROWS + 1 if to.limit is None else to.limit)
-        _shown(_print_rows(_checked(some, completeness), to.limit), to.limit, "row")
+        _print_rows(limited, to.limit, "row")
         return
-    limited = tables if to.limit is None else _limited(tables, to.limit)
-    limited = _checked(limited, completeness)
     quiet = to.quiet or to.path is None
     with to.opened() as target, Bar(to.form, None, quiet=quiet) as bar:
-        counted = _with_progress(limited, bar)
-        columns = schema() if OUTPUTS[to.form].content == "table" else None
-        OUTPUTS[to.form].write(_rows(counted, columns), target)
-
-
-def answer_sql(answer: SqlAnswer, to: Destination) -> None:
-    """Print or write the answer of a statement; nothing for those that return nothing."""
-    import pyarrow as pa
-
-    if answer.columns:
-        tables = (pa.Table.from_batches([batch]) for batch in answer.to_batches())
-        answer_tables(tables, lambda: None, to)
+        answer = _rows(_with_progress(limited, bar))
+        if OUTPUTS[to.form].content == "table":
+            answer.schema = schema()
+        OUTPUTS[to.form].write(answer, target)
 
 
 def write_answer(
@@ -352,92 +282,78 @@ def write_answer(
     strict: bool = False,
     settings: Mapping[str, Any] | None = None,
 ) -> int:
-    """Write the answer of a query, all of it or nothing.
-
-    Args:
-        query: The query.
-        form: A format of `hybridlog.formats.OUTPUTS`.
-        target: Path or binary stream.
-        front: The latched messages in front of the answer, in logs.
-        extras: What a log has beside messages; None for nothing.
-        quiet: No progress bar.
-        strict: As for `answer_query`.
-        settings: Further arguments of the writer of a log.
+    """Write the answer of a query into a path or stream, all of it or nothing.
 
     Returns:
         Messages that are missing, because they do not fit their definition.
     """
-    from hybridlog.formats.answer import Answer
+    counters, written = query.counters, 0
+    counts = OUTPUTS[form].content in {"lines", "table"} and query.question.frame is None
+    answer = _answer_of(query, form, target, front, extras)
+    completeness = query.completeness if strict and query.question.frame is not None else None
 
-    if query.question.frame is not None:
-        _write_in_frame(query, form, target, strict=strict)
-        return 0
-    to, counters = OUTPUTS[form], query.counters
-    total = 0 if quiet else payload_bytes(query)
-    with Bar(form, total, quiet=quiet) as bar:
+    def told(pieces: Iterable[_T]) -> Iterator[_T]:
+        nonlocal written
+        for piece in pieces:
+            yield piece
+            written += len(cast("Sized", piece)) if counts else 0
+            bar(counters.payload_bytes, output.counted(counters.messages, "message"))
 
-        def told(pieces: Iterable[_T]) -> Iterator[_T]:
-            for piece in pieces:
-                yield piece
-                bar(counters.payload_bytes, output.counted(counters.messages, "message"))
-
-        if to.content in {"pictures", "video"}:
-            _write_pictures(query, form, target, told, front)
-            return 0
-        if to.content in {"log", "payloads"}:
-            log = log_of(query, front if to.content == "log" else Front(latched=False), extras)
-            log.batches = told(log.batches)
-            to.write(log, target, **settings or {})
-            output.notes(log.notes)
-            return 0
+    for name in ("lines", "tables", "batches", "points", "messages"):
+        setattr(answer, name, _checked(told(getattr(answer, name)), completeness))
+    with Bar(form, 0 if quiet else payload_bytes(query), quiet=quiet) as bar:
+        OUTPUTS[form].write(answer, target, **settings or {})
+    notes = answer.notes
+    if left_out := len(answer.unreadable):
+        many = output.counted(left_out, "message")
+        notes.append(f"{many} left out; the first: {answer.unreadable[0]}.")
+    if answer.schema is not None:
         from hybridlog.frames.answer import json_columns
-        from hybridlog.frames.lines import lines
-        from hybridlog.query.planner import Planner
 
-        columns, written = None, 0
-
-        def counting(pieces: Iterable[Any]) -> Iterator[Any]:
-            nonlocal written
-            for piece in told(pieces):
-                yield piece
-                written += len(piece)
-
-        if to.content == "table":
-            columns = _schema_of(query)
-            to.write(Answer(tables=counting(query.to_tables()), schema=columns), target)
-        else:
-            counters.reset()
-            planner = Planner(query.session, query.question, counters)
-            to.write(Answer(lines=counting(lines(planner))), target)
-    for name in json_columns(columns):
-        output.note(f"{name} has values of several types: it is written as JSON text.")
-    return counters.messages - counters.reduced - written
+        for name in json_columns(answer.schema):
+            notes.append(f"{name} has values of several types: it is written as JSON text.")
+    output.notes(notes)
+    return counters.messages - counters.reduced - written if counts else 0
 
 
-def _write_in_frame(query: Query, form: str, target: Target, *, strict: bool) -> None:
-    """Write points and poses in the frame of the question."""
+def _answer_of(
+    query: Query, form: str, target: Target, front: Front, extras: Extras | None
+) -> Answer:
+    """The answer in the form that a format takes."""
     from hybridlog.formats.answer import Answer
 
-    completeness = query.completeness if strict else None
-    if OUTPUTS[form].content != "payloads":
-        OUTPUTS[form].write(_rows(_checked(query.to_tables(), completeness)), target)
-        return
-    from hybridlog.tf.in_frame import points_of
+    content, question = OUTPUTS[form].content, query.question
+    if content in {"pictures", "video"}:
+        return _pictures(query, form, target, front)
+    if question.frame is not None and content == "payloads":
+        from hybridlog.tf.in_frame import points_of
 
+        query.counters.reset()
+        found = points_of(query.session, question, query.counters)
+        return Answer(
+            points=(
+                (one.points, one.message.topic, one.message.type, one.message.log_time_ns)
+                for one in found
+            )
+        )
+    if content in {"log", "payloads"}:
+        return log_of(query, front if content == "log" else Front(latched=False), extras)
+    if question.frame is not None:
+        return _rows(query.to_tables())
+    from hybridlog.frames.answer import schema_of
+    from hybridlog.frames.lines import lines
+    from hybridlog.query.counters import Counters
+    from hybridlog.query.planner import Planner
+
+    if content == "table":
+        schema = schema_of(Planner(query.session, question, Counters()))
+        return Answer(tables=query.to_tables(), schema=schema)
     query.counters.reset()
-    points = (
-        (one.points, one.message.topic, one.message.type, one.message.log_time_ns)
-        for one in points_of(query.session, query.question, query.counters)
-    )
-    OUTPUTS[form].write(Answer(points=_checked(points, completeness)), target)
+    return Answer(lines=lines(Planner(query.session, question, query.counters)))
 
 
 def _checked(pieces: Iterable[_T], completeness: Callable[[], Completeness] | None) -> Iterator[_T]:
-    """An answer that is checked behind its last piece: before a file is complete.
-
-    Raises:
-        IncompleteError: Poses have no transform, or messages are lost.
-    """
+    """An answer that is checked behind its last piece: before a file is complete."""
     yield from pieces
     if completeness is not None:
         completeness().check()
@@ -467,36 +383,15 @@ class _Anywhere:
             sys.stdout.buffer.flush()
 
 
-def _rows(tables: Iterable[pa.Table], schema: pa.Schema | None = None) -> Answer:
+def _rows(tables: Iterable[pa.Table]) -> Answer:
     """Tables as they are, or as lines."""
     from hybridlog.formats.answer import Answer
 
-    return Answer(lines=chain.from_iterable(map(_lines_of, tables)), tables=tables, schema=schema)
+    return Answer(lines=chain.from_iterable(map(_lines_of, tables)), tables=tables)
 
 
-def _schema_of(query: Query) -> pa.Schema | None:
-    """Columns of the answer where only messages determine them; None where definitions do."""
-    from hybridlog.frames.answer import schema_of
-    from hybridlog.query.counters import Counters
-    from hybridlog.query.planner import Planner
-
-    return schema_of(Planner(query.session, query.question, Counters()))
-
-
-def _write_pictures(
-    query: Query,
-    form: str,
-    target: Target,
-    told: Callable[[Iterable[Message]], Iterator[Message]],
-    front: Front,
-) -> None:
-    """Write the images; messages that are unreadable are left out and told.
-
-    Raises:
-        UsageError: a message is no image by its type.
-        PayloadError: no image is readable.
-        DefinitionError: the same.
-    """
+def _pictures(query: Query, form: str, target: Target, front: Front) -> Answer:
+    """The images; messages that are unreadable are left out and told."""
     from hybridlog.arrays.message_arrays import IMAGES
     from hybridlog.formats.answer import Answer
     from hybridlog.query.answers.video import frames_in_front
@@ -527,16 +422,10 @@ def _write_pictures(
                 raise answer.unreadable[0]
             if missing and not is_folder:
                 raise PayloadError(f"{missing}: there is no picture")
+        query.counters.frames += len(before)
 
-    answer.messages = told(images())
-    OUTPUTS[form].write(answer, target)
-    query.counters.frames += len(before)
-    if left_out := len(answer.unreadable):
-        are = "is" if left_out == 1 else "are"
-        output.note(
-            f"{output.counted(left_out, 'message')} {are} left out; the first: "
-            f"{answer.unreadable[0]}."
-        )
+    answer.messages = images()
+    return answer
 
 
 def _with_progress(tables: Iterable[pa.Table], bar: Bar) -> Iterator[pa.Table]:
@@ -569,24 +458,10 @@ def _limited(tables: Iterable[pa.Table], limit: int) -> Iterator[pa.Table]:
             return
 
 
-def _shown(found: int, limit: int | None, noun: str) -> int:
-    """Say whether there is nothing, or more than was shown; returns the number shown."""
-    if not found:
-        output.note(f"No {noun}.")
-    if limit is not None or found <= SCREEN_ROWS:
-        return found
-    output.note(
-        f"The first {SCREEN_ROWS} {noun}s. --limit shows more, --format jsonl or -o FILE gives all."
-    )
-    return SCREEN_ROWS
-
-
-def _print_rows(tables: Iterable[pa.Table], limit: int | None, topics: Sequence[str] = ()) -> int:
-    """Print rows for people to read.
-
-    Returns:
-        Number of rows of the tables.
-    """
+def _print_rows(
+    tables: Iterable[pa.Table], limit: int | None, noun: str, topics: Sequence[str] = ()
+) -> int:
+    """Print rows for people to read, and whether there are none or more; gives their number."""
     from hybridlog.frames.cells import MAX_CELL, MAX_LINE, cells
     from hybridlog.schema.arrow_types import is_text
 
@@ -614,37 +489,34 @@ def _print_rows(tables: Iterable[pa.Table], limit: int | None, topics: Sequence[
             titles=2 if len(topics) > 1 else 1,
             about=topics if len(topics) == 1 else (),
         )
-    return read
+    if not read:
+        output.note(f"No {noun}.")
+    if limit is None and read > most:
+        output.note(
+            f"The first {most} {noun}s. --limit shows more, --format jsonl or -o FILE gives all."
+        )
+    return min(read, most)
 
 
 def print_end(given: Topics, counters: Counters, started: float, *, count: bool = False) -> None:
-    """Print what an answer cost, with `--verbose`; without, the messages in front.
-
-    Args:
-        given: The options.
-        counters: Of the query.
-        started: When the command began, see `time.monotonic`.
-        count: The answer was a number, not messages.
-    """
+    """Print what an answer cost, with `--verbose`; without, the messages in front."""
     sys.stdout.flush()
-    if given.quiet or not given.verbose:
-        if (counters.latched or counters.frames) and not count and not given.quiet:
-            output.note(latched(counters).removeprefix(" and "))
+    if given.quiet:
         return
-    used = []
-    if not count:
-        messages = counters.messages - counters.reduced
-        used.append(f"{output.counted(messages, 'message')}{latched(counters)}")
-    if counters.payload_bytes:
-        used.append(f"{output.size(counters.payload_bytes)} of payload")
-    if counters.bytes_read:
-        chunks = counters.chunks_read
-        where = f" in {output.counted(chunks, 'chunk')}" if chunks else ""
-        used.append(f"{output.size(counters.bytes_read)} read from disk{where}")
-    if counters.documents_read:
-        used.append(output.counted(counters.documents_read, "index document"))
-    took = f"{time.monotonic() - started:.3f} s"
-    output.note(f"{', '.join(used)}, {took}" if used else f"answered in {took}")
+    front = latched(counters)
+    if not given.verbose:
+        if front and not count:
+            output.note(front.removeprefix(" and "))
+        return
+    used = [
+        (not count, f"{output.counted(counters.messages - counters.reduced, 'message')}{front}"),
+        (counters.payload_bytes, f"{output.size(counters.payload_bytes)} of payload"),
+        (counters.bytes_read, f"{output.size(counters.bytes_read)} read from disk"),
+        (counters.chunks_read, output.counted(counters.chunks_read, "chunk")),
+        (counters.documents_read, output.counted(counters.documents_read, "index document")),
+        (True, f"{time.monotonic() - started:.3f} s"),
+    ]
+    output.note(", ".join(text for applies, text in used if applies))
 
 
 def latched(counters: Counters) -> str:
@@ -667,23 +539,13 @@ def write_bytes(target: Target, content: bytes) -> None:
 
 
 def check_room(path: Path, *, force: bool, is_directory: bool = False) -> None:
-    """Refuse to overwrite without --force, and foreign directories even with it.
-
-    Args:
-        path: The output.
-        force: --force was given.
-        is_directory: It is to be a directory with a file a message.
-
-    Raises:
-        UsageError: The path cannot be written.
-    """
-    if not os.path.lexists(path) or _is_device(path):
-        return
+    """Refuse to overwrite without --force, and foreign directories even with it."""
+    if not os.path.lexists(path) or (path.exists() and not path.is_file() and not path.is_dir()):
+        return  # there is nothing, or a device
     if path.is_dir():
         if not is_directory:
             raise UsageError(f"{path} is a directory; name a file in it.")
-        inside = next(path.iterdir(), None)
-        if inside is None:
+        if next(path.iterdir(), None) is None:
             return
         if not _holds_messages(path):
             raise UsageError(f"{path} is a directory that holds other things; name a new one.")
@@ -698,9 +560,6 @@ def replacing(path: Path, *, force: bool, is_directory: bool = False) -> Iterato
     """Move a directory aside while a new one is written; it comes back when the block fails.
 
     Files are replaced by their writers in one step.
-
-    Raises:
-        UsageError: The path cannot be written.
     """
     check_room(path, force=force, is_directory=is_directory)
     if not path.is_dir() or path.is_symlink() or next(path.iterdir(), None) is None:
@@ -710,19 +569,19 @@ def replacing(path: Path, *, force: bool, is_directory: bool = False) -> Iterato
     import shutil
 
     aside = path.with_name(f".{path.name[:100]}.{secrets.token_hex(6)}.old")
-    with undone(partial(_bring_back, aside, path)):
+
+    def bring_back() -> None:
+        with suppress(OSError):
+            if not path.exists():
+                aside.rename(path)
+
+    with undone(bring_back):
         try:
             path.rename(aside)
         except OSError as error:
             raise UsageError(f"{path} cannot be replaced: {error.strerror}.") from error
         yield
     shutil.rmtree(aside, ignore_errors=True)
-
-
-def _bring_back(aside: Path, path: Path) -> None:
-    with suppress(OSError):
-        if not path.exists():
-            aside.rename(path)
 
 
 def not_written(path: Path) -> str:
@@ -738,7 +597,3 @@ def _holds_messages(path: Path) -> bool:
         return holds_messages(path) or holds_bag(path)
     except OSError as error:
         raise UsageError(f"{path} cannot be read: {error.strerror}.") from error
-
-
-def _is_device(path: Path) -> bool:
-    return path.exists() and not path.is_file() and not path.is_dir()

@@ -9,13 +9,10 @@ from typing import Final
 import click
 
 from hybridlog import __version__
-from hybridlog.cli.completion import install_completion, show_completion
-from hybridlog.cli.hints import Context
 from hybridlog_storage.errors import NO_SPACE, DiskFullError, HybridlogError
 
 DIFFERENT: Final = 12
 INTERNAL: Final = 70
-_ALL: Final = "hybridlog.all"  # whether `--all` was given
 
 EXIT_CODES: Final = {
     0: "done",
@@ -43,51 +40,28 @@ def of_os_error(error: OSError) -> int:
 
 
 GROUPS: Final = {
-    "Record": {
-        "record": "record",
-        "mark": "edit",
-        "top": "top",
-    },
-    "Look": {"ls": "ls", "info": "info", "view": "open", "open": "open", "plot": "plot"},
-    "Ask": {
-        "fetch": "fetch",
-        "intervals": "intervals",
-        "stats": "stats",
-        "align": "align",
-        "sql": "sql",
-        "tf": "tf",
-        "check": "check",
-        "diff": "check",
-    },
-    "Export": {"export": "export", "copy": "copy", "mcp": "open"},
-    "Maintain": {
-        "tag": "edit",
-        "edit": "edit",
-        "keep": "keep",
-        "index": "index",
-        "verify": "maintain",
-        "rm": "edit",
-        "demo": "record",
-    },
+    "Record": ["record", "mark", "top"],
+    "Look": ["ls", "info", "view", "open", "plot"],
+    "Ask": ["fetch", "intervals", "stats", "align", "sql", "tf", "check", "diff"],
+    "Export": ["export", "copy", "mcp"],
+    "Maintain": ["tag", "edit", "keep", "index", "verify", "rm", "demo"],
 }
-"""Names of the commands by group, in the order of the help text, and their modules."""
+"""Names of the commands by group, in the order of the help text."""
 
-COMMANDS: Final = {name: module for group in GROUPS.values() for name, module in group.items()}
-"""Names of all commands, and their modules."""
+COMMANDS: Final = [name for group in GROUPS.values() for name in group]
+"""Names of all commands, each of which lies in the module of its name."""
 
 
 class _LazyGroup(click.Group):
     """A group whose command `name` is the function `name_command` in the module of its name."""
 
-    context_class = Context
-
     def list_commands(self, ctx: click.Context) -> list[str]:
-        return list(COMMANDS)
+        return COMMANDS
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name not in COMMANDS:
             return None
-        module = import_module(f"hybridlog.cli.{COMMANDS[cmd_name]}")
+        module = import_module(f"hybridlog.cli.{cmd_name}")
         command: click.Command = getattr(module, f"{cmd_name}_command")
         return command
 
@@ -107,32 +81,11 @@ class _LazyGroup(click.Group):
             formatter.write_dl([(f"{code:>3}", meaning) for code, meaning in EXIT_CODES.items()])
 
 
-def _note_all(context: click.Context, _: click.Parameter, wanted: bool) -> None:  # noqa: FBT001
-    context.meta[_ALL] = wanted
-
-
-def _print_version(context: click.Context, _: click.Parameter, wanted: bool) -> None:  # noqa: FBT001
-    if wanted and context.meta[_ALL]:
+def _print_installed(context: click.Context, _: click.Parameter, wanted: bool) -> None:  # noqa: FBT001
+    if wanted:
         from hybridlog.cli.installed import print_installed
 
         print_installed()
-        context.exit()
-    if wanted:
-        click.echo(f"hybridlog {__version__}")
-        context.exit()
-    if context.meta[_ALL]:
-        raise click.UsageError("--all belongs to --version.", context)
-
-
-def _print_script(context: click.Context, _: click.Parameter, wanted: bool) -> None:  # noqa: FBT001
-    if wanted:
-        click.echo(show_completion(context), nl=False)
-        context.exit()
-
-
-def _install_script(context: click.Context, _: click.Parameter, wanted: bool) -> None:  # noqa: FBT001
-    if wanted:
-        click.echo(install_completion(context))
         context.exit()
 
 
@@ -144,34 +97,16 @@ def _install_script(context: click.Context, _: click.Parameter, wanted: bool) ->
     context_settings={"show_default": True, "help_option_names": ["-h", "--help"]},
     epilog="The store is --store, else HYBRIDLOG_STORE, else ./hybridlog-store.",
 )
+@click.version_option(__version__, message="hybridlog %(version)s", help="Print the version.")
 @click.option(
-    "--version",
-    is_flag=True,
-    expose_value=False,
-    callback=_print_version,
-    help="Print the version; with --all of everything, and what is missing for which command.",
-)
-@click.option(
-    "--all", is_flag=True, is_eager=True, expose_value=False, callback=_note_all, hidden=True
-)
-@click.option(
-    "--install-completion",
+    "--installed",
     is_flag=True,
     is_eager=True,
     expose_value=False,
-    callback=_install_script,
-    help="Install completion for your shell: bash, zsh or fish.",
+    callback=_print_installed,
+    help="Print versions of everything, and what is missing for which command.",
 )
-@click.option(
-    "--show-completion",
-    is_flag=True,
-    is_eager=True,
-    expose_value=False,
-    callback=_print_script,
-    help="Print the completion script of your shell.",
-)
-@click.pass_context
-def app(context: click.Context) -> None:
+def app() -> None:
     """Record what a robot says, and ask it.
 
     Payloads go into MCAP files, fields into MongoDB, one reader joins the two.

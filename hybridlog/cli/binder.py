@@ -11,13 +11,13 @@ import inspect
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
 from functools import wraps
+from itertools import chain
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
 import click
 from click.core import ParameterSource
 
-from hybridlog.cli.hints import Command, Pair
 from hybridlog.wording import parse_size
 from hybridlog_storage.errors import HybridlogError, UsageError
 
@@ -30,13 +30,7 @@ _TYPES: Final = {"int": int, "float": float, "Path": PATH}
 
 @dataclass(frozen=True)
 class Amount(click.ParamType[Any]):
-    """A number that is typed with a unit.
-
-    Attributes:
-        parse: Gives the number of a text.
-        least: The least number that is allowed, as typed.
-        most: The greatest one; None for any.
-    """
+    """A number that is typed with a unit, and read by `parse`; so are its bounds."""
 
     parse: Callable[[str], float]
     least: str = "0"
@@ -44,11 +38,7 @@ class Amount(click.ParamType[Any]):
     name: str = "amount"  # for click
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """The number.
-
-        Raises:
-            UsageError: The text is none, or it is out of range.
-        """
+        """The number."""
         of = "" if param is None else param.opts[0]
         try:
             found = self.parse(value)
@@ -62,11 +52,7 @@ class Amount(click.ParamType[Any]):
 
 
 def parse_seconds(text: str) -> float:
-    """Seconds from `1m30s`.
-
-    Raises:
-        TimeError: The text is no duration.
-    """
+    """Seconds from `1m30s`."""
     from hybridlog.query.times import parse_duration
 
     return parse_duration(text) / 1e9
@@ -78,6 +64,46 @@ SECONDS: Final = Amount(parse_seconds)
 """Seconds."""
 SOME_SECONDS: Final = Amount(parse_seconds, "1ns")
 """Seconds, more than none."""
+
+
+_FIRST: Final = ("topic", "between", "where", "fields", "output", "form")
+_SECTIONS: Final[dict[str, tuple[str, ...]]] = {
+    "Live recording": (),
+    "With lerobot": (
+        "features", "propose_map", "fps", "episodes_by", "task", "task_topic", "vcodec", "on_gap",
+    ),
+    "Choosing recordings": (
+        "recording", "tag", "has", "types", "during", "last", "older_than", "conditions",
+    ),
+    "Common options": (
+        "force", "strict", "as_json", "quiet", "verbose", "store", "mongo", "_click_default_help",
+    ),
+}  # fmt: skip
+"""Sections of help behind the options of a command alone, and what is in them everywhere."""
+
+
+class Command(click.Command):
+    """A command whose help has sections."""
+
+    def get_params(self, ctx: click.Context) -> list[click.Parameter]:
+        """The parameters: those that most people need first, those of all commands last."""
+        order = {name: n - len(_FIRST) for n, name in enumerate(_FIRST)}
+        order |= {name: n for n, name in enumerate(chain(*_SECTIONS.values()), 1)}
+        return sorted(super().get_params(ctx), key=lambda one: order.get(one.name or "", 0))
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the options in sections: those of the command alone first."""
+        known = {name: title for title, names in _SECTIONS.items() for name in names}
+        rows: dict[str, list[tuple[str, str]]] = {title: [] for title in ("Options", *_SECTIONS)}
+        for one in self.get_params(ctx):
+            record = one.get_help_record(ctx)
+            if record is not None and isinstance(one, click.Option):
+                title = getattr(one, "section", known.get(one.name or "", "Options"))
+                rows[title].append(record)
+        for title, found in rows.items():
+            if found:
+                with formatter.section(title):
+                    formatter.write_dl(found)
 
 
 def option(
@@ -93,16 +119,8 @@ def option(
 ) -> Any:
     """A field that is an option; its type says how: `bool` has no value, a tuple is repeatable.
 
-    Args:
-        help: What it does.
-        metavar: What its value is called.
-        name: Its long spelling; without, made from the name of the field.
-        short: Its short spelling.
-        needs: Parameters, one of which has to be given, too, of those that the command has;
-            `viewer=rerun` is one with a value.
-        excludes: Parameters that must not be given besides.
-        section: Of the help.
-        settings: Of `click.Option`.
+    It needs one of some fields (`viewer=rerun`: with a value) that the command has, and excludes
+    others. Settings are those of `click.Option`.
     """
 
     def make(field: str, annotation: str) -> click.Parameter:
@@ -113,9 +131,8 @@ def option(
             settings["multiple"], words = True, f"{help} Repeatable."
         elif (of := annotation.removesuffix(" | None")) in _TYPES:
             settings.setdefault("type", _TYPES[of])
-        kind: Any = Pair if settings.get("nargs") == 2 else click.Option
         spelled = [field, name or f"--{field.replace('_', '-')}", *([short] if short else [])]
-        made: click.Option = kind(spelled, help=words, metavar=metavar, **settings)
+        made = click.Option(spelled, help=words, metavar=metavar, **settings)
         made.__dict__.update({"section": section} if section else {})
         return made
 
@@ -129,14 +146,7 @@ def argument(
     excludes: Sequence[str] = (),
     **settings: Any,
 ) -> Any:
-    """A field that is an argument; its type says how: a tuple takes any number of words.
-
-    Args:
-        help: What it is.
-        metavar: What the usage line calls it.
-        excludes: As for `option`.
-        settings: Of `click.Argument`.
-    """
+    """A field that is an argument; its type says how: a tuple takes any number of words."""
 
     def make(field: str, annotation: str) -> click.Parameter:
         of = annotation.removesuffix(" | None")
@@ -165,11 +175,7 @@ def parameters_of(kind: type) -> list[click.Parameter]:
 
 
 def check(kind: type, context: click.Context) -> None:
-    """Refuse parameters that lack another one, or do not go together.
-
-    Raises:
-        UsageError: They do.
-    """
+    """Refuse parameters that lack another one, or do not go together."""
     parameters = {str(one.name): one for one in context.command.params}
     given = {
         name
@@ -189,6 +195,10 @@ def check(kind: type, context: click.Context) -> None:
         name, _, value = name.partition("=")
         return context.params[name] == value if value else name in given
 
+    for name, pair in parameters.items():
+        for value in (context.params[name] or ()) if pair.nargs == 2 else ():
+            if value[:1] == "-" and not value[1:2].isdigit():
+                raise UsageError(f"{pair.opts[0]} takes two values: {pair.opts[0]} {pair.metavar}.")
     for one in (each for each in fields(kind) if each.name in given):
         name = spelled(one.name)
         needs = [n for n in one.metadata.get(_NEEDS, ()) if n.partition("=")[0] in parameters]
@@ -204,14 +214,7 @@ def check(kind: type, context: click.Context) -> None:
 def command(
     kind: type[_Kind], name: str | None = None, to: click.Group | None = None, **settings: Any
 ) -> Callable[[Callable[..., Any]], click.Command]:
-    """Make a function a command; it gets an instance of the class of its options.
-
-    Args:
-        kind: A dataclass of the fields above.
-        name: Name of the command; without, that of the function.
-        to: The group that it belongs to.
-        settings: Of `click.command`.
-    """
+    """Make a function a command; it gets an instance of the dataclass of its options."""
 
     def bound(function: Callable[..., Any]) -> click.Command:
         @wraps(function)

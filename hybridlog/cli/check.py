@@ -1,29 +1,23 @@
-"""`hybridlog check` and `diff`."""
+"""`hybridlog check`."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from hybridlog.cli import output
 from hybridlog.cli.answers import Listing, answering, check_room, write_bytes
 from hybridlog.cli.app import DIFFERENT
-from hybridlog.cli.binder import argument, command, option
-from hybridlog.cli.completion import complete_topic
+from hybridlog.cli.binder import command, option
 from hybridlog.cli.options import (
-    Between,
-    InStore,
-    Quiet,
     Strict,
     Topics,
     Verbose,
-    one_recording,
-    topics,
 )
 from hybridlog.cli.render import Column
 from hybridlog_storage.errors import UsageError
@@ -31,12 +25,9 @@ from hybridlog_storage.errors import UsageError
 if TYPE_CHECKING:
     from hybridlog.contract.judge import Result
 
-_NEAR: Final = 0.05
-"""Share of differences that a tolerance is proposed for."""
-
 
 @dataclass(frozen=True, kw_only=True)
-class _Check(Strict, Verbose, Topics, Listing):
+class _Given(Strict, Verbose, Topics, Listing):
     contract: Path | None = option(
         "Judge recordings by the rules in this file; exit code 12 if one is broken.",
         "FILE",
@@ -52,8 +43,8 @@ class _Check(Strict, Verbose, Topics, Listing):
     )
 
 
-@command(_Check)
-def check_command(given: _Check) -> None:
+@command(_Given)
+def check_command(given: _Given) -> None:
     """Show how regularly topics came, the worst first.
 
     Rate, jitter, longest gap and where it begins, late start, early stop and losses of each
@@ -117,7 +108,7 @@ def _gap_begin(row: Mapping[str, Any]) -> str:
     return "" if begin is None else f"+{(begin - row['begin_ns']) / 1e9:.3f}s"
 
 
-def _show_verdict(results: Sequence[Result], recordings: int, given: _Check) -> None:
+def _show_verdict(results: Sequence[Result], recordings: int, given: _Given) -> None:
     from hybridlog.contract.judge import broken, junit_of
 
     if given.junit is not None:
@@ -127,78 +118,15 @@ def _show_verdict(results: Sequence[Result], recordings: int, given: _Check) -> 
     given.answer(map(asdict, results if given.as_json else bad), [*map(Column, names)])
     sys.stdout.flush()
     if not given.quiet:
-        output.note(_verdict(results, f" in {output.counted(recordings, 'recording')}"))
+        output.note(verdict(results, f" in {output.counted(recordings, 'recording')}"))
     if bad:
         raise click.exceptions.Exit(DIFFERENT)
 
 
-def _verdict(results: Sequence[Result], where: str = "") -> str:
+def verdict(results: Sequence[Result], where: str = "") -> str:
+    """How many rules are broken, in a sentence."""
     from hybridlog.contract.judge import broken
 
     return (
         f"{output.counted(len(results), 'rule')}{where}: {len(broken(results)) or 'none'} broken."
     )
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Diff(Between, InStore, Quiet, Listing):
-    a: str = one_recording("A recording, as for --recording, or a glob for several together.", "A")
-    b: str = one_recording("The same.", "B")
-    words: tuple[str, ...] = argument(
-        "Topics, as for --topic.", "[TOPIC]...", shell_complete=complete_topic
-    )
-    tolerance: str = option(
-        "Numbers are equal that differ by at most this, such as 5%.", "SHARE", default="0"
-    )
-    topic: tuple[str, ...] = topics()
-    contract: Path | None = option("Also compare which rules in this file are broken.", "FILE")
-
-
-@command(_Diff)
-def diff_command(given: _Diff) -> None:
-    """Show what differs between two recordings.
-
-    First what only one has: times and topics. Then types, messages, rates, gaps, losses, and
-    statistics of fields of the time that both have. Exit code 12 if anything differs.
-    """
-    from hybridlog.contract import Contract, parse_share
-
-    rules = None if given.contract is None else Contract.read(given.contract)
-    share = parse_share(given.tolerance)
-    with given.opened(snapshot=True) as store:
-        found = store.diff(
-            given.a,
-            given.b,
-            topics=(*given.words, *given.topic),
-            between=given.between,
-            tolerance=share,
-            contract=rules,
-        )
-        verdicts = [
-            f"{name}: {_verdict(store.judge(rules, name))}"
-            for name in (given.a, given.b)
-            if rules is not None
-        ]
-    columns = [Column("topic"), Column("what"), Column("a", _side("a")), Column("b", _side("b"))]
-    given.answer(map(asdict, found), columns, titles=2)
-    sys.stdout.flush()
-    if not (given.quiet or given.as_json):
-        output.notes(verdicts)
-        near = sum(one.share is not None and one.share <= _NEAR for one in found)
-        if near and not share:
-            output.note(f"--tolerance {_NEAR:.0%} leaves out {near} of the differences.")
-        total = f"{output.counted(len(found), 'difference')}." if found else "No difference."
-        is_cut = given.limit is not None and given.limit < len(found)
-        output.note(f"The first {given.limit} of {total}" if is_cut else total)
-    if found:
-        raise click.exceptions.Exit(DIFFERENT)
-
-
-def _side(name: str) -> Callable[[Mapping[str, Any]], str]:
-    """Gives what a recording has, in words where only it has something."""
-
-    def told(row: Mapping[str, Any]) -> str:
-        is_alone = row[name] and row["what"] in {"times", "topic"}
-        return f"only {name}: {row[name]}" if is_alone else str(row[name])
-
-    return told

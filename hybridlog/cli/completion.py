@@ -1,7 +1,4 @@
-"""Completion of recordings, topics, fields and frames; the scripts that teach it to a shell.
-
-Nothing is repaired for it, and no MongoDB is started.
-"""
+"""Completion of recordings, topics, fields and frames, without repairs and without MongoDB."""
 
 from __future__ import annotations
 
@@ -14,11 +11,10 @@ from functools import partial, wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from hybridlog_storage.errors import HybridlogError, UsageError
+from hybridlog_storage.errors import HybridlogError
 
 if TYPE_CHECKING:
     import click
-    from click.shell_completion import ShellComplete
 
     from hybridlog.session import Session
     from hybridlog_storage.disk.directory import StoreDirectory
@@ -27,28 +23,13 @@ if TYPE_CHECKING:
     _Complete = Callable[[click.Context, click.Parameter, str], list[str]]
 
 VARIABLE: Final = "_HYBRIDLOG_COMPLETE"
-"""Environment variable in which a shell asks for completions."""
+"""Environment variable in which a shell asks for completions, and for the script that does."""
 _TRANSFORMS: Final = 100
 """Messages of a topic that are read to complete frames."""
-_SCRIPTS: Final = {
-    "bash": ".local/share/hybridlog/completion.bash",
-    "zsh": ".zfunc/_hybridlog",
-    "fish": ".config/fish/completions/hybridlog.fish",
-}
-"""Path of the script of each shell, relative to the home directory."""
-_STARTUP: Final = {
-    "bash": (".bashrc", 'source "$HOME/.local/share/hybridlog/completion.bash"'),
-    "zsh": (".zshrc", 'fpath+="$HOME/.zfunc"; autoload -Uz compinit; compinit'),
-}
-"""Startup file of a shell and the line in it that loads the script; fish needs none."""
 
 
 def _of_store(complete: Callable[[Session, click.Context, str], Iterable[str]]) -> _Complete:
-    """A function for click, of one that gives candidates from the opened store.
-
-    The store has what is flushed of running recordings; nothing is repaired for it. Errors are
-    swallowed: a shell that completes a line cannot show them.
-    """
+    """A function for click, of one that gives candidates; a shell cannot show its errors."""
 
     @wraps(complete)
     def found(context: click.Context, _: click.Parameter, incomplete: str) -> list[str]:
@@ -202,56 +183,3 @@ def _short_names(topics: set[str]) -> Iterator[str]:
         for start in range(len(parts))
     )
     yield from (name for name, count in owners.items() if count == 1)
-
-
-def show_completion(context: click.Context) -> str:
-    """The completion script of the user's shell."""
-    return _script(context, _shell()).source()
-
-
-def install_completion(context: click.Context) -> str:
-    """Write the completion script to where the user's shell loads it.
-
-    Returns:
-        What was done, for people.
-
-    Raises:
-        UsageError: A file cannot be written.
-    """
-    shell = _shell()
-    path = Path.home() / _SCRIPTS[shell]
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(_script(context, shell).source(), encoding="utf-8")
-        if shell in _STARTUP:
-            name, line = _STARTUP[shell]
-            _append_once(Path.home() / name, line)
-    except OSError as error:
-        raise UsageError(
-            f"{error.filename} cannot be written: {error.strerror}. "
-            "`hybridlog --show-completion` prints the script."
-        ) from error
-    return f"Completion for {shell} is installed in {path}. Open a new terminal to use it."
-
-
-def _append_once(path: Path, line: str) -> None:
-    text = path.read_text(encoding="utf-8") if path.exists() else ""
-    if line not in text.splitlines():
-        path.write_text(f"{text.rstrip()}\n{line}\n".lstrip(), encoding="utf-8")
-
-
-def _shell() -> str:
-    shell = Path(os.environ.get("SHELL", "")).name
-    if shell not in _SCRIPTS:
-        raise UsageError(
-            f"Completion works in {', '.join(_SCRIPTS)}: set the variable SHELL to one of them."
-        )
-    return shell
-
-
-def _script(context: click.Context, shell: str) -> ShellComplete:
-    from click.shell_completion import get_completion_class
-
-    kind = get_completion_class(shell)
-    assert kind is not None
-    return kind(context.command, {}, "hybridlog", VARIABLE)

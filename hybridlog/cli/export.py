@@ -39,7 +39,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from hybridlog.attachments import Extras
-    from hybridlog.query.pieces import Piece
     from hybridlog.query.query import Query
 
 _LOGS = formats_of("log")
@@ -53,7 +52,9 @@ class _Given(Topics, Slices, Training):
         "File (mcap, bag) or directory (rosbag2, lerobot, mp4, tables).", "OUTPUT"
     )
     form: str | None = option(
-        f"Format; without, by the suffix ({', '.join(suffixes_of(_LOGS))}).",
+        f"Without: by the suffix ({', '.join(suffixes_of(_LOGS))}). One of "
+        f"{', '.join([*_LOGS, LEROBOT, *_FILES])}.",
+        "FORMAT",
         name="--format",
         short="-F",
         type=click.Choice([*_LOGS, LEROBOT, *_FILES]),
@@ -119,7 +120,7 @@ def _write_file(query: Query, to: Destination, path: Path, front: Front, extras:
     has_extras = to.form == "mcap" or (to.form, to.settings.get("storage")) == ("rosbag2", "mcap")
     counts = (len(extras.attachments), "attachment"), (len(extras.metadata), "metadata record")
     beside = "".join(f", {output.counted(count, what)}" for count, what in counts if count)
-    _print_written(path, query, 0, beside if has_extras else "", quiet=to.quiet)
+    print_written(path, query, beside=beside if has_extras else "", quiet=to.quiet)
     if beside and not has_extras:
         output.note(f"A bag cannot hold {beside[2:]} of the log; an MCAP file can.")
     if extras.left_out and has_extras:
@@ -132,14 +133,10 @@ def _write_directory(query: Query, to: Destination, directory: Path, front: Fron
     from hybridlog.query.ranges import RangeResolver
 
     RangeResolver(query.session, query.question).resolve()  # refuses a range without any message
-    if directory.is_dir():
-        _write_files(query, to, directory, front)
-        return
-    if directory.exists():
-        raise UsageError(f"{directory} is a file; name another path for the directory.")
-    with undone(partial(_remove_empty, directory)):
+    is_new = not directory.is_dir()
+    with undone(partial(_remove_empty, directory)) if is_new else contextlib.nullcontext():
         try:
-            directory.mkdir(parents=True)
+            directory.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise UsageError(f"{directory} cannot be made: {error.strerror}.") from error
         _write_files(query, to, directory, front)
@@ -171,18 +168,14 @@ def _write_files(query: Query, to: Destination, directory: Path, front: Front) -
             output.note(f"{'' if is_named else f'{topic}: '}{error}")
             left_out.append(error)
             continue
-        _print_written(path, one, missing, quiet=to.quiet)
+        print_written(path, one, missing, quiet=to.quiet)
         query.counters.add(one.counters)
     if len(left_out) == len(paths):
         raise left_out[0]
 
 
 def _image_topics(query: Query) -> list[str]:
-    """The topics of images and of video among those of a query.
-
-    Raises:
-        UsageError: There is none.
-    """
+    """The topics of images and of video among those of a query."""
     from hybridlog.arrays.message_arrays import IMAGES, plain_type
 
     entries = map(query.session.entry_of, query.summaries())
@@ -192,8 +185,8 @@ def _image_topics(query: Query) -> list[str]:
     return [topic for topic in query.topics if topic in found]
 
 
-def _print_written(
-    path: Path, query: Query, missing: int, beside: str = "", *, quiet: bool
+def print_written(
+    path: Path, query: Query, missing: int = 0, beside: str = "", *, quiet: bool
 ) -> None:
     """Print a line about a file; --quiet leaves it out, unless messages are missing."""
     left_out = f" (left out: {output.unfit(missing)})" if missing else ""
@@ -212,39 +205,22 @@ def pieces(
 ) -> Iterator[tuple[Path, Query]]:
     """The parts of an answer that have messages, and where to write each; says which have none.
 
-    Args:
-        query: The whole question.
-        how: `recording`, `mark`, or a predicate, with `TOPIC: ` in front or about the one topic.
-        target: The output.
-        force: Overwrite files.
-        is_directory: Each part is a directory with a file a message; None if the writer checks
-            its files.
-
-    Raises:
-        UsageError: A predicate of no topic, or a file exists.
-        WhereError: It cannot be parsed, or does not fit the fields.
-        TopicError: There is no such topic.
+    Places are checked here unless `is_directory` is None: then by those who write there.
     """
     from hybridlog.query.pieces import pieces as split
 
-    there = [*split(query, how)]
-    if not there and how != "recording":
-        output.note("No mark." if how == "mark" else "No interval.")
-    found = [piece for piece in there if _has_messages(piece)]
+    found: list[tuple[Path, Query]] = []
+    for piece in split(query, how):
+        count = 0
+        with contextlib.suppress(TimeError):  # the range is outside
+            count = piece.query.count()
+        if count:
+            path = target.with_name(f"{target.stem}-{piece.name}{target.suffix}")
+            found.append((path, piece.query))
+        else:
+            output.note(f"{piece.name}: no messages, so no file.")
     if not found:
         output.note("No messages, so no file.")
-    paths = [target.with_name(f"{target.stem}-{one.name}{target.suffix}") for one in found]
-    if is_directory is not None:
-        for path in paths:
-            check_room(path, force=force, is_directory=is_directory)
-    yield from zip(paths, (piece.query for piece in found), strict=True)
-
-
-def _has_messages(piece: Piece) -> bool:
-    try:
-        count = piece.query.count()
-    except TimeError:  # the range is outside
-        count = 0
-    if not count:
-        output.note(f"{piece.name}: no messages, so no file.")
-    return count > 0
+    for path, _ in found if is_directory is not None else ():
+        check_room(path, force=force, is_directory=bool(is_directory))
+    yield from found

@@ -17,7 +17,6 @@ from hybridlog.cli.answers import (
     Tabular,
     answer_query,
     format_option,
-    latched,
     output_option,
     print_end,
     write_following,
@@ -152,18 +151,15 @@ def _print_end(query: Query, choices: _Choices, started: float, path: Path | Non
 
 def _write_pieces(query: Query, choices: _Choices, to: Destination, front: Front) -> None:
     """Write a file for each part of the answer, and a line about each."""
-    from hybridlog.cli.export import pieces
+    from hybridlog.cli.export import pieces, print_written
 
-    how = choices.split
     assert to.path is not None
-    assert how is not None
     folder = is_directory(to.form, to.path)
+    how = choices.split or ""
     for path, one in pieces(query, how, to.path, force=to.force, is_directory=folder):
         answer_query(one, replace(to, path=path), front=front, strict=choices.strict)
+        print_written(path, one, quiet=to.quiet)
         if not to.quiet:
-            counters = one.counters
-            given = output.counted(counters.messages - counters.reduced, "message")
-            output.note(f"{path}: {given}{latched(counters)}")
             output.notes(one.completeness().sentences)
 
 
@@ -193,11 +189,21 @@ def _follow(query: Query, choices: _Choices, form: str) -> None:
 
 
 def _query(store: Store, choices: _Choices) -> Query:
+    from hybridlog.query.predicate.across import names_topics
+
     query = choices.bounded(query_of(store, choices.topics, choices.choice))
     query = query.clock(choices.clock)
-    near = _near(choices)
-    for predicate in choices.where:
-        query = query.where(predicate, near if _names_topics(predicate) else None)
+    near: str | tuple[str, str] | None = choices.within
+    if (choices.before, choices.after) != (None, None):
+        near = choices.before or "0s", choices.after or "0s"
+    across = [*map(names_topics, choices.where)]
+    if near is not None and not any(across):
+        raise UsageError(
+            "--within, --before and --after are about messages of other topics: add --where "
+            "'TOPIC: PREDICATE'."
+        )
+    for predicate, is_across in zip(choices.where, across, strict=True):
+        query = query.where(predicate, near if is_across else None)
     if choices.fields is not None:
         query = query.fields(*parse_fields(choices.fields))
     if choices.frame is not None:
@@ -208,15 +214,12 @@ def _query(store: Store, choices: _Choices) -> Query:
         query = query.every(choices.every)
     if choices.reverse:
         query = query.reverse()
-    if choices.limit is not None:
-        query = query.limit(choices.limit)
-    return query
+    return query if choices.limit is None else query.limit(choices.limit)
 
 
 def _destination(choices: _Choices) -> Destination:
     """Format and place of the answer; refuses what makes no sense before a store is opened."""
     assert choices.topics
-    _check_near(choices)
     to = choices.destination()
     form = to.form
     to = replace(to, settings=choices.settings(form))
@@ -228,6 +231,7 @@ def _destination(choices: _Choices) -> Destination:
     if not choices.count and (choices.split is None or form == SCREEN):
         to.check()
     return to
+<<<<<<< HEAD
 
 
 def _near(choices: _Choices) -> str | tuple[str, str] | None:
@@ -259,3 +263,5 @@ def _check_near(choices: _Choices) -> None:
         raise UsageError(
             "--where with another topic needs a length of time: add --within, --before or --after."
         )
+=======
+>>>>>>> cli

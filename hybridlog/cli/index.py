@@ -6,7 +6,6 @@ import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from functools import partial
-from shlex import quote
 from typing import TYPE_CHECKING
 
 import click
@@ -16,14 +15,13 @@ from hybridlog.cli.binder import SOME_SECONDS, argument, command, option
 from hybridlog.cli.completion import complete_topic
 from hybridlog.cli.options import AsJson, Choosing, InStore, Quiet, cache_size
 from hybridlog.cli.progress import Bar
-from hybridlog.cli.render import Column, numbers, print_table
+from hybridlog.cli.render import Column, bytes_of, numbers, print_table
 from hybridlog.cli.signals import if_stopped
 from hybridlog.wording import listed
 from hybridlog_storage.errors import StoreError, UsageError
 
 if TYPE_CHECKING:
     from hybridlog.index.of_store import FieldIndex
-    from hybridlog.maintenance.report import ArraysOfTopic
     from hybridlog.store import Store
 
 
@@ -47,7 +45,7 @@ def list_(given: _List) -> None:
     """List the indexes on fields."""
     with given.opened(require_database=True) as store:
         found = store.index.list() if given.topic is None else store.index.list(given.topic)
-    _print(found, given)
+    _show(found, given, "No index on a field.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,19 +61,24 @@ def add(given: _Fields) -> None:
     """Make an index on fields of a topic, for all recordings."""
     with given.opened(require_database=True) as store:
         found = store.index.add(given.topic, *given.field)
-    _print(found, given)
+    _show(found, given)
 
 
 @command(_Fields, to=index_command)
 def remove(given: _Fields) -> None:
-    """Drop an index."""
+    """Drop an index, and list those that are left."""
     topic, field = given.topic, given.field
     with given.opened(require_database=True) as store:
         if not store.index.remove(topic, *field):
-            known = ", ".join(" ".join(one.fields) for one in store.index.list(topic)) or "none"
+            known = listed(" ".join(one.fields) for one in store.index.list(topic))
             raise UsageError(f"{topic} has no index on {' '.join(field)}. Its indexes: {known}.")
         found = store.index.list(topic)
-    _print(found, given)
+    _show(found, given)
+
+
+def _show(found: list[FieldIndex], given: _Shared, without: str = "") -> None:
+    columns = [Column("topic"), Column("fields", lambda row: " ".join(row["fields"]))]
+    given.show([one._asdict() for one in found], columns, without)
 
 
 @command(_Shared, to=index_command)
@@ -128,15 +131,10 @@ def rebuild(given: _Rebuild) -> None:
             Bar("index rebuild", total, quiet=given.quiet) as bar,
         ):
             done = store.index.rebuild(None if given.choice.is_everything else chosen, bar.part)
-    left = [entry.name for entry in chosen.summaries if entry.id not in {r.id for r in done}]
-    for name in left:
-        output.note(f"Recording {name} is in use, and was left as it is.")
-    for entry in done:
-        if entry.status == "damaged":
-            output.note(
-                f"{entry.name} is damaged: `hybridlog info {quote(entry.name)} --losses` shows "
-                "where."
-            )
+    made = {entry.id for entry in done}
+    left = [entry.name for entry in chosen.summaries if entry.id not in made]
+    if left:
+        output.note(f"In use, and left as they are: {listed(left)}.")
     messages = sum(r.documents for r in done)
     without = sum(r.messages - len(r.marks) for r in done) - messages
     elapsed = time.monotonic() - started
@@ -178,33 +176,21 @@ def arrays(given: _Arrays) -> None:
         Bar("index arrays", 0, quiet=given.quiet) as bar,
     ):
         found = store.index.arrays(*given.topic, off=given.off, progress=bar.part)
-        known = {*store.all_topics().topics} if store.recordings() else set()
-    if given.as_json:
-        output.print_json([asdict(one) for one in found])
-        return
-    for one in found:
-        if not given.quiet and (one.recordings or not one.left):
-            output.say(_told(one, is_known=one.topic in known, off=given.off))
-        if one.left:
-            output.note(
-                f"Tables of {one.topic} in {listed(one.left)} stay as they are: the recording is "
-                "in progress or cannot be read, or the disk has no room. Run it again later."
-            )
-
-
-def _told(one: ArraysOfTopic, *, is_known: bool, off: bool) -> str:
-    """A line about a topic."""
-    without = "without" if off else "with"
-    if not is_known:
-        return f"{one.topic}: no recording has it yet; its tables will be {without} arrays"
-    if one.has_arrays is False:
-        return f"{one.topic}: no long arrays, except of bytes; its tables stay as they are"
-    size = output.size(one.bytes_after)
-    told = f"{one.topic}: tables {without} arrays; those of its type take {size}"
-    if not one.recordings:
-        return told
-    made = output.counted(len(one.recordings), "recording")
-    return f"{told}, before {output.size(one.bytes_before)}; {made} made anew"
+    arrays = "without arrays" if given.off else "with arrays"
+    tables = {None: "none yet", False: "no long arrays", True: arrays}
+    columns = [
+        Column("topic"),
+        Column("tables", lambda row: tables[row["has_arrays"]]),
+        Column("made anew", lambda row: len(row["recordings"]), "right"),
+        bytes_of("before", "bytes_before"),
+        bytes_of("after", "bytes_after"),
+    ]
+    given.show([asdict(one) for one in found], columns)
+    if left := {name for one in found for name in one.left}:
+        output.note(
+            f"Tables of {listed(sorted(left))} stay as they are: the recording is in progress or "
+            "cannot be read, or the disk has no room. Run it again later."
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -246,12 +232,3 @@ def _look(store: Store, given: _Shared) -> Iterator[StoreError]:
                 output.say(f"{name}  {output.counted(chunks, 'chunk')}")
     for recording, problem in sorted(repairs.unreadable.items()):
         yield StoreError(f"Recording {recording} cannot be read: {problem}")
-
-
-def _print(found: list[FieldIndex], given: _Shared) -> None:
-    rows = [{"topic": one.topic, "fields": list(one.fields)} for one in found]
-    if rows or given.as_json:
-        columns = [Column("topic"), Column("fields", lambda row: " ".join(row["fields"]))]
-        given.show(rows, columns)
-    elif not given.quiet:
-        output.say("no index on a field")

@@ -34,11 +34,10 @@ from hybridlog.cli.options import (
 )
 from hybridlog.cli.render import Column, numbers, print_fields, print_table
 from hybridlog.query.answers.completeness import coverage, line_of
-from hybridlog.query.choice import Choice
 from hybridlog.query.topics import resolve
 from hybridlog.record.losses import losses_of
-from hybridlog.wording import MAX_LISTED, listed
-from hybridlog_storage.errors import SegmentError, SourceError, StoreError, UsageError
+from hybridlog.wording import listed
+from hybridlog_storage.errors import SegmentError, StoreError, UsageError
 
 if TYPE_CHECKING:
     from hybridlog.attachments import StoredAttachment, StoredMetadata
@@ -102,15 +101,9 @@ def info_command(given: _Given) -> None:
     if len(given.names) == 1 and _is_segment(given.names[0]):
         show_segment(Path(given.names[0]), as_json=given.as_json)
         return
-    try:
-        with given.opened(snapshot=True) as store:
-            if not _show_part(store, given):
-                _show(store, given)
-    except (StoreError, UsageError):
-        # The directory of a ROS 2 bag may be named like its recording.
-        if len(given.names) == 1 and Path(given.names[0], "metadata.yaml").exists():
-            _refuse_log(Path(given.names[0]))
-        raise
+    with given.opened(snapshot=True) as store:
+        if not _show_part(store, given):
+            _show(store, given)
 
 
 def _show_part(store: Store, given: _Given) -> bool:
@@ -139,17 +132,13 @@ def _show_part(store: Store, given: _Given) -> bool:
 
 
 def _show(store: Store, given: _Given) -> None:
-    from hybridlog.query.choosing import is_one
-
-    choice = given.choice
     entries = [with_misfits(store, entry) for entry in given.recordings_in(store)]
     found = [
         _as_dict(store, entry, _videos(store, entry) if number < _MAX_DRAWN else {})
         for number, entry in enumerate(entries)
     ]
     if given.as_json:
-        is_single = choice == Choice.of(choice.name[:1]) and is_one(store.session, choice.name)
-        output.print_json(found[0] if is_single else found)
+        output.print_json(found)
         return
     if not entries:
         output.note(store.session.when_empty)
@@ -241,48 +230,50 @@ def _print_recording(
     entry: RecordingEntry, about: dict[str, Any], store: Store, drawn: Mapping[str, str]
 ) -> None:
     from hybridlog.entries import summary_of
+    from hybridlog.query.times import format_duration
 
     status = status_text(summary_of(entry))
     if entry.status == "open":
         status += f"; `hybridlog top {quote(entry.name)}` shows it"
-    held = (
-        f"{output.size(entry.stored_bytes)} in {output.counted(entry.segments, 'segment')}, "
-        f"{output.counted(entry.chunks, 'chunk')}"
+    source = entry.source["kind"]
+    if entry.source["bytes"]:
+        source += f", {output.size(entry.source['bytes'])}"
+    if entry.source["path"]:
+        source = f"{entry.source['path']} ({source})"
+    first, last = about["start_ns"], about["last_ns"]
+    print_fields(
+        [
+            ("recording", entry.name),
+            ("id", entry.id),
+            ("status", status),
+            ("source", source),
+            ("start", output.time_text(first)),
+            ("last", output.time_text(last)),
+            ("duration", "-" if first is None else format_duration(last - first)),
+            ("messages", entry.messages),
+            (
+                "stored",
+                f"{output.size(entry.stored_bytes)} in {output.counted(entry.segments, 'segment')}"
+                f", {output.counted(entry.chunks, 'chunk')}",
+            ),
+            *_coverage(entry, about["coverage"]),
+            *(("", line_of(loss)) for loss in about["losses"]),
+            *(("tag", f"{key}={value}") for key, value in sorted(entry.tags.items())),
+            *(("note", note["text"]) for note in entry.notes),
+            *(("pin", f"{pin['id']}: {', '.join(pin_cells(pin))}") for pin in entry.pins),
+            *(("attachment", f"{one['name']} ({_content(one)})") for one in about["attachments"]),
+            *(
+                ("metadata", f"{one['name']} ({', '.join(one['values'])})")
+                for one in about["metadata_records"]
+            ),
+            ("index", store.shared.index.connection.place),
+        ]
     )
-    pins = [f"{pin['id']}: {', '.join(pin_cells(pin))}" for pin in entry.pins]
-    contents = [f"{one['name']} ({_content(one)})" for one in about["attachments"]]
-    records = [f"{one['name']} ({', '.join(one['values'])})" for one in about["metadata_records"]]
-    fields = [
-        ("recording", entry.name),
-        ("id", entry.id),
-        ("status", status),
-        ("source", _source(entry.source)),
-        *_span(about["start_ns"], about["last_ns"]),
-        ("messages", entry.messages),
-        ("stored", held),
-        *_coverage(entry, about["coverage"]),
-        *(("", line_of(loss)) for loss in about["losses"]),
-        *(("tag", f"{key}={value}") for key, value in sorted(entry.tags.items())),
-        *(("note", note["text"]) for note in entry.notes),
-        *_cut("pin", pins),
-        *_cut("attachment", contents),
-        *_cut("metadata", records),
-        ("index", store.shared.index.connection.place),
-    ]
-    print_fields(fields)
     if about["channels"]:
         output.say()
         over_time = Column(_OVER_TIME, lambda c: drawn.get(c["topic"]), "whole", order=1)
         columns = [*_CHANNELS[:-1], *([over_time] if drawn else []), _CHANNELS[-1]]
         print_table(columns, sorted(about["channels"], key=itemgetter("topic")))
-
-
-def _span(first: int | None, last: int | None) -> list[tuple[str, str]]:
-    from hybridlog.query.times import format_duration
-
-    length = "-" if first is None or last is None else format_duration(last - first)
-    times = [output.time_text(first), output.time_text(last), length]
-    return [*zip(("start", "last", "duration"), times, strict=True)]
 
 
 def _coverage(entry: RecordingEntry, words: str) -> list[tuple[str, str]]:
@@ -316,13 +307,6 @@ def _sparklines(store: Store, entry: RecordingEntry) -> dict[str, str]:
 def _content(attachment: Mapping[str, Any]) -> str:
     size = output.size(attachment["bytes"])
     return f"{attachment['media_type']}, {size}" if attachment["media_type"] else size
-
-
-def _cut(name: str, lines: list[str]) -> list[tuple[str, str]]:
-    """Fields of a record; the last one counts the lines that are left out."""
-    rows = [(name, output.cut(line)) for line in lines[:MAX_LISTED]]
-    more = len(lines) - len(rows)
-    return [*rows, (name, f"and {more} more")] if more else rows
 
 
 def _kind(channel: Mapping[str, Any]) -> str:
@@ -384,37 +368,25 @@ _CHANNELS = [
 ]
 
 
-def _source(source: Mapping[str, Any]) -> str:
-    """Path or URL of the source, its kind, and the size of a log file."""
-    size = f", {output.size(source['bytes'])}" if source["bytes"] else ""
-    kind = f"{source['kind']}{size}"
-    return f"{source['path']} ({kind})" if source["path"] else kind
-
-
 def show_segment(path: Path, *, as_json: bool) -> None:
-    """Print the summary of a sealed segment.
-
-    Raises:
-        StoreError: It is being written, or is no segment of a store.
-    """
-    from hybridlog_storage.manifests import DiskManifests
+    """Print the summary of a sealed segment."""
     from hybridlog_storage.segments.segment_reader import SegmentReader
 
-    stem = path.name.split(".")[0]
     if path.name.endswith(".open"):
         raise StoreError(
             f"{path} is being written, or was left by a crash. Any command on its store, such as "
             "`hybridlog ls --store DIR`, seals segments that a crash left."
         )
-    number = int(stem) if stem.isascii() and stem.isdigit() else 0
+    stem = path.name.split(".")[0]
     try:
-        with SegmentReader(path, number) as reader:
+        with SegmentReader(path, int(stem) if stem.isdecimal() else 0) as reader:
             summary = reader.summary()
             bytes_all = reader.size
-    except SegmentError:
-        if not DiskManifests(path.absolute().parents[2]).path(path.parent.name).exists():
-            _refuse_log(path)
-        raise
+    except SegmentError as error:
+        raise StoreError(
+            f"{path} is no whole segment of a store. Of a log, `hybridlog record "
+            f"{quote(str(path))}` makes a recording. {error}"
+        ) from error
     chunks = summary.chunks
     channels = [
         {
@@ -425,15 +397,13 @@ def show_segment(path: Path, *, as_json: bool) -> None:
         }
         for channel_id, channel in sorted(summary.channels.items())
     ]
-    first = min((place.first for place in chunks), default=None)
-    last = max((place.last for place in chunks), default=None)
-    about = {
+    about: dict[str, Any] = {
         "segment": str(path),
         "bytes": bytes_all,
         "recording": summary.recording,
         "end": summary.end,
-        "first_ns": first,
-        "last_ns": last,
+        "first_ns": min((place.first for place in chunks), default=None),
+        "last_ns": max((place.last for place in chunks), default=None),
         "chunks": len(chunks),
         "channels": channels,
     }
@@ -445,8 +415,8 @@ def show_segment(path: Path, *, as_json: bool) -> None:
             ("segment", path),
             ("recording", summary.recording.get("name")),
             ("id", summary.recording.get("id")),
-            ("start", output.time_text(first)),
-            ("last", output.time_text(last)),
+            ("start", output.time_text(about["first_ns"])),
+            ("last", output.time_text(about["last_ns"])),
             ("bytes", output.size(bytes_all)),
             ("chunks", len(chunks)),
             ("messages", sum(summary.counts.values())),
@@ -455,20 +425,3 @@ def show_segment(path: Path, *, as_json: bool) -> None:
     output.say()
     kind = Column("type", short=lambda channel: (channel["type"] or "").rpartition("/")[2])
     print_table([Column("topic"), kind, *numbers("messages", "chunks")], channels)
-
-
-def _refuse_log(path: Path) -> None:
-    """Tell a log, and a file of another kind, from a segment."""
-    from hybridlog.formats.log_set import open_source
-    from hybridlog.record.recorder import name_of
-
-    try:
-        open_source(path).close()
-    except SourceError as error:
-        raise StoreError(
-            f"{path} is no segment of a hybridlog store, and no log: {error}"
-        ) from None
-    raise StoreError(
-        f"{path} is a log, and `info` is about recordings: "
-        f"`hybridlog record {quote(str(path))}`, then `hybridlog info {quote(name_of(path))}`."
-    )

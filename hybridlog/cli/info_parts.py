@@ -8,7 +8,6 @@ from dataclasses import asdict
 from fnmatch import fnmatchcase
 from functools import partial
 from pathlib import Path
-from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 from hybridlog.cli import output
@@ -34,11 +33,7 @@ _READABLE = {"ros1msg", "ros2msg", "ros2idl", "jsonschema"}
 
 
 def show_topics(store: Store, query: Query, topics: Sequence[str], *, as_json: bool) -> None:
-    """Print the definition and the fields of topics, those of each type once.
-
-    Raises:
-        TopicError: No recording of the query has any of them.
-    """
+    """Print the definition and the fields of topics, those of each type once."""
     from hybridlog.query.asked import channels_of
 
     seen: dict[tuple[str, str | None], dict[str, Any]] = {}
@@ -59,7 +54,9 @@ def show_topics(store: Store, query: Query, topics: Sequence[str], *, as_json: b
     if as_json:
         output.print_json(list(seen.values()))
         return
-    for item in seen.values():
+    for number, item in enumerate(seen.values()):
+        if number:
+            output.say()
         _print_topic(item)
 
 
@@ -81,7 +78,6 @@ def _print_topic(item: dict[str, Any]) -> None:
         asked = "path" if item["observed"] else _asked_as
         columns = [Column("field", "path"), Column("type"), Column("asked as", asked)]
         print_table(columns, item["fields"])
-    output.say()
 
 
 def _topic_as_dict(store: Store, recorded: RecordedChannel) -> dict[str, Any]:
@@ -120,13 +116,7 @@ def _asked_as(field: dict[str, Any]) -> str:
 
 
 def show_losses(entries: Sequence[RecordingEntry], topics: Sequence[str], given: AsJson) -> None:
-    """Print what is missing, from when to when, and why.
-
-    Args:
-        entries: The recordings.
-        topics: Only of these, as patterns; empty for all.
-        given: How to print.
-    """
+    """Print what is missing of topics (patterns; none: all), from when to when, and why."""
     from hybridlog.query.topics import matcher
 
     fits = matcher(topics) if topics else None
@@ -136,17 +126,11 @@ def show_losses(entries: Sequence[RecordingEntry], topics: Sequence[str], given:
         for loss in losses_of(entry)
         if fits is None or (loss.get("topic") is not None and fits(loss["topic"]))
     ]
-    if rows or given.as_json:
-        given.show(rows, _LOSSES[len(entries) == 1 :])
-    else:
-        named = output.counted(len(entries), "recording")
-        output.say(f"Nothing is missing from {named}, as far as the ledger knows.")
-    for entry in entries:
-        if entry.status == "open":
-            output.note(
-                f"{entry.name} is still being recorded; `hybridlog top {quote(entry.name)}` shows "
-                "later losses."
-            )
+    named = output.counted(len(entries), "recording")
+    without = f"Nothing is missing from {named}, as far as the ledger knows."
+    given.show(rows, _LOSSES[len(entries) == 1 :], without)
+    if running := [entry.name for entry in entries if entry.status == "open"]:
+        output.note(f"Still being recorded, so later losses are to come: {listed(running)}.")
 
 
 def _lasted(loss: Mapping[str, Any]) -> str:
@@ -170,14 +154,7 @@ _LOSSES = [
 
 
 def show_sizes(sizes: Sizes, by: str, given: AsJson, without: str) -> None:
-    """Print the bytes of recordings, topics, or topics of each recording.
-
-    Args:
-        sizes: The sizes.
-        by: `recording`, `topic` or `both`.
-        given: How to print.
-        without: What to say without any.
-    """
+    """Print the bytes by `recording`, by `topic`, or by `both`."""
     found = sizes.rows
     if by != "both":
         found = sizes.by_recording() if by == "recording" else sizes.by_topic()
@@ -219,36 +196,45 @@ def show_attachments(
     *,
     force: bool,
 ) -> None:
-    """List attachments, print the content of one, or write some into files.
-
-    Args:
-        found: Those of the chosen recordings.
-        name: Only this one, or those that fit a glob.
-        target: The file, or the directory for several.
-        given: How to list them.
-        force: Overwrite files.
-    """
-    found = _chosen(found, name)
-    if target is None and (name is None or given.as_json):
+    """List attachments, print the one that is named or fits a glob, or write some into files."""
+    if name is not None:
+        there, found = found, [each for each in found if each.name == name]
+        found = found or [each for each in there if fnmatchcase(each.name, name)]
+        if not found:
+            names = listed(output.quoted(each.name) for each in there)
+            raise TopicError(f"There is no attachment {output.quoted(name)}. There are: {names}.")
+    if target is not None:
+        _write(found, target, is_one=name is not None and len(found) == 1, force=force)
+    elif name is None or given.as_json:
         given.show(list(map(attachment_as_dict, found)), _ATTACHMENTS, "There are no attachments.")
-    elif target is None:
-        _print_content(found)
-    elif name is None or len(found) > 1 or target.is_dir():
-        _write_all(found, target, force=force)
+    elif len(found) > 1:
+        raise UsageError(
+            f"{len(found)} attachments have this name: -o DIR writes each of them into a file."
+        )
+    elif sys.stdout.isatty() and not found[0].media_type.startswith("text/"):
+        raise UsageError(f"{found[0].name} may be no text: name a file with -o.")
     else:
-        check_room(target, force=force)
-        _write(found[0], target)
+        for piece in found[0].pieces():
+            sys.stdout.buffer.write(piece)
 
 
-def _chosen(found: list[StoredAttachment], name: str | None) -> list[StoredAttachment]:
-    if name is None:
-        return found
-    chosen = [each for each in found if each.name == name]
-    chosen = chosen or [each for each in found if fnmatchcase(each.name, name)]
-    if not chosen:
-        names = listed(output.quoted(each.name) for each in found) or "none"
-        raise TopicError(f"There is no attachment {output.quoted(name)}. There are: {names}.")
-    return chosen
+def _write(found: list[StoredAttachment], target: Path, *, is_one: bool, force: bool) -> None:
+    """Write one attachment to a file, or each into a directory under a name made from its own."""
+    from hybridlog.attachments import file_names
+
+    paths = [target]
+    if target.is_dir() or not is_one:
+        paths = [target / name for name in file_names(found)]
+    for path in paths:
+        check_room(path, force=force)
+    try:
+        (target if paths != [target] else target.parent).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"{target} cannot be made: {error.strerror}.") from error
+    for attachment, path in zip(found, paths, strict=True):
+        with if_stopped(partial(not_written, path)):
+            attachment.save(path)
+        output.note(f"{path}: {output.size(attachment.size)}")
 
 
 def attachment_as_dict(attachment: StoredAttachment) -> dict[str, Any]:
@@ -271,39 +257,6 @@ _ATTACHMENTS = [
 ]
 
 
-def _print_content(found: list[StoredAttachment]) -> None:
-    if len(found) > 1:
-        raise UsageError(
-            f"{len(found)} attachments have this name: -o DIR writes each of them into a file."
-        )
-    if sys.stdout.isatty() and not found[0].media_type.startswith("text/"):
-        raise UsageError(f"{found[0].name} may be no text: name a file with -o.")
-    for piece in found[0].pieces():
-        sys.stdout.buffer.write(piece)
-    sys.stdout.buffer.flush()
-
-
-def _write_all(found: list[StoredAttachment], directory: Path, *, force: bool) -> None:
-    """Write each attachment into a directory, under a name made from its own."""
-    from hybridlog.attachments import file_names
-
-    paths = [directory / name for name in file_names(found)]
-    for path in paths:
-        check_room(path, force=force)
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UsageError(f"{directory} cannot be made: {error.strerror}.") from error
-    for attachment, path in zip(found, paths, strict=True):
-        _write(attachment, path)
-
-
-def _write(attachment: StoredAttachment, path: Path) -> None:
-    with if_stopped(partial(not_written, path)):
-        attachment.save(path)
-    output.note(f"{path}: {output.size(attachment.size)}")
-
-
 def show_tables(store: Store, query: Query, *, as_json: bool) -> None:
     """Print the Parquet files with the rows of a topic, and SQL for DuckDB."""
     from hybridlog.maintenance.tables import missing
@@ -315,6 +268,7 @@ def show_tables(store: Store, query: Query, *, as_json: bool) -> None:
     channels = channels_of(query)
     recordings = {one.recording.id: one.recording for one in channels}.values()
     ended = [one for one in recordings if one.status not in UNFINISHED]
+    going = [one.name for one in recordings if one.status in UNFINISHED]
     found = _tables_of(store, [one for one in channels if one.recording.status not in UNFINISHED])
     tables = store.session.tables
     lacking = [one.name for one in ended if missing(store.directory, one, tables, [topic])]
@@ -322,23 +276,17 @@ def show_tables(store: Store, query: Query, *, as_json: bool) -> None:
         output.print_json({"tables": found, "missing": lacking})
         return
     for item in found:
-        for name in item["files"]:
-            output.say(name)
-        output.say()
-        output.say(f"{item['statement']};")
-        output.say()
-    if lacking:
-        output.note(
-            f"Without {listed(lacking, _MAX_NAMES)}, whose rows are missing: "
-            "`hybridlog verify --repair` makes them again."
-        )
-    if others := len(recordings) - len(ended):
-        left = output.counted(others, "unfinished recording")
-        output.note(f"Without {left}: rows are added when a recording ends.")
+        for line in (*item["files"], "", f"{item['statement']};", ""):
+            output.say(line)
     marks = sum(len(one.marks) for one in recordings) if topic == MARKS else 0
-    if marks:
-        left = output.counted(marks, "mark")
-        output.note(f"Without {left} that somebody set: no table has them, `hybridlog sql` has.")
+    without = {
+        f"{listed(lacking, _MAX_NAMES)}, whose rows are missing: `hybridlog verify --repair` "
+        "makes them again": lacking,
+        f"{listed(going)}: rows are added when a recording ends": going,
+        f"{output.counted(marks, 'mark')} that somebody set: no table has them, `hybridlog sql` "
+        "has": marks,
+    }
+    output.notes(f"Without {what}." for what, applies in without.items() if applies)
 
 
 def _tables_of(store: Store, channels: Collection[RecordedChannel]) -> list[dict[str, Any]]:

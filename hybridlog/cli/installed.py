@@ -1,17 +1,13 @@
-"""`--version --all`: what is installed, and what is missing for which command."""
+"""`--installed`: what is installed, and what is missing for which command."""
 
 from __future__ import annotations
 
-import json
 import platform
 import re
 import subprocess
 from collections.abc import Iterator
 from importlib import metadata
-from shlex import quote
 from typing import Final
-from urllib.parse import urlsplit
-from urllib.request import url2pathname
 
 from hybridlog import __version__
 from hybridlog.cli import output
@@ -34,7 +30,6 @@ NEEDED_FOR: Final = {
 
 _NAME: Final = re.compile(r"[\w.-]+")
 _EXTRA: Final = re.compile(r"extra == ['\"]([\w-]+)['\"]")
-_OWN: Final = re.compile(r"pip install 'hybridlog\[(\w+)\]'")
 _LIMIT_S: Final = 10
 
 
@@ -51,17 +46,14 @@ def print_installed() -> None:
         found = list(packages(extra))
         has = ", ".join(f"{name} {version}" for name, version in found if version)
         is_there = all(version for _, version in found)
-        cure = "" if is_there else from_here(f"pip install 'hybridlog[{extra}]'")
+        cure = "" if is_there else f"pip install 'hybridlog[{extra}]'"
         rows.append((extra, purpose, cure or has))
     headings = ("extra", "needed for", "installed, or the cure")
     print_table([Column(heading, n) for n, heading in enumerate(headings)], rows)
 
 
 def packages(extra: str | None = None) -> Iterator[tuple[str, str | None]]:
-    """Names of the packages that hybridlog or one of its extras needs, and their versions.
-
-    A version is None if the package is missing.
-    """
+    """Names and versions (None: missing) of the packages that hybridlog or an extra needs."""
     for line in metadata.requires("hybridlog") or ():
         name, of = _NAME.match(line), _EXTRA.search(line)
         if name is not None and (of[1] if of else None) == extra:
@@ -70,19 +62,6 @@ def packages(extra: str | None = None) -> Iterator[tuple[str, str | None]]:
             except metadata.PackageNotFoundError:
                 if "sys_platform" not in line:  # the MongoDB of another system
                     yield name[0], None
-
-
-def from_here(text: str) -> str:
-    """A text in which `pip install 'hybridlog[…]'` names the checkout of this hybridlog, if any."""
-    try:
-        origin = json.loads(metadata.distribution("hybridlog").read_text("direct_url.json") or "{}")
-        path = url2pathname(urlsplit(origin["url"]).path) if "dir_info" in origin else ""
-    except (KeyError, ValueError, metadata.PackageNotFoundError):
-        path = ""
-    if not path:
-        return text
-    edits = "-e " if origin["dir_info"].get("editable") else ""
-    return _OWN.sub(lambda found: f"pip install {edits}{quote(f'{path}[{found[1]}]')}", text)
 
 
 def mongodb() -> str:

@@ -19,8 +19,6 @@ from hybridlog.wording import listed
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
-    from hybridlog.maintenance.keep import KeepReport
-    from hybridlog.maintenance.retention import Step
     from hybridlog.store import Store
 
 _MAX_PINS = 1000
@@ -109,11 +107,7 @@ def _rules(given: _Given) -> dict[str, Any]:
 
 
 def _check(given: _Given, rules: dict[str, Any]) -> None:
-    """Refuse options that do not go together.
-
-    Raises:
-        UsageError: They do not.
-    """
+    """Refuse options that do not go together."""
     is_all = given.choice.is_everything
     if given.pin and is_all:
         raise UsageError("Choose the recordings to pin: -r 'monday*', --tag robot=7, -r '*'.")
@@ -222,36 +216,33 @@ def _keep(store: Store, rules: dict[str, Any], given: _Given) -> None:
         Bar("keep", 0, quiet=given.quiet or given.as_json) as bar,
     ):
         found = store.keep(wanted, dry_run=dry_run, progress=bar.part)
-    given.tell({**asdict(found), "dry_run": dry_run}, _lines(found, dry_run=dry_run))
+    plan = found.plan
+    if not given.as_json:
+        given.show(plan.steps, _STEPS)
+    size = output.size
+    freed = sum(step.bytes for step in plan.steps) if dry_run else found.freed_bytes
+    parts = [
+        f"{size(plan.used_bytes)} used",
+        *([f"{size(plan.pinned_bytes)} pinned"] if plan.pinned_bytes else []),
+        *([] if plan.free_bytes is None else [f"{size(plan.free_bytes)} free"]),
+    ]
+    told = f"{', '.join(parts)}: {size(freed)} {'would become free' if dry_run else 'freed'}"
+    given.tell({**asdict(found), "dry_run": dry_run}, [told])
     topics = store.topics()
     useless = (
         f"No topic matches {rule.pattern}, so its rule deletes nothing."
         for rule in Rules.of(wanted).topics
         if not any(map(rule.fits, topics))
     )
-    output.notes((*found.problems, *found.plan.warnings, *useless))
-    if found.problems or found.plan.is_short:
+    output.notes((*found.problems, *plan.warnings, *useless))
+    if found.problems or plan.is_short:
         raise click.exceptions.Exit(1)
 
 
-def _lines(found: KeepReport, *, dry_run: bool) -> Iterator[str]:
-    plan = found.plan
-    yield from (_told(step) for step in plan.steps)
-    pinned = f", {output.size(plan.pinned_bytes)} pinned" if plan.pinned_bytes else ""
-    count = sum(step.bytes for step in plan.steps) if dry_run else found.freed_bytes
-    did = f"{output.size(count)} would become free" if dry_run else f"{output.size(count)} freed"
-    free = "" if plan.free_bytes is None else f", {output.size(plan.free_bytes)} free"
-    yield f"{output.size(plan.used_bytes)} used{pinned}{free}: {did}"
-
-
-def _told(step: Step) -> str:
-    """A line about a deletion."""
-    what = "all of it"
-    if step.segments:
-        first, last = step.segments[0], step.segments[-1]
-        what = f"segment {first}" if first == last else f"segments {first} to {last}"
-        if len(step.segments) <= last - first:
-            what = f"{len(step.segments)} of {what}"
-        if step.topics:
-            what = f"{listed(step.topics)} in {what}"
-    return f"{step.recording}: {what}, about {output.size(step.bytes)}: {step.reason}"
+_STEPS = [
+    Column("recording", lambda step: step.recording),
+    Column("segments", lambda step: listed(map(str, step.segments)) if step.segments else "all"),
+    Column("topics", lambda step: listed(step.topics) if step.topics else "all"),
+    Column("about", lambda step: output.size(step.bytes), "right"),
+    Column("reason", lambda step: step.reason),
+]

@@ -62,11 +62,7 @@ class Training:
 def export_set(
     store: Store, query: Query, target: Path, given: Training, *, force: bool, quiet: bool
 ) -> None:
-    """Write a training set, or propose a map for one.
-
-    Raises:
-        UsageError: An option does not fit, a gap is refused, or the output exists.
-    """
+    """Write a training set, or propose a map for one."""
     if given.propose_map:
         _write_map(_proposed(query), target, force=force, quiet=quiet)
         return

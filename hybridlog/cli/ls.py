@@ -30,7 +30,7 @@ def ls_command(given: _Given) -> None:
         recordings = given.recordings_in(store.snapshot()).summaries
     found = [*recordings]
     without = "" if store.repairs.unreadable else store.directory.when_empty
-    given.show(found, RECORDINGS, without, recording_dict, pages=True)
+    given.show(found, RECORDINGS, without, recording_dict)
 
 
 def _note(entry: RecordingSummary) -> str:

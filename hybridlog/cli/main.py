@@ -11,7 +11,7 @@ from typing import NoReturn, TextIO
 
 from hybridlog.cli import signals
 from hybridlog.cli.app import EXIT_CODES, INTERNAL, of_os_error
-from hybridlog_storage.errors import HybridlogError, MissingDependencyError
+from hybridlog_storage.errors import HybridlogError
 
 __all__ = ["EXIT_CODES", "main"]
 
@@ -42,12 +42,7 @@ def _run() -> int:
     try:
         return _run_command()
     except HybridlogError as error:
-        text = "\n".join([str(error), *getattr(error, "__notes__", ())])
-        if isinstance(error, MissingDependencyError):
-            from hybridlog.cli.installed import from_here
-
-            text = from_here(text)
-        _complain(text)
+        _complain("\n".join([str(error), *getattr(error, "__notes__", ())]))
         return error.exit_code
     except BrokenPipeError:
         _discard(sys.stdout)

@@ -1,4 +1,4 @@
-"""`hybridlog open`, `view` and `mcp`: recordings for programs beside this one."""
+"""`hybridlog open`: recordings for viewers."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import click
 from hybridlog.cli import output
 from hybridlog.cli.answers import check_room, not_written, write_answer
 from hybridlog.cli.binder import argument, command, option
-from hybridlog.cli.options import AsJson, Filtered, Forced, InStore, Place, Served, one_recording
+from hybridlog.cli.options import Filtered, Forced, Served
 from hybridlog.cli.signals import ended_by_signal, if_stopped
 from hybridlog.formats.slices import SliceCache
 from hybridlog.wording import listed
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 
     from hybridlog.query.query import Query
     from hybridlog.store import Store
-    from hybridlog.view.playback.played import PlayedLog
     from hybridlog.view.playback.server import PlaybackServer
 
 _WEBSOCKET: Final = "websocket"
@@ -128,11 +127,7 @@ def _written(store: Store, query: Query, given: _Given) -> Path:
 
 
 def _find(viewer: str) -> str:
-    """The path of the program.
-
-    Raises:
-        MissingDependencyError: It is not installed.
-    """
+    """The path of the program."""
     import shutil
 
     programs, _, cure = _VIEWERS[viewer]
@@ -148,11 +143,7 @@ _MAX_SHOWN = 5  # topics
 
 
 def _play(given: _Given) -> None:
-    """Play to viewers, until a signal ends it.
-
-    Raises:
-        MissingDependencyError: The package for it is missing.
-    """
+    """Play to viewers, until a signal ends it."""
     import asyncio
 
     try:
@@ -178,7 +169,6 @@ def _play(given: _Given) -> None:
         if not given.quiet:
             output.notes(query.remarks(is_empty=False))
             print_unplayed(query)
-            _print_undefined(log)
         asyncio.run(_until_signal(server, quiet=given.quiet))
 
 
@@ -197,13 +187,13 @@ def _print_address(port: int, *, quiet: bool) -> None:
     output.say(address)
     sys.stdout.flush()
     if not quiet:
-        url = _foxglove("foxglove-websocket", address)
+        url = foxglove("foxglove-websocket", address)
         output.note(f"In Foxglove or Lichtblick: Open connection, Foxglove WebSocket, {address}")
         output.note(f"In a browser: {url}")
         output.note("Ctrl-C ends it.")
 
 
-def _foxglove(source: str, url: str) -> str:
+def foxglove(source: str, url: str) -> str:
     """The address at which Foxglove opens a source."""
     from urllib.parse import quote
 
@@ -218,96 +208,3 @@ def print_unplayed(query: Query) -> None:
     if topics:
         found = listed(sorted(topics), _MAX_SHOWN)
         output.note(f"Messages without their payload are not played; there are some of {found}.")
-
-
-def _print_undefined(log: PlayedLog) -> None:
-    """Print the topics that a viewer cannot show, since nothing defines their messages."""
-    topics = {
-        each.channel.topic
-        for each in log.channels
-        if each.channel.message_encoding != "json"
-        and (each.channel.schema is None or not each.channel.schema.data)
-    }
-    if topics:
-        output.note(
-            f"Viewers cannot show {listed(sorted(topics), _MAX_SHOWN)}: there is no definition."
-        )
-
-
-@dataclass(frozen=True, kw_only=True)
-class _View(InStore, AsJson, Served):
-    recording: str | None = one_recording(
-        "Show this one first; without, the list of recordings.", "[RECORDING]"
-    )
-    opens: bool = option("Open the page in the browser.", name="--open")
-    mcap: bool = option("Also serve selections as MCAP, to Foxglove and Lichtblick.")
-
-
-@command(_View)
-def view_command(given: _View) -> None:
-    """Look at recordings in the browser.
-
-    The page has a timeline, plots, pictures and scans, and takes questions. Only this computer
-    can open it, at an address with a secret token. The store is only read. Ctrl-C ends it.
-    """
-    import threading
-    import webbrowser
-    from urllib.parse import quote
-
-    try:
-        from hybridlog.view.server import ViewServer
-    except ModuleNotFoundError as error:
-        raise MissingDependencyError(
-            "The view needs starlette and uvicorn: pip install 'hybridlog[view]'"
-        ) from error
-    with given.opened(is_lasting=True) as store:
-        server = ViewServer(store, given.port or 0, viewers=given.mcap, origins=given.origins)
-        url = server.url
-        name = ""
-        if given.recording is not None:
-            (entry,) = store.select([given.recording])
-            name = quote(entry.name, safe="")
-            url += f"#recording={name}"
-        if given.as_json:
-            shown = {"url": url, "port": server.port}
-            output.print_json(shown | ({"mcap": f"{server.url}mcap/"} if given.mcap else {}))
-        else:
-            click.echo(url)
-            output.note("Open this address in a browser. Ctrl-C ends the server.")
-            if given.mcap:
-                _print_mcap(f"{server.url}mcap/", name)
-        sys.stdout.flush()
-        if given.opens:
-            threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()
-        with ended_by_signal(server.stop):
-            server.run()
-
-
-def _print_mcap(url: str, name: str) -> None:
-    """Print where other viewers find selections."""
-    file = f"{url}slice.mcap?recording={name or 'RECORDING'}"
-    output.note(f"MCAP file: {file}")
-    output.note(f"In Foxglove: {_foxglove('remote-file', file)}")
-    output.note(f"For a remote data loader: {url}manifest")
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Mcp(Place):
-    pass
-
-
-@command(_Mcp)
-def mcp_command(given: _Mcp) -> None:
-    """Answer the questions of an assistant, which starts it.
-
-    It speaks the Model Context Protocol over standard input and output. The store is only read;
-    answers are bounded and say what they lack.
-    """
-    try:
-        from hybridlog.view.tool_server import serve
-    except ModuleNotFoundError as error:
-        raise MissingDependencyError("mcp needs: pip install 'hybridlog[mcp]'") from error
-    from hybridlog.store import open_store
-
-    with open_store(given.store, read_only=True) as opened:
-        serve(opened)

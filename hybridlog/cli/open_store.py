@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, nullcontext
 from itertools import chain, islice
 from pathlib import Path
@@ -12,15 +12,15 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from hybridlog.cli.output import counted, note
+from hybridlog.cli.output import counted, note, notes
 from hybridlog.cli.progress import Bar
+from hybridlog.wording import listed
 from hybridlog_storage.errors import StoreError, WithoutMongoError
 
 if TYPE_CHECKING:
     from hybridlog.store import Store
-    from hybridlog_storage.segments.recovery import Recovered
 
-_MAX_LISTED = 3  # recordings that are reported one by one, stores that are named
+_MAX_LISTED = 3  # names of recordings or stores
 _MAX_FOLDERS = 1000
 _EVERY_S: Final = 2.0  # between repairs while a command lasts
 _READING: Final = ("Look", "Ask", "Export")
@@ -38,14 +38,13 @@ def opened_store(
     records: bool = False,
     **how: Any,
 ) -> Iterator[Store]:
-    """The open store.
+    """The open store, in a block around which its repairs are reported.
 
     Args:
         path: Its directory; without, `HYBRIDLOG_STORE` or `./hybridlog-store`.
         mongo: URI of the MongoDB that holds the index.
         quiet: No progress while the index is brought up to date.
-        is_lasting: The command goes on while recordings change; what it meets is repaired
-            meanwhile.
+        is_lasting: What the command meets is repaired while it goes on.
         snapshot: All that the command asks is of one moment.
         records: The command records, also while MongoDB is unavailable.
         how: Of `open_store`; what is not recovered is reported by another opening.
@@ -75,16 +74,15 @@ def opened_store(
             target = store.shared.index.index_to_record("Recording")
             doing = "so the index is made later" if target.is_wanted else "so there is no index"
         if recover:
-            _print_repairs(store, doing)
-        else:
-            _print_rebuilt(store, doing)
+            notes(_recovered(store))
+        _print_rebuilt(store, doing)
         told = {*store.repairs.unreadable}
         try:
             yield store.snapshot() if snapshot else store
             store.mend()
             _print_left(store)
         finally:
-            _print_unreadable(store, told)
+            notes(_unreadable(store, store.repairs.unreadable.keys() - told))
             _print_rebuilt(store, "" if records else doing)
 
 
@@ -109,24 +107,26 @@ def _reads() -> bool:
     return context is not None and any(context.info_name in GROUPS[one] for one in _READING)
 
 
-def _print_repairs(store: Store, doing: str) -> None:
+def _recovered(store: Store) -> Iterator[str]:
+    """Sentences about recordings that were repaired, or cannot be, when the store was opened."""
     repairs = store.repairs
     for recording, segments in repairs.recovered.items():
-        _print_recovered(recording, segments)
-    _print_unreadable(store, ())
+        kept = counted(sum(one.messages for one in segments), "message")
+        yield f"Recording {recording} was cut short by a crash: {kept} of it are recovered."
+        yield from (f"  damaged: {damage}" for one in segments for damage in one.damage)
+    yield from _unreadable(store, repairs.unreadable)
     if repairs.disk_full is not None:
-        note(
+        yield (
             "The disk of the store is full, so nothing in it is repaired or noted. Remove "
             f"recordings with `hybridlog rm`, or make room. {repairs.disk_full}"
         )
     elif not (store.directory.is_writable or store.directory.is_remote):
-        note(f"The store {store.directory.path} is read-only; its segments answer.")
-    _print_rebuilt(store, doing)
+        yield f"The store {store.directory.path} is read-only; its segments answer."
 
 
-def _print_unreadable(store: Store, told: Collection[str]) -> None:
-    for recording in store.repairs.unreadable.keys() - told:
-        note(f"Recording {recording} cannot be read: {store.repairs.unreadable[recording]}")
+def _unreadable(store: Store, recordings: Iterable[str]) -> Iterator[str]:
+    for recording in recordings:
+        yield f"Recording {recording} cannot be read: {store.repairs.unreadable[recording]}"
 
 
 def _print_rebuilt(store: Store, doing: str) -> None:
@@ -135,16 +135,13 @@ def _print_rebuilt(store: Store, doing: str) -> None:
     if repairs.tables:
         note(f"{counted(len(repairs.tables), 'table')} made again: missing or damaged.")
     indexed = {r: n for r, n in repairs.indexed.items() if n and r not in repairs.recovered}
-    added = f"{counted(sum(indexed.values()), 'chunk')} added to the index"
     if repairs.damage:
-        note(f"The data files of the embedded MongoDB were damaged, and were replaced: {added}.")
-    elif len(indexed) > _MAX_LISTED:
-        note(f"{counted(len(indexed), 'recording')}: {added}.")
-    else:
-        for recording, chunks in indexed.items():
-            note(f"Recording {recording}: {counted(chunks, 'chunk')} added to the index.")
-    for recording in repairs.removed:
-        note(f"Recording {recording} has no files any more; it is out of the index.")
+        note("The data files of the embedded MongoDB were damaged, and were replaced.")
+    if indexed:
+        added = counted(sum(indexed.values()), "chunk")
+        note(f"{listed(indexed, _MAX_LISTED)}: {added} added to the index.")
+    if repairs.removed:
+        note(f"{listed(repairs.removed)}: no files any more, so out of the index.")
     reason = store.shared.index.unavailable
     is_wanted = reason is not None and not isinstance(reason, WithoutMongoError)
     if doing and is_wanted and store.directory.is_writable:
@@ -155,35 +152,15 @@ def _print_rebuilt(store: Store, doing: str) -> None:
 
 def _print_left(store: Store) -> None:
     """Name what was met and takes longer to repair."""
-    repairs = store.repairs
-    found = {"recording": len(repairs.noted), "table": len(repairs.noted_tables)}
+    found = {"recording": len(store.repairs.noted), "table": len(store.repairs.noted_tables)}
     left = " and ".join(counted(number, what) for what, number in found.items() if number)
     if left and store.directory.is_writable:
         note(f"Left to repair: {left}. `hybridlog verify --repair` does it.")
 
 
-def _print_recovered(recording: str, segments: list[Recovered]) -> None:
-    kept = sum(s.messages for s in segments)
-    if not any(s.path for s in segments):
-        note(f"Recording {recording} was cut short by a crash before anything was stored.")
-        return
-    note(
-        f"Recording {recording} was cut short by a crash: {counted(kept, 'message')} of it "
-        "are recovered."
-    )
-    for segment in segments:
-        for damage in segment.damage:
-            note(f"  damaged: {damage}")
-
-
 @contextmanager
 def mended_meanwhile(store: Store, every: float = _EVERY_S) -> Iterator[None]:
-    """A block during which another thread calls `Store.mend` again and again.
-
-    Args:
-        store: The store.
-        every: Seconds between two calls.
-    """
+    """A block during which another thread calls `Store.mend` again and again, every so many s."""
     import math
     import threading
 

@@ -79,20 +79,14 @@ class AsJson:
         plain: Callable[[Any], object] = lambda row: row,
         **how: Any,
     ) -> None:
-        """Print rows.
-
-        Args:
-            rows: The rows.
-            columns: Of the table.
-            without: What to say without any row.
-            plain: Gives a row as JSON.
-            how: Of `print_table`.
-        """
+        """Print rows as a table or as JSON (`plain` gives that of a row)."""
         if self.as_json:
             output.print_json([plain(row) for row in rows])
+        elif getattr(self, "quiet", False):
+            return
         elif rows:
             print_table(columns, rows, **how)
-        elif without and not getattr(self, "quiet", False):
+        elif without:
             output.note(without)
 
     def tell(self, value: object, lines: Iterable[str]) -> None:
@@ -127,11 +121,7 @@ class Strict:
 
 @dataclass(frozen=True, kw_only=True)
 class Choosing:
-    """Options that choose recordings.
-
-    Attributes:
-        names: Names in an argument of the command count as `--recording`.
-    """
+    """Options that choose recordings; `names` may be those of an argument of the command."""
 
     names: ClassVar[tuple[str, ...]] = ()
     recording: tuple[str, ...] = option(
@@ -201,13 +191,7 @@ class Choosing:
 def names_argument(
     metavar: str = "[RECORDING]...", what: str = "Only these recordings", without: str = "all"
 ) -> Any:
-    """The argument that names recordings.
-
-    Args:
-        metavar: What the usage line calls it.
-        what: What its recordings are.
-        without: What no name means.
-    """
+    """The argument that names recordings; without one, all, or what is said."""
     return argument(
         f"{what}, as for --recording; without, {without}.",
         metavar,
@@ -253,14 +237,7 @@ class Ranged(Between, Choosing, InStore, Quiet):
 
 @dataclass(frozen=True, kw_only=True)
 class Topics(Ranged):
-    """Options of commands about messages of some topics.
-
-    Attributes:
-        needs_topic: Without a topic, the question is refused: all would be too much.
-        where: Predicates that all messages satisfy.
-        strict: Incomplete answers are refused.
-        verbose: The cost is told.
-    """
+    """Options of commands about messages of some topics."""
 
     needs_topic: ClassVar[bool] = False
     where: ClassVar[tuple[str, ...]] = ()
@@ -273,25 +250,14 @@ class Topics(Ranged):
 
     @property
     def topics(self) -> tuple[str, ...]:
-        """The topics as typed.
-
-        Raises:
-            UsageError: There is none, and one is needed.
-        """
+        """The topics as typed."""
         found = (*self.words, *self.topic)
         if self.needs_topic and not found:
             raise click.UsageError("Missing TOPIC; `hybridlog info` lists the topics.")
         return found
 
     def query(self, store: Store) -> Query:
-        """The query about these topics, recordings, times and predicates.
-
-        Raises:
-            TopicError: A name fits nothing, or several things; or no recording is chosen.
-            TimeError: `between` is no range of time.
-            WhereError: A predicate cannot be parsed, or does not fit the fields.
-            IncompleteError: `--strict`, and messages of the range are lost.
-        """
+        """The query about these topics, recordings, times and predicates."""
         query = self.bounded(query_of(store, self.topics, self.choice))
         for predicate in self.where:
             query = query.where(predicate)
@@ -372,19 +338,6 @@ class Latched:
         excludes=("no_latched",),
     )
 
-    def check_latched(self, form: str) -> None:
-        """Refuse what has no effect in a format.
-
-        Raises:
-            UsageError: The format has no such messages.
-        """
-        logs = formats_of("log")
-        if self.original_times and form not in logs:
-            raise UsageError(
-                f"Latched messages from before the time range are in {' and '.join(logs)}, not in "
-                f"{form}: leave out --original-times."
-            )
-
 
 @dataclass(frozen=True, kw_only=True)
 class Slices(Latched, Forced):
@@ -410,22 +363,21 @@ class Slices(Latched, Forced):
     )
 
     def settings(self, form: str) -> dict[str, Any]:
-        """Arguments of the writer of a format.
-
-        Raises:
-            UsageError: Options do not fit it, or each other.
-        """
-        self.check_latched(form)
-        if self.tags is not None and form in formats_of("log", "payloads", "pictures", "video"):
-            raise UsageError(f"--tags adds columns to tables, and {form} has none: leave it out.")
-        if form != "rosbag2":
-            if (self.storage, self.file_size) != (None, None):
-                raise UsageError(f"--storage and --file-size are for rosbag2, not for {form}.")
-            return {}
-        settings: dict[str, Any] = {"storage": self.storage or "mcap"}
-        if self.file_size is not None:
-            settings["max_file"] = self.file_size
-        return settings
+        """Arguments of the writer of a format; refuses options that do nothing in it."""
+        logs, is_bag = formats_of("log"), form == "rosbag2"
+        fits = {
+            "original_times": form in logs,
+            "tags": form not in formats_of("log", "payloads", "pictures", "video"),
+            "storage": is_bag,
+            "file_size": is_bag,
+        }
+        for name, does_fit in fits.items():
+            if getattr(self, name) and not does_fit:
+                raise UsageError(
+                    f"--{name.replace('_', '-')} does nothing in {form}: leave it out."
+                )
+        settings = {"storage": self.storage or "mcap", "max_file": self.file_size}
+        return {name: value for name, value in settings.items() if is_bag and value is not None}
 
 
 def one_recording(
@@ -459,11 +411,7 @@ def cache_size() -> Any:
 
 
 def parse_tags(pairs: Iterable[str]) -> dict[str, str]:
-    """Tags from KEY=VALUE pairs.
-
-    Raises:
-        UsageError: A pair has no key or no equals sign.
-    """
+    """Tags from KEY=VALUE pairs."""
     tags = {}
     for pair in pairs:
         key, sign, value = pair.partition("=")
@@ -474,28 +422,15 @@ def parse_tags(pairs: Iterable[str]) -> dict[str, str]:
 
 
 def recordings_of(store: Store, choice: Choice) -> Recordings:
-    """The chosen recordings; of an empty store none, if nothing is asked of them.
-
-    Raises:
-        TopicError: No recording satisfies the choice; says which condition none does.
-    """
+    """The chosen recordings; of an empty store none, if nothing is asked of them."""
     chosen = store.choose(choice)
     return chosen if choice.is_everything else chosen.check()
 
 
 def query_of(store: Store, topics: Sequence[str] | None, choice: Choice) -> Query:
-    """A query of some topics of the chosen recordings.
+    """A query of some topics, as typed, of the chosen recordings; without any topic, of all.
 
-    Short names and globs are resolved among the topics of the chosen recordings. A name that
-    is ambiguous in the store may be clear in one recording.
-
-    Args:
-        store: The store.
-        topics: As typed; None or empty for all.
-        choice: The recordings.
-
-    Raises:
-        TopicError: A name fits nothing, or several things; or no recording is chosen.
+    Short names and globs are resolved among the topics of these recordings alone.
     """
     chosen = None if choice.is_everything else recordings_of(store, choice)
     asked = store if chosen is None else chosen
@@ -511,11 +446,7 @@ def query_of(store: Store, topics: Sequence[str] | None, choice: Choice) -> Quer
 
 
 def parse_fields(text: str, option: str = "--fields") -> list[str]:
-    """The names of --fields or a similar option, each once.
-
-    Raises:
-        UsageError: A name is empty.
-    """
+    """The names of --fields or a similar option, each once."""
     names = [name.strip() for name in text.split(",")]
     if not all(names):
         raise UsageError(f"{option} takes names with commas between them, not {text!r}.")

@@ -1,11 +1,8 @@
-"""`hybridlog record` and `demo`."""
+"""`hybridlog record`."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from pathlib import Path
-
-from hybridlog.cli.binder import argument, command
+from hybridlog.cli.binder import command
 from hybridlog.cli.record_choices import RecordChoices, check_choices
 
 
@@ -35,20 +32,3 @@ def record_command(choices: RecordChoices) -> None:
         from hybridlog.cli.record_logs import record_logs
 
         record_logs(choices)
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Demo:
-    directory: Path = argument(
-        "Directory for the bag and the store of the demo.",
-        "[DIRECTORY]",
-        default=Path("hybridlog-demo"),
-    )
-
-
-@command(_Demo)
-def demo_command(given: _Demo) -> int:
-    """Take a tour: record the log of a simulated robot, query it."""
-    from hybridlog.demo import tour
-
-    return tour.run(given.directory)

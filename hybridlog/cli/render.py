@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import sys
 import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -143,7 +142,6 @@ def print_table(
     *,
     titles: int = 1,
     about: Sequence[str] = (),
-    pages: bool = False,
 ) -> None:
     """Print rows under headings; on a terminal that has no room for them, a block for each row.
 
@@ -155,32 +153,22 @@ def print_table(
         rows: What their functions take.
         titles: Number of columns that are the title of a block.
         about: Further words of each title.
-        pages: Use the pager on a terminal that has too few lines.
     """
     source = iter(rows)
     block = [*islice(source, ROWS_AT_ONCE)]
     shape = _shape(columns, block)
     if shape is None:
-        for row in chain(block, source):
+        for number, row in enumerate(chain(block, source)):
             named = [(one.name, one.cell(row)) for one in columns]
+            if number:
+                say()
             say("  ".join([*(cell for _, cell in named[:titles]), *about]))
             print_fields([pair for pair in named[titles:] if pair[1]], indent=2)
-            say()
         return
-    lines = _lines(shape, block, source)
-    if pages and sys.stdout.isatty() and len(block) >= shutil.get_terminal_size().lines:
-        import click
-
-        click.echo_via_pager(f"{line}\n" for line in lines)
-        return
-    for line in lines:
-        print(line)  # noqa: T201
-
-
-def _lines(shape: _Shape, block: list[Any], source: Iterator[Any]) -> Iterator[str]:
     cells = [[one.name for one in shape.columns], *shape.cells(block)]
     while cells:
-        yield from chain.from_iterable(map(shape.lines, cells))
+        for line in chain.from_iterable(map(shape.lines, cells)):
+            print(line)  # noqa: T201
         cells = shape.cells(islice(source, ROWS_AT_ONCE))
 
 

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import signal
 import sys
+from code import InteractiveConsole
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NoReturn, Self
+from typing import TYPE_CHECKING, Final
 
-from hybridlog.cli.answers import Tabular, answer_sql
+from hybridlog.cli.answers import Tabular, answer_tables
 from hybridlog.cli.binder import SECONDS, SIZE, argument, command, option
 from hybridlog.cli.options import Ranged, Strict
 from hybridlog.cli.output import note, notes, say
 from hybridlog.cli.signals import if_stopped
 from hybridlog_storage.errors import HybridlogError
-from hybridlog_storage.stopping import at_safe_points, postpone
+from hybridlog_storage.stopping import at_safe_points
 
 if TYPE_CHECKING:
     from hybridlog.sql.engine import SqlConnection
@@ -60,20 +61,21 @@ def sql_command(given: _Given) -> None:
                 if given.strict:
                     connection.check(text)
                 answer = connection.query(text, timeout=given.timeout)
-                answer_sql(answer, to)
+                if answer.columns:
+                    from pyarrow import Table
+
+                    answer_tables((Table.from_batches([one]) for one in answer.to_batches()), to)
             sys.stdout.flush()
             if not given.quiet:
                 notes(answer.sentences())
 
         if is_prompt:
-            run_prompt(connection, run)
+            _run_prompt(connection, run)
             return
         with if_stopped("The query was stopped."):
             run(query or "")
 
 
-_PROMPT: Final = "sql> "
-_MORE: Final = "...> "
 _ENDS: Final = frozenset({"exit", "quit", ".exit", ".quit", "\\q"})
 _HELP: Final = frozenset({"help", ".help", "?", "\\?"})
 _HINT: Final = "Statements end with a semicolon; `show tables;` lists views, Ctrl-D or `quit` ends."
@@ -81,67 +83,43 @@ _HISTORY: Final = "sql_history"
 _MAX_HISTORY: Final = 1000
 
 
-def run_prompt(connection: SqlConnection, run: Callable[[str], None]) -> None:
-    """Read statements, which end with a semicolon, and print their answers.
+class _Prompt(InteractiveConsole):
+    """Reads statements, which end with a semicolon, and completes their words.
 
     Ctrl-C stops a query, or clears what was typed; Ctrl-D ends the prompt.
     """
-    say(_HINT)
-    completer = Completer(connection)
-    with _Keys() as keys, _line_editing(completer):
-        while (text := _statement(completer, keys)) is not None:
-            if not text.strip():
-                continue
+
+    def __init__(self, connection: SqlConnection, run: Callable[[str], None]) -> None:
+        super().__init__()
+        self._connection = connection
+        self._run = run
+        self._found: list[str] = []
+
+    def raw_input(self, prompt: str = "") -> str:
+        line = input(prompt)
+        if not self.buffer and line.strip().rstrip(";").lower() in _ENDS:
+            raise EOFError
+        return line
+
+    def runsource(self, source: str, *_: object) -> bool:
+        """Answer a statement; True if more of it is to come."""
+        text = source.strip()
+        if text.rstrip(";").lower() in _HELP:
+            say(_HINT)
+        elif text and not text.endswith(";"):
+            return True
+        elif text:
             try:
-                with keys.heard(), at_safe_points():
-                    run(text)
+                with at_safe_points():
+                    self._run(source)
             except HybridlogError as error:
-                for line in str(error).splitlines():
-                    note(line)
+                notes(str(error).splitlines())
             except KeyboardInterrupt:
                 note("The query was stopped.")
+        return False
 
-
-def _statement(completer: Completer, keys: _Keys) -> str | None:
-    """The next statement; None at the end."""
-    lines: list[str] = []
-    while True:
-        completer.before = "\n".join(lines)
-        try:
-            with keys.heard():
-                line = input(_MORE if lines else _PROMPT)
-        except (KeyboardInterrupt, SystemError):  # CPython's, for one that follows at once
-            say()
-            lines.clear()
-            continue
-        except EOFError:
-            say()
-            return None
-        word = line.strip().rstrip(";").lower()
-        if not lines and word in _ENDS:
-            return None
-        if not lines and word in _HELP:
-            say(_HINT)
-            continue
-        lines.append(line)
-        if line.rstrip().endswith(";") or not any(map(str.strip, lines)):
-            return "\n".join(lines)
-
-
-class Completer:
-    """Candidates for the word before the cursor.
-
-    Attributes:
-        before: Lines of the statement before the current one.
-    """
-
-    def __init__(self, connection: SqlConnection) -> None:
-        self._connection = connection
-        self._found: list[str] = []
-        self.before = ""
-
-    def __call__(self, text: str, state: int) -> str | None:
-        """A candidate, as `readline` asks for it."""
+    def complete(self, text: str, state: int) -> str | None:
+        """A candidate for the word before the cursor, as `readline` asks for it."""
         if state == 0:
             import readline
 
@@ -149,52 +127,21 @@ class Completer:
 
             self._found = []
             with suppress(HybridlogError):
-                line = f"{self.before}\n{readline.get_line_buffer()}"
+                line = "\n".join([*self.buffer, readline.get_line_buffer()])
                 self._found = candidates(self._connection, line, text)
         return self._found[state] if state < len(self._found) else None
 
 
-class _Keys:
-    """Ctrl-C stops a query or clears what was typed, and never ends the command.
-
-    It is heard in a block, and once: pressed again, or between two blocks, it does nothing.
-    """
-
-    def __init__(self) -> None:
-        self._is_heard = False
-        self._before: Any = None
-
-    def __enter__(self) -> Self:
-        """Listen."""
-        self._before = signal.signal(signal.SIGINT, self._pressed)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Listen no longer."""
-        signal.signal(signal.SIGINT, self._before)
-
-    def _pressed(self, *_: object) -> None:
-        if self._is_heard:
-            self._is_heard = False
-            if not postpone(_interrupt):
-                raise KeyboardInterrupt
-
-    @contextmanager
-    def heard(self) -> Iterator[None]:
-        """A block in which Ctrl-C raises `KeyboardInterrupt`."""
-        try:
-            self._is_heard = True
-            yield
-        finally:
-            self._is_heard = False
-
-
-def _interrupt() -> NoReturn:
-    raise KeyboardInterrupt
+def _run_prompt(connection: SqlConnection, run: Callable[[str], None]) -> None:
+    prompt = _Prompt(connection, run)
+    sys.ps1, sys.ps2 = "sql> ", "...> "
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    with _line_editing(prompt), suppress(KeyboardInterrupt):
+        prompt.interact(_HINT, "")
 
 
 @contextmanager
-def _line_editing(completer: Completer) -> Iterator[None]:
+def _line_editing(prompt: _Prompt) -> Iterator[None]:
     """Line editing with history, where Python has it."""
     try:
         import readline
@@ -212,7 +159,7 @@ def _line_editing(completer: Completer) -> Iterator[None]:
             readline.read_history_file(path)
     readline.set_history_length(_MAX_HISTORY)
     readline.set_completer_delims(DELIMITERS)
-    readline.set_completer(completer)
+    readline.set_completer(prompt.complete)
     readline.parse_and_bind("tab: complete")
     try:
         yield

@@ -89,7 +89,7 @@ def tf_command(given: _Given) -> None:
         found = tree.lookup(target, source, stamps, extrapolate=given.extrapolate)
         if len(found) == 1 and found.missing:
             tree.transform(target, source, int(stamps[0]), extrapolate=given.extrapolate)
-        answer_tables([found.to_arrow()], lambda: None, to)
+        answer_tables([found.to_arrow()], to)
         sys.stdout.flush()
         if not given.quiet:
             notes(
@@ -129,7 +129,7 @@ def _times(
 
 def _show_tree(tree: FrameTree, to: Destination, *, quiet: bool) -> None:
     if to.form != SCREEN:
-        answer_tables([tree.to_arrow()], lambda: None, to)
+        answer_tables([tree.to_arrow()], to)
         return
     names = ("transforms", "Hz", "longest gap", "from")
     rows = []

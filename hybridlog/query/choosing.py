@@ -91,16 +91,6 @@ def choose(session: Session, choice: Choice) -> Chosen:
     return Chosen(choosing.summaries, "")
 
 
-def is_exact(session: Session, name: str) -> bool:
-    """True if a name is the whole id or name of one recording, or has no wildcards."""
-    return not _GLOB & set(name) or len(session.snapshot().called(name)) == 1
-
-
-def is_one(session: Session, names: Sequence[str]) -> bool:
-    """True if a choice by these names is of one recording, whatever the store holds."""
-    return len(names) == 1 and is_exact(session, names[0])
-
-
 def placed(session: Session, names: Iterable[str]) -> dict[int, None]:
     """Positions of recordings by names and globs.
 

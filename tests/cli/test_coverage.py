@@ -129,7 +129,7 @@ def test_info_shows_notes_and_marks(damaged: Path) -> None:
     assert run("ls", "-r", "part", store=damaged).lines[1].endswith(", the wheel squeaks")
     run("mark", "bump", "-r", "part", "--at", "+1s", store=damaged)
     assert "note       the wheel squeaks" in run("info", "part", store=damaged).out
-    told = run("info", "part", "--json", store=damaged).json
+    (told,) = run("info", "part", "--json", store=damaged).json
     assert [note["text"] for note in told["notes"]] == ["the wheel squeaks"]
     assert [(mark["text"], mark["time"]) for mark in told["marks"]] == [
         ("bump", BEGIN_NS + SECOND_NS)

@@ -2,24 +2,18 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import subprocess
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.feather
-import pyarrow.parquet
 import pytest
 
 from hybridlog.cli.answers import print_end
-from hybridlog.cli.options import Latched, Topics
+from hybridlog.cli.options import Topics
 from hybridlog.query.counters import Counters
-from hybridlog_storage.errors import UsageError
 from tests.independent import Seen, read_bag, read_mcap
 
 from . import odd_log
@@ -45,15 +39,6 @@ def scans(seen: list[Seen]) -> list[Seen]:
     return [m for m in seen if m.topic == "/base/scan"]
 
 
-@pytest.fixture(scope="module")
-def decoded(scans: list[Seen]) -> list[Any]:
-    """The scans as rosbags decodes them."""
-    from rosbags.typesys import Stores, get_typestore
-
-    types = get_typestore(Stores.ROS1_NOETIC)
-    return [types.deserialize_ros1(m.payload, "sensor_msgs/msg/LaserScan") for m in scans]
-
-
 def slice_of(scans: list[Seen], start: int) -> list[Seen]:
     return [m for m in scans if start + SECOND <= m.log_time < start + 2 * SECOND]
 
@@ -65,7 +50,7 @@ def test_the_closing_line(store: Path, scans: list[Seen], start: int) -> None:
     (line,) = done.err.splitlines()
     size = sum(len(m.payload) for m in wanted) / 1000
     assert line.startswith(f"{len(wanted)} messages, {size:.1f} kB of payload, ")
-    assert " read from disk in " in line
+    assert " read from disk, " in line
     assert line.endswith(" s")
     assert run(*SCAN, "--between", "+1s", "+2s", "-F", "raw", store=store).err == ""
 
@@ -85,14 +70,6 @@ def test_times(store: Path, seen: list[Seen], scans: list[Seen], start: int) -> 
     last = run(*SCAN, "--between", "-1s", "end", "--count", store=store)
     end = max(r["last_ns"] for r in run("ls", "--json", store=store).json if r["name"] == "robot")
     assert int(last.out) == sum(m.log_time >= end + 1 - SECOND for m in scans)
-
-
-def test_clocks(store: Path, scans: list[Seen], decoded: list[Any], start: int) -> None:
-    stamps = [m.header.stamp.sec * SECOND + m.header.stamp.nanosec for m in decoded]
-    done = run(*SCAN, "--between", "+1s", "+2s", "--clock", "header", "--count", store=store)
-    assert int(done.out) == sum(start + SECOND <= s < start + 2 * SECOND for s in stamps)
-    refused = run(*SCAN, "--between", "+1s", "+2s", "--clock", "publish", store=store, code=2)
-    assert "--clock log" in refused.err
 
 
 def test_a_wrong_predicate_is_pointed_at(store: Path) -> None:
@@ -131,65 +108,17 @@ def test_fields(store: Path) -> None:
     run(*SCAN, "--fields", "a,,b", store=store, code=2)
 
 
-def test_topics(store: Path) -> None:
-    assert "/base/scan" in run("fetch", "-t", "base", store=store, code=2).err
-    ambiguous = run("fetch", "-t", "image_raw", store=store, code=2)
-    assert "/camera/front/image_raw" in ambiguous.err
-    assert "/camera/rear/image_raw" in ambiguous.err
-    unknown = run("fetch", "-t", "imu/dato", store=store, code=2)
-    assert "/imu/data" in unknown.err
-    several = run(
-        "fetch",
-        "-t",
-        "scan",
-        "-t",
-        "imu/*",
-        "-r",
-        "robot",
-        "--between",
-        "+1s",
-        "+1.2s",
-        store=store,
-    )
-    rows = [json.loads(line) for line in several.lines]
-    assert {r["topic"] for r in rows} == {"/base/scan", "/imu/data"}
-    assert [r["log_time_ns"] for r in rows] == sorted(r["log_time_ns"] for r in rows)
-    run("fetch", "-t", "scan", "-r", "odd", store=store, code=2)
-
-
 @pytest.mark.parametrize("form", ["csv", "parquet", "arrow", "npz", "mcap", "bag", "jsonl"])
-def test_formats(
-    form: str, store: Path, scans: list[Seen], decoded: list[Any], start: int, tmp_path: Path
-) -> None:
-    wanted = slice_of(scans, start)
+def test_a_pipe_gets_what_a_file_gets(form: str, store: Path, tmp_path: Path) -> None:
     path = tmp_path / f"out.{form}"
     run(*SCAN, "--between", "+1s", "+2s", "-o", path, store=store)
     piped = run(*SCAN, "--between", "+1s", "+2s", "-F", form, "-o", "-", store=store)
-    content = path.read_bytes()
-    if form != "bag":  # whose index is written into its head at the end
-        assert piped.raw == content
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
-    first = scans.index(wanted[0])
-    ranges = [m.ranges for m in decoded[first : first + len(wanted)]]
-    times = [m.log_time for m in wanted]
-    if form in {"mcap", "bag"}:
-        found = (read_mcap if form == "mcap" else read_bag)(path)
-        assert [m for m in found if m.topic == "/base/scan"] == wanted
-        if form == "bag":
-            (tmp_path / "piped.bag").write_bytes(piped.raw)
-            assert read_bag(tmp_path / "piped.bag") == found
-    elif form == "csv":
-        rows = list(csv.DictReader(io.StringIO(content.decode())))
-        assert [np.datetime64(r["log_time"].rstrip("Z"), "ns").astype(int) for r in rows] == times
-    elif form == "npz":
-        with np.load(path) as arrays:
-            assert arrays["log_time"].astype(np.int64).tolist() == times
-            np.testing.assert_array_equal(arrays["ranges.values"], np.concatenate(ranges))
-    elif form in {"parquet", "arrow"}:
-        table = pa.parquet.read_table(path) if form == "parquet" else pa.feather.read_table(path)
-        assert table["log_time"].cast(pa.int64()).to_pylist() == times
-        for got, want in zip(table["ranges"], ranges, strict=True):
-            np.testing.assert_array_equal(got.values.to_numpy(), want)
+    if form != "bag":  # whose index is written into its head at the end
+        assert piped.raw == path.read_bytes()
+    else:
+        (tmp_path / "piped.bag").write_bytes(piped.raw)
+        assert read_bag(tmp_path / "piped.bag") == read_bag(path)
 
 
 def test_latched_messages_stand_in_front(store: Path, seen: list[Seen], tmp_path: Path) -> None:
@@ -211,14 +140,6 @@ def test_latched_messages_stand_in_front(store: Path, seen: list[Seen], tmp_path
     # The message at a time is one message.
     at = ("fetch", "-t", "tf_static", "-r", "robot", "--at", "+2s", "-o", tmp_path / "at.mcap")
     assert "1 message, " in run(*at, "-v", store=store).err
-
-
-def test_options_about_latched_messages_without_any() -> None:
-    with pytest.raises(UsageError, match="not in csv"):
-        Latched(no_latched=False, original_times=True).check_latched("csv")
-    for form in ("mcap", "bag"):
-        Latched(no_latched=False, original_times=True).check_latched(form)
-    Latched(no_latched=True, original_times=False).check_latched("csv")
 
 
 def test_nothing_is_overwritten_without_force(store: Path, tmp_path: Path) -> None:

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 import hybridlog as hl
 from tests import places
-from tests.imports import ROOT
 from tests.independent import read_bag
 from tests.other_user import User, needs_root, open_place
 
@@ -142,20 +139,3 @@ def test_the_default_store_is_in_the_working_directory(
     run("record", logs / "odd.mcap", "-q")
     assert places.names(tmp_path / "hybridlog-store") == ["odd"]
     assert "odd" in run("ls").out
-
-
-def test_a_closed_output_is_no_error(tmp_path: Path) -> None:
-    """As by `hybridlog ls >&-`, where there is nothing to print."""
-    with hl.open(tmp_path / "store", create=True):
-        pass
-    command = [sys.executable, "-m", "hybridlog", "ls", "--store", str(tmp_path / "store")]
-    done = subprocess.run(
-        ["sh", "-c", 'exec "$@" >&-', "sh", *command],
-        cwd=ROOT,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "storage")])},
-        stderr=subprocess.PIPE,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0
-    assert "Traceback" not in done.stderr

@@ -158,7 +158,7 @@ def test_large_fields_fit_their_definition(tmp_path: Path) -> None:
     assert notes["/torn"].endswith("1 unreadable")
     rows = {
         row["topic"]: row["unreadable"]
-        for row in run("info", "large", "--json", store=store).json["channels"]
+        for row in run("info", "large", "--json", store=store).json[0]["channels"]
     }
     assert rows == {"/large": 0, "/torn": 1}
 
@@ -210,7 +210,7 @@ def test_a_log_that_gives_nothing_makes_no_store(tmp_path: Path) -> None:
 
 
 def test_a_damaged_log(logs: Path, store: Path) -> None:
-    found = run("info", "torn", "--json", store=store).json
+    (found,) = run("info", "torn", "--json", store=store).json
     readable = {(m.topic, m.log_time) for m in read_bag(logs / "small.bag")}
     assert 0 < found["messages"] < len(readable)
     assert found["losses"]

@@ -44,13 +44,3 @@ def test_wrong_ways(store: Path) -> None:
         done = run("open", "websocket", "/map", "-r", "robot", "--port", port, store=store, code=2)
     assert f"Port {port} is in use" in done.err
     assert done.out == ""
-
-
-def test_topics_that_viewers_cannot_show_are_said(store: Path, tmp_path: Path) -> None:
-    with started(
-        "open", "websocket", "-r", "odd", "--store", store, "--port", 0, output=tmp_path / "out"
-    ) as process:
-        wait_for(lambda: "Ctrl-C ends it." in (tmp_path / "out").read_text())
-        assert "Viewers cannot show" in (tmp_path / "out").read_text()
-        process.send_signal(signal.SIGTERM)
-        assert process.wait(30) == 0

@@ -84,7 +84,7 @@ def test_what_a_kill_leaves_is_recovered_and_told(logs: Path, fresh: Path, tmp_p
     assert "Recording robot was cut short by a crash:" in done.err
     assert "cut short by a crash" in next(line for line in done.lines if line.startswith("robot"))
     assert run("ls", store=fresh).err == ""
-    found = run("info", "robot", "--json", store=fresh).json
+    (found,) = run("info", "robot", "--json", store=fresh).json
     assert 0 < found["messages"] < len(read_bag(logs / "robot.bag"))
     # Chunks of large messages are written first.
     count = run("fetch", "-t", "front/image_raw", "-r", "robot", "--count", store=fresh)

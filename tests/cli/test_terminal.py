@@ -16,7 +16,6 @@ import time
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
@@ -182,29 +181,9 @@ def test_rates_are_sorted_by_topic(store: Path) -> None:
     assert len(topics) > 10
 
 
-def test_the_cure_for_a_missing_extra_can_be_pasted(monkeypatch: pytest.MonkeyPatch) -> None:
-    from hybridlog.cli.installed import from_here
-
-    said = "SQL needs DuckDB: pip install 'hybridlog[sql]'"
-
-    def pretend(origin: str | None) -> str:
-        found = SimpleNamespace(read_text=lambda _: origin)
-        monkeypatch.setattr("importlib.metadata.distribution", lambda _: found)
-        return from_here(said)
-
-    place = {"url": "file:///home/me/my%20robot"}
-    assert pretend(json.dumps({**place, "dir_info": {"editable": True}})) == (
-        "SQL needs DuckDB: pip install -e '/home/me/my robot[sql]'"
-    )
-    assert pretend(json.dumps({**place, "dir_info": {}})) == (
-        "SQL needs DuckDB: pip install '/home/me/my robot[sql]'"
-    )
-    assert pretend(json.dumps({"url": "https://somewhere/x.whl"})) == pretend(None) == said
-
-
 def test_versions_and_definitions_break_no_word(store: Path) -> None:
     for words, width, expected in (
-        (("--version", "--all"), 80, 0),
+        (("--installed",), 80, 0),
         (("info", "-t", "scan", "-r", "robot", "--store", store), 80, 0),
         (("keep", "--quota", "100kB", "--dry-run", "--store", store), 60, 1),
     ):

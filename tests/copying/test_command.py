@@ -75,7 +75,7 @@ def test_payloads_that_were_not_copied_yet_were_not_deleted(
     run("copy", "-r", label, lab, "--store", robots, "--only-fields")
     assert told in answer("fetch", "cloud", "-o", tmp_path / "cut.mcap", store=lab).err
     assert told in " ".join(answer("info", label, store=lab).out.split())
-    assert told in answer("info", label, "--json", store=lab).json["coverage"]
+    assert told in answer("info", label, "--json", store=lab).json[0]["coverage"]
     words = why.partition(" (")[0].partition(" to ")[0]
     assert f"payloads {words}" in answer("ls", store=lab).out
     (listed,) = answer("ls", "--json", store=lab).json

@@ -160,7 +160,7 @@ def test_frames_are_copied(store: hl.Store, form: str, tmp_path: Path) -> None:
     done = answer(
         "fetch", *asked, "--no-latched", "-o", slices, "--force", store=store.directory.path
     )
-    assert "3 messages are left out; the first: a frame of video" in done.err
+    assert "3 messages left out; the first: a frame of video" in done.err
     assert read(slices)[1] == [BASE + n * STEP for n in (10, 11)]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Iterator
 from dataclasses import replace
@@ -251,8 +252,7 @@ def test_a_damaged_chunk_costs_no_table(copy: Path, *, off: bool) -> None:
         assert query.count() == expected > 0
         assert query.counters.chunks_read == 0
     said = answer("index", "arrays", "scan", *["--off"] * off, store=copy)
-    assert said.out == ""
-    assert "Tables of /scan in log stay as they are" in said.err
+    assert "Tables of log stay as they are" in said.err
 
 
 def test_topics_without_long_arrays(copy: Path) -> None:
@@ -266,7 +266,7 @@ def test_topics_without_long_arrays(copy: Path) -> None:
             with pytest.raises(UsageError, match="Name the topics one by one"):
                 store.index.arrays(*wrong)
     said = answer("index", "arrays", "number", store=copy).out
-    assert said == "/number: no long arrays, except of bytes; its tables stay as they are\n"
+    assert said.splitlines()[1].startswith("/number  no long arrays ")
 
 
 def answers_of(path: Path) -> list[Any]:
@@ -344,9 +344,8 @@ def test_new_recordings_follow_the_setting(tmp_path: Path) -> None:
 
 def test_the_command(copy: Path) -> None:
     said = answer("index", "arrays", "scan", "/later", store=copy).out
-    assert "/scan: tables with arrays; those of its type take " in said
-    assert "1 recording made anew" in said
-    assert "/later: no recording has it yet" in said
+    assert re.search(r"(?m)^/scan +with arrays +1 +\S+ \S+ +\S+ \S+$", said)
+    assert re.search(r"(?m)^/later +none yet +0 ", said)
     again = answer("index", "arrays", "scan", "--json", store=copy).json
     assert [(one["topic"], one["recordings"]) for one in again] == [("/scan", [])]
     assert "Its tables have long arrays" in answer("info", "-t", "scan", store=copy).out

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Verify(Named, InStore, AsJson, Quiet):
+class _Given(Named, InStore, AsJson, Quiet):
     repair: bool = option("Mend what can be mended without losing anything; list the rest.")
     moved: bool = option(
         "With --repair: the store was moved to here, take its index over.",
@@ -38,8 +38,8 @@ class _Verify(Named, InStore, AsJson, Quiet):
     )
 
 
-@command(_Verify)
-def verify_command(given: _Verify) -> None:
+@command(_Given)
+def verify_command(given: _Given) -> None:
     """Read everything, check checksums and references.
 
     Exits with 1 when it finds a problem, and prints a cure for each. With --repair, it restores
@@ -74,7 +74,7 @@ def verify_command(given: _Verify) -> None:
         raise DatabaseError(f"The index was not compared: {why}")
 
 
-def _chosen(given: _Verify, store: Store) -> tuple[Sequence[RecordingSummary], list[str]]:
+def _chosen(given: _Given, store: Store) -> tuple[Sequence[RecordingSummary], list[str]]:
     """The chosen recordings, and ids of chosen ones that cannot be read: their names are lost."""
     choice, known = given.choice, [*store.repairs.unreadable]
     unreadable = [one for one in known if any(fnmatchcase(one, name) for name in choice.name)]
@@ -106,7 +106,7 @@ def _print(result: Verification, elapsed: float, *, quiet: bool) -> None:
     )
 
 
-def _repair(given: _Verify) -> None:
+def _repair(given: _Given) -> None:
     """Mend what can be mended, and list what is left."""
     if given.new_id:
         from hybridlog.maintenance.lease import become_another

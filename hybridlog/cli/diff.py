@@ -1,0 +1,87 @@
+"""`hybridlog diff`."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import click
+
+from hybridlog.cli import output
+from hybridlog.cli.answers import Listing
+from hybridlog.cli.app import DIFFERENT
+from hybridlog.cli.binder import argument, command, option
+from hybridlog.cli.check import verdict
+from hybridlog.cli.completion import complete_topic
+from hybridlog.cli.options import Between, InStore, Quiet, one_recording, topics
+from hybridlog.cli.render import Column
+
+_NEAR: Final = 0.05
+"""Share of differences that a tolerance is proposed for."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Given(Between, InStore, Quiet, Listing):
+    a: str = one_recording("A recording, as for --recording, or a glob for several together.", "A")
+    b: str = one_recording("The same.", "B")
+    words: tuple[str, ...] = argument(
+        "Topics, as for --topic.", "[TOPIC]...", shell_complete=complete_topic
+    )
+    tolerance: str = option(
+        "Numbers are equal that differ by at most this, such as 5%.", "SHARE", default="0"
+    )
+    topic: tuple[str, ...] = topics()
+    contract: Path | None = option("Also compare which rules in this file are broken.", "FILE")
+
+
+@command(_Given)
+def diff_command(given: _Given) -> None:
+    """Show what differs between two recordings.
+
+    First what only one has: times and topics. Then types, messages, rates, gaps, losses, and
+    statistics of fields of the time that both have. Exit code 12 if anything differs.
+    """
+    from hybridlog.contract import Contract, parse_share
+
+    rules = None if given.contract is None else Contract.read(given.contract)
+    share = parse_share(given.tolerance)
+    with given.opened(snapshot=True) as store:
+        found = store.diff(
+            given.a,
+            given.b,
+            topics=(*given.words, *given.topic),
+            between=given.between,
+            tolerance=share,
+            contract=rules,
+        )
+        verdicts = [
+            f"{name}: {verdict(store.judge(rules, name))}"
+            for name in (given.a, given.b)
+            if rules is not None
+        ]
+    columns = [Column("topic"), Column("what"), Column("a", _side("a")), Column("b", _side("b"))]
+    given.answer(map(asdict, found), columns, titles=2)
+    sys.stdout.flush()
+    if not (given.quiet or given.as_json):
+        output.notes(verdicts)
+        near = sum(one.share is not None and one.share <= _NEAR for one in found)
+        if near and not share:
+            output.note(f"--tolerance {_NEAR:.0%} leaves out {near} of the differences.")
+        total = f"{output.counted(len(found), 'difference')}." if found else "No difference."
+        is_cut = given.limit is not None and given.limit < len(found)
+        output.note(f"The first {given.limit} of {total}" if is_cut else total)
+    if found:
+        raise click.exceptions.Exit(DIFFERENT)
+
+
+def _side(name: str) -> Callable[[Mapping[str, Any]], str]:
+    """Gives what a recording has, in words where only it has something."""
+
+    def told(row: Mapping[str, Any]) -> str:
+        is_alone = row[name] and row["what"] in {"times", "topic"}
+        return f"only {name}: {row[name]}" if is_alone else str(row[name])
+
+    return told

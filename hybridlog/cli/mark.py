@@ -1,0 +1,90 @@
+"""`hybridlog mark`."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from hybridlog.cli import options, output
+from hybridlog.cli.binder import argument, command, option
+from hybridlog.cli.options import Running
+from hybridlog_storage.errors import StoreError, UsageError
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Given(Running):
+    text: str = argument("What happened.", "TEXT")
+    tags: tuple[str, ...] = option("Add KEY=VALUE to it.", "K=V", name="--set-tag")
+    at: str | None = option(
+        "Mark a recording, also a running one, at this time, written as for --between.", "T"
+    )
+    until: str | None = option("The mark lasts from --at to this time.", "T2", needs=("at",))
+    pin: tuple[str, str] | None = option(
+        "Mark and pin so much before and after the present moment; `keep --pin` pins other times.",
+        "BEFORE AFTER",
+        nargs=2,
+        excludes=("at", "remove"),
+    )
+    remove: bool = option(
+        "Remove the marks with this text; with --at only what begins at this time.",
+        needs=("recording",),
+        excludes=("tags", "until"),
+    )
+
+
+@command(_Given)
+def mark_command(given: _Given) -> None:
+    """Set a mark that queries can use, now or at a past time.
+
+    A mark answers as a message on /hybridlog/marks: `hybridlog fetch scan --where
+    "/hybridlog/marks: text = 'gripper slipped'" --within 5s`.
+    """
+    tags, at = options.parse_tags(given.tags), given.at
+    if not given.text.strip():
+        raise UsageError("A mark needs a text: say what happened.")
+    if (given.remove or at is not None) and len(given.recording) != 1:
+        raise UsageError("A mark at a time needs one recording: name it with --recording.")
+    if given.remove:
+        with given.opened() as store:
+            store.unmark(given.recording[0], given.text, at)
+        return
+    if at is None:
+        from hybridlog.query.times import parse_duration
+
+        before, after = map(parse_duration, given.pin or ("0s", "0s"))
+        around = None if given.pin is None else (before, after)
+        marked = _mark_running(given.text, tags, around, given.recording, given.store)
+    else:
+        (recording,) = given.recording
+        with given.opened() as store:
+            marked = iter([store.mark(recording, at, given.text, tags, until=given.until).name])
+    for name in marked:
+        if not given.quiet:
+            output.note(f"Marked in {name}.")
+
+
+def _mark_running(
+    text: str,
+    tags: dict[str, str],
+    around: tuple[int, int] | None,
+    recordings: tuple[str, ...],
+    store: Path | None,
+) -> Iterator[str]:
+    """Mark what recorders write at this moment, and pin the time around it; yields their names."""
+    from hybridlog.live.clocks import CLOCK
+    from hybridlog.live.state import choose, read
+    from hybridlog.maintenance.edit import mark_now
+    from hybridlog.store import store_path
+    from hybridlog_storage.remote import directory_of
+
+    now, directory = time.time_ns(), directory_of(store_path(store))
+    for recording in choose(directory, recordings):
+        simulated: int | None = None
+        with suppress(StoreError):  # it has just begun
+            simulated = read(directory.path, recording).sim_time
+        if simulated == 0:
+            raise UsageError(f"There is no time of {CLOCK} yet: mark again when it has come.")
+        yield mark_now(directory, recording, simulated or now, text, tags, around=around)

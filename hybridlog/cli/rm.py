@@ -1,0 +1,68 @@
+"""`hybridlog rm`."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import click
+
+from hybridlog.cli import output
+from hybridlog.cli.binder import command, option
+from hybridlog.cli.ls import RECORDINGS
+from hybridlog.cli.options import InStore, Named, Quiet, names_argument, recordings_of
+from hybridlog.cli.render import print_table
+from hybridlog.cli.signals import if_stopped
+from hybridlog.wording import listed
+from hybridlog_storage.errors import UsageError
+
+if TYPE_CHECKING:
+    from hybridlog_storage.summary import RecordingSummary
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Given(Named, InStore, Quiet):
+    names: tuple[str, ...] = names_argument(  # type: ignore[misc]
+        what="These recordings", without="those that the options choose"
+    )
+    yes: bool = option("Do not ask.", short="-y")
+
+
+@command(_Given)
+def rm_command(given: _Given) -> None:
+    """Delete recordings, payloads and index."""
+    choice = given.choice
+    if choice.is_everything:
+        raise UsageError(
+            "Name the recordings to delete, or choose them: -r 'monday*', --tag robot=7. "
+            "`hybridlog ls` lists all; -r '*' is all of them."
+        )
+    with given.opened() as store:
+        chosen = recordings_of(store, choice).summaries
+        if not given.yes:
+            pins = [pin["reason"] for one in chosen for pin in store.entry(one.id).pins]
+            _confirm(chosen, pins)
+        for one in chosen:
+            with if_stopped(
+                "A recording whose removal began is gone; the next command that opens the "
+                "store removes the rest of it."
+            ):
+                store.remove(one.id)
+            if not given.quiet:
+                output.say(f"deleted {one.name}")
+
+
+def _confirm(chosen: Sequence[RecordingSummary], pins: Sequence[str]) -> None:
+    """Ask for consent, with what would be lost."""
+    what = f"{listed(one.name for one in chosen)} for good"
+    if pins:
+        reasons = listed(filter(None, dict.fromkeys(pins)))
+        what += f", with {output.counted(len(pins), 'pin')} ({reasons})"
+    if not sys.stdin.isatty():
+        raise UsageError(f"Deleting {what} needs --yes.")
+    print_table(RECORDINGS, chosen)
+    if not click.confirm(f"Delete {what}?", err=True):
+        output.note("Nothing is deleted.")
+        raise click.exceptions.Exit(1)

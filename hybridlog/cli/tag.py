@@ -1,0 +1,48 @@
+"""`hybridlog tag`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from hybridlog.cli import options
+from hybridlog.cli.binder import argument, command, option
+from hybridlog.cli.completion import complete_recording
+from hybridlog.cli.options import AsJson, Choosing, InStore, Quiet, recordings_of
+from hybridlog.query.choice import Choice
+from hybridlog_storage.errors import UsageError
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Given(Choosing, InStore, AsJson, Quiet):
+    words: tuple[str, ...] = argument(
+        "A recording, as for --recording, unless options choose; and tags to set. Without "
+        "tags, show them.",
+        "[RECORDING] [KEY=VALUE]...",
+        shell_complete=complete_recording,
+    )
+    remove: tuple[str, ...] = option("Remove this tag.", "KEY")
+
+
+@command(_Given)
+def tag_command(given: _Given) -> None:
+    """Set, show or remove the tags of recordings."""
+    choice, pairs = given.choice, given.words
+    if choice.is_everything:
+        if not given.words:
+            raise UsageError("Name a recording, or choose some: -r 'monday*', --has TOPIC.")
+        choice, pairs = Choice.of(given.words[0]), given.words[1:]
+    with given.opened() as store:
+        chosen = recordings_of(store, choice).summaries
+        tags = options.parse_tags(pairs)
+        found = {}
+        for one in chosen:
+            # Of several recordings, some may lack a tag.
+            keys = [key for key in given.remove if len(chosen) == 1 or key in one.tags]
+            changed = store.edit(one.id, tag=tags, untag=keys) if keys or tags else one
+            found[one.name] = changed.tags
+    lines = (
+        f"{'' if len(found) == 1 else f'{name}: '}{key}={value}"
+        for name, own in found.items()
+        for key, value in sorted(own.items())
+    )
+    given.tell(found, lines)

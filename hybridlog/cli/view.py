@@ -1,0 +1,72 @@
+"""`hybridlog view`."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+
+import click
+
+from hybridlog.cli import output
+from hybridlog.cli.binder import command, option
+from hybridlog.cli.open import foxglove
+from hybridlog.cli.options import AsJson, InStore, Served, one_recording
+from hybridlog.cli.signals import ended_by_signal
+from hybridlog_storage.errors import MissingDependencyError
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Given(InStore, AsJson, Served):
+    recording: str | None = one_recording(
+        "Show this one first; without, the list of recordings.", "[RECORDING]"
+    )
+    opens: bool = option("Open the page in the browser.", name="--open")
+    mcap: bool = option("Also serve selections as MCAP, to Foxglove and Lichtblick.")
+
+
+@command(_Given)
+def view_command(given: _Given) -> None:
+    """Look at recordings in the browser.
+
+    The page has a timeline, plots, pictures and scans, and takes questions. Only this computer
+    can open it, at an address with a secret token. The store is only read. Ctrl-C ends it.
+    """
+    import threading
+    import webbrowser
+    from urllib.parse import quote
+
+    try:
+        from hybridlog.view.server import ViewServer
+    except ModuleNotFoundError as error:
+        raise MissingDependencyError(
+            "The view needs starlette and uvicorn: pip install 'hybridlog[view]'"
+        ) from error
+    with given.opened(is_lasting=True) as store:
+        server = ViewServer(store, given.port or 0, viewers=given.mcap, origins=given.origins)
+        url = server.url
+        name = ""
+        if given.recording is not None:
+            (entry,) = store.select([given.recording])
+            name = quote(entry.name, safe="")
+            url += f"#recording={name}"
+        if given.as_json:
+            shown = {"url": url, "port": server.port}
+            output.print_json(shown | ({"mcap": f"{server.url}mcap/"} if given.mcap else {}))
+        else:
+            click.echo(url)
+            output.note("Open this address in a browser. Ctrl-C ends the server.")
+            if given.mcap:
+                _print_mcap(f"{server.url}mcap/", name)
+        sys.stdout.flush()
+        if given.opens:
+            threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()
+        with ended_by_signal(server.stop):
+            server.run()
+
+
+def _print_mcap(url: str, name: str) -> None:
+    """Print where other viewers find selections."""
+    file = f"{url}slice.mcap?recording={name or 'RECORDING'}"
+    output.note(f"MCAP file: {file}")
+    output.note(f"In Foxglove: {foxglove('remote-file', file)}")
+    output.note(f"For a remote data loader: {url}manifest")
