@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, replace
 from stat import S_ISDIR, S_ISREG
 from typing import TYPE_CHECKING
@@ -133,18 +134,23 @@ class LogSet:
         return _JoinedSource(self)
 
     def read_time_range(self) -> tuple[int, int] | None:
-        """Read the log to find its log time `[start, end)`, ns; None without messages.
+        """The log time `[start, end)` of its messages, ns; None without messages.
 
-        Raises:
-            SourceError: As `open`.
+        Files whose own index does not tell it are read.
         """
         first, last = 1 << 63, -1
-        with self.open() as source:
-            for batch in source.batches():
-                if len(batch):
+        for part in self.parts:
+            with suppress(SourceError), LogSet(part.path, (part,)).open() as source:
+                if source.time_range is not None:
+                    first, last = (
+                        min(first, source.time_range[0]),
+                        max(last, source.time_range[1] - 1),
+                    )
+                    continue
+                for batch in source.batches():
                     first = min(first, int(batch.log_time.min()))
                     last = max(last, int(batch.log_time.max()))
-                source.extras.clear()
+                    source.extras.clear()
         return span_of(first, last) if first <= last else None
 
 
@@ -243,40 +249,17 @@ class _JoinedSource(Source):
         self.damage.extend(log.damage)
         self._numbers: dict[tuple[object, ...], int] = {}
         self._inner: Source | None = None
-        if len(log.parts) == 1:
-            # With one file, its error is raised at once.
+        with suppress(SourceError) if len(log.parts) > 1 else nullcontext():
             self._inner = self._open(log.parts[0])
             self._say(self._inner)
-            self.message_count = self._inner.message_count
-            self.time_range = self._inner.time_range
-        elif not any(part.is_packed for part in log.parts):
-            self._look()
+            if len(log.parts) == 1:
+                self.message_count = self._inner.message_count
+                self.time_range = self._inner.time_range
         self.kind = self.kind or form.name
 
     def _say(self, inner: Source) -> None:
         self.profile = self.profile or inner.profile
         self.kind = self.kind or inner.kind
-
-    def _look(self) -> None:
-        """Add up the statements of each file about itself."""
-        counts: list[int | None] = []
-        ranges: list[tuple[int, int]] = []
-        for part in self._log.parts:
-            try:
-                with part.open() as inner:
-                    self._say(inner)
-                    counts.append(inner.message_count)
-                    if inner.time_range is not None:
-                        ranges.append(inner.time_range)
-                    elif inner.message_count != 0:
-                        return
-            except SourceError:
-                return
-        known = [count for count in counts if count is not None]
-        if len(known) == len(counts):
-            self.message_count = sum(known)
-        if ranges:
-            self.time_range = (min(low for low, _ in ranges), max(high for _, high in ranges))
 
     def close(self) -> None:
         """Close the open file."""
