@@ -98,7 +98,7 @@ def _write(
     with Sink(target) as sink:
         try:
             file: _ArrowFile | None = None
-            for group in _groups(answer, form):
+            for group in groups(answer, form):
                 table = prepared(group)
                 file = file or open_file(sink, table)
                 file.write_table(table)
@@ -112,8 +112,12 @@ def _write(
             ) from error
 
 
-def _groups(answer: Answer, form: str) -> Iterator[pa.Table]:
+def groups(answer: Answer, form: str) -> Iterator[pa.Table]:
     """The rows in tables of the same columns, each of many rows; at least one, possibly empty.
+
+    Args:
+        answer: The tables.
+        form: The format, for messages.
 
     Raises:
         UsageError: A column appears too late, twice, or with values that do not fit the type
