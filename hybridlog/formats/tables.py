@@ -240,13 +240,7 @@ def _row_pieces(row: pa.Table) -> Iterator[bytes]:
     for index, column in enumerate(row.columns):
         yield b"," if index else b""
         array = column.combine_chunks()
-        if pa.types.is_string(column.type) and array.nbytes > PIECE_BYTES and not array.null_count:
-            text = array[0].as_py()
-            yield b'"'
-            for begin in range(0, len(text), PIECE_BYTES):
-                yield text[begin : begin + PIECE_BYTES].replace('"', '""').encode()
-            yield b'"'
-        elif array.null_count or not (pa.types.is_nested(column.type) or is_bytes(column.type)):
+        if array.null_count or not (pa.types.is_nested(column.type) or is_bytes(column.type)):
             cell = io.BytesIO()
             pa.csv.write_csv(
                 _as_text(row.select([index])), cell, pa.csv.WriteOptions(include_header=False)

@@ -122,7 +122,10 @@ def write_lerobot(
             place = unfinished / f"{len(made):06d}"
             written = WrittenEpisode.read(place)
             report.resumed += written is not None
-            made.append(written or write_episode(query.session, episode, features, options, place))
+            if written is None:
+                with failures(str(place)):
+                    written = write_episode(query.session, episode, features, options, place)
+            made.append(written)
             if progress is not None:
                 progress(episode.name, made[-1].length)
     if not made:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import sqlite3
 from collections import Counter
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 from urllib.parse import quote
 
 import numpy as np
@@ -57,10 +57,10 @@ class SqliteSource(Source):
         self._select = ""
         self._got = 0
         self._problem: tuple[int, str] | None = None
-        header = _read_header(path)
-        self._missing = header.pages * header.page - self.size_bytes
+        page, pages = _read_header(path)
+        self._missing = pages * page - self.size_bytes
         try:
-            self._db, log_unread = _connect_whole_pages(path, header, self.size_bytes)
+            self._db, log_unread = _connect_whole_pages(path, page, self.size_bytes)
         except sqlite3.Error as error:
             raise _unreadable(path, error) from error
         if log_unread is not None:
@@ -292,14 +292,8 @@ class SqliteSource(Source):
 _LOG_TIMES = ("timestamp", "recv_timestamp")
 
 
-class _Header(NamedTuple):
-    """The used part of a database header: bytes of a page, number of pages."""
-
-    page: int
-    pages: int
-
-
-def _read_header(path: Path) -> _Header:
+def _read_header(path: Path) -> tuple[int, int]:
+    """Bytes of a page, and number of pages, by the header of a database."""
     try:
         with path.open("rb") as file:
             data = file.read(100)
@@ -308,19 +302,19 @@ def _read_header(path: Path) -> _Header:
     if not data.startswith(MAGIC):
         raise SourceError(f"{path}: no SQLite database; give the .db3 file of a ROS 2 bag")
     page = int.from_bytes(data[16:18], "big")
-    return _Header(1 << 16 if page == 1 else page, int.from_bytes(data[28:32], "big"))
+    return 1 << 16 if page == 1 else page, int.from_bytes(data[28:32], "big")
 
 
 def _connect_whole_pages(
-    path: Path, header: _Header, size: int
+    path: Path, page: int, size: int
 ) -> tuple[sqlite3.Connection, Path | None]:
     """Open a database without its truncated last page.
 
     SQLite would read zeros for the missing part of that page, and return them as payload.
     """
-    if header.page < 512 or size % header.page == 0:
+    if page < 512 or size % page == 0:
         return _connect(path)
-    spooled = copy_start(path, size - size % header.page)
+    spooled = copy_start(path, size - size % page)
     try:
         return _connect(spooled.path)
     finally:
