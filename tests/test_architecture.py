@@ -79,7 +79,7 @@ ALLOWED = {
         "hybridlog_storage.summary",
     ),
     "obstore": ("hybridlog_storage.remote.bucket",),
-    "pandas": ("hybridlog.frames",),
+    "pandas": ("hybridlog.frames", "hybridlog.training.lerobot"),
     "picows": (
         "hybridlog.live.sources.foxglove.connection",
         "hybridlog.live.sources.foxglove.session",

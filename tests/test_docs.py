@@ -1182,9 +1182,9 @@ def test_the_specification_names_what_there_is() -> None:
 
 
 def test_the_unit_for_systemd_starts_a_recorder() -> None:
-    from hybridlog.cli.live_options import recorder_options
     from hybridlog.cli.record import record_command
     from hybridlog.cli.record_choices import RecordChoices, check_choices
+    from hybridlog.cli.record_live import recorder_options
 
     (unit,) = (fence for fence in fences(DOCS / "robot.md") if fence.language == "ini")
     settings = dict(line.split("=", 1) for line in unit.lines if "=" in line)

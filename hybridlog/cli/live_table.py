@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Self
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Self
 
 from hybridlog.cli import output
 from hybridlog.cli.signals import restore_echo, stop_echo
 from hybridlog.record.losses import Cause
-from hybridlog.wording import listed
 
 if TYPE_CHECKING:
     from rich.console import Group
@@ -17,7 +16,6 @@ if TYPE_CHECKING:
 
     from hybridlog.live.state import RecorderState
     from hybridlog.live.statistics import TopicState
-    from hybridlog.record.recorder import RecordReport
 
 _HEADINGS = ("Hz", "usual", "MB/s", "jitter ms", "messages", "thinned", "lost")
 _SPARE = ("jitter ms", "usual", "MB/s", "thinned")  # left out first where there is little room
@@ -179,47 +177,3 @@ def _cells(topic: TopicState) -> list[Text]:
         Text(str(topic.thinned), style="dim") if topic.thinned else Text(),
         Text(str(topic.lost), style="red") if topic.lost else Text(),
     ]
-
-
-def closing_rows(
-    report: RecordReport, state: RecorderState, unreached: Sequence[str]
-) -> list[tuple[str, str]]:
-    """Rows of the table at the end.
-
-    Args:
-        report: Result of the recording.
-        state: Of the recorder, at its end.
-        unreached: Addresses of sources that never answered.
-    """
-    entry = report.entry
-    rate = entry.messages / report.elapsed_s if report.elapsed_s else 0.0
-    rows = [
-        ("source", f"{entry.source['path']} ({entry.source['kind']})"),
-        ("topics", str(len({c.topic for c in entry.channels}))),
-        ("messages", f"{entry.messages} of {state.messages} received"),
-        ("bytes in", output.size(state.stored_bytes)),
-        ("bytes stored", output.size(entry.stored_bytes)),
-        ("messages indexed", str(report.indexed)),
-        ("time", f"{report.elapsed_s:.1f} s ({rate:,.0f} messages/s)"),
-    ]
-    if state.let_go:
-        rows.append(("let go", f"{state.let_go}, by the ring"))
-    if unreached:
-        rows.append(("lost", f"unknown, never reached: {', '.join(unreached)}"))
-    elif not state.lost.keys() - {Cause.THROTTLE.value}:
-        rows.append(("lost", "nothing"))
-    for cause, count in sorted(state.lost.items()):
-        losses = [row for row in entry.end.get("losses", []) if row["cause"] == cause]
-        topics = sorted({row["topic"] or "any" for row in losses})
-        named = listed(topics, 3)
-        what = "thinned out" if cause == Cause.THROTTLE else f"lost: {cause}"
-        rows.append((what, f"{_number(count, losses)} ({named})"))
-    return rows
-
-
-def _number(known: int, losses: Sequence[Mapping[str, Any]]) -> str:
-    """The number of lost messages, as far as it is known."""
-    if not known:
-        return "unknown"
-    is_more = any(row["count"] is None for row in losses)
-    return f"at least {known}" if is_more else str(known)

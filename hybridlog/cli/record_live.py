@@ -10,14 +10,22 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
-from typing import TYPE_CHECKING
+from dataclasses import replace
+from typing import TYPE_CHECKING, Final
 
 from hybridlog.cli import output
-from hybridlog.cli.live_options import recorder_options, sources_of
-from hybridlog.cli.live_summary import LiveSummary
 from hybridlog.cli.live_table import LiveTable, in_short, summary
 from hybridlog.cli.open_store import opened_store
-from hybridlog.cli.record_choices import opened_to_record
+from hybridlog.cli.options import parse_tags
+from hybridlog.cli.record_choices import (
+    DEFAULT_CHUNK,
+    OF_ENVIRONMENT,
+    RecordChoices,
+    matchers,
+    opened_to_record,
+    segment_settings,
+)
+from hybridlog.cli.record_summary import LiveSummary
 from hybridlog.cli.signals import handled, restore_echo, write_note
 from hybridlog.contract.judge import broken
 from hybridlog_storage.errors import HybridlogError
@@ -26,12 +34,13 @@ from hybridlog_storage.stopping import Flag
 if TYPE_CHECKING:
     from contextlib import AbstractContextManager
 
-    from hybridlog.cli.record_choices import RecordChoices
-    from hybridlog.live.recorder import Recorder
+    from hybridlog.live.recorder import Recorder, RecorderOptions
+    from hybridlog.live.sources.base import LiveSource
     from hybridlog.live.state import RecorderState
     from hybridlog.record.recorder import RecordReport
     from hybridlog.store import Store
 
+_MIN_CHUNK: Final = 1 << 19
 _STATE_S = 1.0
 _RECOVERY_POLL_S = 0.05
 _EXPLAIN_AFTER_S = 2.0  # a longer wait at the end is explained
@@ -63,22 +72,23 @@ def _record(choices: RecordChoices) -> None:
             held.enter_context(source).check()
         store = held.enter_context(opened_to_record(choices, recover=False))
         check_room(shutil.disk_usage(store.directory.path).free, options.reserve_bytes)
+        recovery = threading.Thread(target=_recover, args=(choices, store), daemon=True)
         with _stop_flag() as stop, frozen_objects():
-            recorder = Recorder(store, sources, options, display.say)
-            recorder.start()
-            recovery = _begin_recovery(choices, store)
+            full = ""
             while True:
+                recorder = Recorder(store, sources, options, display.say)
+                recorder.start()
+                if full:
+                    display.say(f"the manifest of {full} is full: {recorder.name} goes on")
+                else:
+                    recovery.start()
                 with display.table(), _pinned_by_signal(recorder):
                     last = _watch(recorder, stop, display)
                 if stop.is_set or not recorder.is_full:
                     break
                 reports += recorder.stop()
-                options, sources, full = recorder.rest, sources_of(choices), recorder.name
-                recorder = Recorder(
-                    store, [*map(held.enter_context, sources)], options, display.say
-                )
-                recorder.start()
-                display.say(f"the manifest of {full} is full: {recorder.name} goes on")
+                options, full = recorder.rest, recorder.name
+                sources = [held.enter_context(source) for source in sources_of(choices)]
             notify_service("STOPPING=1", "STATUS=writing what is left")
             if quiet:
                 reports += recorder.stop()
@@ -95,22 +105,93 @@ def _record(choices: RecordChoices) -> None:
         ending.print_and_exit(as_json=choices.as_json, quiet=quiet)
 
 
-def _begin_recovery(choices: RecordChoices, store: Store) -> threading.Thread:
+def recorder_options(choices: RecordChoices) -> RecorderOptions:
+    """Options of the recorder.
+
+    Raises:
+        UsageError: A value is out of range.
+        TopicError: A pattern that is malformed.
+    """
+    from hybridlog.contract import Contract
+    from hybridlog.live.memory import default_budget
+    from hybridlog.live.policy import priority_rule, throttle_rule
+    from hybridlog.live.recorder import RecorderOptions
+    from hybridlog.live.triggers import Trigger
+
+    chosen, no_index = matchers(choices)
+    budget_bytes = choices.budget or default_budget()
+    # Each topic of large messages has an open chunk, and all of them are to fit.
+    chunk_size = min(max(budget_bytes >> 8, _MIN_CHUNK), DEFAULT_CHUNK)
+    settings = replace(
+        segment_settings(choices, chunk_size),
+        segment_size=choices.split_size,
+        segment_span_s=choices.split_duration,
+    )
+    return RecorderOptions(
+        name=choices.name or _name(choices),
+        tags=parse_tags(choices.set_tag),
+        matcher=chosen,
+        throttles=[throttle_rule(*one) for one in choices.throttle],
+        priorities=[priority_rule(*one) for one in choices.priority],
+        duration_s=choices.duration,
+        max_messages=choices.max_messages,
+        max_bytes=choices.max_size,
+        reserve_bytes=choices.reserve,
+        budget_bytes=budget_bytes,
+        flush_interval_s=choices.flush_interval,
+        settings=settings,
+        ring_s=choices.ring,
+        triggers=[Trigger.of(text) for text in choices.trigger],
+        before_s=choices.before,
+        after_s=choices.after or 0.0,
+        no_index=no_index,
+        use_sim_time=choices.use_sim_time,
+        contract=None if choices.contract is None else Contract.read(choices.contract),
+    )
+
+
+def _name(choices: RecordChoices) -> str:
+    if choices.replay is not None:
+        return choices.replay.stem or "replay"
+    return "ros1" if choices.ros1 is not None else "ros2" if choices.ros2 else "foxglove"
+
+
+def sources_of(choices: RecordChoices) -> list[LiveSource]:
+    """The chosen sources; each imports the packages it needs.
+
+    Raises:
+        UsageError: A setting is malformed.
+    """
+    found: list[LiveSource] = []
+    if choices.ros1 is not None:
+        from hybridlog.live.sources.ros1.source import Ros1Source
+
+        found.append(Ros1Source(None if choices.ros1 == OF_ENVIRONMENT else choices.ros1))
+    if choices.ros2:
+        from hybridlog.live.sources.ros2.source import Ros2Source
+
+        found.append(Ros2Source(qos_overrides=choices.qos))
+    if choices.foxglove is not None:
+        from hybridlog.live.sources.foxglove.source import FoxgloveSource
+
+        found.append(FoxgloveSource(choices.foxglove))
+    if choices.replay is not None:
+        from hybridlog.live.sources.replay import ReplaySource
+
+        found.append(ReplaySource(choices.replay, speed=choices.speed))
+    return found
+
+
+def _recover(choices: RecordChoices, store: Store) -> None:
     """Open the store again, which recovers what a crash has cut, beside the recorder.
 
     A process that ends meanwhile cuts nothing: the next command recovers it.
     """
-
-    def recover() -> None:
-        try:
-            with opened_store(store.directory.path, choices.mongo, quiet=True) as opened:
-                opened.shared.index.database  # noqa: B018 - brings the index up to date
-        except (HybridlogError, OSError) as error:
-            output.note(f"hybridlog: earlier recordings are not recovered yet: {error}")
-
-    thread = threading.Thread(target=recover, daemon=True)
-    thread.start()
-    return thread
+    try:
+        with opened_store(store.directory.path, choices.mongo, quiet=True) as opened:
+            opened.shared.index.database  # noqa: B018 - brings the index up to date
+    except (HybridlogError, OSError) as error:
+        output.note(f"hybridlog: earlier recordings are not recovered yet: {error}")
 
 
 def _watch(recorder: Recorder, stop: Flag, display: _Display) -> RecorderState:

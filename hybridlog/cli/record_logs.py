@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from functools import partial
@@ -19,6 +19,7 @@ from hybridlog.cli.ls import with_misfits
 from hybridlog.cli.options import parse_tags
 from hybridlog.cli.progress import Bar
 from hybridlog.cli.record_choices import RecordChoices, matchers, opened_to_record, segment_settings
+from hybridlog.cli.record_summary import fields_of, ratio, row_of
 from hybridlog.cli.render import Column, bytes_of, numbers, print_fields, print_table
 from hybridlog.cli.signals import if_stopped
 from hybridlog.cli.watching import watch
@@ -416,12 +417,9 @@ def _summary(path: Path, report: RecordReport) -> dict[str, Any]:
     entry = report.entry
     return {
         "path": str(path),
-        "recording": entry.name,
         "id": entry.id,
-        "status": entry.status,
+        **row_of(report),
         "topics": len({c.topic for c in entry.channels}),
-        "messages": entry.messages,
-        "messages_indexed": report.indexed,
         "messages_unreadable": sum(c.stats.unreadable for c in entry.channels),
         "messages_surplus": sum(c.stats.surplus for c in entry.channels),
         "messages_skipped": report.skipped,
@@ -430,21 +428,14 @@ def _summary(path: Path, report: RecordReport) -> dict[str, Any]:
         "metadata_records": entry.metadata_records,
         "messages_latched": report.latched,
         "bytes_in": entry.source["bytes"],
-        "bytes_stored": entry.stored_bytes,
         "ratio": round(entry.source["bytes"] / (entry.stored_bytes or math.inf), 3),
-        "seconds": round(report.elapsed_s, 3),
         "damage": [{**asdict(d), "file": str(d.file)} for d in report.damage],
         "not_indexed": {c.topic: c.unindexed for c in entry.channels if c.unindexed is not None},
     }
 
 
-def _ratio(row: Mapping[str, Any]) -> str:
-    return f"{row['bytes_in'] / (row['bytes_stored'] or math.inf):.2f}"
-
-
 def _print_one(path: Path, report: RecordReport) -> None:
-    entry, row = report.entry, _summary(path, report)
-    rate = entry.messages / report.elapsed_s if report.elapsed_s else 0.0
+    entry = report.entry
     messages, attachments = str(entry.messages), str(entry.attachments or "")
     if report.skipped:
         messages += f" ({report.skipped} left out)"
@@ -454,20 +445,7 @@ def _print_one(path: Path, report: RecordReport) -> None:
         messages += f"; {report.latched} of them {what}, from before the time range"
     if report.attachments_left_out:
         attachments = f"{entry.attachments} ({report.attachments_left_out} left out)"
-    print_fields(
-        [
-            ("recording", entry.name),
-            ("source", f"{path} ({entry.source['kind']})"),
-            ("topics", row["topics"]),
-            ("messages", messages),
-            *([("attachments", attachments)] if attachments else []),
-            ("bytes in", output.size(row["bytes_in"])),
-            ("bytes stored", output.size(entry.stored_bytes)),
-            ("ratio", _ratio(row)),
-            ("messages indexed", report.indexed),
-            ("time", f"{report.elapsed_s:.2f} s ({rate:,.0f} messages/s)"),
-        ]
-    )
+    print_fields(fields_of(report, path, messages, entry.source["bytes"], attachments))
 
 
 def _print_several(reports: Sequence[RecordReport]) -> None:
@@ -483,7 +461,7 @@ _COLUMNS = [
     *numbers("topics", "messages"),
     bytes_of("bytes in", "bytes_in", order=1),
     bytes_of("stored", "bytes_stored"),
-    Column("ratio", _ratio, "right"),
+    Column("ratio", lambda row: ratio(row["bytes_in"], row["bytes_stored"]), "right"),
     Column("indexed", "messages_indexed", "right"),
     Column("time", lambda row: f"{row['seconds']:.2f} s", "right"),
 ]

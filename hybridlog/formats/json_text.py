@@ -70,12 +70,6 @@ def json_pieces(array: pa.Array) -> Iterator[str]:
             else:
                 yield ", ".join(json_column(part).to_pylist())
         yield "]"
-    elif is_text(kind):
-        text = array[0].as_py()
-        yield '"'
-        for begin in range(0, len(text), PIECE_BYTES):
-            yield json.dumps(text[begin : begin + PIECE_BYTES])[1:-1]
-        yield '"'
     elif is_bytes(kind):
         data = memoryview(array[0].as_buffer())
         yield '"'

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, replace
 from stat import S_ISDIR, S_ISREG
 from typing import TYPE_CHECKING
@@ -133,18 +134,23 @@ class LogSet:
         return _JoinedSource(self)
 
     def read_time_range(self) -> tuple[int, int] | None:
-        """Read the log to find its log time `[start, end)`, ns; None without messages.
+        """The log time `[start, end)` of its messages, ns; None without messages.
 
-        Raises:
-            SourceError: As `open`.
+        Files whose own index does not tell it are read.
         """
         first, last = 1 << 63, -1
-        with self.open() as source:
-            for batch in source.batches():
-                if len(batch):
+        for part in self.parts:
+            with suppress(SourceError), LogSet(part.path, (part,)).open() as source:
+                if source.time_range is not None:
+                    first, last = (
+                        min(first, source.time_range[0]),
+                        max(last, source.time_range[1] - 1),
+                    )
+                    continue
+                for batch in source.batches():
                     first = min(first, int(batch.log_time.min()))
                     last = max(last, int(batch.log_time.max()))
-                source.extras.clear()
+                    source.extras.clear()
         return span_of(first, last) if first <= last else None
 
 
@@ -240,43 +246,16 @@ class _JoinedSource(Source):
         self._log = log
         self._states_frames = log.metadata is not None and log.metadata.packed_messages
         self._got = 0
-        self.damage.extend(log.damage)
+        for damage in log.damage:
+            self.note(damage)
         self._numbers: dict[tuple[object, ...], int] = {}
         self._inner: Source | None = None
-        if len(log.parts) == 1:
-            # With one file, its error is raised at once.
+        with suppress(SourceError) if len(log.parts) > 1 else nullcontext():
             self._inner = self._open(log.parts[0])
-            self._say(self._inner)
-            self.message_count = self._inner.message_count
-            self.time_range = self._inner.time_range
-        elif not any(part.is_packed for part in log.parts):
-            self._look()
+            if len(log.parts) == 1:
+                self.message_count = self._inner.message_count
+                self.time_range = self._inner.time_range
         self.kind = self.kind or form.name
-
-    def _say(self, inner: Source) -> None:
-        self.profile = self.profile or inner.profile
-        self.kind = self.kind or inner.kind
-
-    def _look(self) -> None:
-        """Add up the statements of each file about itself."""
-        counts: list[int | None] = []
-        ranges: list[tuple[int, int]] = []
-        for part in self._log.parts:
-            try:
-                with part.open() as inner:
-                    self._say(inner)
-                    counts.append(inner.message_count)
-                    if inner.time_range is not None:
-                        ranges.append(inner.time_range)
-                    elif inner.message_count != 0:
-                        return
-            except SourceError:
-                return
-        known = [count for count in counts if count is not None]
-        if len(known) == len(counts):
-            self.message_count = sum(known)
-        if ranges:
-            self.time_range = (min(low for low, _ in ranges), max(high for _, high in ranges))
 
     def close(self) -> None:
         """Close the open file."""
@@ -298,7 +277,6 @@ class _JoinedSource(Source):
                 reason = _without_path(error, part.path)
                 self.damage.append(Damage(part.path, 0, size, reason, part.messages))
             else:
-                self._say(inner)
                 with inner:
                     yield from self._read(part, inner, done, size)
                 self._inner = None
@@ -310,8 +288,15 @@ class _JoinedSource(Source):
         self.damage.extend(self._log.unread)
 
     def _open(self, part: LogFile) -> Source:
-        if not part.is_packed:
-            return part.open()
+        inner = self._unspooled(part) if part.is_packed else part.open()
+        self.profile = self.profile or inner.profile
+        self.kind = self.kind or inner.kind
+        self.extras += inner.extras
+        inner.extras = self.extras
+        return inner
+
+    def _unspooled(self, part: LogFile) -> Source:
+        """Open a compressed file, by way of a temporary one."""
         spooled = spool(part.path)
         try:
             inner = part.open(spooled.path)
@@ -339,9 +324,7 @@ class _JoinedSource(Source):
             numbers = self._numbered(inner, numbers, alike)
             share = inner.bytes_read / inner.size_bytes if inner.size_bytes else 1.0
             self.bytes_read = done + int(size * min(share, 1.0))
-            self._take_extras(inner)
             yield replace(batch, channel=numbers[batch.channel])
-        self._take_extras(inner)
         self._numbered(inner, numbers, alike)
         self.damage.extend(replace(damage, file=part.path) for damage in inner.damage)
         self.remarks.extend(f"{part.path}: {remark}" for remark in inner.remarks)
@@ -354,7 +337,8 @@ class _JoinedSource(Source):
         total = metadata.message_count if metadata is not None and path.is_dir() else None
         lost = sum(damage.messages_lost or 0 for damage in self.damage)
         if total is None or self._got + lost < total:
-            self.damage.extend(self._log.gaps)
+            for gap in self._log.gaps:
+                self.note(gap)
         self._check_count(path / NAME, total, self._got, 0)
 
     def _check_count(self, path: Path, total: int | None, got: int, found_before: int) -> None:
@@ -377,10 +361,6 @@ class _JoinedSource(Source):
         elif not unknown and missing > 0:
             reason = f"the log's metadata lists {total} messages, {got} are there"
             self.damage.append(Damage(path, None, None, reason, missing))
-
-    def _take_extras(self, inner: Source) -> None:
-        self.extras.extend(inner.extras)
-        inner.extras.clear()
 
     def _numbered(
         self, inner: Source, numbers: NDArray[np.int32], alike: Counter[tuple[object, ...]]

@@ -11,7 +11,7 @@
 | structures | `name.field` |
 
 If a column has nulls, `name.valid` marks the rows with a value; the others are NaN, NaT,
-zero or empty. Rows wait in temporary Arrow files, from which columns are read one by one.
+zero or empty. Rows wait in a temporary Arrow file, from which columns are read one by one.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from __future__ import annotations
 import zipfile
 from collections.abc import Callable, Iterator
 from functools import partial
-from typing import IO, TYPE_CHECKING, Any, Self, TypeAlias, cast
+from typing import IO, TYPE_CHECKING, Any, TypeAlias, cast
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
 from hybridlog.formats.answer import Answer
+from hybridlog.formats.tables import groups
 from hybridlog.formats.writing import Sink, Target, failures
 from hybridlog.schema.arrow_types import (
     bounds_of,
-    converted,
     is_bytes,
     is_list,
     is_numeric,
@@ -59,100 +59,58 @@ def write_npz(answer: Answer, target: Target) -> None:
         UsageError: A column changes its type, or has a type without a numpy form.
         DiskFullError: No space left.
     """
-    with Sink(target) as sink, failures(sink.name), _Spool(answer.schema) as spool:
-        for table in answer.tables:
-            spool.add(table)
-        with zipfile.ZipFile(cast("IO[bytes]", sink), "w", zipfile.ZIP_STORED) as archive:
-            try:
-                for name, kind, pieces in spool.columns():
-                    for array in _arrays(_array_name(name), kind, pieces):
-                        _add(archive, *array)
-            except BaseException:
-                # Otherwise the archive would be finished, and a stream would look complete.
-                sink.abort()
-                raise
+    directory = scratch_directory()
+    try:
+        with Sink(target) as sink, failures(sink.name):
+            path = str(directory.path / "rows.arrow")
+            schema = _spool(groups(answer, "npz"), path)
+            with zipfile.ZipFile(cast("IO[bytes]", sink), "w", zipfile.ZIP_STORED) as archive:
+                try:
+                    for index, field in enumerate(schema):
+                        if not pa.types.is_null(field.type):
+                            pieces = partial(_column, path, index)
+                            for array in _arrays(_array_name(field.name), field.type, pieces):
+                                _add(archive, *array)
+                except BaseException:
+                    # Otherwise the archive would be finished, and a stream would look complete.
+                    sink.abort()
+                    raise
+    finally:
+        directory.remove()
 
 
-class _Spool:
-    """Rows in temporary Arrow files; columns are matched by name, a missing one is null.
+def _spool(tables: Iterator[pa.Table], path: str) -> pa.Schema:
+    """Write tables of the same columns into an Arrow file; returns the columns of that."""
+    table = _plain(next(tables))
+    for field in table.schema:
+        for _ in _arrays(field.name, field.type, lambda: iter(())):
+            pass  # a type that numpy does not have is refused here
+    with pa.ipc.new_file(path, table.schema) as file:
+        file.write_table(table)
+        for more in tables:
+            file.write_table(_plain(more))
+    return table.schema
 
-    Args:
-        schema: The columns, if they are known before.
-    """
 
-    def __init__(self, schema: pa.Schema | None) -> None:
-        self._schema = schema
-        self._types: dict[str, pa.DataType] = {}
-        self._file: pa.ipc.RecordBatchFileWriter | None = None
-        self._file_schema: pa.Schema | None = None
-        self._paths: list[str] = []
-        self._directory = scratch_directory()
+def _plain(table: pa.Table) -> pa.Table:
+    """The rows without dictionaries, with JSON as text, in one piece."""
+    columns = []
+    for column in table.combine_chunks().columns:
+        kind = column.type
+        if isinstance(kind, pa.BaseExtensionType):
+            arrays = [one.storage for one in column.chunks]
+            columns.append(pa.chunked_array(arrays, kind.storage_type))
+        else:
+            is_coded = pa.types.is_dictionary(kind)
+            columns.append(column.cast(kind.value_type) if is_coded else column)
+    return pa.Table.from_arrays(columns, table.column_names)
 
-    def __enter__(self) -> Self:
-        return self
 
-    def __exit__(self, *_: object) -> None:
-        self._end_file()
-        self._directory.remove()
-
-    def add(self, table: pa.Table) -> None:
-        """Append rows."""
-        names = table.column_names
-        if len(set(names)) != len(names):
-            raise UsageError("two columns have the same name; leave one out with --fields")
-        for batch in table.combine_chunks().to_batches():
-            arrays = [self._plain(*one) for one in zip(names, batch.columns, strict=True)]
-            made = pa.record_batch(arrays, names)
-            if self._file is None or made.schema != self._file_schema:
-                self._end_file()
-                self._paths.append(str(self._directory.path / f"{len(self._paths)}.arrow"))
-                self._file = pa.ipc.new_file(self._paths[-1], made.schema)
-                self._file_schema = made.schema
-            self._file.write_batch(made)
-
-    def columns(self) -> Iterator[tuple[str, pa.DataType, Pieces]]:
-        """Name, type and values of each column that has any."""
-        self._end_file()
-        for name, kind in self._types.items():
-            yield name, kind, partial(self._pieces, name, kind)
-
-    def _plain(self, name: str, array: pa.Array) -> pa.Array:
-        """The array in the type that its column had before, JSON as text."""
-        if self._schema is not None and name in self._schema.names:
-            array = converted(array, self._schema.field(name).type)
-        if isinstance(array, pa.ExtensionArray):
-            array = array.storage
-        if pa.types.is_dictionary(array.type):
-            array = array.dictionary_decode()
-        if pa.types.is_null(array.type):
-            return array  # its type is not known yet
-        if name not in self._types:
-            for _ in _arrays(name, array.type, lambda: iter(())):
-                pass  # a type that numpy does not have is refused here
-            self._types[name] = array.type
-        kind = self._types[name]
-        try:
-            return array.cast(kind)
-        except pa.ArrowException as error:
-            raise UsageError(
-                f"column {name!r} is {kind} at first and {array.type} later, which does not fit "
-                f"({error}); leave it out with --fields"
-            ) from error
-
-    def _end_file(self) -> None:
-        file, self._file = self._file, None
-        if file is not None:
-            file.close()
-
-    def _pieces(self, name: str, kind: pa.DataType) -> Iterator[pa.Array]:
-        for path in self._paths:
-            with pa.memory_map(path) as mapped:
-                file = pa.ipc.open_file(mapped)
-                at = file.schema.get_field_index(name)
-                is_there = at >= 0 and not pa.types.is_null(file.schema.types[at])
-                for number in range(file.num_record_batches):
-                    batch = file.get_batch(number)
-                    yield batch.column(at) if is_there else pa.nulls(len(batch), kind)
+def _column(path: str, index: int) -> Iterator[pa.Array]:
+    with pa.memory_map(path) as mapped:
+        file = pa.ipc.open_file(mapped)
+        for number in range(file.num_record_batches):
+            yield file.get_batch(number).column(index)
 
 
 def _add(

@@ -98,7 +98,7 @@ def _write(
     with Sink(target) as sink:
         try:
             file: _ArrowFile | None = None
-            for group in _groups(answer, form):
+            for group in groups(answer, form):
                 table = prepared(group)
                 file = file or open_file(sink, table)
                 file.write_table(table)
@@ -112,8 +112,12 @@ def _write(
             ) from error
 
 
-def _groups(answer: Answer, form: str) -> Iterator[pa.Table]:
+def groups(answer: Answer, form: str) -> Iterator[pa.Table]:
     """The rows in tables of the same columns, each of many rows; at least one, possibly empty.
+
+    Args:
+        answer: The tables.
+        form: The format, for messages.
 
     Raises:
         UsageError: A column appears too late, twice, or with values that do not fit the type
@@ -236,13 +240,7 @@ def _row_pieces(row: pa.Table) -> Iterator[bytes]:
     for index, column in enumerate(row.columns):
         yield b"," if index else b""
         array = column.combine_chunks()
-        if pa.types.is_string(column.type) and array.nbytes > PIECE_BYTES and not array.null_count:
-            text = array[0].as_py()
-            yield b'"'
-            for begin in range(0, len(text), PIECE_BYTES):
-                yield text[begin : begin + PIECE_BYTES].replace('"', '""').encode()
-            yield b'"'
-        elif array.null_count or not (pa.types.is_nested(column.type) or is_bytes(column.type)):
+        if array.null_count or not (pa.types.is_nested(column.type) or is_bytes(column.type)):
             cell = io.BytesIO()
             pa.csv.write_csv(
                 _as_text(row.select([index])), cell, pa.csv.WriteOptions(include_header=False)

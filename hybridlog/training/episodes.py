@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import reduce
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
 import numpy as np
@@ -171,30 +172,30 @@ def _picture_or_none(message: Message | None) -> NDArray[np.uint8] | None:
     return np.ascontiguousarray(pixels[:, :, :3])
 
 
+@dataclass(frozen=True, slots=True)
 class _Reader:
     """Reads topics of a recording in a range, and the messages that are current at its begin.
 
-    Args:
+    Attributes:
         session: The open store.
         recording: Id of the recording.
         begin: First log time, ns.
         end: Last log time, exclusive, ns.
     """
 
-    def __init__(self, session: Session, recording: str, begin: int, end: int) -> None:
-        self._session = session
-        self._recording = recording
-        self._begin = begin
-        self._end = end
+    session: Session
+    recording: str
+    begin: int
+    end: int
 
     def _query(self, topic: str) -> Query:
         """The question for the messages in the range, and for the current one before it."""
-        whole = Query(self._session, Question((topic,), (self._recording,)))
+        whole = Query(self.session, Question((topic,), (self.recording,)))
         try:
-            begin = whole.at(self._begin).log_time_ns
+            begin = whole.at(self.begin).log_time_ns
         except TopicError:
-            begin = self._begin
-        return whole.between(begin, self._end)
+            begin = self.begin
+        return whole.between(begin, self.end)
 
     def messages(self, topic: str) -> Iterator[Message]:
         """The messages of a topic, by log time."""
@@ -219,12 +220,13 @@ class _Reader:
             UsageError: A field is no number, or an array whose length changes.
         """
         import pyarrow as pa
+        import pyarrow.compute as pc
 
         table = self._query(source.topic).fields(*source.paths).to_arrow()
         present = [column for column in table.column_names if column in source.paths]
         if missing := set(source.paths).difference(present):
             raise UsageError(f"{source.topic} has no field {min(missing)}.")
-        table = table.filter(_is_known(table, present))
+        table = table.filter(reduce(pc.and_, (pc.is_valid(table[name]) for name in present)))
         columns, names = [], []
         for path in source.paths:
             numbers = _numbers(table[path], source.topic, path)
@@ -238,21 +240,12 @@ class _Reader:
 
     def _checked(self, topic: str, times: NDArray[np.int64]) -> NDArray[np.int64]:
         if not len(times):
-            name = self._session.entry(self._recording).name
+            name = self.session.entry(self.recording).name
             raise TopicError(
                 f"Recording {name} has no message of {topic} before "
-                f"{format_time(self._end)}: leave the recording out, or map another topic."
+                f"{format_time(self.end)}: leave the recording out, or map another topic."
             )
         return times
-
-
-def _is_known(table: pa.Table, columns: Sequence[str]) -> pa.ChunkedArray:
-    import pyarrow.compute as pc
-
-    found = pc.is_valid(table[columns[0]])
-    for name in columns[1:]:
-        found = pc.and_(found, pc.is_valid(table[name]))
-    return found
 
 
 def _numbers(column: pa.ChunkedArray, topic: str, path: str) -> NDArray[np.float32]:
@@ -286,11 +279,9 @@ def _is_old(times: NDArray[np.int64], messages: NDArray[np.int64], fps: int) -> 
     period = usual_period(np.diff(messages))
     if not period:
         return np.zeros(len(times), np.bool_)  # a topic that says something once
-    return _ages(times, messages) > max(GAP_PERIODS * period, 10**9 / fps)
-
-
-def _ages(times: NDArray[np.int64], messages: NDArray[np.int64]) -> NDArray[np.int64]:
-    return times - messages[match(times, messages, "asof", None).before]
+    ages = times - messages[match(times, messages, "asof", None).before]
+    old: NDArray[np.bool_] = ages > max(GAP_PERIODS * period, 10**9 / fps)
+    return old
 
 
 def _runs(is_good: NDArray[np.bool_]) -> list[tuple[int, int]]:

@@ -16,6 +16,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
 
 from hybridlog import __version__
 from hybridlog.arrays.video import pyav
@@ -29,7 +32,7 @@ from hybridlog.training.lerobot_episodes import WrittenEpisode, write_episode, w
 from hybridlog_storage.errors import PayloadError, UsageError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -45,7 +48,7 @@ _UNFINISHED: Final = ".episodes"
 _PLAN: Final = "plan.json"
 _DATA: Final = "data/chunk-{chunk:03d}/file-{file:03d}.parquet"
 _VIDEO: Final = "videos/{key}/chunk-{chunk:03d}/file-{file:03d}.mp4"
-_EPISODES: Final = "meta/episodes/chunk-000/file-000.parquet"
+_EPISODES: Final = "meta/episodes/chunk-{chunk:03d}/file-{file:03d}.parquet"
 _INDEX: Final = {"dtype": "int64", "shape": [1], "names": None}
 
 
@@ -108,7 +111,7 @@ def write_lerobot(
     unfinished = root / _UNFINISHED
     if root.exists() and not unfinished.exists():
         raise UsageError(f"{root} is there already: name another directory, or add --force.")
-    if not _is_same(unfinished, plan):
+    if not (unfinished / _PLAN).exists() or (unfinished / _PLAN).read_text() != plan:
         shutil.rmtree(unfinished, ignore_errors=True)  # of another set, which nobody finished
         unfinished.mkdir(parents=True)
         write_text(unfinished / _PLAN, plan)
@@ -119,7 +122,10 @@ def write_lerobot(
             place = unfinished / f"{len(made):06d}"
             written = WrittenEpisode.read(place)
             report.resumed += written is not None
-            made.append(written or write_episode(query.session, episode, features, options, place))
+            if written is None:
+                with failures(str(place)):
+                    written = write_episode(query.session, episode, features, options, place)
+            made.append(written)
             if progress is not None:
                 progress(episode.name, made[-1].length)
     if not made:
@@ -150,13 +156,6 @@ def _plan(query: Query, features: FeatureMap, options: LerobotOptions) -> str:
     )
 
 
-def _is_same(unfinished: Path, plan: str) -> bool:
-    try:
-        return (unfinished / _PLAN).read_text() == plan
-    except OSError:
-        return False
-
-
 # The set.
 
 
@@ -184,7 +183,7 @@ class _Assembly:
         self._features = features
         self._options = options
         self._plan = plan
-        self._rows: list[dict[str, Any]] = [{} for _ in made]
+        self._rows: list[dict[str, Any]] = [{} for _ in made]  # of the table of episodes
         self._tasks = {
             task: n for n, task in enumerate(dict.fromkeys(m.about["task"] for m in made))
         }
@@ -213,14 +212,22 @@ class _Assembly:
         for name in ("data", "videos", "meta"):
             if (self._root / name).exists():
                 shutil.rmtree(self._root / name)
-        everything = self._write_data()
+        (self._root / "meta").mkdir()
+        stats = self._write_data()
         for name in self._features.images:
             self._write_videos(name)
-        self._write_episodes()
-        self._write_tasks()
-        self._write_stats(everything)
-        self._write_own()
-        self._write_info()
+            counts = np.sum([one.counts[name] for one in self._made], axis=0)
+            stats[f"{IMAGE_PREFIX}{name}"] = _colour_stats(counts)
+        path = self._file(_EPISODES, 0)
+        pq.write_table(pa.Table.from_pylist(self._rows), path, compression="snappy")
+        # The text of a task is the index, as LeRobot reads it.
+        tasks = pd.DataFrame(
+            {"task_index": self._tasks.values()}, pd.Index(self._tasks, name="task")
+        )
+        tasks.to_parquet(self._root / "meta/tasks.parquet")
+        own = {**self._plan, "episodes": [one.about for one in self._made]}
+        for file, value in (("stats", stats), ("hybridlog", own), ("info", self._info())):
+            write_text(self._root / f"meta/{file}.json", json.dumps(value, indent=1))
         report.episodes = len(self._made)
         report.frames = sum(one.length for one in self._made)
         report.held = sum(sum(one.about["held"].values()) for one in self._made)
@@ -232,45 +239,30 @@ class _Assembly:
             if file.is_file() and _UNFINISHED not in file.parts
         )
 
-    def _write_data(self) -> dict[str, NDArray[Any]]:
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-
-        limit, number, writer = _DATA_MB << 20, -1, None
-        chosen: dict[str, list[NDArray[Any]]] = {}
-        begin = size = 0
-        for place, one in enumerate(self._made):
-            values = one.vectors() | self._own_columns(place, one, begin)
-            table = pa.table({name: _column(array) for name, array in values.items()})
-            if writer is None or size + table.nbytes > limit:
-                if writer is not None:
-                    writer.close()
-                number, size = number + 1, 0
-                path = self._root / _DATA.format(
-                    chunk=number // _CHUNK_FILES, file=number % _CHUNK_FILES
-                )
-                path.parent.mkdir(parents=True, exist_ok=True)
-                writer = pq.ParquetWriter(path, table.schema, compression="snappy")
-            writer.write_table(table)
-            size += table.nbytes
-            for name, array in values.items():
-                chosen.setdefault(name, []).append(array)
-            self._rows[place] |= {
-                "episode_index": place,
-                "tasks": [one.about["task"]],
-                "length": one.length,
-                "data/chunk_index": number // _CHUNK_FILES,
-                "data/file_index": number % _CHUNK_FILES,
-                "dataset_from_index": begin,
-                "dataset_to_index": begin + one.length,
-            }
-            self._rows[place] |= _flat_stats(
-                {name: _stats(array) for name, array in values.items()}
-            )
-            begin += one.length
-        assert writer is not None
-        writer.close()
-        return {name: np.concatenate(parts) for name, parts in chosen.items()}
+    def _write_data(self) -> dict[str, Any]:
+        """Write the rows; returns statistics of all."""
+        begins = np.cumsum([0, *(one.length for one in self._made)]).tolist()
+        found = [
+            one.vectors() | self._own_columns(place, one, begins[place])
+            for place, one in enumerate(self._made)
+        ]
+        tables = [pa.table({key: _column(array) for key, array in own.items()}) for own in found]
+        for number, places in _by_file((table.nbytes for table in tables), _DATA_MB):
+            path = self._file(_DATA, number)
+            with pq.ParquetWriter(path, tables[0].schema, compression="snappy") as writer:
+                for place in places:
+                    writer.write_table(tables[place])
+                    self._rows[place] = {
+                        "episode_index": place,
+                        "tasks": [self._made[place].about["task"]],
+                        "length": self._made[place].length,
+                        **_place_of("data", number),
+                        **_place_of("meta/episodes", 0),
+                        "dataset_from_index": begins[place],
+                        "dataset_to_index": begins[place + 1],
+                        **_flat_stats({key: _stats(one) for key, one in found[place].items()}),
+                    }
+        return {key: _stats(np.concatenate([own[key] for own in found])) for key in found[0]}
 
     def _file(self, form: str, number: int, key: str = "") -> Path:
         """The path of a file by its number; its folder is made."""
@@ -291,95 +283,37 @@ class _Assembly:
 
     def _write_videos(self, name: str) -> None:
         """Join the videos of the episodes; packets are copied."""
-        av, fps = pyav(), self._options.fps
-        key = f"{IMAGE_PREFIX}{name}"
-        number, size, frames, target, track = -1, 0, 0, None, None
-        for place, one in enumerate(self._made):
-            source = one.place / f"{name}.mp4"
-            if target is None or size + source.stat().st_size > _VIDEO_MB << 20:
-                if target is not None:
-                    target.close()
-                number, size, frames, track = number + 1, 0, 0, None
-                path = self._file(_VIDEO, number, key)
-                target = av.open(str(path), "w", format="mp4")
-            begin = frames
-            with av.open(str(source)) as file:
-                if track is None:
-                    track = target.add_stream_from_template(file.streams.video[0])
-                for packet in file.demux(video=0):
-                    if packet.dts is None:
-                        continue
-                    packet.stream, packet.time_base = track, Fraction(1, fps)
-                    packet.pts = packet.dts = frames
-                    packet.duration = 1
-                    target.mux(packet)
-                    frames += 1
-            size += source.stat().st_size
-            self._rows[place] |= {
-                f"videos/{key}/chunk_index": number // _CHUNK_FILES,
-                f"videos/{key}/file_index": number % _CHUNK_FILES,
-                f"videos/{key}/from_timestamp": begin / fps,
-                f"videos/{key}/to_timestamp": frames / fps,
-            }
-            self._rows[place] |= _flat_stats({key: _colour_stats(one.counts[name])})
-            if frames - begin != one.length:
-                raise PayloadError(f"{source.name} has {frames - begin} frames, not {one.length}")
-        assert target is not None
-        target.close()
+        fps, key = self._options.fps, f"{IMAGE_PREFIX}{name}"
+        videos = [one.place / f"{name}.mp4" for one in self._made]
+        for number, places in _by_file((path.stat().st_size for path in videos), _VIDEO_MB):
+            with pyav().open(str(self._file(_VIDEO, number, key)), "w", format="mp4") as target:
+                frames, track = 0, None
+                for place in places:
+                    begin = frames
+                    with pyav().open(str(videos[place])) as file:
+                        track = track or target.add_stream_from_template(file.streams.video[0])
+                        for packet in file.demux(video=0):
+                            if packet.dts is None:
+                                continue
+                            packet.stream, packet.time_base = track, Fraction(1, fps)
+                            packet.pts = packet.dts = frames
+                            packet.duration = 1
+                            target.mux(packet)
+                            frames += 1
+                    one = self._made[place]
+                    if frames - begin != one.length:
+                        raise PayloadError(
+                            f"{name}.mp4 has {frames - begin} frames, not {one.length}"
+                        )
+                    self._rows[place] |= {
+                        **_place_of(f"videos/{key}", number),
+                        f"videos/{key}/from_timestamp": begin / fps,
+                        f"videos/{key}/to_timestamp": frames / fps,
+                        **_flat_stats({key: _colour_stats(one.counts[name])}),
+                    }
 
-    def _write_episodes(self) -> None:
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-
-        rows = [
-            {**row, "meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0}
-            for row in self._rows
-        ]
-        path = self._root / _EPISODES
-        path.parent.mkdir(parents=True)
-        pq.write_table(pa.Table.from_pylist(rows), path, compression="snappy")
-
-    def _write_tasks(self) -> None:
-        """Tasks by number; pandas takes the text as the index."""
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-
-        table = pa.table(
-            {"task_index": pa.array([*self._tasks.values()], pa.int64()), "task": [*self._tasks]}
-        )
-        columns = [
-            {
-                "name": name,
-                "field_name": name,
-                "pandas_type": kind,
-                "numpy_type": of,
-                "metadata": None,
-            }
-            for name, kind, of in (("task_index", "int64", "int64"), ("task", "unicode", "object"))
-        ]
-        pandas = {
-            "index_columns": ["task"],
-            "column_indexes": [],
-            "columns": columns,
-            "creator": {"library": "pyarrow", "version": pa.__version__},
-            "pandas_version": "2.0.0",
-        }
-        table = table.replace_schema_metadata({"pandas": json.dumps(pandas)})
-        pq.write_table(table, self._root / "meta/tasks.parquet")
-
-    def _write_stats(self, everything: Mapping[str, NDArray[Any]]) -> None:
-        found = {name: _stats(array) for name, array in everything.items()}
-        for name in self._features.images:
-            counts = np.sum([one.counts[name] for one in self._made], axis=0)
-            found[f"{IMAGE_PREFIX}{name}"] = _colour_stats(counts)
-        write_text(self._root / "meta/stats.json", json.dumps(found, indent=1))
-
-    def _write_own(self) -> None:
-        """Write the question, the origin of each episode, and losses there."""
-        own = {**self._plan, "episodes": [one.about for one in self._made]}
-        write_text(self._root / "meta/hybridlog.json", json.dumps(own, indent=1))
-
-    def _write_info(self) -> None:
+    def _info(self) -> dict[str, Any]:
+        """The description of the set for LeRobot."""
         first, fps = self._made[0], self._options.fps
         features: dict[str, Any] = {}
         for name, array in first.vectors().items():
@@ -404,7 +338,7 @@ class _Assembly:
             }
         features["timestamp"] = {"dtype": "float32", "shape": [1], "names": None}
         features |= dict.fromkeys(("frame_index", "episode_index", "index", "task_index"), _INDEX)
-        info = {
+        return {
             "codebase_version": "v3.0",
             "robot_type": self._features.robot_type or "unknown",
             "total_episodes": len(self._made),
@@ -419,12 +353,26 @@ class _Assembly:
             "video_path": "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4",
             "features": features,
         }
-        write_text(self._root / "meta/info.json", json.dumps(info, indent=1))
+
+
+def _by_file(sizes: Iterable[int], limit_mb: int) -> Iterator[tuple[int, list[int]]]:
+    """Numbers of files, and the episodes of so many bytes that go into each."""
+    total, files = 0, list[list[int]]()
+    for place, size in enumerate(sizes):
+        if not files or total + size > limit_mb << 20:
+            total = 0
+            files.append([])
+        total += size
+        files[-1].append(place)
+    return enumerate(files)
+
+
+def _place_of(what: str, number: int) -> dict[str, int]:
+    chunk, file = divmod(number, _CHUNK_FILES)
+    return {f"{what}/chunk_index": chunk, f"{what}/file_index": file}
 
 
 def _column(array: NDArray[Any]) -> Any:
-    import pyarrow as pa
-
     if array.ndim == 1 or array.shape[1] == 1:
         return pa.array(array.ravel())
     return pa.FixedSizeListArray.from_arrays(pa.array(array.ravel()), array.shape[1])

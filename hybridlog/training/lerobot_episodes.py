@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import numpy as np
 
 from hybridlog.arrays.video import pyav
-from hybridlog.formats.writing import failures
 from hybridlog.query.query import Query
 from hybridlog.query.question import Question
 from hybridlog.training.episodes import pictures
@@ -118,13 +117,6 @@ def write_episode(
         PayloadError: No picture can be shown.
         DiskFullError: No space left.
     """
-    with failures(str(place)):
-        return _write_episode(session, episode, features, options, place)
-
-
-def _write_episode(
-    session: Session, episode: Episode, features: FeatureMap, options: LerobotOptions, place: Path
-) -> WrittenEpisode:
     if place.exists():
         shutil.rmtree(place)
     place.mkdir()
@@ -148,7 +140,11 @@ def _write_episode(
         with closing(_Video(place / f"{name}.mp4", options)) as video:
             for picture, shown in pictures(session, episode, topic):
                 if picture is None:
-                    _refuse_missing(episode, topic, options)
+                    if options.on_gap == "refuse":
+                        raise UsageError(
+                            f"{episode.name}: a picture of {topic} cannot be shown, or has no "
+                            "payload. --on-gap hold shows the one before."
+                        )
                     about["missing"][topic] = about["missing"].get(topic, 0) + shown
                 video.add(picture, shown)
             video.finish(f"{episode.name}: {topic}")
@@ -160,14 +156,6 @@ def _write_episode(
     written = WrittenEpisode.read(place)
     assert written is not None
     return written
-
-
-def _refuse_missing(episode: Episode, topic: str, options: LerobotOptions) -> None:
-    if options.on_gap == "refuse":
-        raise UsageError(
-            f"{episode.name}: a picture of {topic} cannot be shown, or has no payload. "
-            "--on-gap hold shows the one before."
-        )
 
 
 def _task(session: Session, episode: Episode, options: LerobotOptions) -> str:
@@ -208,7 +196,7 @@ class _Video:
         if picture is not None:
             count, self._waiting = count + self._waiting, 0
             self._before = self._checked(picture)
-            if self._frames % self._sampled() == 0 or self._frames == 0:
+            if self._frames % max(self._frames // _SAMPLED_FRAMES, 1) == 0:
                 self._count(picture)
         frame = self._av.VideoFrame.from_ndarray(self._before, format="rgb24")
         frame = frame.reformat(format="yuv420p")
@@ -216,9 +204,6 @@ class _Video:
             frame.pts, frame.time_base = self._frames, Fraction(1, self._options.fps)
             self._mux(frame)
             self._frames += 1
-
-    def _sampled(self) -> int:
-        return max(self._frames // _SAMPLED_FRAMES, 1)
 
     def _checked(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
         if self._track is None:

@@ -29,7 +29,8 @@ from rich.console import Console
 import hybridlog as hl
 from hybridlog.cli import record_live
 from hybridlog.cli.app import app
-from hybridlog.cli.live_table import closing_rows, drawn, summary
+from hybridlog.cli.live_table import drawn, summary
+from hybridlog.cli.record_summary import closing_fields
 from hybridlog.live.sources.base import Sink
 from hybridlog.live.state import RecorderState
 from hybridlog.live.statistics import TopicState
@@ -501,7 +502,7 @@ def test_a_number_of_losses_that_nobody_knows(
     source = {"path": "x", "kind": "replay", "bytes": 0}
     entry = RecordingEntry("r", "r", {}, source, 0, "complete", {"losses": rows})
     state = state_with({"unreadable": known})
-    found = dict(closing_rows(RecordReport(entry, [], 0, 0, None, 0, 1.0), state, []))
+    found = dict(closing_fields(RecordReport(entry, [], 0, 0, None, 0, 1.0), state, []))
     assert found["lost: unreadable"] == f"{shown} (any)"
     assert "lost" not in found
     if not known:

@@ -116,7 +116,7 @@ def test_metadata_of_any_kind_is_bounded(tmp_path: Path, text: str, reason: str 
         assert "the files beside it are read without it" in damage[0][0]
 
 
-def test_missing_files_of_the_metadata_are_counted_together(tmp_path: Path) -> None:
+def test_missing_files_of_the_metadata_are_told(tmp_path: Path) -> None:
     folder = make(tmp_path / "bag")
     files = "".join(f"    - {{path: f{k}.db3, message_count: 2}}\n" for k in range(1000))
     (folder / "metadata.yaml").write_text(f"{BAG}  files:\n{files}")
@@ -125,9 +125,7 @@ def test_missing_files_of_the_metadata_are_counted_together(tmp_path: Path) -> N
         "[bag.db3]", "[bag.db3, " + ", ".join(f"f{k}.db3" for k in range(1000)) + "]"
     )
     (folder / "metadata.yaml").write_text(f"{text}  files:\n{files}")
-    damage = read(folder)[2]
-    assert damage[:100] == [["the file is missing; metadata.yaml lists it", 2]] * 100
-    assert damage[100:] == [["900 more files that it lists are missing", 1800]]
+    assert read(folder)[2] == [["the file is missing; metadata.yaml lists it", 2]] * 1000
 
 
 def test_yaml_values() -> None:

@@ -74,8 +74,8 @@ class Found:
     """What a log gives: numbers of its messages, time range, and damage by file name."""
 
     def __init__(self, path: Path) -> None:
+        self.time_range = LogSet.at(path).read_time_range()
         with open_source(path) as source:
-            self.time_range = source.time_range
             self.numbers = [
                 int.from_bytes(bytes(batch.payload(row))[4:8], "little")
                 for batch in source.batches()
@@ -211,12 +211,10 @@ def test_last_part_that_was_not_compressed_any_more(bag: Path) -> None:
         (bag / name).unlink()
     found = Found(bag)
     assert (found.numbers, found.damage) == (FIFTEEN, [])
-    # A compressed file says its times only when it is unpacked.
-    assert found.time_range is None
     put_metadata(bag, ["bag_0.db3.zstd", "bag_1.db3.zstd"], 10, "  compression_mode: FILE")
     found = Found(bag)
-    assert (found.numbers, found.damage, found.time_range) == (FIFTEEN, [], None)
-    assert LogSet.at(bag).read_time_range() == (BEGIN, BEGIN + 14 * SECOND + 1)
+    assert (found.numbers, found.damage) == (FIFTEEN, [])
+    assert found.time_range == (BEGIN, BEGIN + 14 * SECOND + 1)
 
 
 @pytest.mark.parametrize("kind", ["db3", "mcap"])
@@ -264,7 +262,7 @@ def test_mcap_files_one_after_the_other_in_one_file(tmp_path: Path) -> None:
     joined.write_bytes(b"".join(whole))
     found = Found(joined)
     assert (found.numbers, found.damage) == (FIFTEEN, [])
-    assert LogSet.at(joined).read_time_range() == (BEGIN, BEGIN + 14 * SECOND + 1)
+    assert found.time_range == (BEGIN, BEGIN + 14 * SECOND + 1)
     joined.write_bytes(whole[0] + whole[0])
     assert (Found(joined).numbers, Found(joined).damage) == ([*FIFTEEN[:5] * 2], [])
     # The first was not closed: it has no summary.
@@ -289,5 +287,5 @@ def test_wrong_statistics_of_a_split_mcap(tmp_path: Path) -> None:
     data = data[: at + 8] + (BEGIN + 7 * SECOND).to_bytes(8, "little") + data[at + 16 :]
     path.write_bytes(data[:-12] + bytes(4) + data[-8:])
     found = Found(tmp_path)
-    assert (found.numbers, found.time_range) == (FIFTEEN[:10], None)
+    assert (found.numbers, found.time_range) == (FIFTEEN[:10], (BEGIN, BEGIN + 9 * SECOND + 1))
     shutil.rmtree(tmp_path)

@@ -476,9 +476,10 @@ def test_message_length_that_lies(compression: str) -> None:
     found, damage = read_bytes(
         bag(chunk(connection(0) + b"".join(rows), compression), index(0, 20))
     )
-    assert [time for time, _ in found[("/a", "")]] == [t for t in range(20) if t != 7]
+    left = range(8, 20) if compression == "none" else ()  # damage costs the rest of the chunk
+    assert [time for time, _ in found[("/a", "")]] == [*range(7), *left]
     assert set(values(found)) == {bytes(30)}
-    assert [each.messages_lost for each in damage] == [1]
+    assert [each.messages_lost for each in damage] == [13 - len(left)]
 
 
 def test_unknown_compression_and_destroyed_chunk_header() -> None:
@@ -526,7 +527,7 @@ def test_zeros_are_no_records() -> None:
     data = sound + bytes(16 << 20)
     tracemalloc.start()
     try:
-        run = walk(data)
+        run = walk(data, len(data))
         assert tracemalloc.get_traced_memory()[1] < 1 << 20
     finally:
         tracemalloc.stop()

@@ -1,6 +1,6 @@
 """Reads ROS 1 bags (format 2.0) from the start: also unindexed, cut and damaged ones.
 
-Records are walked in the order of the file, without the index. Damage in a compressed chunk costs
+Records are read in the order of the file, without the index. Damage in a compressed chunk costs
 the rest of the chunk; elsewhere reading goes on at the next record. What was lost is counted by
 the chunk list at the end of the bag, or by the index records behind a chunk.
 """
@@ -8,12 +8,13 @@ the chunk list at the end of the bag, or by the index records behind a chunk.
 from __future__ import annotations
 
 import bz2
+import re
 import struct
 from bisect import bisect_left
 from collections import Counter
 from dataclasses import dataclass, field
-from tempfile import SpooledTemporaryFile
-from typing import IO, TYPE_CHECKING, Any, BinaryIO, Final, NamedTuple
+from io import BytesIO
+from typing import TYPE_CHECKING, Any, BinaryIO, Final, NamedTuple
 
 import lz4.frame
 import numpy as np
@@ -59,16 +60,19 @@ _UNPACKERS: Final[dict[bytes, Any]] = {
 _UNDEFINED, _TOO_MANY = -1, -2  # in the place of a channel
 
 _MAX_HEADER: Final = 1 << 20
-_LEAST_HEADER: Final = 8  # bytes of one with the field `op` only; zeros are no header
-_MAX_DEFINITION: Final = 64 << 20
 _OP: Final = b"\x04\0\0\0op="
 _LOOK_BACK: Final = 320  # most bytes in front of this field in a header that is searched for
 _MAX_FOUND: Final = 4096  # longest header that is searched for
-_WINDOW = 4 << 20  # bytes that are read at once
-_AT_ONCE: Final = 64 << 20  # bytes of an unpacked chunk in memory; larger ones go to a file
+_WINDOW = 4 << 20  # bytes of messages outside of compressed chunks that are read at once
 _UNSTATED = 16 << 20  # bytes that a chunk may unpack to whatever its header says
-_MAX_CHUNK_BYTES: Final = 2 << 30  # and whatever it says
-_STEP: Final = 256 << 10  # bytes that are unpacked at once
+_STEP: Final = 256 << 10  # bytes that are searched or unpacked at once
+
+_USUAL: Final = re.compile(
+    rb"(?s)\x26\0\0\0"
+    rb"(?:\x04\0\0\0op=\x02|\x09\0\0\0conn=(....)|\x0d\0\0\0time=(........)){3}...."
+)
+"""The header of a message without further fields, and the length of its data."""
+_USUAL_BYTES: Final = 46
 
 _u32 = struct.Struct("<I").unpack_from
 
@@ -114,53 +118,6 @@ def _parsed(header: bytes, start: int, end: int) -> _Record | None:
     return None
 
 
-def _record_at(file: IO[bytes], pos: int, size: int) -> _Record | None:
-    """The record at a position of a file, None without one; its data may end past the file."""
-    file.seek(pos)
-    length = int.from_bytes(file.read(4), "little")
-    if not 0 < length <= min(_MAX_HEADER, size - pos - 8):
-        return None
-    raw = file.read(length + 4)
-    start = pos + 8 + length
-    return _parsed(raw[:length], start, start + _u32(raw, length)[0])
-
-
-def _search(file: IO[bytes], pos: int, size: int) -> int | None:
-    """First position at or behind `pos` of a file that looks like a record."""
-    while pos < size:
-        file.seek(pos)
-        data = file.read(_STEP + _LOOK_BACK + len(_OP))
-        hit = data.find(_OP)
-        while hit >= 0:
-            # The header's length precedes its first field and must reach past the op.
-            for place in range(min(hit - 4, _STEP - 1), max(0, hit - _LOOK_BACK) - 1, -1):
-                length = _u32(data, place)[0]
-                if hit + 4 - place <= length <= _MAX_FOUND and _is_believable(
-                    file, pos + place, size
-                ):
-                    return pos + place
-            hit = data.find(_OP, hit + 1)
-        pos += _STEP
-    return None
-
-
-def _is_believable(file: IO[bytes], pos: int, size: int) -> bool:
-    """True if what looks like a record is one.
-
-    A message counts only if another record follows it. Compressed chunks contain pieces of
-    messages, too, but no valid record follows those. Only a chunk may be cut.
-    """
-    record = _record_at(file, pos, size)
-    if record is None or record.op not in _NEEDED or (record.op != _CHUNK and record.end > size):
-        return False
-    return record.op != _MESSAGE or _is_sound(file, record.end, size)
-
-
-def _is_sound(file: IO[bytes], pos: int, size: int) -> bool:
-    """True if a record starts at a position, or the file ends there."""
-    return pos == size or _record_at(file, pos, size) is not None
-
-
 class _Walk(NamedTuple):
     """The messages at the beginning of some bytes.
 
@@ -174,45 +131,61 @@ class _Walk(NamedTuple):
     connections: list[tuple[int, _Record]]
     end: int
 
+    def without_wrong(self, data: bytes) -> int:
+        """Leave out the last message if its length is wrong, as a record begins in it.
 
-def walk(data: bytes) -> _Walk:
-    """Read the whole message and connection records at the beginning of some bytes."""
+        Args:
+            data: The bytes, which are damaged behind it.
+
+        Returns:
+            The end of what is sound.
+        """
+        if self.rows and sum(self.rows[-1][:2]) == self.end:
+            start = self.rows[-1][0]
+            if _OP in data[start : self.end + len(_OP)]:
+                self.rows.pop()
+                return start
+        return self.end
+
+
+def walk(data: bytes, most: int) -> _Walk:
+    """Read the whole message and connection records at the beginning of some bytes.
+
+    Args:
+        data: The bytes.
+        most: Messages that are read at most.
+    """
     rows: list[tuple[int, int, int, int]] = []
     connections: list[tuple[int, _Record]] = []
-    # Headers of one length are mostly alike, except for these two values.
-    shapes: dict[int, tuple[int, int, bytes, bytes, bytes]] = {}
-    pos, size, u32 = 0, len(data), _u32
-    while pos + 8 <= size:
-        head = pos + 4
-        body = head + u32(data, pos)[0]
-        if body - head < _LEAST_HEADER or body + 4 > size:
-            break
-        start = body + 4
-        count = u32(data, body)[0]
-        if start + count > size:
-            break
-        if body - head in shapes:
-            conn, time, first, second, third = shapes[body - head]
-            if (
-                data.startswith(first, head)
-                and data.startswith(second, head + len(first) + (4 if conn < time else 8))
-                and data.endswith(third, head, body)
-            ):
-                rows.append((start, count, head + conn, head + time))
+    pos, size, u32, usual = 0, len(data), _u32, _USUAL.match
+    while pos + 8 <= size and len(rows) < most:
+        head = usual(data, pos)
+        if head is not None and head.end() == pos + _USUAL_BYTES:
+            conn, time = head.start(1), head.start(2)
+            if conn > 0 and time > 0:
+                start = pos + _USUAL_BYTES
+                count = u32(data, start - 4)[0]
+                if start + count > size:
+                    break
+                rows.append((start, count, conn, time))
                 pos = start + count
                 continue
-        record = _parsed(data[head:body], start, start + count)
-        if record is None or record.op not in {_MESSAGE, _CONNECTION}:
+        body = pos + 4 + u32(data, pos)[0]
+        if body + 4 > size:
             break
-        pos = record.end
+        header, start = data[pos + 4 : body], body + 4
+        record = _parsed(header, start, start + u32(data, body)[0])
+        if record is None or record.end > size or record.op not in {_MESSAGE, _CONNECTION}:
+            break
         if record.op == _CONNECTION:
             connections.append((len(rows), record))
-            continue
-        header = data[head:body]
-        conn, time = header.rindex(b"\x09\0\0\0conn=") + 9, header.rindex(b"\x0d\0\0\0time=") + 9
-        rows.append((start, count, head + conn, head + time))
-        (low, low_end), (high, high_end) = sorted(((conn, conn + 4), (time, time + 8)))
-        shapes[body - head] = conn, time, header[:low], header[low_end:high], header[high_end:]
+        else:
+            conn, time = (
+                pos + 4 + header.rindex(field) + len(field)
+                for field in (b"\x09\0\0\0conn=", b"\x0d\0\0\0time=")
+            )
+            rows.append((start, record.end - start, conn, time))
+        pos = record.end
     return _Walk(rows, connections, pos)
 
 
@@ -221,11 +194,10 @@ class _Place:
     """A chunk with its index records, or the bytes in its place."""
 
     start: int
-    end: int  # as far as known
+    end: int  # of the chunk, as it says
     got: int = 0  # messages read in it
     indexed: int | None = None  # messages in its index records, None before the first one
     reasons: list[str] = field(default_factory=list)
-    is_broken: bool = False  # messages may be missing
     is_torn: bool = False  # some of its index records could not be read
     is_cut: bool = False  # the file ends in it
 
@@ -324,16 +296,13 @@ class Rosbag1Source(Source):
             if record is None and pos > self._index_pos and (end := self._behind_zeros(pos)):
                 pos = end
                 continue
-            if record is None or record.end > self.size_bytes:
+            if record is None or record.end > min(self.size_bytes, record.start + MAX_PAYLOAD):
                 return
-            length = record.end - record.start
-            self._file.seek(record.start)
-            data = self._file.read(min(length, _MAX_DEFINITION))
-            if record.op == _CONNECTION:
+            data = self._read(record.start, record.end - record.start)
+            if record.op == _CONNECTION:  # that in a chunk may be lost
                 connections += 1
-                if len(data) == length:  # that in a chunk may be lost
-                    conn = record.number(b"conn")
-                    self._fallback[conn] = _Connection(conn, record.fields[b"topic"], data)
+                conn = record.number(b"conn")
+                self._fallback[conn] = _Connection(conn, record.fields[b"topic"], data)
             elif record.op == _CHUNK_INFO:
                 pairs = np.frombuffer(data, "<u4", len(data) // 8 * 2).reshape(-1, 2)
                 chunks.append((record.number(b"chunk_pos"), int(pairs[:, 1].sum(dtype=np.int64))))
@@ -355,21 +324,35 @@ class Rosbag1Source(Source):
 
     # Records of the file.
 
-    def _record(self, pos: int) -> _Record | None:
-        """The record at a position, None without one; its data may end past the file.
+    def _read(self, pos: int, count: int) -> bytes:
+        self._file.seek(pos)
+        return self._file.read(count)
 
-        Some recorders state a wrong length for the list in an index record. Its number of
-        entries then says where the next record starts.
+    def _plain_record(self, pos: int) -> _Record | None:
+        """The record at a position, None without one; its data may end past the file."""
+        length = int.from_bytes(self._read(pos, 4), "little")
+        if not 0 < length <= min(_MAX_HEADER, self.size_bytes - pos - 8):
+            return None
+        raw = self._file.read(length + 4)
+        start = pos + 8 + length
+        return _parsed(raw[:length], start, start + _u32(raw, length)[0])
+
+    def _record(self, pos: int) -> _Record | None:
+        """The record at a position, also if it states a wrong length of the list in it.
+
+        Some recorders do so in index records. The number of entries then says where the next
+        record starts.
         """
-        record = _record_at(self._file, pos, self.size_bytes)
+        record = self._plain_record(pos)
         if record is None or record.op not in _ENTRY_BYTES:
             return record
         end = record.start + _ENTRY_BYTES[record.op] * record.number(b"count")
-        if record.end != end and _record_at(self._file, record.end, self.size_bytes) is None:
-            return (
-                record._replace(end=end) if _is_sound(self._file, end, self.size_bytes) else record
-            )
-        return record
+        is_wrong = record.end != end and self._plain_record(record.end) is None
+        return record._replace(end=end) if is_wrong and self._is_sound(end) else record
+
+    def _is_sound(self, pos: int) -> bool:
+        """True if a record starts at a position, or the file ends there."""
+        return pos == self.size_bytes or self._plain_record(pos) is not None
 
     def _behind_zeros(self, pos: int) -> int | None:
         """Position of the record, or end of the file, behind zeros; None without one."""
@@ -381,10 +364,34 @@ class Rosbag1Source(Source):
             if rest:
                 break
         # The first bytes of a record may be zeros, too.
-        starts = range(max(pos + 1, end - 3), end + 1)
-        return next(
-            (start for start in starts if _is_sound(self._file, start, self.size_bytes)), None
-        )
+        return next(filter(self._is_sound, range(max(pos + 1, end - 3), end + 1)), None)
+
+    def _search(self, pos: int) -> int | None:
+        """First position at or behind `pos` that looks like a record."""
+        for start in range(pos, self.size_bytes, _STEP):
+            data = self._read(start, _STEP + _LOOK_BACK + len(_OP))
+            hit = data.find(_OP)
+            while hit >= 0:
+                # The header's length precedes its first field and must reach past the op.
+                for place in range(min(hit - 4, _STEP - 1), max(0, hit - _LOOK_BACK) - 1, -1):
+                    is_long = hit + 4 - place <= _u32(data, place)[0] <= _MAX_FOUND
+                    if is_long and self._is_believable(start + place):
+                        return start + place
+                hit = data.find(_OP, hit + 1)
+        return None
+
+    def _is_believable(self, pos: int) -> bool:
+        """True if what looks like a record is one.
+
+        A message counts only if another record follows it. Compressed chunks contain pieces of
+        messages, too, but no valid record follows those. Only a chunk may be cut.
+        """
+        record = self._plain_record(pos)
+        if record is None or record.op not in _NEEDED:
+            return False
+        if record.op == _MESSAGE:
+            return self._is_sound(record.end)
+        return record.op == _CHUNK or record.end <= self.size_bytes
 
     # Reading the file.
 
@@ -397,10 +404,8 @@ class Rosbag1Source(Source):
         except OSError as error:
             place = self._place_at(pos)
             place.reasons.append(f"the system cannot read on: {error.strerror or error}")
-            place.end, place.is_broken = self.size_bytes, True
         self.bytes_read = self.size_bytes
-        was_cut = self._place is not None and self._place.is_cut
-        self._finish_place()
+        was_cut = self._finish_place(self.size_bytes)
         if (self._index_pos > self.size_bytes or self._index_is_short) and not was_cut:
             reason = f"the file ends before the end of its index, which starts at {self._index_pos}"
             lost = 0 if self._index_is_short else None
@@ -412,23 +417,32 @@ class Rosbag1Source(Source):
         record = self._record(pos)
         passed, self._passed = self._passed, 0
         if record is None:
-            return self._skip(pos, passed or pos + 1)
+            return self._skip(pos, passed or pos)
         if record.op == _CHUNK:
             return (yield from self._chunk(pos, record))
         if record.end > min(self.size_bytes, record.start + MAX_PAYLOAD):
             return self._skip(pos, record.start)
         if record.op in {_MESSAGE, _CONNECTION}:
-            # The end of an uncompressed chunk too, whose length is too small or is damaged.
-            place = self._place_at(pos)
-            return (yield from self._run(self._file, pos, self.size_bytes, place))
+            return (yield from self._run(pos, record.end))
         if record.op == _INDEX_DATA:
             place = self._place or self._place_at(pos)
             place.indexed = (place.indexed or 0) + record.number(b"count")
-            place.end = record.end
         elif record.op == _CHUNK_INFO:
-            self._finish_place()
+            self._finish_place(pos)
         self._passed = record.start
         return record.end
+
+    def _run(self, pos: int, end: int) -> Generator[Batch, None, int]:
+        """Read messages outside of compressed chunks, the first of which ends at `end`."""
+        place = self._place_at(pos)
+        most = min(_WINDOW, place.end - pos) if place.end > pos else _WINDOW
+        data = self._read(pos, max(most, end - pos))
+        found = walk(data, len(data))
+        behind = pos + found.end
+        if not self._is_sound(behind):
+            behind = pos + found.without_wrong(data)
+        yield self._batch(data, found, place)
+        return behind
 
     def _skip(self, pos: int, start: int) -> int:
         """Go from damage at `pos` to the first record at or behind `start`."""
@@ -436,31 +450,20 @@ class Rosbag1Source(Source):
         if self._chunks and behind is not None and not self._listed(pos, behind):
             self._zeros.append(range(pos, behind))
             return behind
-        if self._place is not None:  # the record before, with a wrong length, is not its end
-            self._place.end = min(self._place.end, start)
-        place = self._place_at(pos)
-        place.is_torn = place.start < pos
-        return self._behind(place, self._file, pos, start, self.size_bytes)
-
-    def _behind(self, place: _Place, file: IO[bytes], pos: int, start: int, size: int) -> int:
-        """The first record of a file at or behind `start`, after damage at `pos`."""
-        found = _search(file, start, size)
+        place = self._place_at(start)
+        place.is_torn = place.start < start and place.end <= start
+        found = self._search(start)
+        place.is_cut = found is None
         what = "bytes that are no record" if found else "the file ends in a record that starts"
-        if file is self._file:
-            place.end = found or size
-            place.is_cut = found is None
-        place.is_broken |= file is not self._file or place.indexed is None
-        where = "" if file is self._file else " of the chunk"
-        place.reasons.append(f"{what} at byte {pos}{where}")
-        return found or size
+        place.reasons.append(f"{what} at byte {pos}")
+        return found or self.size_bytes
 
-    # Chunks and runs of messages.
+    # Chunks.
 
     def _chunk(self, pos: int, record: _Record) -> Generator[Batch, None, int]:
-        """Read a chunk; returns the position behind it."""
-        self._finish_place()
-        end = min(record.end, self.size_bytes)
-        place = self._place = _Place(pos, end)
+        """Read a compressed chunk, or the beginning of another; returns the position behind it."""
+        self._finish_place(pos)
+        place = self._place = _Place(pos, record.end)
         form, length = record.fields[b"compression"], record.end - record.start
         if form not in _UNPACKERS:
             if form != b"none":
@@ -468,49 +471,45 @@ class Rosbag1Source(Source):
                 place.reasons.append(f"the chunk's compression {name!r} is not known")
             if (size := record.number(b"size")) != length:
                 place.reasons.append(f"the chunk's header says {size} bytes, its record {length}")
-            pos = yield from self._run(self._file, record.start, end, place)
-            if pos == self.size_bytes < record.end and not place.is_cut:
-                place.reasons.append("the file ends in a chunk")
-                place.is_cut = True
-            return pos
-        with SpooledTemporaryFile(max_size=_AT_ONCE) as file:
-            try:
-                used = self._unpack(record, file, place)
-            except (OSError, EOFError, RuntimeError, ValueError) as error:
-                if isinstance(error, OSError) and error.errno:  # of the system, not of the format
-                    raise
-                place.reasons.append(f"the chunk cannot be unpacked: {error}")
-                size, start = self.size_bytes, record.start
-                if record.end <= size and _is_sound(self._file, record.end, size):
-                    return record.end
-                return self._behind(place, self._file, start, start, size)
-            size = file.tell()
-            place.end = self.size_bytes if place.is_cut else record.start + used
-            for batch in self._run(file, 0, size, place):
-                if place.got > MIN_RECORDS + used:
-                    place.got -= len(batch)
-                    place.reasons.append("the chunk holds too many messages for its size")
-                    place.is_broken = True
-                    break
-                yield batch
-        return place.end
+            return record.start
+        try:
+            data, used = self._unpacked(record, place)
+        except (OSError, EOFError, RuntimeError, ValueError) as error:
+            if isinstance(error, OSError) and error.errno:  # of the system, not of the format
+                raise
+            place.reasons.append(f"the chunk cannot be unpacked: {error}")
+            if record.end <= self.size_bytes and self._is_sound(record.end):
+                return record.end
+            return self._skip(record.start, record.start)
+        place.end = record.start + used
+        most = MIN_RECORDS + used
+        found = walk(data, most + 1)
+        if len(found.rows) > most:
+            place.reasons.append("the chunk holds too many messages for its size")
+            return place.end
+        if found.end < len(data) and not place.is_cut:
+            place.reasons.append(f"bytes that are no record at byte {found.end} of the chunk")
+            found.without_wrong(data)
+        yield self._batch(data, found, place)
+        return self.size_bytes if place.is_cut else place.end
 
-    def _unpack(self, record: _Record, file: IO[bytes], place: _Place) -> int:
-        """Unpack a chunk into a file, also one whose record states too few bytes.
+    def _unpacked(self, record: _Record, place: _Place) -> tuple[bytes, int]:
+        """The content of a chunk, also of one whose record states too few bytes.
 
         Returns:
-            Number of its compressed bytes.
+            The content, and the number of its compressed bytes.
 
         Raises:
             ValueError: The chunk is damaged or too large; or another error of its format.
         """
         size, length = record.number(b"size"), record.end - record.start
-        most = min(max(size, _UNSTATED), _MAX_CHUNK_BYTES)
+        most = min(max(size, _UNSTATED), MAX_PAYLOAD)
         # In a valid bag index records follow, so a little more is enough.
         there = min(record.end, self.size_bytes) - record.start
         end = min(record.start + there + max(there, 1 << 20), self.size_bytes)
         self._file.seek(record.start)
-        pos, stream = record.start, _UNPACKERS[record.fields[b"compression"]]()
+        pos, content = record.start, BytesIO()
+        stream = _UNPACKERS[record.fields[b"compression"]]()
         while not stream.eof:
             data = self._file.read(min(_STEP, end - pos)) if stream.needs_input else b""
             if stream.needs_input and not data:
@@ -518,57 +517,23 @@ class Rosbag1Source(Source):
                     raise ValueError("its compressed bytes end too early")
                 place.is_cut = True
                 place.reasons.append("the file ends in a chunk")
-                return pos - record.start
+                return content.getvalue(), pos - record.start
             pos += len(data)
-            file.write(stream.decompress(data, _STEP))
-            if file.tell() > most:
+            content.write(stream.decompress(data, _STEP))
+            if content.tell() > most:
                 raise ValueError(f"its header says {size} bytes, it has more than {most}")
-            if is_implausible(file.tell(), there):
-                raise ValueError(f"its {there} bytes become more than {file.tell()}")
+            if is_implausible(content.tell(), there):
+                raise ValueError(f"its {there} bytes become more than {content.tell()}")
         used = pos - len(stream.unused_data or b"") - record.start
         if used != length:
             place.reasons.append(
                 f"the chunk's record says {length} compressed bytes, there are {used}"
             )
-        if size != file.tell():
-            place.reasons.append(f"the chunk's header says {size} bytes, there are {file.tell()}")
-        return used
-
-    def _run(
-        self, file: IO[bytes], pos: int, end: int, place: _Place
-    ) -> Generator[Batch, None, int]:
-        """Read message and connection records; returns the position of what is neither.
-
-        Args:
-            file: The bag, or an unpacked chunk.
-            pos: First byte.
-            end: End of the bytes.
-            place: Counts the messages, and is told of damage in an unpacked chunk.
-        """
-        size, window = (self.size_bytes, _WINDOW) if file is self._file else (end, _AT_ONCE)
-        need, is_over = 0, False
-        while pos < end and not is_over:
-            file.seek(pos)
-            data = file.read(min(max(window, need), end - pos))
-            found = walk(data)
-            behind = pos + found.end
-            record = None if behind == end else _record_at(file, behind, size)
-            need = record.end - behind if record and record.op in {_MESSAGE, _CONNECTION} else 0
-            is_over = not 0 < need <= min(end - behind, MAX_PAYLOAD)
-            if behind < end and (record is None or (is_over and file is not self._file)):
-                start, rows = behind + 1, found.rows
-                if rows and sum(rows[-1][:2]) == found.end:
-                    start = pos + rows[-1][0]
-                behind = self._behind(place, file, behind, start, size)
-                if behind < pos + found.end:  # the length of the last message was wrong
-                    found = found._replace(rows=rows[:-1])
-                is_over = file is self._file
-            yield self._batch(data, found, place)
-            if file is self._file:
-                place.end = max(place.end, behind)
-                self.bytes_read = behind
-            pos = behind
-        return pos
+        if size != content.tell():
+            place.reasons.append(
+                f"the chunk's header says {size} bytes, there are {content.tell()}"
+            )
+        return content.getvalue(), used
 
     def _batch(self, data: bytes, found: _Walk, place: _Place) -> Batch:
         """The messages of a run with a known channel."""
@@ -625,28 +590,29 @@ class Rosbag1Source(Source):
         """The place of `pos`: the current one unless its index covers all its messages."""
         place = self._place
         if place is None or (place.indexed is not None and place.indexed >= place.got):
-            self._finish_place()
+            self._finish_place(pos)
             place = self._place = _Place(pos, pos)
         return place
 
-    def _finish_place(self) -> None:
-        """Report the losses of the current place."""
+    def _finish_place(self, pos: int) -> bool:
+        """Report the losses of the current place, which ends at `pos`; True if the file does."""
         place, self._place = self._place, None
         if place is None:
-            return
+            return False
+        if place.end > pos == self.size_bytes and not place.is_cut:
+            place.is_cut = True
+            place.reasons.append("the file ends in a chunk")
         expected = None if place.is_torn else place.indexed
         if self._chunks:
-            expected = self._listed(place.start, max(place.end, place.start + 1))
+            expected = self._listed(place.start, max(pos, place.start + 1))
         lost = None if expected is None else max(0, expected - place.got)
-        if not place.reasons:
-            if not lost:
-                return
+        if not place.reasons and lost:
             place.reasons.append(f"its index lists {expected} messages, {place.got} are there")
-        if lost is None and not place.is_broken:
-            lost = 0
         if place.is_cut and not 0 < self._index_pos <= self.size_bytes:
             lost = None  # the content behind the end is unknown
-        self._report(place.start, max(place.end - place.start, 0), "; ".join(place.reasons), lost)
+        if place.reasons:
+            self._report(place.start, pos - place.start, "; ".join(place.reasons), lost)
+        return place.is_cut
 
     def _listed(self, start: int, end: int) -> int:
         """Number of messages in some bytes by the chunk list at the end of the bag."""

@@ -18,9 +18,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-_MAX_MISSING = 100  # files that are reported one by one
-
-
 def read_metadata(folder: Path) -> BagMetadata | Damage | None:
     """Read the metadata of the bag in a folder.
 
@@ -53,9 +50,9 @@ def locate(folder: Path, metadata: BagMetadata) -> tuple[dict[Path, int | None],
         SourceError: The folder cannot be read.
     """
     files: dict[Path, int | None] = {}
-    absent: list[str] = []
+    missing: list[Damage] = []
     for name in metadata.files:
-        path = folder / name
+        path, count = folder / name, metadata.counts.get(name)
         # Some recorders list compressed files under their name before compression, and early
         # ones with the folder's name before it.
         choices = [
@@ -68,36 +65,15 @@ def locate(folder: Path, metadata: BagMetadata) -> tuple[dict[Path, int | None],
         except OSError as error:
             raise cannot_open(path, error) from error
         if found is not None:
-            files.setdefault(found, metadata.counts.get(name))
+            files.setdefault(found, count)
         else:
-            absent.append(name)
-    return files, _missing(folder, metadata, absent)
+            missing.append(Damage(path, None, None, f"the file is missing; {NAME} lists it", count))
+    return files, missing
 
 
 def plain(path: Path) -> str:
     """Name of a file before it was compressed."""
     return path.name.removesuffix(".zstd")
-
-
-def _missing(folder: Path, metadata: BagMetadata, names: list[str]) -> list[Damage]:
-    """The damage for missing files; many are counted together."""
-    damage = [
-        Damage(
-            folder / name,
-            None,
-            None,
-            f"the file is missing; {NAME} lists it",
-            metadata.counts.get(name),
-        )
-        for name in names[:_MAX_MISSING]
-    ]
-    if more := names[_MAX_MISSING:]:
-        counts = [metadata.counts.get(name) for name in more]
-        known = [count for count in counts if count is not None]
-        lost = sum(known) if len(known) == len(counts) else None
-        reason = f"{len(more)} more files that it lists are missing"
-        damage.append(Damage(folder / NAME, None, None, reason, lost))
-    return damage
 
 
 NAME = "metadata.yaml"

@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import sqlite3
 from collections import Counter
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 from urllib.parse import quote
 
 import numpy as np
@@ -35,20 +35,11 @@ if TYPE_CHECKING:
 
 MAGIC = b"SQLite format 3\x00"
 
-# Without an index on time, counting reads the whole file, so only small ones are counted.
-_COUNT_BYTES = 64 << 20
-
 _MIN_ROWID = -(2**63)
 
 
-class _Row(NamedTuple):
-    """A message as read from the database."""
-
-    rowid: int
-    topic: int
-    log_time: int
-    publish_time: int
-    data: bytes
+_Row = tuple[int, int, int, int, bytes]
+"""Row id, topic id, log time, publish time and payload of a message."""
 
 
 class SqliteSource(Source):
@@ -66,10 +57,10 @@ class SqliteSource(Source):
         self._select = ""
         self._got = 0
         self._problem: tuple[int, str] | None = None
-        header = _read_header(path)
-        self._missing = header.pages * header.page - self.size_bytes
+        page, pages = _read_header(path)
+        self._missing = pages * page - self.size_bytes
         try:
-            self._db, log_unread = _connect_whole_pages(path, header, self.size_bytes)
+            self._db, log_unread = _connect_whole_pages(path, page, self.size_bytes)
         except sqlite3.Error as error:
             raise _unreadable(path, error) from error
         if log_unread is not None:
@@ -118,7 +109,7 @@ class SqliteSource(Source):
         self._has_publish_time = has_publish_time
         self._read_metadata(tables)
         self._read_topics(topics, tables)
-        self._read_totals(tables, log_time)
+        self._read_totals(log_time)
 
     def _tables(self) -> set[str]:
         """Names of real tables, without views, whose cost is unlimited."""
@@ -184,28 +175,17 @@ class SqliteSource(Source):
                 )
             )
 
-    def _read_totals(self, tables: set[str], log_time: str) -> None:
-        indexed = any(
-            row[0] == log_time
-            for name in self._indexes()
-            for row in self._optional("SELECT name FROM pragma_index_info(?) LIMIT 1", name)
-        )
-        if "messages" not in tables or (not indexed and self.size_bytes > _COUNT_BYTES):
+    def _read_totals(self, log_time: str) -> None:
+        """Read number and times of the messages; one end of an index a query."""
+        columns = f"count(*) min({log_time}) max({log_time})".split()
+        found = [self._optional(f"SELECT {one} FROM messages") for one in columns]  # noqa: S608
+        if not found[0]:
             return
-        rows = self._optional("SELECT count(*) FROM messages")
-        if not rows:
-            return
-        self.message_count = int(rows[0][0])
-        # Two queries: SQLite answers each from one end of the index.
-        first = self._optional(f"SELECT min({log_time}) FROM messages")  # noqa: S608
-        last = self._optional(f"SELECT max({log_time}) FROM messages")  # noqa: S608
-        if not (first and last and isinstance(first[0][0], int) and isinstance(last[0][0], int)):
-            return
-        if first[0][0] >= 0:  # earlier ones are not read
-            self.time_range = (first[0][0], last[0][0] + 1)
-
-    def _indexes(self) -> list[str]:
-        return [row[1] for row in self._optional("PRAGMA index_list(messages)")]
+        ((self.message_count,),), *ends = found
+        first, last = (one[0][0] if one else None for one in ends)
+        # Messages before 1970 are not read.
+        if isinstance(first, int) and isinstance(last, int) and first >= 0:
+            self.time_range = (first, last + 1)
 
     def _optional(self, query: str, *values: str | int) -> list[tuple[Any, ...]]:
         """Rows of an optional query; empty if it fails."""
@@ -255,7 +235,7 @@ class SqliteSource(Source):
         for row in self._optional(f"{self._select} LIMIT 1", start):
             if row[0] >= start:
                 start = row[0] + 1
-                yield _Row(*row)
+                yield row
         self._problem = max(start, 1), problem
 
     def _batch(self, rows: list[_Row], size: int) -> Iterator[Batch]:
@@ -312,14 +292,8 @@ class SqliteSource(Source):
 _LOG_TIMES = ("timestamp", "recv_timestamp")
 
 
-class _Header(NamedTuple):
-    """The used part of a database header: bytes of a page, number of pages."""
-
-    page: int
-    pages: int
-
-
-def _read_header(path: Path) -> _Header:
+def _read_header(path: Path) -> tuple[int, int]:
+    """Bytes of a page, and number of pages, by the header of a database."""
     try:
         with path.open("rb") as file:
             data = file.read(100)
@@ -328,19 +302,19 @@ def _read_header(path: Path) -> _Header:
     if not data.startswith(MAGIC):
         raise SourceError(f"{path}: no SQLite database; give the .db3 file of a ROS 2 bag")
     page = int.from_bytes(data[16:18], "big")
-    return _Header(1 << 16 if page == 1 else page, int.from_bytes(data[28:32], "big"))
+    return 1 << 16 if page == 1 else page, int.from_bytes(data[28:32], "big")
 
 
 def _connect_whole_pages(
-    path: Path, header: _Header, size: int
+    path: Path, page: int, size: int
 ) -> tuple[sqlite3.Connection, Path | None]:
     """Open a database without its truncated last page.
 
     SQLite would read zeros for the missing part of that page, and return them as payload.
     """
-    if header.page < 512 or size % header.page == 0:
+    if page < 512 or size % page == 0:
         return _connect(path)
-    spooled = copy_start(path, size - size % header.page)
+    spooled = copy_start(path, size - size % page)
     try:
         return _connect(spooled.path)
     finally:

@@ -124,7 +124,7 @@ class Rosbag2Writer(LogWriter):
         self._max_file = max_file
         with failures(self._name):
             self._final, self._unfinished = new_directory(path, "a bag of ROS 2 is a directory")
-        self._topics: dict[tuple[str, str], _Topic] = {}
+        self.topics: dict[tuple[str, str], _Topic] = {}
         self._known: dict[Channel, _Topic] = {}
         self._files: dict[str, _Span] = {}
         self._all = _Span()
@@ -140,13 +140,12 @@ class Rosbag2Writer(LogWriter):
         """
         if not len(batch):
             return
-        topics = {number: self._topic(channels[number]) for number in set(batch.channel.tolist())}
+        topics = {number: self.topic(channels[number]) for number in set(batch.channel.tolist())}
         for number in batch.channel.tolist():
             topics[number].messages += 1
-        if self._log is None or self._size >= self._max_file:
+        if self._size >= self._max_file:
             self._next_file()
-        assert self._log is not None
-        self._log.write(batch, channels)
+        self._current().write(batch, channels)
         self._size += batch.payload_bytes
         self._all.add(batch)
         self._files[next(reversed(self._files))].add(batch)
@@ -155,7 +154,7 @@ class Rosbag2Writer(LogWriter):
         """Add channels, which need have no messages; those that fit into no bag are left out."""
         for channel in channels:
             if channel.message_encoding == "cdr" and channel.schema is not None:
-                self._topic(channel)
+                self.topic(channel)
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
         """Add a metadata record to the current file."""
@@ -183,7 +182,12 @@ class Rosbag2Writer(LogWriter):
         else:
             self._log = _SqliteFile(path, self)
 
-    def _topic(self, channel: Channel) -> _Topic:
+    def topic(self, channel: Channel) -> _Topic:
+        """The topic of a channel.
+
+        Raises:
+            UsageError: It has another encoding than CDR.
+        """
         if channel not in self._known:
             if channel.message_encoding != "cdr" or channel.schema is None:
                 cure = "write --format mcap"
@@ -196,8 +200,8 @@ class Rosbag2Writer(LogWriter):
                     f"came: {cure}, or leave the topic out with -t"
                 )
             type_hash = channel.metadata.get("topic_type_hash", "").strip()
-            own = _Topic(len(self._topics) + 1, channel, type_hash)
-            found = self._topics.setdefault((channel.topic, channel.schema.name), own)
+            own = _Topic(len(self.topics) + 1, channel, type_hash)
+            found = self.topics.setdefault((channel.topic, channel.schema.name), own)
             found.offered[channel.metadata.get("offered_qos_profiles", "")] = None
             self._known[channel] = found
         return self._known[channel]
@@ -230,7 +234,7 @@ class Rosbag2Writer(LogWriter):
                     },
                     "message_count": topic.messages,
                 }
-                for (name, kind), topic in self._topics.items()
+                for (name, kind), topic in self.topics.items()
             ],
             "compression_format": "",
             "compression_mode": "",
@@ -239,15 +243,6 @@ class Rosbag2Writer(LogWriter):
             "custom_data": None,
             "ros_distro": "hybridlog",
         }
-
-    def rows(self) -> Iterator[tuple[_Topic, str, str]]:
-        """The topics so far, with their names and types."""
-        for (name, kind), topic in self._topics.items():
-            yield topic, name, kind
-
-    def number_of(self, channel: Channel) -> int:
-        """The number of a channel's topic."""
-        return self._topic(channel).number
 
     def abort(self) -> None:
         """Remove the bag."""
@@ -269,7 +264,7 @@ class _SqliteFile(LogWriter):
 
     def write(self, batch: Batch, channels: Sequence[Channel]) -> None:
         """Append messages in the order of the rows."""
-        numbers = {n: self._bag.number_of(channels[n]) for n in set(batch.channel.tolist())}
+        numbers = {n: self._bag.topic(channels[n]).number for n in set(batch.channel.tolist())}
         rows = (
             (numbers[channel], time, batch.payload(row))
             for row, (channel, time) in enumerate(
@@ -285,7 +280,7 @@ class _SqliteFile(LogWriter):
         """Complete the file."""
         types: dict[str, tuple[str, str, str, str]] = {}
         with self._failures():
-            for topic, name, kind in self._bag.rows():
+            for (name, kind), topic in self._bag.topics.items():
                 row = (topic.number, name, kind, "cdr", _yaml(topic.profiles()), topic.type_hash)
                 self._db.execute("INSERT INTO topics VALUES (?, ?, ?, ?, ?, ?)", row)
                 schema = topic.channel.schema

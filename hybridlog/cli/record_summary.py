@@ -1,8 +1,9 @@
-"""The summary of a live recording: tables, remarks, and the exit code."""
+"""The end of `hybridlog record`: what is told of a recording, and the exit code of a robot's."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -10,10 +11,10 @@ import click
 
 from hybridlog.cli import output
 from hybridlog.cli.app import DIFFERENT
-from hybridlog.cli.live_table import closing_rows
 from hybridlog.cli.render import print_fields
 from hybridlog.query.answers.completeness import line_of
 from hybridlog.record.losses import Cause
+from hybridlog.wording import listed
 from hybridlog_storage.errors import (
     DatabaseError,
     DiskFullError,
@@ -29,6 +30,44 @@ if TYPE_CHECKING:
     from hybridlog.record.recorder import RecordReport
 
 _MAX_ROWS = 10  # of the ledger; `losses` prints all
+
+
+def row_of(report: RecordReport) -> dict[str, Any]:
+    """What is told in JSON of each recording."""
+    entry = report.entry
+    return {
+        "recording": entry.name,
+        "status": entry.status,
+        "messages": entry.messages,
+        "messages_indexed": report.indexed,
+        "bytes_stored": entry.stored_bytes,
+        "seconds": round(report.elapsed_s, 3),
+    }
+
+
+def fields_of(
+    report: RecordReport, source: object, messages: str, bytes_in: int, attachments: str = ""
+) -> list[tuple[str, object]]:
+    """What is told to people of one recording."""
+    entry = report.entry
+    rate = entry.messages / report.elapsed_s if report.elapsed_s else 0.0
+    return [
+        ("recording", entry.name),
+        ("source", f"{source} ({entry.source['kind']})"),
+        ("topics", len({c.topic for c in entry.channels})),
+        ("messages", messages),
+        *([("attachments", attachments)] if attachments else []),
+        ("bytes in", output.size(bytes_in)),
+        ("bytes stored", output.size(entry.stored_bytes)),
+        ("ratio", ratio(bytes_in, entry.stored_bytes)),
+        ("messages indexed", report.indexed),
+        ("time", f"{report.elapsed_s:.2f} s ({rate:,.0f} messages/s)"),
+    ]
+
+
+def ratio(bytes_in: int, bytes_stored: int) -> str:
+    """How many times smaller a recording is than what it is of."""
+    return f"{bytes_in / (bytes_stored or math.inf):.2f}"
 
 
 @dataclass(slots=True)
@@ -72,9 +111,7 @@ class LiveSummary:
         if not self.reports:
             output.note("Nothing was stored.")
             return
-        report = self.reports[-1]
-        fields = [("recording", report.entry.name)]
-        fields += closing_rows(report, self.state, self.unreached)
+        fields = closing_fields(self.reports[-1], self.state, self.unreached)
         if self.recorder.reason:
             fields.append(("ended", self.recorder.reason))
         print_fields(fields)
@@ -133,23 +170,52 @@ class LiveSummary:
         return DIFFERENT if self.broken else 0
 
 
+def closing_fields(
+    report: RecordReport, state: RecorderState, unreached: Sequence[str]
+) -> list[tuple[str, object]]:
+    """What is told to people of a robot's recording.
+
+    Args:
+        report: Result of the recording.
+        state: Of the recorder, at its end.
+        unreached: Addresses of sources that never answered.
+    """
+    entry = report.entry
+    messages = f"{entry.messages} of {state.messages} received"
+    fields = fields_of(report, entry.source["path"], messages, state.stored_bytes)
+    if state.let_go:
+        fields.append(("let go", f"{state.let_go}, by the ring"))
+    if unreached:
+        fields.append(("lost", f"unknown, never reached: {', '.join(unreached)}"))
+    elif not state.lost.keys() - {Cause.THROTTLE.value}:
+        fields.append(("lost", "nothing"))
+    for cause, count in sorted(state.lost.items()):
+        losses = [row for row in entry.end.get("losses", []) if row["cause"] == cause]
+        named = listed(sorted({row["topic"] or "any" for row in losses}), 3)
+        what = "thinned out" if cause == Cause.THROTTLE else f"lost: {cause}"
+        fields.append((what, f"{_number(count, losses)} ({named})"))
+    return fields
+
+
+def _number(known: int, losses: Sequence[Mapping[str, Any]]) -> str:
+    """The number of lost messages, as far as it is known."""
+    if not known:
+        return "unknown"
+    is_more = any(row["count"] is None for row in losses)
+    return f"at least {known}" if is_more else str(known)
+
+
 def _summary(reports: Sequence[RecordReport], state: RecorderState, reason: str) -> dict[str, Any]:
-    recordings = [
-        {
-            "recording": report.entry.name,
-            "status": report.entry.status,
-            "tags": report.entry.tags,
-            "messages": report.entry.messages,
-            "messages_indexed": report.indexed,
-            "losses": report.entry.end.get("losses", []),
-            "bytes_stored": report.entry.stored_bytes,
-            "seconds": round(report.elapsed_s, 3),
-        }
-        for report in reports
-    ]
     return {
         "ended": reason,
-        "recordings": recordings,
+        "recordings": [
+            {
+                **row_of(report),
+                "tags": report.entry.tags,
+                "losses": report.entry.end.get("losses", []),
+            }
+            for report in reports
+        ],
         "messages_received": state.messages,
         "bytes": state.stored_bytes,
         # A cause without a number stands for an unknown number.
