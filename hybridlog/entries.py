@@ -48,7 +48,6 @@ from hybridlog_storage.manifest import (
     free_name,
     is_id,
     loss_of,
-    name_of,
 )
 from hybridlog_storage.messages import EXPIRED, NOT_COPIED, REDUCED, Channel, schema_hash
 from hybridlog_storage.segments.gone_log import GoneLog, open_log
@@ -936,10 +935,9 @@ def sealed_of(inventory: Inventory, number: int) -> Sealed:
     return Sealed(number, name, summary.size, digest, channels, group, has_losses)
 
 
-def free_name_in(catalog: Catalog, name: str, but: str = "") -> str:
+def free_name_in(others: Iterable[RecordingSummary | Manifest], name: str, but: str = "") -> str:
     """A name that no recording of a store has, but for one, by its id; within `creating`."""
-    wanted = name_of(text(name))
-    return free_name(wanted, {known for known, one in catalog.names_like(wanted) if one != but})
+    return free_name(text(name), {one.name for one in others if one.id != but})
 
 
 def text(name: str) -> str:

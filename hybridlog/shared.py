@@ -95,12 +95,7 @@ class Shared(ABC):
     @lazy
     def catalog(self) -> Catalog:
         """Recordings, channels, chunks and schemas."""
-        made = open_catalog(self.directory)
-        made.fill = self._fill
-        return made
-
-    def _fill(self) -> None:
-        self._files.look_at_all()
+        return open_catalog(self.directory)
 
     @lazy
     def tables(self) -> Tables:

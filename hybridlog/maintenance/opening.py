@@ -97,7 +97,6 @@ class StoreFiles:
         mends = mends and not catalog.is_in_memory
         # A recording has its manifest before it has tables.
         gone = tables.unfinished(directory) if mends else set()
-        opened = catalog.opened
         rows = catalog.summaries()
         report.unreadable.clear()
         ids = directory.ids()
@@ -109,7 +108,6 @@ class StoreFiles:
                 catalog.remove(summary.id)
                 gone.add(summary.id)
         snapshot = snapshot_of(catalog, found.values())
-        catalog.filled = opened
         if gone and mends and not report.unreadable:
             tables.remove_unfinished(directory, snapshot)
             tables.remove_all(directory, gone - found.keys())

@@ -97,7 +97,7 @@ def repair(
 
 
 def _repair_one(directory: StoreDirectory, catalog: Catalog, recording: str) -> list[Repaired]:
-    done = _put_manifest_right(directory, catalog, recording)
+    done = _put_manifest_right(directory, recording)
     done += _put_segments_right(directory, recording)
     inventory = take_inventory(directory, recording)
     for misfit in inventory.misfits:
@@ -146,9 +146,7 @@ def _rebuild(inventory: Inventory, misfit: Misfit, path: Path) -> bool:
     return rebuild_summary(path / misfit.file, log.digest)
 
 
-def _put_manifest_right(
-    directory: StoreDirectory, catalog: Catalog, recording: str
-) -> list[Repaired]:
+def _put_manifest_right(directory: StoreDirectory, recording: str) -> list[Repaired]:
     manifests = directory.manifests
     try:
         is_lost = manifests.find(recording) is None
@@ -160,7 +158,8 @@ def _put_manifest_right(
         def make(old: Manifest | None) -> Manifest:
             inventory = inventory_of(directory, recording, directory.listing(recording), None)
             made = made_again(inventory, old)
-            return replace(made, name=free_name_in(catalog, made.name, recording))
+            others = manifests.each(directory.ids())
+            return replace(made, name=free_name_in(others, made.name, recording))
 
         made = manifests.restore(recording, make)
         return [Repaired(made.name, "manifest", "made again")]

@@ -12,7 +12,7 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Container, Iterable, Iterator, Mapping
+from collections.abc import Collection, Container, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
@@ -69,9 +69,7 @@ _NOTING_S: Final = 0.1
 _MAX_TABLES: Final = 64 << 20  # bytes of chunk tables in memory
 _MAX_NOTED: Final = 1 << 17  # recordings with bounds of one kind
 _MAX_KINDS: Final = 256  # of bounds
-_MAX_SOUGHT: Final = 200  # bytes of a name; of long ones, a number takes the place of the end
 _FEW: Final = 100  # cells that are read one by one
-_TRIES: Final = 3  # to read it, while it is lost
 _T = TypeVar("_T")
 Ends = tuple[float | None, float | None]
 """The least and the greatest of some numbers; None twice without any."""
@@ -289,13 +287,6 @@ class ChunkEntry:
         return sum(stats.messages for stats in self.stats.values())
 
 
-def _fingerprints(source: Mapping[str, Any]) -> set[str]:
-    """Fingerprints of the log of a recording and of its parts."""
-    parts = source.get("parts")
-    found = [source.get("fingerprint"), *(parts if isinstance(parts, list) else ())]
-    return {fingerprint for fingerprint in found if isinstance(fingerprint, str)}
-
-
 def channel_totals(
     table: ChunkTable, stamps: NDArray[np.void] | None, silent: Container[int] = ()
 ) -> dict[int, ChannelStats]:
@@ -421,11 +412,7 @@ class Catalog:
     Attributes:
         is_in_memory: True if what is put into it stays in the memory of this process.
         has_changed: True if an ended recording was changed by this process.
-        fill: Puts all recordings of the store into it, once what it had is lost.
-        filled: The `opened` as of which it has them.
     """
-
-    fill: Callable[[], object] | None = None
 
     def __init__(
         self,
@@ -442,13 +429,6 @@ class Catalog:
         self._topics: dict[str, tuple[TopicType, ...]] = {}
         self._bounds: dict[str, dict[str, Ends]] = defaultdict(dict)  # to be written, by kind
         self._tables = Cache(_MAX_TABLES)
-        self.filled = 0
-
-    @property
-    def opened(self) -> int:
-        """Changes when what it had may be lost."""
-        self._cells.read(_SUMMARY, "")
-        return self._cells.opened
 
     @property
     def recordings_file(self) -> Path:
@@ -534,17 +514,6 @@ class Catalog:
 
         self._cells.write(statements, _NOTING_S)
 
-    def put_name(self, recording: str, name: str) -> None:
-        """Note the name of a recording; the rest is read again when it is looked at."""
-
-        def renamed() -> Iterator[Statement]:
-            for one in self.summaries([recording]):
-                yield put(_SUMMARY, recording, _summary_body(one._replace(name=name, look="")))
-
-        self.has_changed = True
-        self._remove_recordings_file()
-        self._cells.write(renamed, _BUSY_S)
-
     def put_indexed(self, recordings: Collection[str], index: str) -> None:
         """Note that an index is complete for recordings, as long as they look the same.
 
@@ -592,19 +561,6 @@ class Catalog:
 
     # Answers.
 
-    def _with(self, text: bytes) -> list[RecordingSummary]:
-        """Summaries of all recordings that have some text.
-
-        Raises:
-            CatalogError: It is lost again and again.
-        """
-        for _ in range(_TRIES):
-            bodies = self._cells.each(_SUMMARY, text).values()
-            if self.fill is None or self.filled == self._cells.opened:
-                return [one for body in bodies if (one := _read(_SUMMARY_OF, body))]
-            self.fill()
-        raise CatalogError(f"The catalog {self._store / CATALOG} is lost all the time. Ask again.")
-
     def summaries(self, recordings: Collection[str] | None = None) -> list[RecordingSummary]:
         """Summaries of recordings by id, None for all; unordered, without damaged ones."""
         indexed = self._bodies(_INDEX, recordings)
@@ -619,13 +575,6 @@ class Catalog:
                     summary = summary._replace(indexed_by=index)
             found.append(summary)
         return found
-
-    def names_like(self, name: str) -> set[tuple[str, str]]:
-        """Names and ids of recordings whose names begin like this one, if one is called so."""
-        quoted = encode(name)
-        if not self._with(quoted):
-            return set()
-        return {(o.name, o.id) for o in self._with(quoted[:_MAX_SOUGHT].removesuffix(b'"'))}
 
     def _bodies(self, kind: str, recordings: Collection[str] | None) -> dict[str, bytes]:
         """The cells of some recordings by id; None for all."""
@@ -658,11 +607,6 @@ class Catalog:
         """State of the files and entry of a recording; None if it is missing or damaged."""
         found = _read(_ENTRY_OF, self._cells.read(_ENTRY, recording))
         return found if found is not None and found[1].id == recording else None
-
-    def with_fingerprint(self, fingerprint: str) -> RecordingSummary | None:
-        """A recording of a log with this content, or of one of which it is a part."""
-        found = self._with(_body(fingerprint))
-        return next((one for one in found if fingerprint in _fingerprints(one.source)), None)
 
     def _index(self, recording: str) -> _Indexed:
         return _indexed(self._cells.read(_INDEX, recording))
