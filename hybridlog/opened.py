@@ -148,10 +148,12 @@ class OpenStore(Shared):
 
     def newest(self) -> Snapshot:
         """All recordings; those that look different by now are read again."""
-        known = {one.id: one.look for one in self.now().snapshot().summaries}
-        looks = self.directory.looks(self.directory.ids())
-        self.catch_up(*(one for one, look in known.items() if looks.get(one) != look))
-        return self.now().snapshot()
+        with self.following:
+            known = {one.id: one.look for one in self.now().snapshot().summaries}
+            looks = self.directory.looks(list(known))
+            self._changed = 0, False  # ids are compared in any case
+            self.catch_up(*(one for one, look in known.items() if looks.get(one) != look))
+            return self.now().snapshot()
 
     def invalidate(self) -> None:
         """Drop everything that was read, so that the next question reads the store again."""

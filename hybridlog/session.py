@@ -578,10 +578,6 @@ class Session:
             known = self.shared.columns[key] = table, ChunkColumns(number, table, channels)
         return known[1], stamps
 
-    def chunk_stats(self, recording: RecordingEntry, chunk: Chunk) -> dict[int, ChannelStats]:
-        """Statistics of the channels in a chunk."""
-        return self._of_catalog(recording, self.catalog.chunk_stats, chunk.segment, chunk.number)
-
     def _of_catalog(
         self,
         recording: RecordingEntry,

@@ -87,12 +87,6 @@ def test_segments_that_were_renamed_are_told_by_their_names(store: Path) -> None
     assert (status, messages + lost) == ("damaged", COUNT)
     assert lost
     assert repair(store) == {("one", f"{number:06d}.mcap"): False for number in (0, 2)}
-    with closing(hl.open(store, mongo=NOWHERE)) as opened:
-        cures = {one.place: one.cure for one in opened.verify(["one"]).findings}
-    names = ("000000.mcap", "000002.mcap")
-    assert {
-        name: f"rename it to {other}" for name, other in zip(names, names[::-1], strict=True)
-    }.items() <= (cures.items())
     exchange(store)
     assert look(store) == ("complete", COUNT, 0)
 

@@ -101,9 +101,8 @@ def _repair_one(directory: StoreDirectory, catalog: Catalog, recording: str) -> 
     done += _put_segments_right(directory, recording)
     inventory = take_inventory(directory, recording)
     for misfit in inventory.misfits:
-        cure = inventory.cure(misfit, "restore it from a copy, if there is one")
         place = misfit.file or f"segment {misfit.segment}"
-        what = f"{misfit.reason}; {cure}"
+        what = f"{misfit.reason}; restore it from a copy, if there is one"
         done.append(Repaired(inventory.name, place, what, is_cured=False))
     return [*done, *_damage(directory.recording(recording), inventory)]
 
@@ -141,7 +140,7 @@ def _put_segments_right(directory: StoreDirectory, recording: str) -> list[Repai
 def _rebuild(inventory: Inventory, misfit: Misfit, path: Path) -> bool:
     """Rebuild a damaged summary, if the result has the digest in the manifest."""
     log = inventory.logs.get(misfit.segment)
-    if log is None or log.name != misfit.file or misfit.own_name:
+    if log is None or log.name != misfit.file:
         return False
     return rebuild_summary(path / misfit.file, log.digest)
 

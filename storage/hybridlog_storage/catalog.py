@@ -717,20 +717,6 @@ class Catalog:
             raise CatalogError(f"Segment {path} has changed since the store was opened.")
         return summary.table, self.stamps(entry, number, summary.table)
 
-    def chunk_stats(
-        self, entry: RecordingEntry, segment: int, number: int
-    ) -> dict[int, ChannelStats]:
-        """Statistics of the channels in a chunk.
-
-        Raises:
-            CatalogError: As for `table`.
-        """
-        table, stamps = self.decoded_table(entry, segment)
-        begin, end = table.part_bounds()[number : number + 2].tolist()
-        own = replace(table, chunks=table.chunks[number : number + 1], parts=table.parts[begin:end])
-        silent = {c.id for c in entry.channels if not c.has_publish_time}
-        return channel_totals(own, None if stamps is None else stamps[begin:end], silent)
-
 
 def _summary_body(summary: RecordingSummary) -> bytes:
     return encode(summary[:-1])

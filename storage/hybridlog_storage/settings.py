@@ -13,10 +13,9 @@ import re
 import stat
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Final, TypeGuard
-from urllib.parse import quote
+from urllib.parse import SplitResult, quote, urlsplit
 
 from msgspec import Meta, Struct, ValidationError, convert
 from msgspec.structs import replace
@@ -175,13 +174,15 @@ def without_password(uri: str) -> str:
             show it.
     """
     parts = _split(uri)
-    user, colon, _ = parts.user.partition(":")
-    mark = ";" if ";" in parts.options else "&"
-    options = parts.options.split(mark)
+    login, _, hosts = parts.netloc.rpartition("@")
+    user, colon, _ = login.partition(":")
+    mark = ";" if ";" in parts.query else "&"
+    options = parts.query.split(mark)
     public = [option for option in options if not _is_secret(option)]
     if not colon and len(public) == len(options):
         return uri
-    return _join(_Uri(parts.scheme, user, parts.hosts, parts.path, mark.join(public)))
+    clean = parts._replace(netloc=f"{user}@{hosts}" if user else hosts, query=mark.join(public))
+    return clean.geturl()
 
 
 def with_password(uri: str) -> str:
@@ -197,60 +198,31 @@ def with_password(uri: str) -> str:
         parts = _split(uri)
     except UsageError:
         return uri  # connecting reports the error
-    if not parts.user or ":" in parts.user:
+    user, _, hosts = parts.netloc.rpartition("@")
+    if not user or ":" in user or (password := _password()) is None:
         return uri
-    password = _password()
-    if password is None:
-        return uri
-    user = f"{parts.user}:{quote(password, safe='')}"
-    return _join(_Uri(parts.scheme, user, parts.hosts, parts.path, parts.options))
+    return parts._replace(netloc=f"{user}:{quote(password, safe='')}@{hosts}").geturl()
 
 
-@dataclass(frozen=True, slots=True)
-class _Uri:
-    """The parts of a connection string; missing ones are empty.
-
-    Attributes:
-        scheme: `mongodb` or `mongodb+srv`.
-        user: Name, and password behind a colon.
-        hosts: One or several hosts.
-        path: `/` and the name of a database.
-        options: The text behind the question mark.
-    """
-
-    scheme: str
-    user: str
-    hosts: str
-    path: str
-    options: str
-
-
-def _split(uri: str) -> _Uri:
-    scheme, found, rest = uri.partition("://")
-    rest, _, options = rest.partition("?")
-    authority, slash, name = rest.partition("/")
-    user, _, hosts = authority.rpartition("@")
+def _split(uri: str) -> SplitResult:
+    try:
+        parts = urlsplit(uri, allow_fragments=False)
+    except ValueError:
+        parts = urlsplit("")
     is_whole = (
-        found
-        and scheme in {"mongodb", "mongodb+srv"}
+        parts.scheme in {"mongodb", "mongodb+srv"}
         and uri.isprintable()
-        and _HOSTS.fullmatch(hosts)
-        and not set(name) & set("@/:")
-        and not {"&", ";"} <= set(options)
-        and all("=" in option for option in re.split("[&;]", options) if option)
+        and _HOSTS.fullmatch(parts.netloc.rpartition("@")[2])
+        and not set(parts.path[1:]) & set("@/:")
+        and not {"&", ";"} <= set(parts.query)
+        and all("=" in option for option in re.split("[&;]", parts.query) if option)
     )
     if not is_whole:
         raise UsageError(
             "The URI is not a MongoDB connection string. Write mongodb://host:port/NAME, and "
             "percent-encode user name, password and socket path."
         )
-    return _Uri(scheme, user, hosts, slash + name, options)
-
-
-def _join(parts: _Uri) -> str:
-    user = f"{parts.user}@" if parts.user else ""
-    options = f"?{parts.options}" if parts.options else ""
-    return f"{parts.scheme}://{user}{parts.hosts}{parts.path}{options}"
+    return parts
 
 
 def _is_secret(option: str) -> bool:

@@ -17,6 +17,7 @@ import errno
 import fcntl
 import math
 import os
+import random
 import resource
 import secrets
 import stat
@@ -27,7 +28,6 @@ from pathlib import Path
 from typing import Any, Final, Protocol, cast
 
 from hybridlog_storage.errors import StoreError
-from hybridlog_storage.stopping import pause
 
 _STORE = "hybridlog.toml"
 _LEVELS = 5  # of folders in a store
@@ -198,6 +198,7 @@ def write_file(
     *,
     sync: bool = True,
     modified: int | None = None,
+    temporary: Path | None = None,
 ) -> None:
     """Write a small file atomically. It replaces a file or symlink of its name.
 
@@ -207,11 +208,12 @@ def write_file(
         mode: Its permissions, before the umask.
         sync: Whether it is on the disk when this returns.
         modified: Time of its modification, ns; None for the one that the system gives.
+        temporary: A free name beside it, until all is written; None for a random one.
 
     Raises:
         OSError: It cannot be written; no part of it remains.
     """
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}")
+    temporary = temporary or path.with_name(f".{path.name}.{secrets.token_hex(8)}")
     fd = open_file(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
     try:
         try:
@@ -245,17 +247,23 @@ def locked_folder(path: Path, wait_s: float = math.inf) -> Iterator[None]:
         BlockingIOError: Another process has held the lock for longer.
         OSError: The folder cannot be opened.
     """
-    begun = time.monotonic()
     with folder(path) as fd:
-        while True:
-            try:
-                fcntl.flock(fd, fcntl.LOCK_EX | (0 if wait_s == math.inf else fcntl.LOCK_NB))
-                break
-            except BlockingIOError:
-                if time.monotonic() - begun >= wait_s:
-                    raise
-                pause(_POLL_S)
+        lock(fd, wait_s)
         yield
+
+
+def lock(fd: int, wait_s: float = math.inf) -> None:
+    """Lock an open file or folder against other processes; errors as of `locked_folder`."""
+    end = time.monotonic() + wait_s
+    while True:
+        try:
+            fcntl.flock(fd, fcntl.LOCK_EX | (0 if wait_s == math.inf else fcntl.LOCK_NB))
+        except BlockingIOError:
+            if time.monotonic() >= end:
+                raise
+            time.sleep(random.uniform(0, _POLL_S))  # noqa: S311 - no secret
+        else:
+            return
 
 
 def status(path: Path) -> os.stat_result:
