@@ -150,11 +150,7 @@ class Inventory:
         return {} if self.manifest is None else self.manifest.logs
 
     def digest(self, number: int) -> str:
-        """Digest of the file of a valid segment; one that is not listed is read for it.
-
-        Raises:
-            SegmentError: It cannot be read.
-        """
+        """Digest of the file of a valid segment; one that is not listed is read for it."""
         if number in self.logs:
             return self.logs[number].digest
         with open_log(self.path / self.listing.sealed[number], number) as reader:
@@ -232,11 +228,7 @@ def take_inventory(directory: StoreDirectory, recording: str) -> Inventory:
 def inventory_of(
     directory: StoreDirectory, recording: str, listing: Listing, manifest: Manifest | None
 ) -> Inventory:
-    """Compare the sealed segments of a recording with a manifest; None for a lost one.
-
-    Raises:
-        StoreError: They cannot be read, or all are of another recording.
-    """
+    """Compare the sealed segments of a recording with a manifest; None for a lost one."""
     path = directory.recording(recording)
     listed = manifest.logs if manifest is not None else {}
     listing = listing.choosing(manifest)
@@ -279,9 +271,6 @@ def steady_inventory(directory: StoreDirectory, recording: str) -> Inventory:
 
     Files come and go before or after the manifest says so. What seems to be missing is looked
     for again if anything has changed; edits alone, however many, are waited for by nobody.
-
-    Raises:
-        StoreError: Its files cannot be read, or change all the time.
     """
     for _ in range(_TRIES):
         found = take_inventory(directory, recording)
@@ -314,11 +303,7 @@ def _parts(channels: Iterable[SealedChannel]) -> dict[int, truth.Part]:
 
 
 def read_summary(path: Path, number: int) -> SegmentSummary:
-    """The summary of a sealed segment.
-
-    Raises:
-        SegmentError: It has no readable summary, or cannot be opened.
-    """
+    """The summary of a sealed segment."""
     with open_log(path, number) as reader:
         return reader.summary()
 
@@ -339,9 +324,6 @@ def describe(catalog: Catalog, inventory: Inventory, *, is_open: bool = False) -
         catalog: Has the decoding results of its segments, and its unreadable chunks.
         inventory: Content of its directory.
         is_open: Whether a process is writing it.
-
-    Raises:
-        ManifestError: It has no manifest.
     """
     from hybridlog.schema.codecs import codec_for
 
@@ -410,23 +392,14 @@ def _ledger(end: Mapping[str, Any] | None) -> Iterable[Mapping[str, Any]]:
 def describe_now(
     directory: StoreDirectory, catalog: Catalog, recording: str, *, is_open: bool = False
 ) -> Described:
-    """Read a recording from its files.
-
-    Raises:
-        SegmentError: The recording cannot be identified.
-        StoreError: Its files change all the time.
-    """
+    """Read a recording from its files."""
     return describe(catalog, steady_inventory(directory, recording), is_open=is_open)
 
 
 def put_entry(
     directory: StoreDirectory, catalog: Catalog, recording: str, *, is_open: bool = False
 ) -> RecordingEntry:
-    """Read a recording's files and update its catalog row.
-
-    Raises:
-        SegmentError: The recording cannot be identified.
-    """
+    """Read a recording's files and update its catalog row."""
     described = describe_now(directory, catalog, recording, is_open=is_open)
     catalog.put(described)
     return described.entry
@@ -438,11 +411,7 @@ def with_said(entry: RecordingEntry, manifest: Manifest) -> RecordingEntry:
 
 
 def read_again(directory: StoreDirectory, catalog: Catalog, entry: RecordingEntry) -> None:
-    """Read the files of a recording again, after one of them was not what its entry says.
-
-    Raises:
-        StoreError: They cannot be read, or have changed.
-    """
+    """Read the files of a recording again, after one of them was not what its entry says."""
     is_open = directory.is_recorded(entry.id)
     now = describe_now(directory, catalog, entry.id, is_open=is_open)
     catalog.put(now, waits=False)
@@ -628,11 +597,7 @@ def lost_in_crash(manifest: Manifest, after: Sealed) -> list[truth.Loss]:
 
 
 def described(inventory: Inventory) -> Manifest:
-    """What the segments of a recording say of it, without its files.
-
-    Raises:
-        SegmentError: None says anything that can be read.
-    """
+    """What the segments of a recording say of it, without its files."""
     for _, summary in sorted(inventory.summaries.items()):
         said = summary.recording
         known = {name: said.get(name) for name in ("id", "name", "tags", "source", "created")}
@@ -843,9 +808,6 @@ def made_again(inventory: Inventory, old: Manifest | None) -> Manifest:
     Args:
         inventory: What is there.
         old: The one before the last change, if it can be read.
-
-    Raises:
-        SegmentError: Nothing says what recording it is.
     """
     made = old or described(inventory)
     numbers = [

@@ -62,11 +62,7 @@ class OpenStore(Shared):
         self._mending = threading.Lock()
 
     def now(self) -> Session:
-        """The store at this moment, for one question; no file is read if nothing has changed.
-
-        Raises:
-            UsageError: This is a forked process.
-        """
+        """The store at this moment, for one question; no file is read if nothing has changed."""
         self.check_process()
         latest = self._latest
         if latest is None:

@@ -37,9 +37,6 @@ def bring_derived(source: Shared, target: RemoteDirectory, recordings: Collectio
         source: The open store that they were copied from.
         target: The store in the bucket.
         recordings: Their ids.
-
-    Raises:
-        BucketError: The server does not answer, or refuses.
     """
     known = {}
     for recording in recordings:

@@ -241,9 +241,6 @@ class StoreFiles:
 
         Returns:
             The entry, None if the recording is gone; and whether the files were read again.
-
-        Raises:
-            StoreError: Its files cannot be read.
         """
         known = self._known(summary.id)
         if known is not None:
@@ -312,11 +309,7 @@ class StoreFiles:
 
 
 def snapshot_of(catalog: Catalog, summaries: Collection[RecordingSummary]) -> Snapshot:
-    """Some recordings with their topics.
-
-    Raises:
-        CatalogError: The catalog has lost topics.
-    """
+    """Some recordings with their topics."""
     hashes = {summary.topics for summary in summaries}
     return Snapshot(summaries, {digest: catalog.topics(digest) for digest in hashes})
 

@@ -446,11 +446,7 @@ class Catalog:
     # Changes.
 
     def _remove_recordings_file(self) -> None:
-        """Remove the list of ended recordings, which is wrong now.
-
-        Raises:
-            StoreError: It cannot be removed.
-        """
+        """Remove the list of ended recordings, which is wrong now."""
         if not self.is_in_memory:
             try:
                 files.unlink(self.recordings_file)
@@ -584,11 +580,7 @@ class Catalog:
         return every if recordings is None else {o: every[o] for o in recordings if o in every}
 
     def topics(self, digest: str) -> tuple[TopicType, ...]:
-        """A set of topics and their types, by its hash, which a summary has.
-
-        Raises:
-            CatalogError: It is missing.
-        """
+        """A set of topics and their types, by its hash, which a summary has."""
         found = self._set(digest)
         if found is None:
             raise CatalogError(f"The catalog {self._store / CATALOG} has lost topics. Ask again.")
@@ -674,21 +666,13 @@ class Catalog:
     # Chunks.
 
     def table(self, entry: RecordingEntry, number: int) -> ChunkTable:
-        """The chunks of a segment, from its footer.
-
-        Raises:
-            CatalogError: The segment is not the one of the entry, or cannot be read.
-        """
+        """The chunks of a segment, from its footer."""
         return self.decoded_table(entry, number)[0]
 
     def decoded_table(
         self, entry: RecordingEntry, number: int
     ) -> tuple[ChunkTable, NDArray[np.void] | None]:
-        """The chunks of a segment, and the results of decoding for each row of its parts.
-
-        Raises:
-            CatalogError: The segment is not the one of the entry, or cannot be read.
-        """
+        """The chunks of a segment, and the results of decoding for each row of its parts."""
         if number in entry.flushed:
             return entry.flushed[number].table, None
         digest = entry.digests.get(str(number), "")

@@ -356,9 +356,6 @@ class DiskManifests(Manifests):
         """Remove what is left of beginnings and removals of processes that were killed.
 
         While a recording begins, nothing is removed.
-
-        Raises:
-            HybridlogError: Something cannot be removed.
         """
         if not (self._left() or self._bare()):
             return

@@ -70,12 +70,7 @@ class StoreSettings(Struct, frozen=True):
 
 
 def read_settings(path: Path) -> StoreSettings:
-    """Read the settings of a store.
-
-    Raises:
-        StoreError: It is not a store, or has another format; or the settings are damaged, or
-            hold a password.
-    """
+    """Read the settings of a store."""
     file = path / NAME
     return _settings(path, file, _read(path, file))
 
@@ -105,21 +100,12 @@ def _settings(path: Path | str, file: Path, values: Mapping[str, object]) -> Sto
 
 
 def write_settings(path: Path, settings: StoreSettings) -> None:
-    """Write the settings of a store, without a password in its URI.
-
-    Raises:
-            UsageError: The URI is not a MongoDB connection string.
-            OSError: They cannot be written.
-    """
+    """Write the settings of a store, without a password in its URI."""
     files.write_file(path / NAME, settings_text(settings))
 
 
 def settings_text(settings: StoreSettings) -> bytes:
-    """The content of the file, without a password in the URI.
-
-    Raises:
-        UsageError: The URI is not a MongoDB connection string.
-    """
+    """The content of the file, without a password in the URI."""
     lines = [f"format = {FORMAT}", f"store_id = {_quoted(settings.store_id)}"]
     if settings.mongo is not None:
         mongo = without_password(settings.mongo) if is_uri(settings.mongo) else settings.mongo
@@ -141,11 +127,7 @@ def is_uri(mongo: str | None) -> TypeGuard[str]:
 
 
 def checked_cache_mb(value: object, name: str) -> int:
-    """A size of the embedded MongoDB's cache in MiB.
-
-    Raises:
-        UsageError: It is not an integer, or MongoDB does not accept it.
-    """
+    """A size of the embedded MongoDB's cache in MiB."""
     if type(value) is not int or not MIN_CACHE_MB <= value <= MAX_CACHE_MB:
         raise UsageError(
             f"{name} must be a number of MB from {MIN_CACHE_MB} to {MAX_CACHE_MB}, not {value!r}."
@@ -154,11 +136,7 @@ def checked_cache_mb(value: object, name: str) -> int:
 
 
 def cache_mb_from_environment() -> int | None:
-    """The size of the cache in HYBRIDLOG_CACHE_SIZE, in MiB; None without one.
-
-    Raises:
-        UsageError: It is not a size.
-    """
+    """The size of the cache in HYBRIDLOG_CACHE_SIZE, in MiB; None without one."""
     text = os.environ.get("HYBRIDLOG_CACHE_SIZE")
     if not text:
         return None
@@ -167,12 +145,7 @@ def cache_mb_from_environment() -> int | None:
 
 
 def without_password(uri: str) -> str:
-    """A connection string with the user's name, but without secrets.
-
-    Raises:
-        UsageError: It is invalid, so a password may be anywhere in it. The message does not
-            show it.
-    """
+    """A connection string with the user's name, but without secrets."""
     parts = _split(uri)
     login, _, hosts = parts.netloc.rpartition("@")
     user, colon, _ = login.partition(":")
@@ -190,9 +163,6 @@ def with_password(uri: str) -> str:
 
     HYBRIDLOG_MONGO_PASSWORD holds it, or the file named by HYBRIDLOG_MONGO_PASSWORD_FILE. A
     URI without a user, or with a password of its own, is unchanged.
-
-    Raises:
-        UsageError: The file cannot be read, or others can read it.
     """
     try:
         parts = _split(uri)
@@ -247,11 +217,7 @@ def _stored_uri(file: Path, mongo: str | None) -> str | None:
 
 
 def _password() -> str | None:
-    """The password from the environment.
-
-    Raises:
-        UsageError: Its file cannot be used.
-    """
+    """The password from the environment."""
     given = os.environ.get("HYBRIDLOG_MONGO_PASSWORD")
     if given:
         return given
@@ -289,11 +255,7 @@ def _password() -> str | None:
 
 
 def _read(path: Path, file: Path) -> dict[str, object]:
-    """The parsed file.
-
-    Raises:
-        StoreError: It cannot be read, or is not TOML.
-    """
+    """The parsed file."""
     try:
         content = files.read_file(file, MAX_SETTINGS)
     except FileNotFoundError:
