@@ -44,9 +44,7 @@ from hybridlog_storage.manifest import (
     Manifest,
     Source,
     free_name,
-    is_id,
     loss_of,
-    name_of,
 )
 from hybridlog_storage.messages import EXPIRED, NOT_COPIED, REDUCED, Channel, schema_hash
 from hybridlog_storage.segments.gone_log import GoneLog, open_log
@@ -100,14 +98,12 @@ class Misfit:
         file: Its name; empty for one that is missing.
         reason: Description of the problem.
         is_unlisted: Whether it is a whole segment of this recording that the manifest lacks.
-        own_name: Name that the manifest has for it, if it is another segment of this recording.
     """
 
     segment: int
     file: str
     reason: str
     is_unlisted: bool = False
-    own_name: str = ""
 
 
 @dataclass(slots=True)
@@ -115,7 +111,7 @@ class Inventory:
     """Content of a recording's directory, compared with its manifest.
 
     Attributes:
-        folder: Name of the directory.
+        id: Id of the recording, which is the name of its directory.
         path: The directory.
         listing: Names of its files; of several segments of one number, the listed one.
         manifest: Its manifest; None without one.
@@ -124,7 +120,7 @@ class Inventory:
         lost: Listed segments that are missing or changed.
     """
 
-    folder: str
+    id: str
     path: Path
     listing: Listing
     manifest: Manifest | None
@@ -133,20 +129,12 @@ class Inventory:
     lost: list[File] = field(default_factory=list)
 
     @property
-    def id(self) -> str:
-        """The recording's id; empty if unknown."""
-        if self.manifest is not None:
-            return self.manifest.id
-        ids = Counter(str(s.recording.get("id", "")) for s in self.summaries.values())
-        return ids.most_common(1)[0][0] if ids else ""
-
-    @property
     def name(self) -> str:
         """The recording's name, or its folder's while that is unknown."""
         if self.manifest is not None:
             return self.manifest.name
         names = (str(summary.recording.get("name", "")) for summary in self.summaries.values())
-        return next(filter(None, names), self.folder)
+        return next(filter(None, names), self.id)
 
     @property
     def rows(self) -> list[File]:
@@ -159,18 +147,8 @@ class Inventory:
         """The segments that the manifest lists, by number."""
         return {} if self.manifest is None else self.manifest.logs
 
-    def cure(self, misfit: Misfit, otherwise: str) -> str:
-        """The cure of a misfit: to rename it, unless the segment of that name is there."""
-        there = {self.listing.sealed[number] for number in self.summaries}
-        is_renamed = misfit.own_name and misfit.own_name not in there
-        return f"rename it to {misfit.own_name}" if is_renamed else otherwise
-
     def digest(self, number: int) -> str:
-        """Digest of the file of a valid segment; one that is not listed is read for it.
-
-        Raises:
-            SegmentError: It cannot be read.
-        """
+        """Digest of the file of a valid segment; one that is not listed is read for it."""
         if number in self.logs:
             return self.logs[number].digest
         with open_log(self.path / self.listing.sealed[number], number) as reader:
@@ -234,50 +212,47 @@ def state_of(listing: Listing, manifest: Manifest | None) -> str:
     return listing.print if manifest is None else truth.state_of(manifest, listing.print)
 
 
-def take_inventory(directory: StoreDirectory, folder: str) -> Inventory:
+def take_inventory(directory: StoreDirectory, recording: str) -> Inventory:
     """Compare the sealed segments of a recording with its manifest.
 
     Raises:
         RecordingGoneError: It is being removed.
-        StoreError: Directory or manifest cannot be read, or it is the copy of another one.
+        StoreError: Directory or manifest cannot be read, or all files are of another recording.
     """
-    listing = directory.listing(folder)
-    return inventory_of(directory, folder, listing, directory.manifests.find(folder))
+    listing = directory.listing(recording)
+    return inventory_of(directory, recording, listing, directory.manifests.find(recording))
 
 
 def inventory_of(
-    directory: StoreDirectory, folder: str, listing: Listing, manifest: Manifest | None
+    directory: StoreDirectory, recording: str, listing: Listing, manifest: Manifest | None
 ) -> Inventory:
-    """Compare the sealed segments of a recording with a manifest; None for a lost one.
-
-    Raises:
-        StoreError: They cannot be read, or are a copy of another recording.
-    """
-    path = directory.recording(folder)
+    """Compare the sealed segments of a recording with a manifest; None for a lost one."""
+    path = directory.recording(recording)
     listed = manifest.logs if manifest is not None else {}
     listing = listing.choosing(manifest)
-    found = Inventory(folder, path, listing, manifest)
+    found = Inventory(recording, path, listing, manifest)
+    others = set[str]()
     for number, name in listing.sealed.items():
         if manifest is not None and manifest.has_let_go(number):
             continue
         try:
-            found.summaries[number] = read_summary(path / name, number)
+            summary = read_summary(path / name, number)
         except SegmentError as error:
             found.misfits.append(Misfit(number, name, str(error)))
-    recording = found.id
-    check_folder(directory, folder, recording)
-    for number, summary in list(found.summaries.items()):
-        name = listing.sealed[number]
-        problem = _difference(found, summary, number, recording)
-        if problem is not None:
-            del found.summaries[number]
-            own = summary.recording.get("segment")
-            is_ours = summary.recording.get("id") == recording and own != number
-            own_name = listed[own].name if is_ours and own in listed else ""
-            found.misfits.append(Misfit(number, name, problem, own_name=own_name))
-        elif manifest is not None and number not in listed:
+            continue
+        if not _is_listed(summary, recording, number, listed.get(number)):
+            others.add(str(summary.recording.get("id")))
+            found.misfits.append(Misfit(number, name, "it is another file than the one listed"))
+            continue
+        found.summaries[number] = summary
+        if manifest is not None and number not in listed:
             reason = "the manifest does not list it"
             found.misfits.append(Misfit(number, name, reason, is_unlisted=True))
+    if manifest is None and others and not found.summaries:
+        raise StoreError(
+            f"{path} has files of {', '.join(sorted(others))}: give the folder this name again, "
+            "or remove it if it is a copy."
+        )
     rows = {} if manifest is None else manifest.rows
     for number, file in listed.items():
         if number not in found.summaries and number not in listing.open:
@@ -294,9 +269,6 @@ def steady_inventory(directory: StoreDirectory, recording: str) -> Inventory:
 
     Files come and go before or after the manifest says so. What seems to be missing is looked
     for again if anything has changed; edits alone, however many, are waited for by nobody.
-
-    Raises:
-        StoreError: Its files cannot be read, or change all the time.
     """
     for _ in range(_TRIES):
         found = take_inventory(directory, recording)
@@ -307,33 +279,11 @@ def steady_inventory(directory: StoreDirectory, recording: str) -> Inventory:
     raise StoreError(f"The files of recording {recording!r} change while they are read. Ask again.")
 
 
-def check_folder(directory: StoreDirectory, folder: str, recording: str) -> None:
-    """Raise if a folder has another name than the id of its recording.
-
-    Raises:
-        StoreError: It has.
-    """
-    if recording and folder != recording:
-        path = directory.recording(folder)
-        own = directory.listing(recording) if is_id(recording) else None
-        if own is not None and (own.sealed or own.open):
-            raise StoreError(f"{path} is a copy of {recording}: remove it.")
-        raise StoreError(f"{path} is recording {recording}: give the folder this name again.")
-
-
-def _difference(
-    inventory: Inventory, summary: SegmentSummary, number: int, recording: str
-) -> str | None:
-    """The difference of a whole segment from the manifest; None if it matches."""
-    its_id, its_number = summary.recording.get("id"), summary.recording.get("segment")
-    if its_id != recording:
-        return f"it is a segment of another recording, {its_id}"
-    if its_number != number:
-        return f"it is segment {its_number} of this recording"
-    log = inventory.logs.get(number)
-    if log is not None and (summary.size, _parts_of(summary)) != (log.bytes, log.parts):
-        return "it is not the segment that the manifest lists: an older or a changed one"
-    return None
+def _is_listed(summary: SegmentSummary, recording: str, number: int, log: File | None) -> bool:
+    """True for a whole segment of a recording and number that is as the manifest lists it."""
+    said = summary.recording.get("id"), summary.recording.get("segment")
+    as_listed = log is None or (summary.size, _parts_of(summary)) == (log.bytes, log.parts)
+    return said == (recording, number) and as_listed
 
 
 def _parts_of(summary: SegmentSummary) -> dict[int, truth.Part]:
@@ -351,11 +301,7 @@ def _parts(channels: Iterable[SealedChannel]) -> dict[int, truth.Part]:
 
 
 def read_summary(path: Path, number: int) -> SegmentSummary:
-    """The summary of a sealed segment.
-
-    Raises:
-        SegmentError: It has no readable summary, or cannot be opened.
-    """
+    """The summary of a sealed segment."""
     with open_log(path, number) as reader:
         return reader.summary()
 
@@ -376,14 +322,11 @@ def describe(catalog: Catalog, inventory: Inventory, *, is_open: bool = False) -
         catalog: Has the decoding results of its segments, and its unreadable chunks.
         inventory: Content of its directory.
         is_open: Whether a process is writing it.
-
-    Raises:
-        ManifestError: It has no manifest.
     """
     from hybridlog.schema.codecs import codec_for
 
     if inventory.manifest is None:
-        raise ManifestError(NO_MANIFEST.format(inventory.folder))
+        raise ManifestError(NO_MANIFEST.format(inventory.id))
     entry = _base(inventory)
     channels: dict[int, Channel] = {}
     lost: list[dict[str, Any]] = []
@@ -447,23 +390,14 @@ def _ledger(end: Mapping[str, Any] | None) -> Iterable[Mapping[str, Any]]:
 def describe_now(
     directory: StoreDirectory, catalog: Catalog, recording: str, *, is_open: bool = False
 ) -> Described:
-    """Read a recording from its files.
-
-    Raises:
-        SegmentError: The recording cannot be identified.
-        StoreError: Its files change all the time.
-    """
+    """Read a recording from its files."""
     return describe(catalog, steady_inventory(directory, recording), is_open=is_open)
 
 
 def put_entry(
     directory: StoreDirectory, catalog: Catalog, recording: str, *, is_open: bool = False
 ) -> RecordingEntry:
-    """Read a recording's files and update its catalog row.
-
-    Raises:
-        SegmentError: The recording cannot be identified.
-    """
+    """Read a recording's files and update its catalog row."""
     described = describe_now(directory, catalog, recording, is_open=is_open)
     catalog.put(described)
     return described.entry
@@ -475,11 +409,7 @@ def with_said(entry: RecordingEntry, manifest: Manifest) -> RecordingEntry:
 
 
 def read_again(directory: StoreDirectory, catalog: Catalog, entry: RecordingEntry) -> None:
-    """Read the files of a recording again, after one of them was not what its entry says.
-
-    Raises:
-        StoreError: They cannot be read, or have changed.
-    """
+    """Read the files of a recording again, after one of them was not what its entry says."""
     is_open = directory.is_recorded(entry.id)
     now = describe_now(directory, catalog, entry.id, is_open=is_open)
     catalog.put(now, waits=False)
@@ -663,18 +593,14 @@ def lost_in_crash(manifest: Manifest, after: Sealed) -> list[truth.Loss]:
 
 
 def described(inventory: Inventory) -> Manifest:
-    """What the segments of a recording say of it, without its files.
-
-    Raises:
-        SegmentError: None says anything that can be read.
-    """
+    """What the segments of a recording say of it, without its files."""
     for _, summary in sorted(inventory.summaries.items()):
         said = summary.recording
         known = {name: said.get(name) for name in ("id", "name", "tags", "source", "created")}
         with suppress(ValidationError):
             return convert(known, Manifest)
     raise SegmentError(
-        f"Recording {inventory.folder!r} has neither a manifest nor a segment that can be read."
+        f"Recording {inventory.id!r} has neither a manifest nor a segment that can be read."
     )
 
 
@@ -878,9 +804,6 @@ def made_again(inventory: Inventory, old: Manifest | None) -> Manifest:
     Args:
         inventory: What is there.
         old: The one before the last change, if it can be read.
-
-    Raises:
-        SegmentError: Nothing says what recording it is.
     """
     made = old or described(inventory)
     numbers = [
@@ -932,10 +855,9 @@ def sealed_of(inventory: Inventory, number: int) -> Sealed:
     return Sealed(number, name, summary.size, digest, channels, group, has_losses)
 
 
-def free_name_in(catalog: Catalog, name: str, but: str = "") -> str:
+def free_name_in(others: Iterable[RecordingSummary | Manifest], name: str, but: str = "") -> str:
     """A name that no recording of a store has, but for one, by its id; within `creating`."""
-    wanted = name_of(text(name))
-    return free_name(wanted, {known for known, one in catalog.names_like(wanted) if one != but})
+    return free_name(text(name), {one.name for one in others if one.id != but})
 
 
 def text(name: str) -> str:

@@ -62,11 +62,7 @@ class OpenStore(Shared):
         self._mending = threading.Lock()
 
     def now(self) -> Session:
-        """The store at this moment, for one question; no file is read if nothing has changed.
-
-        Raises:
-            UsageError: This is a forked process.
-        """
+        """The store at this moment, for one question; no file is read if nothing has changed."""
         self.check_process()
         latest = self._latest
         if latest is None:
@@ -146,6 +142,15 @@ class OpenStore(Shared):
             self.index.note_changes()
             self._invalidate_recordings(ids & before.by_id.keys())
 
+    def newest(self) -> Snapshot:
+        """All recordings; those that look different by now are read again."""
+        with self.following:
+            known = {one.id: one.look for one in self.now().snapshot().summaries}
+            looks = self.directory.looks(list(known))
+            self._changed = 0, False  # ids are compared in any case
+            self.catch_up(*(one for one, look in known.items() if looks.get(one) != look))
+            return self.now().snapshot()
+
     def invalidate(self) -> None:
         """Drop everything that was read, so that the next question reads the store again."""
         with self.following:
@@ -206,11 +211,8 @@ class OpenStore(Shared):
             files.unlink(self.catalog.recordings_file)
 
     def _ended_now(self) -> list[RecordingSummary]:
-        """Summaries of all ended recordings; those that look different are read again."""
-        known = {one.id: one.look for one in self.now().snapshot().summaries}
-        looks = self.directory.looks(self.directory.ids())
-        self.catch_up(*(one for one, look in known.items() if looks.get(one) != look))
-        return [one for one in self.now().snapshot().summaries if one.status not in UNFINISHED]
+        """Summaries of all ended recordings."""
+        return [one for one in self.newest().summaries if one.status not in UNFINISHED]
 
     def close(self) -> None:
         """Close files and connections. May be called more than once."""

@@ -578,10 +578,6 @@ class Session:
             known = self.shared.columns[key] = table, ChunkColumns(number, table, channels)
         return known[1], stamps
 
-    def chunk_stats(self, recording: RecordingEntry, chunk: Chunk) -> dict[int, ChannelStats]:
-        """Statistics of the channels in a chunk."""
-        return self._of_catalog(recording, self.catalog.chunk_stats, chunk.segment, chunk.number)
-
     def _of_catalog(
         self,
         recording: RecordingEntry,
@@ -632,11 +628,7 @@ class Session:
     def times(
         self, recording: RecordingEntry, segment: int, chunk: int
     ) -> dict[int, NDArray[np.int64]]:
-        """Log times of a chunk's messages by channel, ascending; reads no payload.
-
-        Raises:
-            SegmentError: They are missing or damaged.
-        """
+        """Log times of a chunk's messages by channel, ascending; reads no payload."""
         place = place_of(self.chunk_table(recording, segment), chunk)
         found = self._read(recording.id, segment, lambda reader: reader.read_times(place))
         if not found.keys() >= {*place.channels}:
@@ -657,9 +649,6 @@ class Session:
             segment: Number of its segment.
             place: Its position there.
             count: Called with the chunk if it is read.
-
-        Raises:
-            SegmentError: It is damaged.
         """
 
         def read() -> StoredChunk:

@@ -81,11 +81,7 @@ class Shared(ABC):
         return os.getpid() != self._process
 
     def check_process(self) -> None:
-        """Refuse to go on in a child of the process that opened the store.
-
-        Raises:
-            UsageError: This is one.
-        """
+        """Refuse to go on in a child of the process that opened the store."""
         if self.is_inherited:
             raise UsageError(
                 f"The store {self.directory.place} was opened before this process was forked: open "
@@ -95,12 +91,7 @@ class Shared(ABC):
     @lazy
     def catalog(self) -> Catalog:
         """Recordings, channels, chunks and schemas."""
-        made = open_catalog(self.directory)
-        made.fill = self._fill
-        return made
-
-    def _fill(self) -> None:
-        self._files.look_at_all()
+        return open_catalog(self.directory)
 
     @lazy
     def tables(self) -> Tables:
@@ -204,11 +195,7 @@ class Shared(ABC):
     # Files.
 
     def segment(self, entry: RecordingEntry, number: int) -> SegmentReader:
-        """The reader of a sealed segment.
-
-        Raises:
-            SegmentError: It cannot be opened, as where the recording has another name by now.
-        """
+        """The reader of a sealed segment."""
         with self._opening:
             name = file_of(entry, number)
             key = entry.id, name

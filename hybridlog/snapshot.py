@@ -136,13 +136,13 @@ class Snapshot:
             columns["set"] = np.searchsorted(used, columns["set"])
         unfinished = np.flatnonzero(columns["is_open"]).tolist()
         vars(found).update(_columns=columns, _topics=known, _having={}, unfinished=unfinished)
-        stale = {"tags", "by_id", "by_name"}
+        stale = {"tags", "by_id", "by_name", "by_fingerprint"}
         if before == places[::-1] and [one.id for one in changed] == [
             self.summaries[place].id for place in before
         ]:
             names = [self.summaries[place].name for place in before]
             is_renamed = names != [one.name for one in changed]
-            stale = {"tags", "by_name"} if is_renamed else {"tags"}  # each is where it was
+            stale = {"tags", "by_fingerprint"} | ({"by_name"} if is_renamed else set())
         if known.keys() != self._topics.keys():
             stale |= {"topics", "schemas"}
         for name in stale:
@@ -187,6 +187,16 @@ class Snapshot:
         for place, summary in enumerate(self.summaries):
             for key, value in summary.tags.items():
                 found[key][value].append(place)
+        return found
+
+    @lazy
+    def by_fingerprint(self) -> dict[str, RecordingSummary]:
+        """A recording of each log, and of each part of one, by the fingerprint of its content."""
+        found: dict[str, RecordingSummary] = {}
+        for summary in self.summaries:
+            parts = summary.source.get("parts", ())
+            for fingerprint in (summary.source.get("fingerprint"), *parts):
+                found.setdefault(fingerprint, summary)
         return found
 
     def topics_of(self, summary: RecordingSummary) -> set[str]:

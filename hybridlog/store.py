@@ -80,6 +80,7 @@ if TYPE_CHECKING:
     from hybridlog.query.times import DurationLike, TimeLike
     from hybridlog.record.recorder import RecordOptions, RecordReport
     from hybridlog.recordings import Recordings
+    from hybridlog.snapshot import Snapshot
     from hybridlog.sql.engine import SqlAnswer, SqlEngine
     from hybridlog.tf.tree import FrameTree
     from hybridlog.training.lerobot import LerobotReport
@@ -193,14 +194,18 @@ def _target(to: str | Path, options: CopyOptions, store: Store) -> Iterator[Targ
             yield Target(server, lambda name, _: free_name(name, server.names()))
         return
     if address is not None:
-        from hybridlog.maintenance.bucket_derived import bring_derived, free_name_there
+        from hybridlog.maintenance.bucket_derived import bring_derived
         from hybridlog_storage.remote.store import RemoteDirectory
 
         if source.place == address:
             raise UsageError(f"{address} is this very store: there is nothing to copy.")
         target = RemoteDirectory.create_in(address)
         place = BucketStore(target.bucket, target.manifests)
-        found = Target(place, partial(free_name_there, target))
+
+        def named(name: str, recording: str) -> str:
+            return free_name_in(target.manifests.each(target.ids()), name, recording)
+
+        found = Target(place, named)
         try:
             yield found
         finally:
@@ -210,11 +215,11 @@ def _target(to: str | Path, options: CopyOptions, store: Store) -> Iterator[Targ
     if not source.is_remote and source.path.resolve() in path.resolve().parents:
         raise UsageError(f"{to} lies inside the store {source.path}: copy to another directory.")
     with open_store(path, create=True) as other:
-        _ = other.session  # the catalog then has all names
+        _ = other.session  # what a crash has left is mended before
         directory, catalog = other.directory, other.catalog
         found = Target(
             Directory(path.absolute()),
-            partial(free_name_in, catalog),
+            lambda name, one: free_name_in(other.shared.newest().summaries, name, one),
             partial(put_entry, directory, catalog),
         )
         yield found
@@ -854,6 +859,7 @@ class Store:
                 self.directory,
                 self.catalog,
                 self._to_change().index.index_to_record("Recording a log"),
+                self._newest(),
                 fingerprint=fingerprint(source.files),
                 options=options or RecordOptions(**choices),
                 progress=progress,
@@ -880,8 +886,14 @@ class Store:
             IndexTarget() if chosen.is_ring else target,
             name,
             chosen,
+            known=self._newest(),
             on_close=self._after_ring if chosen.is_ring else self._after,
         )
+
+    def _newest(self) -> Callable[[], Snapshot]:
+        """What tells all recordings as they are when one begins."""
+        _ = self.session  # what a crash has left is mended before
+        return self.shared.newest
 
     def _after_ring(self, report: RecordReport) -> None:
         """Make tables and index documents of what a ring has left."""

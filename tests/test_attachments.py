@@ -190,19 +190,6 @@ def test_commands(store: hl.Store, tmp_path: Path) -> None:
     assert "späte Karte.png" in missing.err
 
 
-<<<<<<< HEAD
-=======
-def test_info(store: hl.Store) -> None:
-    done = run("info", "drive", store=store.directory.path)
-    assert "attachment  späte Karte.png (image/png, 76.8 kB)" in done.out
-    assert "metadata    robot (id)" in done.out
-    (about,) = run("info", "drive", "--json", store=store.directory.path).json
-    assert [a["name"] for a in about["attachments"]] == [a[1] for a in ATTACHMENTS]
-    assert [(m["name"], m["values"]) for m in about["metadata_records"]] == METADATA
-    assert len(about["channels"]) == 4
-
-
->>>>>>> cli
 def test_nothing_is_lost_on_the_way(log: Path, tmp_path: Path) -> None:
     """In many segments, packed, with another name, without derived data, in another store."""
     packed = tmp_path / "drive.mcap.zstd"

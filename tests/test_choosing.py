@@ -3,11 +3,6 @@
 from __future__ import annotations
 
 import json
-<<<<<<< HEAD
-=======
-import random
-import re
->>>>>>> cli
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -270,29 +265,6 @@ def test_recordings_are_deleted_by_choice(tmp_path: Path) -> None:
         assert store.recordings() == []
 
 
-<<<<<<< HEAD
-=======
-def test_who_is_asked_sees_what_goes(
-    store: hl.Store, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    from hybridlog.cli import rm
-
-    shown: list[str] = []
-    monkeypatch.setattr(rm.output, "note", shown.append)
-    monkeypatch.setattr(rm.sys, "stdin", type("T", (), {"isatty": staticmethod(lambda: True)}))
-    monkeypatch.setattr(rm.click, "confirm", lambda text, err: shown.append(text) or False)
-    many = [summary(n, (START, START), ["/a"])[0] for n in range(25)]
-    with pytest.raises(rm.click.exceptions.Exit):
-        rm._confirm(many, ["a talk"])
-    assert re.fullmatch(r"Delete r0, r1, .* for good, with 1 pin \(a talk\)\?", shown[0])
-    assert shown[1] == "Nothing is deleted."
-    rows = capsys.readouterr().out.splitlines()[1:]
-    assert [row.split()[:2] for row in rows] == [
-        [f"r{n}", "2025-06-03T00:00:00Z"] for n in range(25)
-    ]
-
-
->>>>>>> cli
 def test_queries_of_chosen_recordings(store: hl.Store) -> None:
     found = store.recordings(tag="robot=7")
     assert isinstance(found, Recordings)

@@ -120,10 +120,10 @@ def test_a_copy_inside_a_store_is_told_and_left_alone(place: Path, uri: str, cop
     for _ in range(2):
         with hl.open(place, mongo=uri) as store:
             assert [r.name for r in store.recordings()] == ["one"]
-            assert "is a copy of" in store.repairs.unreadable[copy]
+            assert "if it is a copy" in store.repairs.unreadable[copy]
             assert answers(store) == right()
             (finding,) = store.verify().findings
-            assert (finding.recording, "is a copy of" in finding.problem) == (copy, True)
+            assert (finding.recording, "if it is a copy" in finding.problem) == (copy, True)
             store.index.rebuild()
             assert answers(store) == right()
             done = store.verify(repair=True)

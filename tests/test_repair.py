@@ -73,29 +73,6 @@ def test_a_store_that_is_whole(store: Path) -> None:
     assert look(store) == ("complete", COUNT, 0)
 
 
-def exchange(store: Path) -> None:
-    file(store, 0).rename(file(store, 99))
-    file(store, 2).rename(file(store, 0))
-    file(store, 99).rename(file(store, 2))
-
-
-def test_segments_that_were_renamed_are_told_by_their_names(store: Path) -> None:
-    """Who has renamed them gives them their names again."""
-    exchange(store)
-    status, messages, lost = look(store)
-    assert (status, messages + lost) == ("damaged", COUNT)
-    assert lost
-    assert repair(store) == {("one", f"{number:06d}.mcap"): False for number in (0, 2)}
-    with closing(hl.open(store, mongo=NOWHERE)) as opened:
-        cures = {one.place: one.cure for one in opened.verify(["one"]).findings}
-    names = ("000000.mcap", "000002.mcap")
-    assert {
-        name: f"rename it to {other}" for name, other in zip(names, names[::-1], strict=True)
-    }.items() <= (cures.items())
-    exchange(store)
-    assert look(store) == ("complete", COUNT, 0)
-
-
 def flip_the_summary(store: Path) -> None:
     data = bytearray(file(store, 1).read_bytes())
     data[-60] ^= 4

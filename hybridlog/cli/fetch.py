@@ -189,7 +189,7 @@ def _follow(query: Query, choices: _Choices, form: str) -> None:
 
 
 def _query(store: Store, choices: _Choices) -> Query:
-    from hybridlog.query.predicate.across import names_topics
+    from hybridlog.query.predicate.parser import names_topics
 
     query = choices.bounded(query_of(store, choices.topics, choices.choice))
     query = query.clock(choices.clock)
@@ -231,37 +231,3 @@ def _destination(choices: _Choices) -> Destination:
     if not choices.count and (choices.split is None or form == SCREEN):
         to.check()
     return to
-<<<<<<< HEAD
-
-
-def _near(choices: _Choices) -> str | tuple[str, str] | None:
-    """Greatest distance in time to the messages of other topics in --where."""
-    around = choices.before, choices.after
-    if around == (None, None):
-        return choices.within
-    return around[0] or "0s", around[1] or "0s"
-
-
-def _names_topics(predicate: str) -> bool:
-    from hybridlog.query.predicate.parser import names_topics
-
-    return names_topics(predicate)
-
-
-def _check_near(choices: _Choices) -> None:
-    """Refuse a distance without other topics, and other topics without one or with one message."""
-    near = (choices.within, choices.before, choices.after) != (None, None, None)
-    asks = any(map(_names_topics, choices.where))
-    if asks and (choices.at is not None or choices.follow):
-        raise UsageError("--at and --follow have no messages of other topics: leave out --where.")
-    if near and not asks:
-        raise UsageError(
-            "--within, --before and --after are about messages of other topics: add --where "
-            "'TOPIC: PREDICATE'."
-        )
-    if asks and not near:
-        raise UsageError(
-            "--where with another topic needs a length of time: add --within, --before or --after."
-        )
-=======
->>>>>>> cli

@@ -301,7 +301,7 @@ class LogRecorder:
 
         missing: list[Path] = []
         if self._is_search and not self._choices.again and len(log.files) > 1:
-            find = store.catalog.with_fingerprint
+            find = store.session.snapshot().by_fingerprint.get
             try:
                 prints = fingerprint(log.files)
             except SourceError:

@@ -39,6 +39,7 @@ from hybridlog_storage.threads import processors
 if TYPE_CHECKING:
     from hybridlog.index.index_writer import IndexTarget
     from hybridlog.query.topics import TopicMatcher
+    from hybridlog.snapshot import Snapshot
     from hybridlog_storage.catalog import Catalog
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.messages import Buffer
@@ -178,6 +179,7 @@ class LiveRecording:
         name: str,
         options: LiveOptions,
         *,
+        known: Callable[[], Snapshot],
         on_close: Callable[[RecordReport], None],
     ) -> None:
         load()
@@ -218,6 +220,7 @@ class LiveRecording:
             directory,
             catalog,
             target,
+            known,
             name=name,
             tags=options.tags,
             source={**_SOURCE, **options.source, "flush_interval_s": options.flush_interval_s},

@@ -10,20 +10,18 @@ from typing import TYPE_CHECKING, Final
 
 from hybridlog.columns.folders import Addition, TableFolders, files_of
 from hybridlog.columns.layout import SHARED, SUFFIX, TABLES
-from hybridlog.entries import describe, take_inventory, text
+from hybridlog.entries import describe, take_inventory
 from hybridlog.maintenance.opening import open_catalog
 from hybridlog.snapshot import UNFINISHED
 from hybridlog_storage.copy_places import read
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import CatalogError, StoreError, unreadable
-from hybridlog_storage.manifest import free_name
 
 if TYPE_CHECKING:
     from collections.abc import Collection
 
     from hybridlog.shared import Shared
     from hybridlog_storage.catalog import Catalog, RecordingEntry
-    from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.remote.bucket import Object
     from hybridlog_storage.remote.store import RemoteDirectory
 
@@ -39,9 +37,6 @@ def bring_derived(source: Shared, target: RemoteDirectory, recordings: Collectio
         source: The open store that they were copied from.
         target: The store in the bucket.
         recordings: Their ids.
-
-    Raises:
-        BucketError: The server does not answer, or refuses.
     """
     known = {}
     for recording in recordings:
@@ -59,12 +54,6 @@ def bring_derived(source: Shared, target: RemoteDirectory, recordings: Collectio
         if cells.save():
             return
     cells.close()  # a manifest may have been made again
-
-
-def free_name_there(directory: StoreDirectory, name: str, but: str) -> str:
-    """A name that no recording of a store has, by their manifests, but for one, by its id."""
-    others = directory.manifests.each({*directory.ids()} - {but})
-    return free_name(text(name), {one.name for one in others})
 
 
 def _describe(

@@ -63,7 +63,7 @@ def change(
     with ExitStack() as held:
         if name is not None:
             held.enter_context(directory.manifests.creating())
-            free, others = free_name_in(catalog, name, entry.id), how
+            free, others = free_name_in(shared.newest().summaries, name, entry.id), how
 
             def how(now: Manifest) -> Manifest:
                 return replace(others(now), name=free)
@@ -72,8 +72,6 @@ def change(
             made = directory.manifests.change(entry.id, how)
         except RecordingGoneError as error:
             raise gone(entry.name) from error
-        if name is not None:
-            catalog.put_name(entry.id, made.name)  # before another recording gets it
     shared.catch_up(entry.id)
     row = catalog.recording(entry.id)
     if row is not None and index.connected is not None and index.connection.may_write:

@@ -97,7 +97,6 @@ class StoreFiles:
         mends = mends and not catalog.is_in_memory
         # A recording has its manifest before it has tables.
         gone = tables.unfinished(directory) if mends else set()
-        opened = catalog.opened
         rows = catalog.summaries()
         report.unreadable.clear()
         ids = directory.ids()
@@ -109,7 +108,6 @@ class StoreFiles:
                 catalog.remove(summary.id)
                 gone.add(summary.id)
         snapshot = snapshot_of(catalog, found.values())
-        catalog.filled = opened
         if gone and mends and not report.unreadable:
             tables.remove_unfinished(directory, snapshot)
             tables.remove_all(directory, gone - found.keys())
@@ -243,9 +241,6 @@ class StoreFiles:
 
         Returns:
             The entry, None if the recording is gone; and whether the files were read again.
-
-        Raises:
-            StoreError: Its files cannot be read.
         """
         known = self._known(summary.id)
         if known is not None:
@@ -314,11 +309,7 @@ class StoreFiles:
 
 
 def snapshot_of(catalog: Catalog, summaries: Collection[RecordingSummary]) -> Snapshot:
-    """Some recordings with their topics.
-
-    Raises:
-        CatalogError: The catalog has lost topics.
-    """
+    """Some recordings with their topics."""
     hashes = {summary.topics for summary in summaries}
     return Snapshot(summaries, {digest: catalog.topics(digest) for digest in hashes})
 

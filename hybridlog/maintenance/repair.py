@@ -97,13 +97,12 @@ def repair(
 
 
 def _repair_one(directory: StoreDirectory, catalog: Catalog, recording: str) -> list[Repaired]:
-    done = _put_manifest_right(directory, catalog, recording)
+    done = _put_manifest_right(directory, recording)
     done += _put_segments_right(directory, recording)
     inventory = take_inventory(directory, recording)
     for misfit in inventory.misfits:
-        cure = inventory.cure(misfit, "restore it from a copy, if there is one")
         place = misfit.file or f"segment {misfit.segment}"
-        what = f"{misfit.reason}; {cure}"
+        what = f"{misfit.reason}; restore it from a copy, if there is one"
         done.append(Repaired(inventory.name, place, what, is_cured=False))
     return [*done, *_damage(directory.recording(recording), inventory)]
 
@@ -141,14 +140,12 @@ def _put_segments_right(directory: StoreDirectory, recording: str) -> list[Repai
 def _rebuild(inventory: Inventory, misfit: Misfit, path: Path) -> bool:
     """Rebuild a damaged summary, if the result has the digest in the manifest."""
     log = inventory.logs.get(misfit.segment)
-    if log is None or log.name != misfit.file or misfit.own_name:
+    if log is None or log.name != misfit.file:
         return False
     return rebuild_summary(path / misfit.file, log.digest)
 
 
-def _put_manifest_right(
-    directory: StoreDirectory, catalog: Catalog, recording: str
-) -> list[Repaired]:
+def _put_manifest_right(directory: StoreDirectory, recording: str) -> list[Repaired]:
     manifests = directory.manifests
     try:
         is_lost = manifests.find(recording) is None
@@ -160,7 +157,8 @@ def _put_manifest_right(
         def make(old: Manifest | None) -> Manifest:
             inventory = inventory_of(directory, recording, directory.listing(recording), None)
             made = made_again(inventory, old)
-            return replace(made, name=free_name_in(catalog, made.name, recording))
+            others = manifests.each(directory.ids())
+            return replace(made, name=free_name_in(others, made.name, recording))
 
         made = manifests.restore(recording, make)
         return [Repaired(made.name, "manifest", "made again")]

@@ -244,7 +244,7 @@ class _Check:
     def _files(self, inventory: Inventory, *, is_held: bool) -> None:
         for misfit in inventory.misfits:
             place = misfit.file or f"segment {misfit.segment}"
-            cure = inventory.cure(misfit, _REPAIR if misfit.file else _RESTORE_LOST)
+            cure = _REPAIR if misfit.file else _RESTORE_LOST
             self.found(place, misfit.reason, RESTORE if is_rows(misfit.file) else cure)
         for name in inventory.listing.open.values():
             if not is_held:

@@ -235,7 +235,7 @@ class RangeResolver:
     def _ends(self, channel: RecordedChannel) -> Iterator[int]:
         """First and last time of a channel on the question's clock, perhaps of each chunk.
 
-        Where statistics do not have them, the messages are read.
+        Where its statistics do not have them, the messages are read.
         """
         recording, is_publish = channel.recording, self._question.clock == "publish"
         if recording.is_decoded if not is_publish else not recording.flushed:
@@ -243,16 +243,12 @@ class RangeResolver:
             return
         number = channel.channel_id
         for chunk in self._session.chunks(recording, [number], None, "log"):
-            stats = self._session.chunk_stats(recording, chunk)[number]
-            known = _known_ends(stats, is_publish=is_publish)
-            if not known:
-                from hybridlog.schema.codec import stamps_of
+            from hybridlog.schema.codec import stamps_of
 
-                batch = self._session.read_chunk(recording.id, chunk.segment, chunk.place).batch
-                batch = batch.take(np.flatnonzero(batch.channel == number))
-                times = batch.publish_time if is_publish else stamps_of(channel.codec, batch)[1]
-                known = [int(times.min()), int(times.max())] if len(times) else []
-            yield from known
+            batch = self._session.read_chunk(recording.id, chunk.segment, chunk.place).batch
+            batch = batch.take(np.flatnonzero(batch.channel == number))
+            times = batch.publish_time if is_publish else stamps_of(channel.codec, batch)[1]
+            yield from (int(times.min()), int(times.max())) if len(times) else ()
 
     def _is_outside(self, bounds: Span, recording: RecordingSummary) -> bool:
         """True if a range is empty, or does not overlap the recording on the log clock."""

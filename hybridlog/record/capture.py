@@ -40,6 +40,7 @@ from hybridlog_storage.segments.segment_format import END_METADATA, LOSSES_METAD
 from hybridlog_storage.segments.segment_writer import RecordingWriter, SegmentSettings
 
 if TYPE_CHECKING:
+    from hybridlog.snapshot import Snapshot
     from hybridlog_storage.catalog import Catalog
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.messages import Channel
@@ -80,6 +81,7 @@ class Capture:
         directory: The store.
         catalog: Its catalog.
         target: Where its index documents go.
+        known: Returns all recordings of the store as they are now.
         name: Name of the recording.
         tags: Tags of the recording.
         source: Origin of its messages, for the catalog.
@@ -89,7 +91,7 @@ class Capture:
             no topic.
         is_ring: Whether files of it go while it is recorded. Then nothing is derived of it, and
             latched messages have files of their own.
-        check: Called with the catalog before anything is written, while no other process can
+        check: Called with all recordings before anything is written, while no other process can
             start a recording; raises to refuse.
 
     Attributes:
@@ -103,6 +105,7 @@ class Capture:
         directory: StoreDirectory,
         catalog: Catalog,
         target: IndexTarget,
+        known: Callable[[], Snapshot],
         *,
         name: str,
         tags: Mapping[str, str],
@@ -111,7 +114,7 @@ class Capture:
         pressure: Backpressure | None = None,
         no_index: Callable[[str], bool] | None = None,
         is_ring: bool = False,
-        check: Callable[[Catalog], None] | None = None,
+        check: Callable[[Snapshot], None] | None = None,
     ) -> None:
         self.catalog = catalog
         self._directory = directory
@@ -131,11 +134,12 @@ class Capture:
             try:
                 with directory.manifests.creating() as create:
                     # Of two processes that record the same content now, one is refused.
+                    recorded = known()
                     if check is not None:
-                        check(self.catalog)
+                        check(recorded)
                     manifest = Manifest(
                         recording,
-                        free_name_in(self.catalog, name),
+                        free_name_in(recorded.summaries, name),
                         time.time_ns(),
                         source=convert(dict(source), Source),
                         tags={text(key): text(value) for key, value in tags.items()},

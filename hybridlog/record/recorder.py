@@ -41,8 +41,10 @@ if TYPE_CHECKING:
     from hybridlog.formats.reading import Damage, Fingerprint, Source
     from hybridlog.index.index_writer import IndexTarget
     from hybridlog.query.topics import TopicMatcher
+    from hybridlog.snapshot import Snapshot
     from hybridlog_storage.catalog import Catalog
     from hybridlog_storage.disk.directory import StoreDirectory
+    from hybridlog_storage.summary import RecordingSummary
 
 _MAX_PARTS = 1000  # of a log, whose fingerprints the recording has
 
@@ -111,6 +113,7 @@ def record(
     directory: StoreDirectory,
     catalog: Catalog,
     target: IndexTarget,
+    known: Callable[[], Snapshot],
     *,
     fingerprint: Fingerprint,
     options: RecordOptions,
@@ -123,6 +126,7 @@ def record(
         directory: The store.
         catalog: Its catalog.
         target: Where its index documents go.
+        known: Returns all recordings of the store.
         fingerprint: Fingerprint of the source's content.
         options: Options of the recording.
         progress: Called periodically with bytes read and messages stored.
@@ -134,14 +138,15 @@ def record(
     """
     started = time.monotonic()
 
-    def refuse_known(catalog: Catalog) -> None:
+    def refuse_known(snapshot: Snapshot) -> None:
         if not options.again:
-            _refuse_known(catalog, source, fingerprint)
+            _refuse_known(snapshot.by_fingerprint, source, fingerprint)
 
     capture = Capture(
         directory,
         catalog,
         target,
+        known,
         name=options.name or name_of(source.path),
         tags=options.tags,
         source={
@@ -337,10 +342,12 @@ def _identity(fingerprint: Fingerprint) -> dict[str, object]:
     return {"fingerprint": fingerprint.whole, **parts}
 
 
-def _refuse_known(catalog: Catalog, source: Source, fingerprint: Fingerprint) -> None:
-    known = catalog.with_fingerprint(fingerprint.whole)
+def _refuse_known(
+    recorded: Mapping[str, RecordingSummary], source: Source, fingerprint: Fingerprint
+) -> None:
+    known = recorded.get(fingerprint.whole)
     if known is None and len(fingerprint.parts) > 1:
-        parts = [catalog.with_fingerprint(part) for part in fingerprint.parts]
+        parts = [recorded.get(part) for part in fingerprint.parts]
         names = dict.fromkeys(one.name for one in parts if one is not None)
         if None not in parts:
             raise AlreadyRecordedError(

@@ -12,7 +12,7 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from collections.abc import Callable, Collection, Container, Iterable, Iterator, Mapping
+from collections.abc import Collection, Container, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
@@ -65,9 +65,7 @@ _RECORDINGS_FILE: Final = Path("tables/recordings.parquet")
 _BUSY_S: Final = 1.0
 _NOTING_S: Final = 0.1
 _MAX_TABLES: Final = 64 << 20  # bytes of chunk tables in memory
-_MAX_SOUGHT: Final = 200  # bytes of a name; of long ones, a number takes the place of the end
 _FEW: Final = 100  # cells that are read one by one
-_TRIES: Final = 3  # to read it, while it is lost
 _T = TypeVar("_T")
 _STAMP = RowType(
     ("unreadable", "<u4"),
@@ -283,13 +281,6 @@ class ChunkEntry:
         return sum(stats.messages for stats in self.stats.values())
 
 
-def _fingerprints(source: Mapping[str, Any]) -> set[str]:
-    """Fingerprints of the log of a recording and of its parts."""
-    parts = source.get("parts")
-    found = [source.get("fingerprint"), *(parts if isinstance(parts, list) else ())]
-    return {fingerprint for fingerprint in found if isinstance(fingerprint, str)}
-
-
 def channel_totals(
     table: ChunkTable, stamps: NDArray[np.void] | None, silent: Container[int] = ()
 ) -> dict[int, ChannelStats]:
@@ -415,11 +406,7 @@ class Catalog:
     Attributes:
         is_in_memory: True if what is put into it stays in the memory of this process.
         has_changed: True if an ended recording was changed by this process.
-        fill: Puts all recordings of the store into it, once what it had is lost.
-        filled: The `opened` as of which it has them.
     """
-
-    fill: Callable[[], object] | None = None
 
     def __init__(
         self,
@@ -435,13 +422,6 @@ class Catalog:
         self._cells = cells or Cells(store / CATALOG, store_id, writes=not in_memory)
         self._topics: dict[str, tuple[TopicType, ...]] = {}
         self._tables = Cache(_MAX_TABLES)
-        self.filled = 0
-
-    @property
-    def opened(self) -> int:
-        """Changes when what it had may be lost."""
-        self._cells.read(_SUMMARY, "")
-        return self._cells.opened
 
     @property
     def recordings_file(self) -> Path:
@@ -456,11 +436,7 @@ class Catalog:
     # Changes.
 
     def _remove_recordings_file(self) -> None:
-        """Remove the list of ended recordings, which is wrong now.
-
-        Raises:
-            StoreError: It cannot be removed.
-        """
+        """Remove the list of ended recordings, which is wrong now."""
         if not self.is_in_memory:
             try:
                 files.unlink(self.recordings_file)
@@ -524,17 +500,6 @@ class Catalog:
 
         self._cells.write(statements, _NOTING_S)
 
-    def put_name(self, recording: str, name: str) -> None:
-        """Note the name of a recording; the rest is read again when it is looked at."""
-
-        def renamed() -> Iterator[Statement]:
-            for one in self.summaries([recording]):
-                yield put(_SUMMARY, recording, _summary_body(one._replace(name=name, look="")))
-
-        self.has_changed = True
-        self._remove_recordings_file()
-        self._cells.write(renamed, _BUSY_S)
-
     def put_indexed(self, recordings: Collection[str], index: str) -> None:
         """Note that an index is complete for recordings, as long as they look the same.
 
@@ -582,19 +547,6 @@ class Catalog:
 
     # Answers.
 
-    def _with(self, text: bytes) -> list[RecordingSummary]:
-        """Summaries of all recordings that have some text.
-
-        Raises:
-            CatalogError: It is lost again and again.
-        """
-        for _ in range(_TRIES):
-            bodies = self._cells.each(_SUMMARY, text).values()
-            if self.fill is None or self.filled == self._cells.opened:
-                return [one for body in bodies if (one := _read(_SUMMARY_OF, body))]
-            self.fill()
-        raise CatalogError(f"The catalog {self._store / CATALOG} is lost all the time. Ask again.")
-
     def summaries(self, recordings: Collection[str] | None = None) -> list[RecordingSummary]:
         """Summaries of recordings by id, None for all; unordered, without damaged ones."""
         indexed = self._bodies(_INDEX, recordings)
@@ -610,13 +562,6 @@ class Catalog:
             found.append(summary)
         return found
 
-    def names_like(self, name: str) -> set[tuple[str, str]]:
-        """Names and ids of recordings whose names begin like this one, if one is called so."""
-        quoted = encode(name)
-        if not self._with(quoted):
-            return set()
-        return {(o.name, o.id) for o in self._with(quoted[:_MAX_SOUGHT].removesuffix(b'"'))}
-
     def _bodies(self, kind: str, recordings: Collection[str] | None) -> dict[str, bytes]:
         """The cells of some recordings by id; None for all."""
         if recordings is not None and len(recordings) <= _FEW:
@@ -625,11 +570,7 @@ class Catalog:
         return every if recordings is None else {o: every[o] for o in recordings if o in every}
 
     def topics(self, digest: str) -> tuple[TopicType, ...]:
-        """A set of topics and their types, by its hash, which a summary has.
-
-        Raises:
-            CatalogError: It is missing.
-        """
+        """A set of topics and their types, by its hash, which a summary has."""
         found = self._set(digest)
         if found is None:
             raise CatalogError(f"The catalog {self._store / CATALOG} has lost topics. Ask again.")
@@ -648,11 +589,6 @@ class Catalog:
         """State of the files and entry of a recording; None if it is missing or damaged."""
         found = _read(_ENTRY_OF, self._cells.read(_ENTRY, recording))
         return found if found is not None and found[1].id == recording else None
-
-    def with_fingerprint(self, fingerprint: str) -> RecordingSummary | None:
-        """A recording of a log with this content, or of one of which it is a part."""
-        found = self._with(_body(fingerprint))
-        return next((one for one in found if fingerprint in _fingerprints(one.source)), None)
 
     def _index(self, recording: str) -> _Indexed:
         return _indexed(self._cells.read(_INDEX, recording))
@@ -695,21 +631,13 @@ class Catalog:
     # Chunks.
 
     def table(self, entry: RecordingEntry, number: int) -> ChunkTable:
-        """The chunks of a segment, from its footer.
-
-        Raises:
-            CatalogError: The segment is not the one of the entry, or cannot be read.
-        """
+        """The chunks of a segment, from its footer."""
         return self.decoded_table(entry, number)[0]
 
     def decoded_table(
         self, entry: RecordingEntry, number: int
     ) -> tuple[ChunkTable, NDArray[np.void] | None]:
-        """The chunks of a segment, and the results of decoding for each row of its parts.
-
-        Raises:
-            CatalogError: The segment is not the one of the entry, or cannot be read.
-        """
+        """The chunks of a segment, and the results of decoding for each row of its parts."""
         if number in entry.flushed:
             return entry.flushed[number].table, None
         digest = entry.digests.get(str(number), "")
@@ -737,20 +665,6 @@ class Catalog:
         if not is_ours or {*spans_of(number, summary.table)} - {*entry.spans}:
             raise CatalogError(f"Segment {path} has changed since the store was opened.")
         return summary.table, self.stamps(entry, number, summary.table)
-
-    def chunk_stats(
-        self, entry: RecordingEntry, segment: int, number: int
-    ) -> dict[int, ChannelStats]:
-        """Statistics of the channels in a chunk.
-
-        Raises:
-            CatalogError: As for `table`.
-        """
-        table, stamps = self.decoded_table(entry, segment)
-        begin, end = table.part_bounds()[number : number + 2].tolist()
-        own = replace(table, chunks=table.chunks[number : number + 1], parts=table.parts[begin:end])
-        silent = {c.id for c in entry.channels if not c.has_publish_time}
-        return channel_totals(own, None if stamps is None else stamps[begin:end], silent)
 
 
 def _summary_body(summary: RecordingSummary) -> bytes:

@@ -1,10 +1,10 @@
 """Cells: small values in an SQLite file that is a cache.
 
 Nothing that happens to the file does more than cost time. A damaged file is removed and made
-again. While it is locked or on a full disk, memory takes its place; so it does, with a copy of
-its content, where this process may not write. The file may come from elsewhere: each cell has a
-checksum, no symlink is followed, and no journal is read or written, so a process that is
-killed may leave a damaged file.
+again. If it is locked or on a full disk, memory takes its place from then on; so it does, with a
+copy of its content, where this process may not write. The file may come from elsewhere: each
+cell has a checksum, no symlink is followed, and no journal is read or written, so a process that
+is killed may leave a damaged file.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from __future__ import annotations
 import os
 import sqlite3
 import stat
-import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
@@ -33,7 +32,6 @@ _TABLE: Final = (
 _SELECT: Final = "SELECT kind, key, number, body, crc FROM cells WHERE kind = ? AND "
 _ASIDE: Final = ("-journal", "-wal", "-shm")  # what SQLite would read or write, too
 _READ_S: Final = 0.1
-_AGAIN_S: Final = 5.0  # until a file that could not be used is tried again
 _MAX_BYTES: Final = 1 << 28  # of a cell
 _MAX_COPIED: Final = 1 << 30  # bytes of a file that is read into memory
 _ERRORS: Final = (sqlite3.DatabaseError, UnicodeDecodeError, OSError)
@@ -82,7 +80,6 @@ class Cells:
     Attributes:
         lock: Held while cells are read or changed.
         changes: Counts what was written here.
-        opened: Counts the databases that were used: a new one may lack what was written before.
     """
 
     def __init__(self, path: Path | None, owner: str, *, writes: bool = True) -> None:
@@ -90,42 +87,25 @@ class Cells:
         self._owner = crc32(f"{_VERSION} {owner}".encode()) >> 1
         self._writes = writes and path is not None
         self.lock = RLock()
-        self.changes = self.opened = 0
+        self.changes = 0
         self._db: sqlite3.Connection | None = None
-        self._file: tuple[int, int] | None = None  # that is open; None in memory
-        self._again_at = float("inf")
 
     def close(self) -> None:
         """Close the file."""
         with self.lock:
             if self._db is not None:
                 self._db.close()
-            self._db = self._file = None
+            self._db = None
 
     # The file.
 
     def _use(self) -> sqlite3.Connection:
-        """The database to ask now: the file, or memory in its place."""
-        if self._db is not None and self._is_current():
-            return self._db
-        self.close()
-        self.opened += 1
-        if self._writes:
-            self._db, self._file = self._opened()
-            self._again_at = float("inf")
-        else:
-            self._db = self.loaded()
+        """The database to ask: the file, or memory in its place."""
+        if self._db is None:
+            self._db = self._opened() if self._writes else self.loaded()
         return self._db
 
-    def _is_current(self) -> bool:
-        """False if somebody has removed or replaced the file, or it is to be tried again."""
-        if self._file is None or self._path is None:
-            return time.monotonic() < self._again_at
-        with suppress(OSError):
-            return _place(self._path) == self._file
-        return False
-
-    def _opened(self) -> tuple[sqlite3.Connection, tuple[int, int]]:
+    def _opened(self) -> sqlite3.Connection:
         """The file, made if it does not exist."""
         assert self._path is not None
         for suffix in ("", *_ASIDE):
@@ -135,7 +115,6 @@ class Cells:
                     files.remove_tree(place)
         with suppress(FileExistsError):
             os.close(files.open_file(self._path, os.O_RDWR | os.O_CREAT | os.O_EXCL))
-        found = _place(self._path)
         opened = _connected(_address(self._path, "rw"))
         try:
             if not self._is_ours(opened):
@@ -147,7 +126,7 @@ class Cells:
         except BaseException:
             opened.close()
             raise
-        return opened, found
+        return opened
 
     def _is_ours(self, opened: sqlite3.Connection) -> bool:
         (version,) = opened.execute("PRAGMA user_version").fetchone()
@@ -190,12 +169,8 @@ class Cells:
                             files.remove_tree(self._path)
                     else:
                         break
-            self.close()
-            self.opened += 1
-            self._db = _connected()
-            self._fill(self._db)
-            self._again_at = time.monotonic() + _AGAIN_S if self._writes else float("inf")
-            return work(self._db)
+            self._writes, self._path = False, None
+            return work(self._use())
 
     def _is_damage(self, error: Exception) -> bool:
         """False if the file may be as it should be: locked, read-only, on a full disk."""
@@ -213,9 +188,9 @@ class Cells:
         found = self._found(f"{_SELECT} key = ? AND number = ?", kind, key, number)
         return next(iter(found.values()), None)
 
-    def each(self, kind: str, containing: bytes = b"") -> dict[str, bytes]:
-        """All cells of a kind by key, or those with some bytes in them."""
-        return self._found(f"{_SELECT} instr(body, ?)", kind, containing)
+    def each(self, kind: str) -> dict[str, bytes]:
+        """All cells of a kind by key."""
+        return self._found(f"{_SELECT} TRUE", kind)
 
     def _found(self, query: str, *values: object) -> dict[str, bytes]:
         def work(opened: sqlite3.Connection) -> dict[str, bytes]:
@@ -261,11 +236,6 @@ def _transaction(opened: sqlite3.Connection, wait_s: float) -> Iterator[None]:
     finally:
         with suppress(sqlite3.Error):
             opened.execute(f"PRAGMA busy_timeout = {int(_READ_S * 1000)}")
-
-
-def _place(path: Path) -> tuple[int, int]:
-    about = files.status(path)
-    return about.st_dev, about.st_ino
 
 
 def _address(path: Path, mode: str) -> str:

@@ -300,11 +300,7 @@ class Manifest(Record, frozen=True):
         return is_old and number not in self.logs
 
     def __post_init__(self) -> None:
-        """Refuse what no writer writes.
-
-        Raises:
-            ValueError: Two files have one name, or a time or a channel does not fit.
-        """
+        """Refuse what no writer writes."""
         if len({file.name for file in self.files}) < len(self.files):
             raise ValueError("two files have one name")
         if any(int(file.name[:6]) != file.number for file in self.files):
@@ -367,11 +363,7 @@ def free_name(text: str, taken: Collection[str]) -> str:
 
 
 def replace(part: _Part, **values: object) -> _Part:
-    """A manifest, or a part of one, with other values.
-
-    Raises:
-        ValueError: They do not fit.
-    """
+    """A manifest, or a part of one, with other values."""
     return structs.replace(part, **values)
 
 
@@ -470,20 +462,12 @@ def encode_file(file: File) -> bytes:
 
 
 def decode_file(data: bytes) -> File:
-    """The opposite.
-
-    Raises:
-        ValueError: It is none.
-    """
+    """The opposite."""
     return json.decode(data, type=File)
 
 
 def encode(manifest: Manifest) -> bytes:
-    """The bytes of a manifest.
-
-    Raises:
-        StoreError: It would be larger than any that is read, or have a value out of bounds.
-    """
+    """The bytes of a manifest."""
     try:
         text = json.encode(manifest)
         _DECODER.decode(text)
@@ -495,11 +479,7 @@ def encode(manifest: Manifest) -> bytes:
 
 
 def decode(data: bytes) -> Manifest:
-    """The manifest of some bytes.
-
-    Raises:
-        ValueError: They are none, or are damaged; says why.
-    """
+    """The manifest of some bytes."""
     text, _, digest = data.removesuffix(b"\n").rpartition(b"\n")
     if blake3(text).hexdigest().encode() != digest:
         raise ValueError("its digest differs")

@@ -18,7 +18,6 @@ In a bucket, the first one only. All that is in `recordings/<id>` goes with a re
 from __future__ import annotations
 
 import errno
-import fcntl
 import os
 import random
 import stat
@@ -49,7 +48,6 @@ if TYPE_CHECKING:
 
 WAIT_S: Final = 30.0
 """Longest wait of a change for others, which take milliseconds."""
-_PAUSE_S: Final = 0.002
 _YIELD_S: Final = 0.05
 _last: Final[dict[Path, tuple[float, float]]] = {}
 """Of the lock that this process had last: when it was left, and how long it was held."""
@@ -358,9 +356,6 @@ class DiskManifests(Manifests):
         """Remove what is left of beginnings and removals of processes that were killed.
 
         While a recording begins, nothing is removed.
-
-        Raises:
-            HybridlogError: Something cannot be removed.
         """
         if not (self._left() or self._bare()):
             return
@@ -473,19 +468,7 @@ class DiskManifests(Manifests):
             modified = max(modified, files.status(path).st_mtime_ns + 1)
         with suppress(FileNotFoundError):
             files.unlink(new)  # of a writer that died
-        fd = files.open_file(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL)
-        try:
-            try:
-                durability.write_all(fd, [data])
-                os.utime(fd, ns=(modified, modified))
-                durability.sync_file(fd)
-            finally:
-                os.close(fd)
-            durability.publish(new, path)
-        except BaseException:
-            with suppress(OSError):
-                files.unlink(new)
-            raise
+        files.write_file(path, data, modified=modified, temporary=new)
 
     def old(self, recording: str) -> Manifest | None:
         """As of `Manifests`."""
@@ -684,23 +667,18 @@ def _odd(path: Path) -> str:
 
 
 def _lock(fd: int, path: Path, end: float) -> None:
-    while True:
-        try:
-            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            if time.monotonic() > end:
-                message = f"Another process has held {path} for {WAIT_S:.0f} s; end it."
-                raise HeldError(message, is_recording=False) from None
-            time.sleep(random.uniform(0, _PAUSE_S))  # noqa: S311 - no secret
-        except OSError as error:
-            if error.errno not in _NO_LOCKS:
-                raise
-            raise StoreError(
-                f"The file system of {path.parent} has no locks (flock), so the store can only be "
-                "read there. Copy it to another one to change it."
-            ) from error
-        else:
-            return
+    try:
+        files.lock(fd, max(end - time.monotonic(), 0))
+    except BlockingIOError:
+        message = f"Another process has held {path} for {WAIT_S:.0f} s; end it."
+        raise HeldError(message, is_recording=False) from None
+    except OSError as error:
+        if error.errno not in _NO_LOCKS:
+            raise
+        raise StoreError(
+            f"The file system of {path.parent} has no locks (flock), so the store can only be "
+            "read there. Copy it to another one to change it."
+        ) from error
 
 
 def _exists(path: Path) -> bool:

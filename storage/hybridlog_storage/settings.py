@@ -13,10 +13,9 @@ import re
 import stat
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Final, TypeGuard
-from urllib.parse import quote
+from urllib.parse import SplitResult, quote, urlsplit
 
 from msgspec import Meta, Struct, ValidationError, convert
 from msgspec.structs import replace
@@ -71,12 +70,7 @@ class StoreSettings(Struct, frozen=True):
 
 
 def read_settings(path: Path) -> StoreSettings:
-    """Read the settings of a store.
-
-    Raises:
-        StoreError: It is not a store, or has another format; or the settings are damaged, or
-            hold a password.
-    """
+    """Read the settings of a store."""
     file = path / NAME
     return _settings(path, file, _read(path, file))
 
@@ -106,21 +100,12 @@ def _settings(path: Path | str, file: Path, values: Mapping[str, object]) -> Sto
 
 
 def write_settings(path: Path, settings: StoreSettings) -> None:
-    """Write the settings of a store, without a password in its URI.
-
-    Raises:
-            UsageError: The URI is not a MongoDB connection string.
-            OSError: They cannot be written.
-    """
+    """Write the settings of a store, without a password in its URI."""
     files.write_file(path / NAME, settings_text(settings))
 
 
 def settings_text(settings: StoreSettings) -> bytes:
-    """The content of the file, without a password in the URI.
-
-    Raises:
-        UsageError: The URI is not a MongoDB connection string.
-    """
+    """The content of the file, without a password in the URI."""
     lines = [f"format = {FORMAT}", f"store_id = {_quoted(settings.store_id)}"]
     if settings.mongo is not None:
         mongo = without_password(settings.mongo) if is_uri(settings.mongo) else settings.mongo
@@ -142,11 +127,7 @@ def is_uri(mongo: str | None) -> TypeGuard[str]:
 
 
 def checked_cache_mb(value: object, name: str) -> int:
-    """A size of the embedded MongoDB's cache in MiB.
-
-    Raises:
-        UsageError: It is not an integer, or MongoDB does not accept it.
-    """
+    """A size of the embedded MongoDB's cache in MiB."""
     if type(value) is not int or not MIN_CACHE_MB <= value <= MAX_CACHE_MB:
         raise UsageError(
             f"{name} must be a number of MB from {MIN_CACHE_MB} to {MAX_CACHE_MB}, not {value!r}."
@@ -155,11 +136,7 @@ def checked_cache_mb(value: object, name: str) -> int:
 
 
 def cache_mb_from_environment() -> int | None:
-    """The size of the cache in HYBRIDLOG_CACHE_SIZE, in MiB; None without one.
-
-    Raises:
-        UsageError: It is not a size.
-    """
+    """The size of the cache in HYBRIDLOG_CACHE_SIZE, in MiB; None without one."""
     text = os.environ.get("HYBRIDLOG_CACHE_SIZE")
     if not text:
         return None
@@ -168,20 +145,17 @@ def cache_mb_from_environment() -> int | None:
 
 
 def without_password(uri: str) -> str:
-    """A connection string with the user's name, but without secrets.
-
-    Raises:
-        UsageError: It is invalid, so a password may be anywhere in it. The message does not
-            show it.
-    """
+    """A connection string with the user's name, but without secrets."""
     parts = _split(uri)
-    user, colon, _ = parts.user.partition(":")
-    mark = ";" if ";" in parts.options else "&"
-    options = parts.options.split(mark)
+    login, _, hosts = parts.netloc.rpartition("@")
+    user, colon, _ = login.partition(":")
+    mark = ";" if ";" in parts.query else "&"
+    options = parts.query.split(mark)
     public = [option for option in options if not _is_secret(option)]
     if not colon and len(public) == len(options):
         return uri
-    return _join(_Uri(parts.scheme, user, parts.hosts, parts.path, mark.join(public)))
+    clean = parts._replace(netloc=f"{user}@{hosts}" if user else hosts, query=mark.join(public))
+    return clean.geturl()
 
 
 def with_password(uri: str) -> str:
@@ -189,68 +163,36 @@ def with_password(uri: str) -> str:
 
     HYBRIDLOG_MONGO_PASSWORD holds it, or the file named by HYBRIDLOG_MONGO_PASSWORD_FILE. A
     URI without a user, or with a password of its own, is unchanged.
-
-    Raises:
-        UsageError: The file cannot be read, or others can read it.
     """
     try:
         parts = _split(uri)
     except UsageError:
         return uri  # connecting reports the error
-    if not parts.user or ":" in parts.user:
+    user, _, hosts = parts.netloc.rpartition("@")
+    if not user or ":" in user or (password := _password()) is None:
         return uri
-    password = _password()
-    if password is None:
-        return uri
-    user = f"{parts.user}:{quote(password, safe='')}"
-    return _join(_Uri(parts.scheme, user, parts.hosts, parts.path, parts.options))
+    return parts._replace(netloc=f"{user}:{quote(password, safe='')}@{hosts}").geturl()
 
 
-@dataclass(frozen=True, slots=True)
-class _Uri:
-    """The parts of a connection string; missing ones are empty.
-
-    Attributes:
-        scheme: `mongodb` or `mongodb+srv`.
-        user: Name, and password behind a colon.
-        hosts: One or several hosts.
-        path: `/` and the name of a database.
-        options: The text behind the question mark.
-    """
-
-    scheme: str
-    user: str
-    hosts: str
-    path: str
-    options: str
-
-
-def _split(uri: str) -> _Uri:
-    scheme, found, rest = uri.partition("://")
-    rest, _, options = rest.partition("?")
-    authority, slash, name = rest.partition("/")
-    user, _, hosts = authority.rpartition("@")
+def _split(uri: str) -> SplitResult:
+    try:
+        parts = urlsplit(uri, allow_fragments=False)
+    except ValueError:
+        parts = urlsplit("")
     is_whole = (
-        found
-        and scheme in {"mongodb", "mongodb+srv"}
+        parts.scheme in {"mongodb", "mongodb+srv"}
         and uri.isprintable()
-        and _HOSTS.fullmatch(hosts)
-        and not set(name) & set("@/:")
-        and not {"&", ";"} <= set(options)
-        and all("=" in option for option in re.split("[&;]", options) if option)
+        and _HOSTS.fullmatch(parts.netloc.rpartition("@")[2])
+        and not set(parts.path[1:]) & set("@/:")
+        and not {"&", ";"} <= set(parts.query)
+        and all("=" in option for option in re.split("[&;]", parts.query) if option)
     )
     if not is_whole:
         raise UsageError(
             "The URI is not a MongoDB connection string. Write mongodb://host:port/NAME, and "
             "percent-encode user name, password and socket path."
         )
-    return _Uri(scheme, user, hosts, slash + name, options)
-
-
-def _join(parts: _Uri) -> str:
-    user = f"{parts.user}@" if parts.user else ""
-    options = f"?{parts.options}" if parts.options else ""
-    return f"{parts.scheme}://{user}{parts.hosts}{parts.path}{options}"
+    return parts
 
 
 def _is_secret(option: str) -> bool:
@@ -275,11 +217,7 @@ def _stored_uri(file: Path, mongo: str | None) -> str | None:
 
 
 def _password() -> str | None:
-    """The password from the environment.
-
-    Raises:
-        UsageError: Its file cannot be used.
-    """
+    """The password from the environment."""
     given = os.environ.get("HYBRIDLOG_MONGO_PASSWORD")
     if given:
         return given
@@ -317,11 +255,7 @@ def _password() -> str | None:
 
 
 def _read(path: Path, file: Path) -> dict[str, object]:
-    """The parsed file.
-
-    Raises:
-        StoreError: It cannot be read, or is not TOML.
-    """
+    """The parsed file."""
     try:
         content = files.read_file(file, MAX_SETTINGS)
     except FileNotFoundError:

@@ -150,11 +150,7 @@ class Server(Place):
             yield
 
     def begin(self) -> None:
-        """Make a store where there is none.
-
-        Raises:
-            StoreError: Something else is there, or a store that this hybridlog does not know.
-        """
+        """Make a store where there is none."""
         content = self.fetched(SETTINGS, MAX_SETTINGS)
         if content is not None:
             settings_of(content, self.address)
@@ -191,11 +187,7 @@ class Server(Place):
         }
 
     def names(self) -> set[str]:
-        """Names of all recordings.
-
-        Raises:
-            StoreError: The server does not answer.
-        """
+        """Names of all recordings."""
         if self.has_shell:
             pattern = r'^{"id":"[^"]*","name":"\([^"\]\|\\.\)*"'
             whole = f"find {MANIFESTS} -name '[!.]*.json'"  # others were left by a cut
@@ -312,9 +304,6 @@ class Server(Place):
             passed: A handle that a command reads.
             watch: Called now and then with the id of the process; what it raises ends it.
             options: Of the program.
-
-        Raises:
-            StoreError: The server is not reached, or a command fails.
         """
         root = self._root.replace("\\", "\\\\").replace('"', '\\"')
         script = "\n".join([f'-@mkdir "{root}"', f'@cd "{root}"', *map(_silent, lines), ""])
@@ -333,11 +322,7 @@ class Server(Place):
         return said.splitlines()
 
     def shell(self, script: str) -> tuple[int, str]:
-        """Exit code and output of a script that runs in the folder of the store.
-
-        Raises:
-            StoreError: The server is not reached.
-        """
+        """Exit code and output of a script that runs in the folder of the store."""
         return self._run(self._ssh_process(script))[:2]
 
     def _run(

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import shutil
-import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +12,7 @@ import pytest
 import hybridlog as hl
 from hybridlog.maintenance.copying import CopyOptions, CopyReport
 from hybridlog_storage import copy
-from hybridlog_storage.errors import HeldError, StoreError, UsageError
+from hybridlog_storage.errors import HeldError, UsageError
 from tests import places
 from tests.cli.within import answer
 from tests.copying.conftest import STATES, all_answers, answers, expire, files_in
@@ -232,29 +230,6 @@ def test_a_recording_that_is_held_there_is_left_for_later(
             report = copied(robots, {"to": lab}, "recorded", "noted")
     assert (report.copied, report.held) == (["noted"], [recording])
     assert "is being changed by" in report.refused["recorded"]
-
-
-def test_two_copies_at_once_end_with_one(robots: Path, tmp_path: Path, to: To) -> None:
-    """And who reads there meanwhile sees it."""
-    lab = tmp_path / "lab"
-    with hl.open(lab, mongo="none", create=True) as reader:
-        barrier = threading.Barrier(2)
-
-        def one() -> CopyReport:
-            barrier.wait()
-            return copied(robots, to(lab), "driven")
-
-        with ThreadPoolExecutor(2) as pool:
-            both = [pool.submit(one) for _ in range(2)]
-        found = []
-        for each in both:
-            # Without a shell, two that send one file are refused: it is copied again.
-            is_refused = isinstance(each.exception(), StoreError)
-            found.append(copied(robots, to(lab), "driven") if is_refused else each.result())
-        assert [len({*one.copied, *one.known}) for one in found] == [1, 1]
-        assert [one.name for one in reader.summaries()] == ["driven"]
-        assert reader.topic("/number").count() > 20
-    assert answers(lab, "driven") == answers(robots, "driven")
 
 
 def test_a_name_that_another_recording_has_there_gets_a_number(

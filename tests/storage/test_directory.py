@@ -45,11 +45,6 @@ def test_a_uri_is_kept_without_its_password(tmp_path: Path, uri: str) -> None:
     assert StoreDirectory(tmp_path / "store").settings.mongo == uri.replace(":p%5Cw", "")
 
 
-def test_an_empty_directory_becomes_a_store(tmp_path: Path) -> None:
-    (tmp_path / "store").mkdir()
-    assert StoreDirectory.create(tmp_path / "store").ids() == []
-
-
 def test_what_is_no_place_for_a_store(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("x")
     (tmp_path / "full").mkdir()
@@ -59,23 +54,6 @@ def test_what_is_no_place_for_a_store(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match="holds files"):
         StoreDirectory.create(tmp_path / "full")
     assert sorted(p.name for p in tmp_path.rglob("*")) == ["file", "full", "precious.txt"]
-    with pytest.raises(StoreError, match="no such directory"):
-        StoreDirectory(tmp_path / "nothing")
-    with pytest.raises(StoreError, match=r"no hybridlog\.toml"):
-        StoreDirectory(tmp_path / "full")
-    with pytest.raises(StoreError, match="is a file"):
-        StoreDirectory(tmp_path / "file")
-
-
-@pytest.mark.parametrize(
-    ("content", "words"), [(b"", "format"), (b"format = 1\nstore_id = 'x'", "format 1, and")]
-)
-def test_settings_that_are_none(store: StoreDirectory, content: bytes, words: str) -> None:
-    (store.path / "hybridlog.toml").write_bytes(content)
-    with pytest.raises(StoreError, match=words):
-        StoreDirectory(store.path)
-    with pytest.raises(StoreError, match=words):
-        StoreDirectory.create(store.path)
 
 
 def test_many_make_the_same_store_at_once(tmp_path: Path) -> None:

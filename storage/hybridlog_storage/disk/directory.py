@@ -188,9 +188,6 @@ class StoreDirectory:
             path: The directory.
             mongo: URI of the MongoDB to use instead of the embedded one; without a password.
             cache_mb: Size of the embedded MongoDB's cache in MiB; for a new store only.
-
-        Raises:
-            StoreError: The directory holds other files, or cannot be written.
         """
         if path.exists() and not path.is_dir():
             raise StoreError(f"{path} is a file; a store is a directory. Choose another name.")
@@ -237,11 +234,7 @@ class StoreDirectory:
         return all(os.access(one, os.W_OK | os.X_OK) or not one.exists() for one in folders)
 
     def check_writable(self) -> None:
-        """Raise if the store cannot be written.
-
-        Raises:
-            StoreError: It is read-only for this user.
-        """
+        """Raise if the store cannot be written."""
         if not self.is_writable:
             raise StoreError(
                 f"The store {self.path} is read-only. Check its owner and mount, or choose "
@@ -253,11 +246,7 @@ class StoreDirectory:
         self.check_writable()
 
     def change_settings(self, **changes: Any) -> None:
-        """Change settings of the store.
-
-        Raises:
-            StoreError: They cannot be written.
-        """
+        """Change settings of the store."""
         with self.manifests.creating():
             settings = structs.replace(read_settings(self.path), **changes)
             try:
@@ -298,9 +287,6 @@ class StoreDirectory:
 
         Args:
             ids: From `ids`.
-
-        Raises:
-            StoreError: They cannot be read.
         """
         found: dict[str, str] = {}
         if not ids:
@@ -386,11 +372,7 @@ class StoreDirectory:
         return False
 
     def listing(self, recording: str) -> Listing:
-        """Read the content of a recording's directory.
-
-        Raises:
-            StoreError: It cannot be read.
-        """
+        """Read the content of a recording's directory."""
         path = self.recording(recording)
         look = self._look_of(recording)
         found = {}
@@ -431,9 +413,6 @@ class StoreDirectory:
         """Manifests of those recordings, by id, all of whose files are there.
 
         Nothing else is there to be read or mended. No log is opened.
-
-        Raises:
-            StoreError: They cannot be read.
         """
         try:
             with files.folder(self.recordings) as inside:

@@ -39,11 +39,7 @@ def explain(error: OSError, path: Path, doing: str) -> HybridlogError:
 
 
 def write_all(fd: int, parts: Sequence[Buffer]) -> int:
-    """Write all parts at the file's position; return the number of bytes.
-
-    Raises:
-        OSError: when the system refuses; a part may have been written by then.
-    """
+    """Write all parts at the file's position; return the number of bytes."""
     views = [memoryview(part).cast("B") for part in parts if len(part)]
     total = sum(len(view) for view in views)
     while views:
@@ -71,20 +67,13 @@ def publish(temporary: Path, final: Path) -> None:
     Args:
         temporary: The file; in the folder of `final`.
         final: Its new name; a file of that name is replaced.
-
-    Raises:
-        OSError: It cannot be renamed, or the folder cannot be synced.
     """
     files.rename(temporary, final)
     files.sync_folder(final.parent)
 
 
 def write_new(final: Path, content: bytes) -> None:
-    """Write a small file atomically.
-
-    Raises:
-        HybridlogError: It cannot be written.
-    """
+    """Write a small file atomically."""
     try:
         files.write_file(final, content)
     except OSError as error:

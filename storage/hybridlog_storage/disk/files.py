@@ -17,6 +17,7 @@ import errno
 import fcntl
 import math
 import os
+import random
 import resource
 import secrets
 import stat
@@ -27,7 +28,6 @@ from pathlib import Path
 from typing import Any, Final, Protocol, cast
 
 from hybridlog_storage.errors import StoreError
-from hybridlog_storage.stopping import pause
 
 _STORE = "hybridlog.toml"
 _LEVELS = 5  # of folders in a store
@@ -117,11 +117,7 @@ system: System = System()
 
 @contextmanager
 def folder(path: Path) -> Iterator[int]:
-    """The handle of a folder, which must be no symlink if it lies in a store.
-
-    Raises:
-        OSError: It does not exist, is not a folder, or is a symlink.
-    """
+    """The handle of a folder, which must be no symlink if it lies in a store."""
     if _mounted(path) is not None:
         raise OSError(errno.EROFS, "a store in a bucket cannot be changed like this", str(path))
     try:
@@ -147,9 +143,6 @@ def open_file(path: Path, flags: int, mode: int = 0o666) -> int:
         path: The file.
         flags: As of `os.open`.
         mode: Permissions of a new file; the umask applies.
-
-    Raises:
-        OSError: As `os.open`; ELOOP or ENOTDIR for a symlink.
     """
     if not flags & _WRITES and (found := _mounted(path)) is not None:
         return found[0].open(found[1])
@@ -163,9 +156,6 @@ def read_file(path: Path, most: int) -> bytes:
     Args:
         path: The file.
         most: Largest expected size; one more byte is read to notice larger files.
-
-    Raises:
-        OSError: It cannot be read, or is not an ordinary file.
     """
     return _content(open_file(path, os.O_RDONLY), most, path)
 
@@ -198,6 +188,7 @@ def write_file(
     *,
     sync: bool = True,
     modified: int | None = None,
+    temporary: Path | None = None,
 ) -> None:
     """Write a small file atomically. It replaces a file or symlink of its name.
 
@@ -207,11 +198,9 @@ def write_file(
         mode: Its permissions, before the umask.
         sync: Whether it is on the disk when this returns.
         modified: Time of its modification, ns; None for the one that the system gives.
-
-    Raises:
-        OSError: It cannot be written; no part of it remains.
+        temporary: A free name beside it, until all is written; None for a random one.
     """
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}")
+    temporary = temporary or path.with_name(f".{path.name}.{secrets.token_hex(8)}")
     fd = open_file(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
     try:
         try:
@@ -245,35 +234,33 @@ def locked_folder(path: Path, wait_s: float = math.inf) -> Iterator[None]:
         BlockingIOError: Another process has held the lock for longer.
         OSError: The folder cannot be opened.
     """
-    begun = time.monotonic()
     with folder(path) as fd:
-        while True:
-            try:
-                fcntl.flock(fd, fcntl.LOCK_EX | (0 if wait_s == math.inf else fcntl.LOCK_NB))
-                break
-            except BlockingIOError:
-                if time.monotonic() - begun >= wait_s:
-                    raise
-                pause(_POLL_S)
+        lock(fd, wait_s)
         yield
 
 
-def status(path: Path) -> os.stat_result:
-    """The status of a file or folder; of a symlink, that of the link itself.
+def lock(fd: int, wait_s: float = math.inf) -> None:
+    """Lock an open file or folder against other processes; errors as of `locked_folder`."""
+    end = time.monotonic() + wait_s
+    while True:
+        try:
+            fcntl.flock(fd, fcntl.LOCK_EX | (0 if wait_s == math.inf else fcntl.LOCK_NB))
+        except BlockingIOError:
+            if time.monotonic() >= end:
+                raise
+            time.sleep(random.uniform(0, _POLL_S))  # noqa: S311 - no secret
+        else:
+            return
 
-    Raises:
-        OSError: It does not exist.
-    """
+
+def status(path: Path) -> os.stat_result:
+    """The status of a file or folder; of a symlink, that of the link itself."""
     with folder(path.parent) as fd:
         return os.stat(path.name, dir_fd=fd, follow_symlinks=False)
 
 
 def names(path: Path) -> dict[str, os.stat_result]:
-    """The status of each entry of a folder, by name.
-
-    Raises:
-        OSError: It cannot be read.
-    """
+    """The status of each entry of a folder, by name."""
     if (found := _mounted(path)) is not None:
         return found[0].names(found[1])[1]
     with folder(path) as fd:
@@ -291,9 +278,6 @@ def changed_names(
 
     Returns:
         Inode of the folder and time of its last change, ns, and None for entries as before.
-
-    Raises:
-        OSError: It cannot be read.
     """
     if (found := _mounted(path)) is not None:
         number, entries = found[0].names(found[1])
@@ -350,11 +334,7 @@ def duplicate(fd: int) -> int:
 
 
 def names_in(fd: int) -> dict[str, os.stat_result]:
-    """The status of each entry of an open folder, by name.
-
-    Raises:
-        OSError: It cannot be read.
-    """
+    """The status of each entry of an open folder, by name."""
     found: dict[str, os.stat_result] = {}
     with os.scandir(fd) as entries:
         for entry in entries:
@@ -370,41 +350,25 @@ def most_open(most: int) -> int:
 
 
 def make_folder(path: Path, mode: int = 0o777) -> None:
-    """Create a folder; the umask applies.
-
-    Raises:
-        OSError: It exists, or cannot be created.
-    """
+    """Create a folder; the umask applies."""
     with folder(path.parent) as fd:
         system.mkdir(path.name, mode, folder=fd)
 
 
 def rename(old: Path, new: Path) -> None:
-    """Give a file or a folder of the store another name, in another folder, too.
-
-    Raises:
-        OSError: It does not exist, or cannot be renamed.
-    """
+    """Give a file or a folder of the store another name, in another folder, too."""
     with folder(old.parent) as fd, folder(new.parent) as new_fd:
         system.rename(old.name, new.name, folder=fd, new_folder=new_fd)
 
 
 def link(old: Path, new: Path) -> None:
-    """Give a file of the store a second name.
-
-    Raises:
-        OSError: It does not exist, or the file system has no links.
-    """
+    """Give a file of the store a second name."""
     with folder(old.parent) as fd, folder(new.parent) as new_fd:
         system.link(old.name, new.name, folder=fd, new_folder=new_fd)
 
 
 def unlink(path: Path) -> None:
-    """Remove a file.
-
-    Raises:
-        OSError: It does not exist, or cannot be removed.
-    """
+    """Remove a file."""
     with folder(path.parent) as fd:
         system.unlink(path.name, folder=fd)
 
@@ -416,22 +380,14 @@ def sync_folder(path: Path) -> None:
 
 
 def make_folders(path: Path) -> None:
-    """Make a folder and the one above it, as far as they are missing.
-
-    Raises:
-        OSError: One cannot be made.
-    """
+    """Make a folder and the one above it, as far as they are missing."""
     for place in (path.parent, path):
         with suppress(FileExistsError):
             make_folder(place)
 
 
 def remove_tree(path: Path) -> None:
-    """Remove a folder and its content; ignore what does not exist.
-
-    Raises:
-        OSError: Something cannot be removed.
-    """
+    """Remove a folder and its content; ignore what does not exist."""
     with folder(path.parent) as fd:
         _remove(fd, path.name)
 
@@ -470,9 +426,6 @@ def user_directory(variable: str, below_home: str, purpose: str) -> Path:
         variable: Environment variable with an absolute path; a relative one does not count.
         below_home: Path below the home directory that counts without it.
         purpose: What is kept there, for the error.
-
-    Raises:
-        StoreError: This user has no home directory.
     """
     named = os.environ.get(variable, "")
     if os.path.isabs(named):  # noqa: PTH117 - a relative one does not count

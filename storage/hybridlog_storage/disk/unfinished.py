@@ -40,9 +40,6 @@ class Unfinished:
         Args:
             final: A path in the same directory. It replaces a file, or as a directory an empty
                 directory.
-
-        Raises:
-            OSError: The rename fails.
         """
         from hybridlog_storage.disk.durability import publish
 
@@ -64,11 +61,7 @@ def beside(final: Path) -> Unfinished:
 
 
 def scratch_directory() -> Unfinished:
-    """Create a directory for temporary files that only this user may enter.
-
-    Raises:
-        OSError: It cannot be created.
-    """
+    """Create a directory for temporary files that only this user may enter."""
     import secrets
     import tempfile
 

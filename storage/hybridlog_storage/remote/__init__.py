@@ -18,12 +18,7 @@ def address_of(path: str | Path) -> str | None:
 
 
 def directory_of(path: str | Path, *, read_only: bool = False) -> StoreDirectory:
-    """The directory of an existing store, here or in a bucket; with `read_only` it never changes.
-
-    Raises:
-        StoreError: It is not a store, has another format, or cannot be read.
-        BucketError: The server does not answer, or refuses.
-    """
+    """The directory of an existing store, here or in a bucket; `read_only` keeps it as it is."""
     address = address_of(path)
     if address is None:
         return StoreDirectory(Path(path), read_only=read_only)

@@ -62,13 +62,7 @@ class CachedFile(int):
         return CachedFile(os.dup(self), self._cache, self._bucket, self._about)
 
     def fetch(self, ranges: Iterable[tuple[int, int]]) -> None:
-        """Fetch the missing blocks of some ranges of bytes.
-
-        Raises:
-            OSError: The object is missing, or has another size, as a disk says of a bad sector.
-            BucketError: The server does not answer.
-            ResourceError: The cache cannot be written.
-        """
+        """Fetch the missing blocks of some ranges of bytes."""
         size = self._about.size
         wanted: set[int] = set()
         for begin, end in ranges:
@@ -138,11 +132,7 @@ class BlockCache:
         self._lock = threading.Lock()
 
     def open(self, bucket: Bucket, about: Object) -> CachedFile:
-        """A handle of the cached file of an object.
-
-        Raises:
-            ResourceError: The file cannot be made.
-        """
+        """A handle of the cached file of an object."""
         with self.writing():
             self.path.mkdir(mode=0o700, parents=True, exist_ok=True)
             fd = _opened(self.paths(bucket, about)[0])

@@ -385,11 +385,7 @@ class RemoteDirectory(StoreDirectory):
 
     @classmethod
     def create_in(cls, address: str) -> RemoteDirectory:
-        """The store at an address; made if there is none.
-
-        Raises:
-            BucketError: The server does not answer, refuses, or ignores conditions.
-        """
+        """The store at an address; made if there is none."""
         try:
             return cls(address)
         except StoreError as error:
@@ -549,11 +545,7 @@ class RemoteDirectory(StoreDirectory):
         segments: Collection[int] = (),
         check: Callable[[Manifest], object] = lambda _: None,
     ) -> Iterator[tuple[StoreDirectory, int]]:
-        """As of a directory: a hidden one on the disk, of which all that is new becomes objects.
-
-        Raises:
-            StoreError: An object that is needed is lost; or another process was faster.
-        """
+        """As of a directory: a hidden one on the disk, of which all that is new becomes objects."""
         before = self.manifests.read(recording)
         listed = {one.path: one for one in listed_files(before)}
         there = BucketStore(self.bucket, self.manifests)
@@ -585,11 +577,7 @@ class RemoteDirectory(StoreDirectory):
 def _brought(
     before: Manifest, after: Manifest, check: Callable[[Manifest], object], now: Manifest
 ) -> Manifest:
-    """The newest manifest with what was changed in a copy of an older one.
-
-    Raises:
-        StoreError: Files that were changed are others by now.
-    """
+    """The newest manifest with what was changed in a copy of an older one."""
     check(now)
     for number, log in after.logs.items():
         if log != before.logs[number]:
