@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from benchmarks.backends.base import BackendMissingError
+from benchmarks.backends.database import schema_of
 from benchmarks.backends.recording_files import FileBackend, Recorder
 from benchmarks.backends.requirements import need
 
@@ -30,10 +30,6 @@ class BagFile(FileBackend):
     def check(cls) -> None:
         need("rosbags", "rosbags")
 
-    def _check_channels(self, channels: Sequence[Channel]) -> None:
-        if any(channel.message_encoding != "ros1" for channel in channels):
-            raise BackendMissingError("A ROS 1 bag holds messages of ROS 1 alone.")
-
     def _record(self, path: Path) -> Recorder:
         return _Ros1Recorder(path, self._channels)
 
@@ -41,19 +37,7 @@ class BagFile(FileBackend):
         from rosbags.rosbag1 import Reader
 
         with Reader(path) as reader:
-            found = Counter((c.id, c.topic) for c, _, _ in reader.messages())
-        topics: Counter[str] = Counter()
-        for (number, topic), count in found.items():
-            topics[self._as_given(number, topic)] += count
-        return topics
-
-    def _as_given(self, number: int, topic: str) -> str:
-        """A topic as its channel spells it: rosbags leaves out slashes that say nothing."""
-        if number < len(self._channels):
-            given = self._channels[number].topic
-            if [part for part in given.split("/") if part] == topic.strip("/").split("/"):
-                return given
-        return topic
+            return Counter(c.topic for c, _, _ in reader.messages())
 
 
 class _Ros1Recorder:
@@ -67,12 +51,12 @@ class _Ros1Recorder:
     def _add(self, number: int, channel: Channel) -> Connection:
         from rosbags.typesys.msg import normalize_msgtype
 
-        schema = channel.schema
+        schema = schema_of(channel)
         latching = channel.metadata.get("latching", "")
         return self._writer.add_connection(
             channel.topic,
-            normalize_msgtype(schema.name if schema is not None else "unknown/Unknown"),
-            msgdef=schema.data.decode("utf-8", "replace") if schema is not None else "",
+            normalize_msgtype(schema.name),
+            msgdef=schema.data.decode(),
             md5sum=channel.metadata.get("md5sum") or _ANY_MD5,
             # Two connections of a topic differ in who sent, or rosbags refuses the second.
             callerid=channel.metadata.get("callerid") or f"/publisher_{number}",

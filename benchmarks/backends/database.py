@@ -12,7 +12,13 @@ from benchmarks.backends.base import Backend
 from benchmarks.backends.conversion import Converter, converter_for
 
 if TYPE_CHECKING:
-    from hybridlog_storage.messages import Channel
+    from hybridlog_storage.messages import Channel, Schema
+
+
+def schema_of(channel: Channel) -> Schema:
+    """The definition of a channel's messages: all loads have them."""
+    assert channel.schema is not None
+    return channel.schema
 
 
 class DatabaseBackend(Backend):
@@ -35,7 +41,7 @@ class DatabaseBackend(Backend):
     def _take_channels(self, channels: Sequence[Channel]) -> None:
         """Compile the decoders, so that no message has to wait for that."""
         self._channels = channels
-        self._converters = [converter_for(channel) for channel in channels]
+        self._converters = [converter_for(schema_of(channel)) for channel in channels]
 
     def _topics(self) -> dict[str, list[tuple[str, ...]]]:
         """Topics in order, and the groups of fields to be indexed in each."""

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from benchmarks.backends.database import schema_of
 from benchmarks.backends.recording_files import FileBackend, Recorder
 from benchmarks.backends.requirements import need
 
@@ -52,19 +53,12 @@ class _McapRecorder:
 
         self._stream = path.open("xb")
         self._writer = Writer(self._stream)
-        encodings = {channel.message_encoding for channel in channels}
-        profile = {"ros1": "ros1", "cdr": "ros2"}.get(next(iter(encodings), ""), "")
-        self._writer.start(profile=profile if len(encodings) == 1 else "", library="")
+        self._writer.start(profile="ros1", library="")
         self._ids = [self._register(channel) for channel in channels]
 
     def _register(self, channel: Channel) -> int:
-        schema = channel.schema
-        # 0 says that there is none.
-        number = (
-            self._writer.register_schema(schema.name, schema.encoding, schema.data)
-            if schema is not None
-            else 0
-        )
+        schema = schema_of(channel)
+        number = self._writer.register_schema(schema.name, schema.encoding, schema.data)
         return self._writer.register_channel(
             channel.topic, channel.message_encoding, number, dict(channel.metadata)
         )

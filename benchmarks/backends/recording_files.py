@@ -58,7 +58,6 @@ class FileBackend(Backend):
 
     def open(self, channels: Sequence[Channel]) -> None:
         self.check()
-        self._check_channels(channels)
         self._channels = channels
         if not self.paths:
             with self._lock, self._failures():
@@ -98,9 +97,6 @@ class FileBackend(Backend):
             if recorder is not None:
                 with suppress(Exception):  # on a full disk there is no good end
                     recorder.close()
-
-    def _check_channels(self, channels: Sequence[Channel]) -> None:
-        """See that the files can hold such channels."""
 
     @abstractmethod
     def _record(self, path: Path) -> Recorder:

@@ -237,7 +237,7 @@ class _Mcap(_File):
             for schema, channel, message in reader.iter_messages(
                 topics, start_time=begin, end_time=end
             ):
-                yield channel.topic, message.log_time, decode(schema, channel, message.data)
+                yield channel.topic, message.log_time, decode(schema, message.data)
 
     def times(self) -> Iterator[int]:
         with self.opened() as reader:
@@ -248,8 +248,8 @@ class _Mcap(_File):
         decode = _Decoder()
         with self.opened() as reader:
             found = reader.iter_messages([topic], end_time=time + 1, reverse=True)
-            for schema, channel, message in islice(found, 1):
-                return decode(schema, channel, message.data)
+            for schema, _, message in islice(found, 1):
+                return decode(schema, message.data)
         raise LookupError(f"no message of {topic} is at or before {time}")
 
 
@@ -259,7 +259,7 @@ class _Decoder:
     def __init__(self) -> None:
         self._types: dict[int, tuple[Any, str]] = {}
 
-    def __call__(self, schema: Any, channel: Any, data: bytes) -> Any:
+    def __call__(self, schema: Any, data: bytes) -> Any:
         if schema.id not in self._types:
             from hybridlog_storage.messages import Schema
 
@@ -267,9 +267,7 @@ class _Decoder:
                 Schema(name=schema.name, encoding=schema.encoding, data=schema.data)
             )
         types, name = self._types[schema.id]
-        if channel.message_encoding == "ros1":
-            return types.deserialize_ros1(data, name)
-        return types.deserialize_cdr(data, name)
+        return types.deserialize_ros1(data, name)
 
 
 class BagAsker(_Bag, _FileAsker):
