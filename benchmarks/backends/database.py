@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import threading
-from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -22,21 +20,14 @@ def schema_of(channel: Channel) -> Schema:
 
 
 class DatabaseBackend(Backend):
-    """A backend whose messages are decoded first.
-
-    Attributes:
-        refused: By topic, messages that the database cannot hold at all (too large a
-            document); they are not kept, and so `counts` lacks them.
-    """
+    """A backend whose messages are decoded first."""
 
     kind = "database"
 
     def __init__(self, directory: Path) -> None:
         super().__init__(directory)
-        self.refused: Counter[str] = Counter()
         self._channels: Sequence[Channel] = ()
         self._converters: list[Converter] = []
-        self._refused_lock = threading.Lock()
 
     def _take_channels(self, channels: Sequence[Channel]) -> None:
         """Compile the decoders, so that no message has to wait for that."""
@@ -50,7 +41,3 @@ class DatabaseBackend(Backend):
             groups = found.setdefault(channel.topic, [])
             groups.extend(group for group in converter.indexed if group not in groups)
         return found
-
-    def _refuse(self, channel: int) -> None:
-        with self._refused_lock:
-            self.refused[self._channels[channel].topic] += 1

@@ -74,7 +74,6 @@ class Mongo(DatabaseBackend):
         self._client: MongoClient[Document] | None = None
         self._collections: list[Collection[Document]] = []
         self._batches: list[_Batch] = []
-        self._largest = 0
 
     @classmethod
     def check(cls) -> None:
@@ -116,7 +115,6 @@ class Mongo(DatabaseBackend):
             self._make_collections()
         except PyMongoError as error:
             raise BackendFailedError(f"MongoDB: {error}") from error
-        self._largest = self.database.command("hello")["maxBsonObjectSize"]
         self._batches = [_Batch() for _ in channels]
 
     def _make_collections(self) -> None:
@@ -132,18 +130,10 @@ class Mongo(DatabaseBackend):
 
     def insert(self, channel: int, log_time: int, payload: bytes) -> None:
         from bson import ObjectId, encode
-        from bson.errors import InvalidDocument
         from bson.raw_bson import RawBSONDocument
 
         document = self._converters[channel].document(log_time, payload)
-        try:
-            encoded = encode({"_id": ObjectId(), **document})
-        except InvalidDocument:
-            self._refuse(channel)
-            return
-        if len(encoded) > self._largest:
-            self._refuse(channel)
-            return
+        encoded = encode({"_id": ObjectId(), **document})
         batch = self._batches[channel]
         with batch.lock:
             if not batch.documents:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -22,7 +21,6 @@ from hybridlog_storage.mongo.collection_names import collection_of
 
 if TYPE_CHECKING:
     from psycopg import Connection, Copy
-    from psycopg.sql import Composed
 
     from hybridlog_storage.messages import Channel
 
@@ -30,22 +28,14 @@ BATCH_S = 2.0
 """Seconds of messages in one transaction, as in the paper."""
 BATCH_BYTES = 16 << 20
 """Characters of JSON after which a transaction is not put off any longer."""
-_LONGEST_NAME = 63
 _DEFAULT_CONNECTIONS = 100
 _SPARE_CONNECTIONS = 10
 _MIB = 1 << 20
 
 
 def table_of(topic: str) -> str:
-    """Name of the table of a topic, unquoted: its collection's, cut to 63 bytes.
-
-    Names that are cut end in a part of the topic's hash.
-    """
-    name = collection_of(topic)
-    if len(name) <= _LONGEST_NAME:
-        return name
-    digest = hashlib.sha256(topic.encode("utf-8", "surrogatepass")).hexdigest()[:8]
-    return f"{name[: _LONGEST_NAME - 1 - len(digest)]}~{digest}"
+    """Name of the table of a topic, as an SQL identifier: its collection's."""
+    return f'"{collection_of(topic)}"'
 
 
 def expression(path: str, column: str = "data") -> str:
@@ -69,17 +59,8 @@ class _Batch:
     lock: threading.Lock = field(default_factory=threading.Lock)
     copy: Copy | None = None
     ending: ExitStack = field(default_factory=ExitStack)
-    texts: list[str] = field(default_factory=list)
     size: int = 0
     since: float = 0.0
-
-    def give_up(self, why: BaseException) -> None:
-        """Take back what it was given."""
-        import psycopg
-
-        self.copy = None
-        with suppress(psycopg.Error):
-            self.ending.__exit__(type(why), why, why.__traceback__)
 
 
 class Postgres(DatabaseBackend):
@@ -109,20 +90,15 @@ class Postgres(DatabaseBackend):
     def __init__(self, directory: Path) -> None:
         super().__init__(directory)
         self._server = Server("postgres", directory)
-        self._inserts: list[Composed] = []
         self._connections: list[Connection] = []
         self._batches: list[_Batch] = []
-        self._copies: list[Composed] = []
+        self._copies: list[str] = []
 
     @classmethod
     def check(cls) -> None:
         need("psycopg", "psycopg[binary]")
         need("orjson", "orjson")
         postgres_server.find_programs()
-
-    def table_of(self, topic: str) -> str:
-        """Name of the table of a topic, unquoted."""
-        return table_of(topic)
 
     def connect(self) -> Connection:
         """A new connection in autocommit mode; whoever asked for it closes it."""
@@ -157,92 +133,65 @@ class Postgres(DatabaseBackend):
 
     def _make_tables(self) -> None:
         import psycopg
-        from psycopg.sql import SQL, Identifier
 
         with self.connect() as connection:
             try:
                 for topic, groups in self._topics().items():
-                    self._make_table(connection, table_of(topic), groups)
+                    self._make_table(connection, topic, groups)
             except psycopg.Error as error:
                 raise _failed(error) from error
-        self._inserts = [
-            SQL("INSERT INTO {} (data) VALUES (%s)").format(Identifier(table_of(channel.topic)))
-            for channel in self._channels
-        ]
-        self._copies = [
-            SQL("COPY {} (data) FROM STDIN").format(Identifier(table_of(channel.topic)))
-            for channel in self._channels
-        ]
+        self._copies = [f"COPY {table_of(c.topic)} (data) FROM STDIN" for c in self._channels]
 
     def _make_table(
-        self, connection: Connection, table: str, groups: Sequence[tuple[str, ...]]
+        self, connection: Connection, topic: str, groups: Sequence[tuple[str, ...]]
     ) -> None:
-        from psycopg.sql import SQL, Identifier
-
-        known = connection.execute("SELECT 1 FROM pg_tables WHERE tablename = %s", [table])
-        if known.fetchone() is not None:
+        known = connection.execute("SELECT to_regclass(%s)", [table_of(topic)]).fetchone()
+        if known != (None,):
             return
-        name = Identifier(table)
+        name = table_of(topic)
         # All or nothing: a table that is there has its indexes.
         with connection.transaction():
-            connection.execute(
-                SQL("CREATE TABLE {} (id bigserial PRIMARY KEY, data {})").format(
-                    name, SQL(self._type)
-                )
-            )
+            connection.execute(f"CREATE TABLE {name} (id bigserial PRIMARY KEY, data {self._type})")
             for group in [*groups, (T,)] if self._is_indexed else ():
-                keys = SQL(", ".join(expression(path) for path in group))
-                connection.execute(SQL("CREATE INDEX ON {} ({})").format(name, keys))
+                keys = ", ".join(expression(path) for path in group)
+                connection.execute(f"CREATE INDEX ON {name} ({keys})")
 
     def insert(self, channel: int, log_time: int, payload: bytes) -> None:
-        text = self._text(channel, log_time, payload)
-        batch = self._batches[channel]
-        with batch.lock:
-            with self._one_by_one(channel, batch):
-                copy = batch.copy or self._begin(channel, batch)
-                batch.texts.append(text)
-                batch.size += len(text)
-                copy.write_row((text,))
-            if batch.size >= BATCH_BYTES or time.monotonic() - batch.since >= BATCH_S:
-                self._commit(channel, batch)
-
-    def _text(self, channel: int, log_time: int, payload: bytes) -> str:
-        return self._converters[channel].text(log_time, payload)
-
-    def _insert_one(self, channel: int, text: str) -> None:
         import psycopg
 
-        try:
-            self._connections[channel].execute(self._inserts[channel], [text])
-        except (psycopg.DataError, psycopg.errors.ProgramLimitExceeded):
-            self._refuse(channel)
-        except psycopg.Error as error:
-            raise _failed(error) from error
+        text = self._converters[channel].text(log_time, payload)
+        batch = self._batches[channel]
+        with batch.lock:
+            try:
+                copy = batch.copy or self._begin(channel, batch)
+                copy.write_row((text,))
+            except psycopg.Error as error:
+                raise _failed(error) from error
+            batch.size += len(text)
+            if batch.size >= BATCH_BYTES or time.monotonic() - batch.since >= BATCH_S:
+                self._commit(batch)
 
     def finish(self) -> None:
-        for channel, batch in enumerate(self._batches):
+        for batch in self._batches:
             with batch.lock:
-                self._commit(channel, batch)
+                self._commit(batch)
 
     def counts(self) -> Mapping[str, int]:
         import psycopg
-        from psycopg.sql import SQL, Identifier
 
         found = {}
         with self.connect() as connection:
             try:
                 for topic in self._topics():
-                    query = SQL("SELECT count(*) FROM {}").format(Identifier(table_of(topic)))
-                    row: Any = connection.execute(query).fetchone()
+                    row: Any = connection.execute(
+                        f"SELECT count(*) FROM {table_of(topic)}"
+                    ).fetchone()
                     found[topic] = int(row[0])
             except psycopg.Error as error:
                 raise _failed(error) from error
         return found
 
     def close(self) -> None:
-        for batch in self._batches:
-            if batch.copy is not None:
-                batch.give_up(BackendFailedError("PostgreSQL: closed too early"))
         connections, self._connections = self._connections, []
         try:
             for connection in connections:
@@ -260,29 +209,14 @@ class Postgres(DatabaseBackend):
         batch.since = time.monotonic()
         return batch.copy
 
-    def _commit(self, channel: int, batch: _Batch) -> None:
-        if batch.copy is None:
-            return
-        with self._one_by_one(channel, batch):
-            batch.copy = None
-            batch.ending.close()
-            batch.texts, batch.size = [], 0
-
-    @contextmanager
-    def _one_by_one(self, channel: int, batch: _Batch) -> Iterator[None]:
-        """If one message cannot be held, the others need not suffer for it."""
+    def _commit(self, batch: _Batch) -> None:
         import psycopg
 
         try:
-            yield
-        except (psycopg.DataError, psycopg.errors.ProgramLimitExceeded) as error:
-            batch.give_up(error)
-            texts, batch.texts, batch.size = batch.texts, [], 0
-            for text in texts:
-                self._insert_one(channel, text)
+            batch.ending.close()
         except psycopg.Error as error:
-            batch.give_up(error)
             raise _failed(error) from error
+        batch.copy, batch.size = None, 0
 
 
 class PostgresIndexed(Postgres):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import sqlite3
 import threading
 import time
@@ -10,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from benchmarks.backends.base import BackendFailedError, BackendMissingError
+from benchmarks.backends.base import BackendFailedError
 from benchmarks.backends.conversion import T
 from benchmarks.backends.database import DatabaseBackend
 from benchmarks.backends.requirements import need
@@ -27,21 +26,8 @@ _BUSY_S = 5.0
 
 
 def table_of(topic: str) -> str:
-    """Name of the table of a topic, unquoted: its collection's.
-
-    SQLite's names do not know upper case from lower case, and those that begin with
-    `sqlite_` are its own. Such names end in a part of the topic's hash.
-    """
-    name = collection_of(topic)
-    if name == name.lower() and not name.startswith("sqlite_"):
-        return name
-    digest = hashlib.sha256(topic.encode("utf-8", "surrogatepass")).hexdigest()[:8]
-    return f"t_{name}~{digest}" if name.lower().startswith("sqlite_") else f"{name}~{digest}"
-
-
-def quoted(name: str) -> str:
-    """A name as an SQL identifier."""
-    return '"' + name.replace('"', '""') + '"'
+    """Name of the table of a topic, as an SQL identifier: its collection's."""
+    return f'"{collection_of(topic)}"'
 
 
 def expression(path: str, column: str = "msg") -> str:
@@ -101,30 +87,25 @@ class Sqlite(DatabaseBackend):
         except sqlite3.Error as error:
             raise _failed(error) from error
         self._inserts = [
-            f"INSERT INTO {quoted(table_of(channel.topic))} (msg) VALUES (?)"
-            for channel in channels
+            f"INSERT INTO {table_of(channel.topic)} (msg) VALUES (?)" for channel in channels
         ]
 
     def _make_tables(self) -> None:
         for topic, groups in self._topics().items():
             table = table_of(topic)
             self.connection.execute(
-                f"CREATE TABLE IF NOT EXISTS {quoted(table)} (id INTEGER PRIMARY KEY, msg TEXT)"
+                f"CREATE TABLE IF NOT EXISTS {table} (id INTEGER PRIMARY KEY, msg TEXT)"
             )
             for group in [*groups, (T,)] if self._is_indexed else ():
                 keys = ", ".join(expression(path) for path in group)
-                index = quoted(f"{table} by {group[0]}")
-                self.connection.execute(
-                    f"CREATE INDEX IF NOT EXISTS {index} ON {quoted(table)} ({keys})"
-                )
+                index = f'"{collection_of(topic)} by {group[0]}"'
+                self.connection.execute(f"CREATE INDEX IF NOT EXISTS {index} ON {table} ({keys})")
 
     def insert(self, channel: int, log_time: int, payload: bytes) -> None:
         text = self._converters[channel].text(log_time, payload)
         with self._lock:
             try:
                 self.connection.execute(self._inserts[channel], (text,))
-            except sqlite3.DataError:  # longer than SQLite's limit of 1 GB
-                self._refuse(channel)
             except sqlite3.Error as error:
                 raise _failed(error) from error
 
@@ -141,7 +122,7 @@ class Sqlite(DatabaseBackend):
             try:
                 return {
                     topic: self.connection.execute(
-                        f"SELECT count(*) FROM {quoted(table_of(topic))}"
+                        f"SELECT count(*) FROM {table_of(topic)}"
                     ).fetchone()[0]
                     for topic in self._topics()
                 }
@@ -176,21 +157,6 @@ class SqliteIndexed(Sqlite):
         self._since = 0.0
         self._size = 0
 
-    @classmethod
-    def check(cls) -> None:
-        super().check()
-        if sqlite3.sqlite_version_info < (3, 38):
-            connection = sqlite3.connect(":memory:")
-            try:
-                connection.execute("SELECT json_extract('{}', '$.a')")
-            except sqlite3.Error:
-                raise BackendMissingError(
-                    f"This Python's SQLite {sqlite3.sqlite_version} has no JSON functions. "
-                    "Use a Python with SQLite 3.38 or newer."
-                ) from None
-            finally:
-                connection.close()
-
     def insert(self, channel: int, log_time: int, payload: bytes) -> None:
         text = self._converters[channel].text(log_time, payload)
         with self._lock:
@@ -203,8 +169,6 @@ class SqliteIndexed(Sqlite):
                 self._size += len(text)
                 if self._size >= BATCH_BYTES or time.monotonic() - self._since >= BATCH_S:
                     connection.execute("COMMIT")
-            except sqlite3.DataError:
-                self._refuse(channel)
             except sqlite3.Error as error:
                 raise _failed(error) from error
 

@@ -12,10 +12,6 @@ if TYPE_CHECKING:
     from benchmarks.backends.base import Backend
 
 
-def _quoted(topic: str) -> str:
-    return '"' + table_of(topic).replace('"', '""') + '"'
-
-
 class _Connected(Sql):
     """A connection in autocommit mode."""
 
@@ -45,7 +41,7 @@ class _Connected(Sql):
         return expression(path, f"{table}.data" if table else "data")
 
     def name(self, topic: str) -> str:
-        return _quoted(topic)
+        return table_of(topic)
 
 
 class PostgresAsker(_Connected, SqlAsker):

@@ -8,15 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 import orjson
 
-from benchmarks.backends.sqlite import expression, quoted, table_of
+from benchmarks.backends.sqlite import expression, table_of
 from benchmarks.questions.sql import Sql, SqlAsker, SqlReading
 
 if TYPE_CHECKING:
     from benchmarks.backends.base import Backend
-
-
-def _quoted(topic: str) -> str:
-    return quoted(table_of(topic))
 
 
 class _Connected(Sql):
@@ -38,7 +34,7 @@ class _Connected(Sql):
         return expression(path, f"{table}.msg" if table else "msg")
 
     def name(self, topic: str) -> str:
-        return _quoted(topic)
+        return table_of(topic)
 
     def loaded(self, value: Any) -> dict[str, Any]:
         """A row's message."""
