@@ -14,7 +14,6 @@ from PIL import Image as Pillow
 from hybridlog.arrays.message_arrays import to_numpy
 from hybridlog_storage.errors import MissingDependencyError, PayloadError
 from tests.calls import Calls
-from tests.data import DATA, needs_data
 
 
 def image(encoding: str, width: int, height: int, data: bytes, **other: Any) -> SimpleNamespace:
@@ -261,55 +260,6 @@ def cloud(**change: Any) -> SimpleNamespace:
     return SimpleNamespace(**fields)
 
 
-def test_organised_cloud() -> None:
-    message = cloud()
-    got = to_numpy("sensor_msgs/msg/PointCloud2", message)
-    assert got.shape == (2, 3)
-    assert got.dtype.itemsize == 16
-    assert got["x"].tolist() == [[0, 1, 2], [3, 4, 5]]
-    assert got["ring"].tolist() == [[7] * 3] * 2
-    assert got["rgb"].shape == (2, 3, 3)
-    assert got["rgb"][1, 2].tolist() == [1, 2, 3]
-    assert np.shares_memory(got, message.data)
-
-
-def test_unorganised_and_empty_clouds() -> None:
-    message = cloud(height=1, row_step=0)
-    got = to_numpy("sensor_msgs/PointCloud2", message)
-    assert got.shape == (3,)
-    assert got["x"].tolist() == [0, 1, 2]
-    assert to_numpy("sensor_msgs/PointCloud2", cloud(width=0, row_step=0)).shape == (2, 0)
-    assert to_numpy("sensor_msgs/PointCloud2", cloud(height=1, width=0)).shape == (0,)
-
-
-def test_a_row_step_of_0_means_rows_without_padding() -> None:
-    packed = np.arange(96, dtype=np.uint8)
-    got = to_numpy("sensor_msgs/PointCloud2", cloud(row_step=0, data=packed))
-    assert got.shape == (2, 3)
-    assert got["rgb"][1, 0].tolist() == [60, 61, 62]
-    with pytest.raises(PayloadError, match="needs 96 bytes and has 95"):
-        to_numpy("sensor_msgs/PointCloud2", cloud(row_step=0, data=packed[:95]))
-
-
-def test_fields_that_overlap() -> None:
-    # Drivers give a colour both as a float and as an integer.
-    fields = [point_field("x", 0, 7), point_field("rgb", 12, 7), point_field("rgba", 12, 6)]
-    got = to_numpy("sensor_msgs/PointCloud2", cloud(fields=fields))
-    assert got["rgba"].tolist() == [[0x030201] * 3] * 2
-    assert got["rgb"].view("<u4").tolist() == [[0x030201] * 3] * 2
-    assert got["x"].tolist() == [[0, 1, 2], [3, 4, 5]]
-    assert np.stack([got, got])["rgba"][1, 1, 2] == 0x030201
-
-
-def test_a_cloud_without_fields() -> None:
-    got = to_numpy("sensor_msgs/PointCloud2", cloud(fields=[]))
-    assert got.shape == (2, 3)
-    assert got.dtype.names == ()
-    assert got.dtype.itemsize == 16
-    nothing = cloud(fields=[], height=0, width=0, point_step=0, row_step=0, data=np.zeros(0, "u1"))
-    assert to_numpy("sensor_msgs/PointCloud2", nothing).shape == (0, 0)
-
-
 def test_field_names_that_numpy_refuses() -> None:
     fields = [point_field("x", 0, 7), point_field("x", 4, 7), point_field("", 8, 7)]
     got = to_numpy("sensor_msgs/PointCloud2", cloud(fields=fields))
@@ -379,78 +329,3 @@ def test_other_types_are_refused() -> None:
         to_numpy("nav_msgs/msg/Odometry", SimpleNamespace())
     with pytest.raises(PayloadError, match="unusual fields"):
         to_numpy("sensor_msgs/Image", SimpleNamespace(encoding="rgb8"))
-
-
-# Real messages
-
-
-def decoded(path: str, *types: str) -> list[tuple[str, Any]]:
-    from rosbags.highlevel import AnyReader
-    from rosbags.typesys import Stores, get_typestore
-
-    found = []
-    with AnyReader([DATA / path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
-        chosen = [c for c in reader.connections if c.msgtype.split("/")[-1] in types]
-        for connection, _, raw in reader.messages(chosen):
-            found.append((connection.msgtype, reader.deserialize(raw, connection.msgtype)))
-    return found
-
-
-def ouster(*types: str) -> list[tuple[str, Any]]:
-    from mcap.reader import make_reader
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-
-    found = []
-    store = get_typestore(Stores.EMPTY)
-    with (DATA / "real/ouster.mcap").open("rb") as stream:
-        for schema, _, message in make_reader(stream).iter_messages():
-            assert schema is not None
-            package, name = schema.name.split("/")
-            if name in types:
-                full = f"{package}/msg/{name}"
-                if full not in store.types:
-                    store.register(get_types_from_msg(schema.data.decode(), full))
-                found.append((schema.name, store.deserialize_ros1(message.data, full)))
-    return found
-
-
-def unpacked(message: Any) -> list[tuple[Any, ...]]:
-    """Points read one by one with struct."""
-    codes = "?bBhHiIfd"
-    order = ">" if message.is_bigendian else "<"
-    raw = message.data.tobytes()
-    points = []
-    for row in range(message.height):
-        for place in range(message.width):
-            at = row * message.row_step + place * message.point_step
-            points.append(
-                tuple(
-                    struct.unpack_from(order + codes[f.datatype], raw, at + f.offset)[0]
-                    for f in message.fields
-                )
-            )
-    return points
-
-
-@needs_data
-def test_real_clouds() -> None:
-    messages = [
-        *decoded("real/sick_laser_radar.bag", "PointCloud2")[::40],
-        *decoded("real/luminar_pointcloud.bag", "PointCloud2")[:1],
-        *decoded("odd/every_sensor_msg_ros2.mcap", "PointCloud2"),
-    ]
-    assert len(messages) > 5
-    for name, message in messages:
-        got = to_numpy(name, message)
-        assert np.shares_memory(got, message.data)
-        assert got.dtype.names == tuple(field.name for field in message.fields)
-        assert repr(got.reshape(-1).tolist()) == repr(unpacked(message))
-    (name, message), *_ = ouster("PointCloud2")
-    got = to_numpy(name, message)
-    assert got.shape == (64, 2048)
-    assert repr(got[5, :3].tolist()) == repr(unpacked(message)[5 * 2048 : 5 * 2048 + 3])
-    # Distance is a field of its own, in millimetres.
-    distance = np.sqrt(sum(got[axis].astype(float) ** 2 for axis in "xyz")) * 1000
-    hit = got["range"] > 0
-    assert hit.sum() > 10_000
-    assert np.abs(distance - got["range"])[hit].max() < 60

@@ -20,6 +20,7 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 
 import hybridlog as hl
+from hybridlog.arrays.message_arrays import to_numpy
 from hybridlog.columns.clouds import PointColumns
 from hybridlog.columns.fields import FieldShape
 from hybridlog.columns.parquet_file import ParquetFileReader
@@ -417,6 +418,9 @@ def test_points_are_those_of_the_messages(
     except ValueError:
         assert not found[1].is_valid
         return
+    array = to_numpy(CLOUD, message)
+    assert array.shape == (shape if rows > 1 else (width,))
+    assert not array.size or np.shares_memory(array, message.data)
     values = [v for name, v in found[1].as_py().items() if name != "w"]
     assert len(values) == len(points)
     for have, want in zip(values, points, strict=True):
