@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import click
 
-from hybridlog.cli.answers import Destination, Tabular, answer_tables, print_end
+from hybridlog.cli.answers import Tabular, answer_tables, print_end
 from hybridlog.cli.binder import command, option
 from hybridlog.cli.completion import (
     complete_condition,
@@ -23,7 +23,7 @@ from hybridlog.query.choice import Choice
 from hybridlog_storage.errors import TopicError, UsageError
 
 if TYPE_CHECKING:
-    from hybridlog.query.counters import Counters
+    from hybridlog.across.align import Aligned
     from hybridlog.query.query import Query
     from hybridlog.store import Store
 
@@ -98,35 +98,28 @@ def align_command(given: _Given) -> None:
     """
     if given.base is None and given.step is None:
         raise UsageError("Name the rows: --to TOPIC for its messages, or --step for times.")
-    topics, to = given.topics, given.to
-    started = time.monotonic()
+    to, started = given.to, time.monotonic()
     with given.opened(snapshot=True) as store:
-        show = _resample if given.base is None else _align
-        counters, remarks = show(store, given, topics, to)
-        print_end(given, counters, started)
-        notes([] if given.quiet else remarks)
+        rows = _resampled(store, given) if given.base is None else _aligned(store, given)
+        # That there is a transform shows only at the end.
+        completeness = rows.completeness if given.strict else None
+        answer_tables(rows.to_tables(to.shown), to, rows.schema, completeness)
+        print_end(given, rows.counters, started)
+        notes([] if given.quiet else rows.remarks())
 
 
-def _resample(
-    store: Store, given: _Given, topics: Sequence[str], to: Destination
-) -> tuple[Counters, Sequence[str]]:
-    """Answer with rows at regular times; gives the cost and what is to be known."""
+def _resampled(store: Store, given: _Given) -> Aligned:
+    """Rows at regular times."""
     query = given.query(store)
     if given.fields:
         query = query.fields(*parse_fields(",".join(given.fields)))
-    rows = query.resample(given.step or 0, given.how, given.tolerance)
-    answer_tables(rows.to_tables(to.shown), to, rows.schema)
-    return rows.counters, rows.remarks()
+    return query.resample(given.step or 0, given.how, given.tolerance)
 
 
-def _align(
-    store: Store, given: _Given, topics: Sequence[str], to: Destination
-) -> tuple[Counters, Sequence[str]]:
-    """Answer with a row for each message of a topic; gives the cost and what is to be known."""
-    if given.how not in _BESIDE:
-        raise UsageError(f"--how {given.how} is for --step, not for --to.")
+def _aligned(store: Store, given: _Given) -> Aligned:
+    """A row for each message of a topic."""
     base = given.base or ""
-    queries = _queries(store, [base, *topics], given.choice, given.beside)
+    queries = _queries(store, [base, *given.topics], given.choice, given.beside)
     for text in given.where:
         places, predicate = _named(store, queries, text, "--where wants TOPIC: PREDICATE")
         for place in places:
@@ -148,7 +141,7 @@ def _align(
     if given.strict:
         for query in queries:
             query.completeness().check()
-    aligned = store.align(
+    return store.align(
         queries[0],
         queries[1:],
         how=given.how,
@@ -156,10 +149,6 @@ def _align(
         clock=given.clock,
         across_recordings=bool(given.beside),
     )
-    # That there is a transform shows only at the end.
-    completeness = aligned.completeness if given.strict else None
-    answer_tables(aligned.to_tables(to.shown), to, aligned.schema, completeness)
-    return aligned.counters, aligned.remarks()
 
 
 def _queries(

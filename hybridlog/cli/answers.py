@@ -6,7 +6,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Sized
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import chain, groupby, islice
@@ -24,7 +24,7 @@ from hybridlog.cli.render import ROWS_AT_ONCE, Column, print_table
 from hybridlog.cli.signals import if_stopped
 from hybridlog.formats import OUTPUTS, formats_of, is_directory, suffixes_of
 from hybridlog.formats.slices import IN_FORCE, Front, log_of, payload_bytes
-from hybridlog_storage.disk.unfinished import is_published, undone
+from hybridlog_storage.disk.unfinished import is_published
 from hybridlog_storage.errors import PayloadError, UsageError
 from hybridlog_storage.stopping import anywhere
 
@@ -74,14 +74,11 @@ class Destination:
 
     @contextmanager
     def opened(self) -> Iterator[Target]:
-        """The target for a writer; what was there stays if the block fails."""
+        """The target for a writer, which leaves what was there if it fails."""
         if self.path is None:
             yield sys.stdout.buffer
             return
-        with (
-            if_stopped(partial(not_written, self.path)),
-            replacing(self.path, force=self.force, is_directory=is_directory(self.form, self.path)),
-        ):
+        with if_stopped(partial(not_written, self.path)):
             yield self.path
 
     def check(self) -> None:
@@ -539,61 +536,19 @@ def write_bytes(target: Target, content: bytes) -> None:
 
 
 def check_room(path: Path, *, force: bool, is_directory: bool = False) -> None:
-    """Refuse to overwrite without --force, and foreign directories even with it."""
+    """Refuse to overwrite files without --force, and directories with files even with it."""
     if not os.path.lexists(path) or (path.exists() and not path.is_file() and not path.is_dir()):
         return  # there is nothing, or a device
-    if path.is_dir():
-        if not is_directory:
-            raise UsageError(f"{path} is a directory; name a file in it.")
-        if next(path.iterdir(), None) is None:
-            return
-        if not _holds_messages(path):
-            raise UsageError(f"{path} is a directory that holds other things; name a new one.")
-    elif is_directory:
+    if path.is_dir() and not is_directory:
+        raise UsageError(f"{path} is a directory; name a file in it.")
+    if is_directory and not path.is_dir():
         raise UsageError(f"{path} is a file; messages go into a directory.")
-    if not force:
+    if is_directory and any(path.iterdir()):
+        raise UsageError(f"{path} is not empty: remove it, or name a new directory.")
+    if not (is_directory or force):
         raise UsageError(f"{path} exists; --force overwrites it.")
-
-
-@contextmanager
-def replacing(path: Path, *, force: bool, is_directory: bool = False) -> Iterator[None]:
-    """Move a directory aside while a new one is written; it comes back when the block fails.
-
-    Files are replaced by their writers in one step.
-    """
-    check_room(path, force=force, is_directory=is_directory)
-    if not path.is_dir() or path.is_symlink() or next(path.iterdir(), None) is None:
-        yield
-        return
-    import secrets
-    import shutil
-
-    aside = path.with_name(f".{path.name[:100]}.{secrets.token_hex(6)}.old")
-
-    def bring_back() -> None:
-        with suppress(OSError):
-            if not path.exists():
-                aside.rename(path)
-
-    with undone(bring_back):
-        try:
-            path.rename(aside)
-        except OSError as error:
-            raise UsageError(f"{path} cannot be replaced: {error.strerror}.") from error
-        yield
-    shutil.rmtree(aside, ignore_errors=True)
 
 
 def not_written(path: Path) -> str:
     """The sentence about an output file after a stopped command; empty if the file is complete."""
     return "" if is_published(path) else f"{path} is not written."
-
-
-def _holds_messages(path: Path) -> bool:
-    from hybridlog.formats.raw import holds_messages
-    from hybridlog.formats.rosbag2.directory import holds_bag
-
-    try:
-        return holds_messages(path) or holds_bag(path)
-    except OSError as error:
-        raise UsageError(f"{path} cannot be read: {error.strerror}.") from error

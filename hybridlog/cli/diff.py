@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import click
 
@@ -18,9 +18,6 @@ from hybridlog.cli.check import verdict
 from hybridlog.cli.completion import complete_topic
 from hybridlog.cli.options import Between, InStore, Quiet, one_recording, topics
 from hybridlog.cli.render import Column
-
-_NEAR: Final = 0.05
-"""Share of differences that a tolerance is proposed for."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,9 +64,6 @@ def diff_command(given: _Given) -> None:
     sys.stdout.flush()
     if not (given.quiet or given.as_json):
         output.notes(verdicts)
-        near = sum(one.share is not None and one.share <= _NEAR for one in found)
-        if near and not share:
-            output.note(f"--tolerance {_NEAR:.0%} leaves out {near} of the differences.")
         total = f"{output.counted(len(found), 'difference')}." if found else "No difference."
         is_cut = given.limit is not None and given.limit < len(found)
         output.note(f"The first {given.limit} of {total}" if is_cut else total)

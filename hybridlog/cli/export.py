@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from hybridlog.cli import output
 from hybridlog.cli.answers import (
-    Destination,
     check_room,
     form_of,
     latched,
@@ -25,7 +24,6 @@ from hybridlog.cli.lerobot import LEROBOT, Training, export_set
 from hybridlog.cli.options import Slices, Topics, parse_fields
 from hybridlog.cli.signals import if_stopped
 from hybridlog.formats import OUTPUTS, formats_of, is_directory, suffixes_of
-from hybridlog.formats.slices import Front
 from hybridlog_storage.disk.unfinished import undone
 from hybridlog_storage.errors import (
     DefinitionError,
@@ -38,7 +36,6 @@ from hybridlog_storage.errors import (
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from hybridlog.attachments import Extras
     from hybridlog.query.query import Query
 
 _LOGS = formats_of("log")
@@ -68,13 +65,13 @@ def export_command(given: _Given) -> None:
 
     `lerobot` makes a training set for robot learning.
     """
-    target, force, quiet, split = given.target, given.force, given.quiet, given.split
+    target, force, split = given.target, given.force, given.split
     if str(target) == "-":
         raise UsageError("export writes files; for a pipe: `hybridlog fetch '**' -F mcap -o -`.")
     form = given.form or form_of(target, suffixes_of(_LOGS))
-    front = Front(latched=not given.no_latched, original_times=given.original_times)
     settings = given.settings(form)
-    if form in _LOGS and split is None:
+    is_log = form in _LOGS
+    if is_log and split is None:
         check_room(target, force=force, is_directory=is_directory(form, target))
     with given.opened(snapshot=True) as store:
         query = given.query(store)
@@ -85,42 +82,43 @@ def export_command(given: _Given) -> None:
         if form == LEROBOT:
             if split is not None:
                 raise UsageError("lerobot has --episodes-by in place of --split-by.")
-            export_set(store, query, target, given, force=force, quiet=quiet)
+            export_set(store, query, target, given, force=force, quiet=given.quiet)
             return
         parts: Iterable[tuple[Path, Query]] = [(target, query)]
         if split is not None:
-            folder = is_directory(form, target) if form in _LOGS else None
+            folder = is_directory(form, target) if is_log else None
             parts = pieces(query, split, target, force=force, is_directory=folder)
         for path, one in parts:
-            to = Destination(form=form, path=path, force=force, quiet=quiet, settings=settings)
-            if form in _LOGS:
-                from hybridlog.attachments import extras_of
-
-                extras = extras_of(one.session, one.question)
-                if given.no_attachments:
-                    extras = extras._replace(attachments=[], left_out=0)
-                _write_file(one, to, path, front, extras)
+            if is_log:
+                _write_log(one, form, path, given, settings)
             else:
-                _write_directory(one, to, path, front)
-            if not quiet:
-                output.notes(one.remarks(is_empty=None if form in _LOGS else False))
+                _write_tables(one, form, path, given)
+            if not given.quiet:
+                output.notes(one.remarks(is_empty=None if is_log else False))
 
 
-def _write_file(query: Query, to: Destination, path: Path, front: Front, extras: Extras) -> None:
-    with to.opened() as target:
+def _write_log(
+    query: Query, form: str, path: Path, given: _Given, settings: Mapping[str, Any]
+) -> None:
+    from hybridlog.attachments import extras_of
+
+    extras = extras_of(query.session, query.question)
+    if given.no_attachments:
+        extras = extras._replace(attachments=[], left_out=0)
+    with if_stopped(partial(not_written, path)):
         write_answer(
             query,
-            to.form,
-            target,
-            front=front,
+            form,
+            path,
+            front=given.front,
             extras=extras,
-            quiet=to.quiet,
-            settings=to.settings,
+            quiet=given.quiet,
+            settings=settings,
         )
-    has_extras = to.form == "mcap" or (to.form, to.settings.get("storage")) == ("rosbag2", "mcap")
+    has_extras = form == "mcap" or settings.get("storage") == "mcap"
     counts = (len(extras.attachments), "attachment"), (len(extras.metadata), "metadata record")
     beside = "".join(f", {output.counted(count, what)}" for count, what in counts if count)
-    print_written(path, query, beside=beside if has_extras else "", quiet=to.quiet)
+    print_written(path, query, beside=beside if has_extras else "", quiet=given.quiet)
     if beside and not has_extras:
         output.note(f"A bag cannot hold {beside[2:]} of the log; an MCAP file can.")
     if extras.left_out and has_extras:
@@ -128,50 +126,44 @@ def _write_file(query: Query, to: Destination, path: Path, front: Front, extras:
         output.note(f"{left_out} from behind the time range: left out.")
 
 
-def _write_directory(query: Query, to: Destination, directory: Path, front: Front) -> None:
+def _write_tables(query: Query, form: str, directory: Path, given: _Given) -> None:
     """Write one file a topic, except topics that do not fit or have no message in the range."""
+    from hybridlog.query.asked import narrowed
     from hybridlog.query.ranges import RangeResolver
+    from hybridlog_storage.mongo.collection_names import collection_of
 
     RangeResolver(query.session, query.question).resolve()  # refuses a range without any message
+    topics = _image_topics(query) if OUTPUTS[form].content == "video" else query.topics
+    suffix = OUTPUTS[form].suffixes[0]
+    paths = {topic: directory / f"{collection_of(topic)}{suffix}" for topic in topics}
+    for path in paths.values():
+        check_room(path, force=given.force)
+    left_out: list[HybridlogError] = []
     is_new = not directory.is_dir()
     with undone(partial(_remove_empty, directory)) if is_new else contextlib.nullcontext():
         try:
             directory.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise UsageError(f"{directory} cannot be made: {error.strerror}.") from error
-        _write_files(query, to, directory, front)
+        for topic, path in paths.items():
+            one = narrowed(query, topic)
+            try:
+                with if_stopped(lambda: f"The files named above are whole. {not_written(path)}"):  # noqa: B023 - of this round
+                    missing = write_answer(one, form, path, front=given.front, quiet=given.quiet)
+            except (DefinitionError, PayloadError, TimeError, UsageError) as error:
+                is_named = isinstance(error, DefinitionError) or topic in str(error)
+                output.note(f"{'' if is_named else f'{topic}: '}{error}")
+                left_out.append(error)
+                continue
+            print_written(path, one, missing, quiet=given.quiet)
+            query.counters.add(one.counters)
+        if len(left_out) == len(paths):
+            raise left_out[0]
 
 
 def _remove_empty(directory: Path) -> None:
     with contextlib.suppress(OSError):  # files were written into it
         directory.rmdir()
-
-
-def _write_files(query: Query, to: Destination, directory: Path, front: Front) -> None:
-    from hybridlog.query.asked import narrowed
-    from hybridlog_storage.mongo.collection_names import collection_of
-
-    suffix, topics = OUTPUTS[to.form].suffixes[0], [*query.topics]
-    if OUTPUTS[to.form].content == "video":
-        topics = _image_topics(query)
-    paths = {topic: directory / f"{collection_of(topic)}{suffix}" for topic in topics}
-    for path in paths.values():
-        check_room(path, force=to.force)
-    left_out: list[HybridlogError] = []
-    for topic, path in paths.items():
-        one = narrowed(query, topic)
-        try:
-            with if_stopped(lambda: f"The files named above are whole. {not_written(path)}"):  # noqa: B023 - of this round
-                missing = write_answer(one, to.form, path, front=front, quiet=to.quiet)
-        except (DefinitionError, PayloadError, TimeError, UsageError) as error:
-            is_named = isinstance(error, DefinitionError) or topic in str(error)
-            output.note(f"{'' if is_named else f'{topic}: '}{error}")
-            left_out.append(error)
-            continue
-        print_written(path, one, missing, quiet=to.quiet)
-        query.counters.add(one.counters)
-    if len(left_out) == len(paths):
-        raise left_out[0]
 
 
 def _image_topics(query: Query) -> list[str]:

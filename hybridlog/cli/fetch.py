@@ -124,28 +124,23 @@ def fetch_command(choices: _Choices) -> None:
             if lost.has_losses and not choices.quiet:
                 output.note(lost.describe(count, query.question.limit))
         else:
-            front = Front(
-                # With --at, the answer is one message; a video needs those before it.
-                latched=not choices.no_latched and (choices.at is None or to.form == "mp4"),
-                original_times=choices.original_times,
-            )
+            front = choices.front
+            if choices.at is not None and to.form != "mp4":  # the answer is one message
+                front = replace(front, latched=False)
             if choices.split is not None:
                 _write_pieces(query, choices, to, front)
                 return
             query = answer_query(query, to, front=front, strict=choices.strict)
-            _print_end(query, choices, started, to.path)
+            _print_end(query, choices, started)
 
 
-def _print_end(query: Query, choices: _Choices, started: float, path: Path | None = None) -> None:
+def _print_end(query: Query, choices: _Choices, started: float) -> None:
     """Print the cost of an answer, with that of conditions on other topics, and what it lacks."""
     cost = query.counters.copy()
     for condition in query.conditions:
         cost.add(condition.counters)
     print_end(choices, cost, started, count=choices.count)
     if not choices.quiet:
-        if path is not None and not (cost.messages or cost.latched or cost.frames):
-            what = " and ".join(f"'{one}'" for one in choices.where) or "the question"
-            output.note(f"Nothing matched {what}, so {path} is empty.")
         output.notes(query.remarks())
 
 

@@ -25,6 +25,7 @@ from hybridlog.cli.completion import (
 )
 from hybridlog.cli.render import Column, print_table
 from hybridlog.formats import formats_of
+from hybridlog.formats.slices import Front
 from hybridlog.query.choice import Choice
 from hybridlog.wording import parse_size
 from hybridlog_storage.errors import TopicError, UsageError
@@ -337,6 +338,11 @@ class Latched:
         "Latched messages and frames from before the time range keep their log time.",
         excludes=("no_latched",),
     )
+
+    @property
+    def front(self) -> Front:
+        """The choice of these messages."""
+        return Front(latched=not self.no_latched, original_times=self.original_times)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,7 +16,7 @@ from hybridlog.cli.answers import answering, check_room, form_of, not_written, w
 from hybridlog.cli.binder import command, option
 from hybridlog.cli.completion import complete_path
 from hybridlog.cli.options import Asking, Forced, parse_fields
-from hybridlog.cli.render import Column, print_table, room
+from hybridlog.cli.render import Column, print_table
 from hybridlog.cli.signals import if_stopped
 from hybridlog_storage.errors import UsageError
 
@@ -123,9 +123,11 @@ def _print(found: Sequence[Line]) -> None:
         Column("least", lambda line: _ends(line.series)[0], "right"),
         Column("greatest", lambda line: _ends(line.series)[1], "right"),
     ]
-    width = max(_LETTERS // 4, room(columns, found)) if sys.stdout.isatty() else _LETTERS
-    drawn = Column("", lambda line: sparkline(line.series.by_column(width)), "whole")
-    print_table([*columns, drawn], found)
+    wide, narrow = (
+        lambda line, width=width: sparkline(line.series.by_column(width))
+        for width in (_LETTERS, _LETTERS // 3)
+    )
+    print_table([*columns, Column("", wide, "whole", narrow)], found)
 
 
 def _ends(series: Series) -> tuple[str, str]:

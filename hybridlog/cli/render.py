@@ -172,13 +172,6 @@ def print_table(
         cells = shape.cells(islice(source, ROWS_AT_ONCE))
 
 
-def room(columns: Sequence[Column], rows: Sequence[Any]) -> int:
-    """Columns of the terminal that a table leaves to one more."""
-    shape = _Shape(columns, [len(one.name) for one in columns], short=False)
-    shape.cells(rows)
-    return shape.room() - 2
-
-
 def print_fields(fields: Sequence[tuple[str, object]], indent: int = 0) -> None:
     """Print a line for each name and value, folded on a terminal."""
     width = max((len(name) for name, _ in fields), default=0)

@@ -11,10 +11,8 @@ from __future__ import annotations
 
 import json
 import os
-import re
 from collections.abc import Mapping
 from contextlib import suppress
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hybridlog.formats.answer import Answer
@@ -27,40 +25,6 @@ if TYPE_CHECKING:
 INDEX = "index.jsonl"
 """The file that describes each file. No topic's directory has a dot."""
 PICTURE_SUFFIXES = (".jpg", ".png", ".webp", ".gif", ".avif", ".bmp", ".tif", ".jp2", ".jxl")
-
-_LONGEST_LINE = 1 << 20
-_FILE = re.compile(
-    rf"[0-9]+(-[0-9]+)?({'|'.join(map(re.escape, ('.bin', '.ply', *PICTURE_SUFFIXES)))})"
-)
-
-
-def holds_messages(directory: Path) -> bool:
-    """True if this module wrote a directory, and no file was added since.
-
-    Raises:
-        OSError: It cannot be read.
-    """
-    index = directory / INDEX
-    if not index.is_file() or not _is_index(index):
-        return False
-    for entry in directory.iterdir():
-        if entry.name == INDEX:
-            continue
-        if entry.is_symlink() or not entry.is_dir():
-            return False
-        if not all(_FILE.fullmatch(file.name) for file in entry.iterdir()):
-            return False
-    return True
-
-
-def _is_index(path: Path) -> bool:
-    with path.open("rb") as file:
-        first = file.readline(_LONGEST_LINE)
-    try:
-        line = json.loads(first or b"{}")
-    except ValueError:
-        return False
-    return isinstance(line, dict) and (not first or {"file", "log_time_ns"} <= line.keys())
 
 
 def write_raw(answer: Answer, target: Target) -> None:

@@ -51,9 +51,9 @@ def test_by_recording_in_every_format(store: Path, tmp_path: Path, form: str) ->
     said = run(*fetch, out, "--split-by", "recording", store=store).err
     assert {one.name for one in tmp_path.iterdir()} == {f"all-one{suffix}", f"all-two{suffix}"}
     for label in ("one", "two"):
-        part, alone = tmp_path / f"all-{label}{suffix}", tmp_path / f"alone{suffix}"
+        part, alone = tmp_path / f"all-{label}{suffix}", tmp_path / f"alone-{label}{suffix}"
         assert f"{part}: " in said
-        run(*fetch, alone, "-r", label, "-f", store=store)
+        run(*fetch, alone, "-r", label, store=store)
         assert contents(part) == contents(alone)
 
 

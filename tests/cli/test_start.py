@@ -159,18 +159,6 @@ def test_wrong_usage_is_code_2(arguments: tuple[str, ...]) -> None:
     assert done.err.count("\n") <= 2
 
 
-def test_usage_names_what_is_wanted() -> None:
-    for command, words in (
-        ("record", "[PATH]..."),
-        ("verify", "[RECORDING]..."),
-        ("rm", "rm [OPTIONS] [RECORDING]...\n"),
-        ("export", "-t, --topic TOPIC"),
-        ("rm", "without, those that the options choose."),
-    ):
-        out = run(command, "--help").out
-        assert words in out or words in " ".join(out.split())
-
-
 def test_completion(store: Path) -> None:
     assert complete(f"info --store {store} r") == ["robot"]
     assert complete(f"verify --store {store} o") == ["odd"]

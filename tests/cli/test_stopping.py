@@ -271,19 +271,11 @@ def test_no_instant_leaves_a_part(form: str, moment: str, store: Path, tmp_path:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_directory_that_was_to_be_replaced_comes_back(store: Path, tmp_path: Path) -> None:
-    target = tmp_path / "payloads"
-    command = ["fetch", "-t", "/base/scan", "-F", "raw", "-o", str(target), "-r", "robot"]
-    run(*command, store=store)
-    before = sorted(path.name for path in target.iterdir())
-    ended = stop_at("return Directory.__init__", *command, "--force", store=store)
-    assert ended.returncode == 130, ended.stderr
-    assert [path.name for path in tmp_path.iterdir()] == ["payloads"]
-    assert sorted(path.name for path in target.iterdir()) == before
+def test_a_directory_of_tables_is_complete_or_absent(store: Path, tmp_path: Path) -> None:
     command = ["export", str(tmp_path / "new"), "-F", "csv", "-r", "robot"]
     ended = stop_at("return Whole.__enter__", *command, store=store)
     assert ended.returncode == 130, ended.stderr
-    assert [path.name for path in tmp_path.iterdir()] == ["payloads"]
+    assert [*tmp_path.iterdir()] == []
 
 
 def limited(kilobytes: int) -> tuple[str, ...]:

@@ -166,21 +166,6 @@ def test_statistics_at_eighty_columns_break_no_name(store: Path) -> None:
         assert lines == [name, *(row[name] for row in rows)]
 
 
-def test_a_block_of_statistics_has_all_of_them(store: Path) -> None:
-    code, shown = on_terminal(
-        "stats", "scan", "imu/data", "-r", "robot", "--store", store, width=40
-    )
-    assert code == 0
-    assert len(re.findall(r"(?m)^  std +\S", plain(shown))) > 10
-
-
-def test_rates_are_sorted_by_topic(store: Path) -> None:
-    rows = run("stats", "--rate", "-r", "robot", "--json", store=store).json
-    topics = [row["topic"] for row in rows]
-    assert topics == sorted(topics)
-    assert len(topics) > 10
-
-
 def test_versions_and_definitions_break_no_word(store: Path) -> None:
     for words, width, expected in (
         (("--installed",), 80, 0),
@@ -210,16 +195,16 @@ def test_info_on_a_narrow_screen_folds_no_type_of_the_robot(store: Path) -> None
     assert len(plain(shown).splitlines()[-1]) <= 160
 
 
-def test_a_plot_of_text_is_as_wide_as_the_screen(store: Path) -> None:
+def test_a_plot_of_text_fits_the_screen(store: Path) -> None:
     ask = ("plot", "-t", "odom", "-r", "robot", "--fields", "twist.twist.linear", "-q")
-    for width in (60, 100):
+    for width, letters in ((80, 20), (160, 60)):
         code, shown = on_terminal(*ask, "--store", store, width=width)
         assert code == 0
         head, *rows = plain(shown).splitlines()
         assert head.split() == ["field", "least", "greatest"]
         assert [row.split()[0][-1] for row in rows] == ["x", "y", "z"]
-        assert width - 4 <= max(map(len, rows)) <= width
-        assert len({*rows[0][-20:]} & {*"▁▂▃▄▅▆▇█"}) > 2
+        assert max(map(len, rows)) <= width
+        assert len({*rows[0][-letters:]} & {*"▁▂▃▄▅▆▇█"}) > 2
 
 
 def test_an_answer_is_a_table_when_it_fits(store: Path) -> None:
@@ -269,16 +254,6 @@ def test_a_long_text_of_a_block_is_whole_and_breaks_between_words(tmp_path: Path
     begin = next(n for n, line in enumerate(lines) if line.startswith("  msg "))
     assert " ".join([lines[begin].split(maxsplit=1)[1], lines[begin + 1].strip()]) == text
     assert lines[begin + 1].startswith(" " * 8)
-
-
-def test_the_message_at_a_time_is_one_on_a_terminal(store: Path) -> None:
-    command = ("fetch", "-t", "scan", "-r", "robot", "--at", "+3s", "-v")
-    code, shown = on_terminal(*command, "--store", store)
-    assert code == 0
-    text = plain(shown)
-    assert len(re.findall(r"(?m)^\d{4}-\S+Z  /base/scan$", text)) == 1
-    assert "--limit" not in text
-    assert re.search(r"(?m)^1 message, ", text)
 
 
 def test_binary_formats_are_kept_off_the_terminal(store: Path) -> None:

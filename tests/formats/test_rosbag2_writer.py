@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -71,7 +72,8 @@ def test_the_command_and_what_fits_into_no_bag(tmp_path: Path) -> None:
     assert len(rows_of(bag)) == 18558
     run("export", bag, "-F", "rosbag2", store=store, code=2)
     small = ("--storage", "sqlite3", "--file-size", "500kB")
-    run("export", bag, "-F", "rosbag2", *small, "-f", store=store)
+    shutil.rmtree(bag)
+    run("export", bag, "-F", "rosbag2", *small, store=store)
     assert len(rows_of(bag)) == 18558
     assert {one.suffix for one in bag.iterdir()} == {".db3", ".yaml"}
     for other in (("--storage", "mcap"), ("--file-size", "1MB")):
@@ -81,10 +83,10 @@ def test_the_command_and_what_fits_into_no_bag(tmp_path: Path) -> None:
     assert "--original-times does nothing in csv" in said
     run("export", tmp_path / "x", "-F", "rosbag2", "--file-size", "0", store=store, code=2)
     some = ("fetch", "-t", "/tf", "-F", "rosbag2", "-o", bag)
-    run(*some, "-f", store=store)
+    assert "is not empty" in run(*some, "-f", store=store, code=2).err
+    shutil.rmtree(bag)
+    run(*some, store=store)
     assert {topic for topic, *_ in rows_of(bag)} == {"/tf"}
-    (bag / "mine.txt").touch()
-    assert "holds other things" in run(*some, "-f", store=store, code=2).err
     run("mark", "here", "-r", "auv", "--at", "+1s", store=store)
     said = run("export", tmp_path / "marked", "-F", "rosbag2", store=store, code=2).err
     assert "/hybridlog/marks has json messages" in said

@@ -167,14 +167,3 @@ def _name(path: str) -> str:
     parts = PureWindowsPath(path)  # splits at both kinds of slashes
     is_below = not parts.anchor and ".." not in parts.parts
     return "/".join(parts.parts) if is_below else parts.name
-
-
-def holds_bag(directory: Path) -> bool:
-    """True if a directory holds a bag and nothing else.
-
-    Raises:
-        OSError: It cannot be read.
-    """
-    return (directory / NAME).is_file() and all(
-        entry.name == NAME or entry.suffix in {".mcap", ".db3"} for entry in directory.iterdir()
-    )
