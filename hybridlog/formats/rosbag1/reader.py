@@ -294,7 +294,10 @@ class Rosbag1Source(Source):
         while pos < self.size_bytes:
             record = self._record(pos)
             if record is None and pos > self._index_pos:  # zeros, as some recorders write them
-                pos = self._search(pos) or self.size_bytes
+                end = self._search(pos) or self.size_bytes
+                if not self._are_zeros(pos, end):
+                    return
+                pos = end
                 continue
             if record is None or record.end > min(self.size_bytes, record.start + MAX_PAYLOAD):
                 return
@@ -353,6 +356,9 @@ class Rosbag1Source(Source):
     def _is_sound(self, pos: int) -> bool:
         """True if a record starts at a position, or the file ends there."""
         return pos == self.size_bytes or self._plain_record(pos) is not None
+
+    def _are_zeros(self, pos: int, end: int) -> bool:
+        return 0 < end - pos <= _WINDOW and not self._read(pos, end - pos).strip(b"\0")
 
     def _search(self, pos: int) -> int | None:
         """First position at or behind `pos` that looks like a record."""
@@ -436,8 +442,7 @@ class Rosbag1Source(Source):
         """Go from damage at `pos` to the first record at or behind `start`."""
         found = self._search(start)
         end = found or self.size_bytes
-        is_spare = bool(self._chunks) and 0 < end - pos <= _WINDOW and not self._listed(pos, end)
-        if is_spare and not self._read(pos, end - pos).strip(b"\0"):
+        if self._chunks and self._are_zeros(pos, end) and not self._listed(pos, end):
             self._zeros.append(range(pos, end))
             return end
         place = self._place_at(start)
