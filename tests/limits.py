@@ -26,6 +26,7 @@ PLACES = {
     "json_text_piece_bytes": "hybridlog.formats.json_text.PIECE_BYTES",
     "unstated_bag_bytes": "hybridlog.formats.rosbag1.reader._UNSTATED",
     "bag_window_bytes": "hybridlog.formats.rosbag1.reader._WINDOW",
+    "cached_slices_bytes": "hybridlog.formats.slices.MAX_BYTES",
     "output_held_bytes": "hybridlog.formats.tables.HELD_BYTES",
     "tables_piece_bytes": "hybridlog.formats.tables.PIECE_BYTES",
     "frame_block_rows": "hybridlog.frames.answer._BLOCK_ROWS",

@@ -151,13 +151,13 @@ def summary(state: RecorderState) -> str:
 
 def _index(state: RecorderState) -> str:
     if state.index_failure:
-        return f"index {state.lag} behind: {in_short(state.index_failure)}"
+        return f"index {state.lag} behind: {_in_short(state.index_failure)}"
     if state.late:
         return f"index {state.late} behind"
     return "index within seconds" if state.lag else "index up to date"
 
 
-def in_short(reason: str) -> str:
+def _in_short(reason: str) -> str:
     """The beginning of a reason, for a place with little room."""
     line = output.printable(reason.partition("\n")[0])
     sentence = line.partition(". ")[0].rstrip(".")

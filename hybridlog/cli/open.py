@@ -17,7 +17,7 @@ from hybridlog.cli.answers import check_room, not_written, write_answer
 from hybridlog.cli.binder import argument, command, option
 from hybridlog.cli.options import Filtered, Forced, Served
 from hybridlog.cli.signals import ended_by_signal, if_stopped
-from hybridlog.formats.slices import SliceCache
+from hybridlog.formats.slices import cached_slice
 from hybridlog.wording import listed
 from hybridlog_storage.errors import HybridlogError, MissingDependencyError
 
@@ -120,7 +120,7 @@ def _written(store: Store, query: Query, given: _Given) -> Path:
     if given.path is None:
         ids = query.recordings
         name = store.entry(ids[0]).name if len(ids) == 1 else "slice"
-        return SliceCache().get(query, name, write)
+        return cached_slice(query, name, write)
     with if_stopped(partial(not_written, given.path)):
         write(query, given.path)
     return given.path

@@ -14,7 +14,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from hybridlog.cli import output
-from hybridlog.cli.live_table import LiveTable, in_short, summary
+from hybridlog.cli.live_table import LiveTable, summary
 from hybridlog.cli.open_store import opened_store
 from hybridlog.cli.options import parse_tags
 from hybridlog.cli.record_choices import (
@@ -43,7 +43,6 @@ if TYPE_CHECKING:
 _MIN_CHUNK: Final = 1 << 19
 _STATE_S = 1.0
 _RECOVERY_POLL_S = 0.05
-_EXPLAIN_AFTER_S = 2.0  # a longer wait at the end is explained
 
 
 def record_live(choices: RecordChoices) -> None:
@@ -90,12 +89,11 @@ def _record(choices: RecordChoices) -> None:
                 options, full = recorder.rest, recorder.name
                 sources = [held.enter_context(source) for source in sources_of(choices)]
             notify_service("STOPPING=1", "STATUS=writing what is left")
-            if quiet:
-                reports += recorder.stop()
-            else:
-                output.note("hybridlog: writing what is left; Ctrl-C leaves at once")
-                with _explain_wait(last):
-                    reports += recorder.stop()
+            if not quiet:
+                lag = output.counted(last.late, "message")
+                wait = f", and waiting for MongoDB, which lacks {lag}" if last.late else ""
+                output.note(f"hybridlog: writing what is left{wait}; Ctrl-C leaves at once")
+            reports += recorder.stop()
             while recovery.is_alive() and not stop.wait(_RECOVERY_POLL_S):
                 pass
         rules, results = options.contract, []
@@ -201,22 +199,6 @@ def _watch(recorder: Recorder, stop: Flag, display: _Display) -> RecorderState:
         if stop.is_set or recorder.wait(0):
             return state
         stop.wait(_STATE_S)
-
-
-@contextmanager
-def _explain_wait(last: RecorderState) -> Iterator[None]:
-    """Print what the end of the recording waits for, when it takes long."""
-    what = "what is left is still being written"
-    if last.lag:
-        what = f"waiting for MongoDB, which lacks {output.counted(last.lag, 'message')}"
-    if last.index_failure:
-        what += f" ({in_short(last.index_failure)})"
-    timer = threading.Timer(_EXPLAIN_AFTER_S, output.note, [f"hybridlog: {what}"])
-    timer.start()
-    try:
-        yield
-    finally:
-        timer.cancel()
 
 
 @contextmanager

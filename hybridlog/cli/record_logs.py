@@ -43,7 +43,6 @@ if TYPE_CHECKING:
     from hybridlog.record.recorder import RecordOptions, RecordReport
     from hybridlog.store import Store
 
-_MAX_FAILED = 20  # errors that are repeated at the end
 _MAX_UNFINISHED = 10
 
 
@@ -255,7 +254,6 @@ class LogRecorder:
         # Those that are shown at the end.
         self._reports: list[tuple[Path, RecordReport]] = []
         self._summaries: list[dict[str, Any]] = []
-        self._messages: list[str] = []
 
     @contextmanager
     def opened(self) -> Iterator[Store]:
@@ -367,8 +365,6 @@ class LogRecorder:
         output.note(f"hybridlog: {error}")
         self._failed += 1
         self._exit_code = self._exit_code or error.exit_code
-        if len(self._messages) < _MAX_FAILED:
-            self._messages.append(str(error))
         about = {} if path is None else {"path": str(path)}
         self._summarise({**about, "error": str(error), "exit_code": error.exit_code})
 
@@ -400,13 +396,7 @@ class LogRecorder:
             _print_one(*self._reports[0])
         elif self._reports and not choices.as_json and not choices.quiet:
             _print_several([report for _, report in self._reports])
-        if not self._is_search:
-            return
-        for message in self._messages:
-            output.note(f"not recorded: {message}")
-        if self._failed > len(self._messages):
-            output.note(f"and {self._failed - len(self._messages)} more")
-        if not choices.quiet:
+        if self._is_search and not choices.quiet:
             output.note(
                 f"{output.counted(self._recorded, 'log')} recorded, {self._known} in the store "
                 f"already, {self._failed} not recorded."

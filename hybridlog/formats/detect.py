@@ -84,16 +84,6 @@ class LogFile:
             reason = "the file is empty; record or copy it again, there is nothing in it"
         raise SourceError(f"{self.path}: {reason}")
 
-    def stated(self) -> int | None:
-        """Number of messages by its own index, None if unknown."""
-        try:
-            if not self.is_packed:
-                with self.open() as source:
-                    return source.message_count
-        except SourceError:
-            pass
-        return None
-
 
 def kinds() -> str:
     """The logs that can be read."""

@@ -20,7 +20,7 @@ from hybridlog.formats.detect import (
     missing_parts,
     natural,
 )
-from hybridlog.formats.reading import BATCH_BYTES, Damage, Source, cannot_open, regroup
+from hybridlog.formats.reading import BATCH_BYTES, Damage, Source, cannot_open
 from hybridlog.formats.rosbag2.directory import NAME, BagMetadata, locate, plain, read_metadata
 from hybridlog.formats.spool import ZSTD_MAGIC, spool
 from hybridlog.wording import listed
@@ -185,7 +185,6 @@ def _in_folder(folder: Path) -> LogSet:
                 f"{NAME} does not list it, and its name is not that of a part of the bag; record "
                 "it by its own path"
             )
-            lost = file.stated()
         if reason:
             unread.append(Damage(file.path, None, None, f"the file is not read: {reason}", lost))
     if more:
@@ -244,7 +243,6 @@ class _JoinedSource(Source):
             files=log.files,
         )
         self._log = log
-        self._states_frames = log.metadata is not None and log.metadata.packed_messages
         self._got = 0
         for damage in log.damage:
             self.note(damage)
@@ -317,9 +315,7 @@ class _JoinedSource(Source):
         alike: Counter[tuple[object, ...]] = Counter()
         got = 0
         found_before = len(self.damage)
-        is_stated = self._states_frames or inner.packed_messages
-        batches = self._unpacked(part.path, inner, is_stated=is_stated)
-        for batch in regroup(batches) if is_stated else batches:
+        for batch in self._unpacked(part.path, inner):
             got += len(batch)
             numbers = self._numbered(inner, numbers, alike)
             share = inner.bytes_read / inner.size_bytes if inner.size_bytes else 1.0
@@ -391,21 +387,18 @@ class _JoinedSource(Source):
             more.append(number)
         return np.append(numbers, np.array(more, np.int32)) if more else numbers
 
-    def _unpacked(self, path: Path, inner: Source, *, is_stated: bool) -> Iterator[Batch]:
-        """Unpack payloads that are zstd frames; the others stay as they are.
+    def _unpacked(self, path: Path, inner: Source) -> Iterator[Batch]:
+        """Unpack messages of CDR that are zstd frames, whatever the log says of them.
 
-        In a log that does not say so only CDR is unpacked, which never begins like a frame.
+        CDR never begins like a frame. Frames that do not unpack stay as they are.
         """
         may_be = np.empty(0, np.bool_)
         unpacker = zstandard.ZstdDecompressor()
-        broken = plain = 0
+        broken = 0
         for batch in inner.batches():
             if len(may_be) < len(inner.channels):
-                may_be = np.array(
-                    [is_stated or c.message_encoding in _CDR for c in inner.channels], np.bool_
-                )
+                may_be = np.array([c.message_encoding in _CDR for c in inner.channels], np.bool_)
             packed = may_be[batch.channel] & _is_frame(batch)
-            plain += len(batch) - int(packed.sum())
             if not packed.any():
                 yield batch
                 continue
@@ -425,13 +418,9 @@ class _JoinedSource(Source):
                 yield replace(
                     rows, buffer=b"".join(payloads), length=length, offset=length.cumsum() - length
                 )
-        for count, problem in ((broken, "do not unpack"), (plain, "are not compressed")):
-            if count and is_stated:
-                reason = (
-                    f"{count} payloads {problem}, although the bag says they are compressed; they "
-                    "are taken as they are"
-                )
-                self.damage.append(Damage(path, None, None, reason, 0))
+        if broken:
+            reason = f"{broken} payloads are zstd frames that do not unpack; they stay as they are"
+            self.damage.append(Damage(path, None, None, reason, 0))
 
 
 def _is_frame(batch: Batch) -> NDArray[np.bool_]:

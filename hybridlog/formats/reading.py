@@ -98,8 +98,6 @@ class Source(ABC):
         time_range: Log time `[start, end)`, ns, by the log's own index, None without an index
             or without messages.
         bytes_read: Bytes read of `size_bytes`, for progress.
-        packed_messages: The log states that each payload is a zstd frame, and this reader
-            yields the frames (`LogSet` unpacks them).
     """
 
     def __init__(self, path: Path, *, kind: str, profile: str, files: Sequence[Path]) -> None:
@@ -115,7 +113,6 @@ class Source(ABC):
         self.message_count: int | None = None
         self.time_range: tuple[int, int] | None = None
         self.bytes_read: int = 0
-        self.packed_messages: bool = False
         self._more_places = 0
 
     def note(self, damage: Damage) -> None:

@@ -8,15 +8,18 @@ import pickle
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from hybridlog.formats import OUTPUTS
+from hybridlog_storage.disk.files import user_directory
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from hybridlog.attachments import Extras
     from hybridlog.formats.answer import Answer
     from hybridlog.query.query import Query
@@ -109,88 +112,67 @@ def write_mcap(query: Query, path: Path) -> None:
 
 
 MAX_BYTES: Final = 16 << 30
-"""Bytes that the files may have together, by default."""
+"""Bytes that the files in the cache may have together."""
 
 _NAME_DIGITS = 16
 _NAME_LENGTH = 50  # characters; a file name has 255 bytes at most
+_writing = threading.Lock()  # one at a time: they would compete for the disk
 
 
-class SliceCache:
-    """MCAP files of slices. Several threads and processes may use the same directory.
+def cached_slice(query: Query, name: str, write: Callable[[Query, Path], None]) -> Path:
+    """The MCAP file of a slice in `hybridlog/slices` of the user's cache.
 
-    A file is the same, byte for byte, whenever it is written again for the same state of the
-    recordings.
+    It is written if there is none; those that are unused for longest make room for it. A file
+    is the same, byte for byte, whenever it is written again for the same state of the
+    recordings. Several threads and processes may use the same directory.
 
     Args:
-        directory: Where they lie; without, `hybridlog/slices` in the user's cache.
-        max_bytes: Bytes that they may have together. Those unused for longest are removed.
+        query: The slice.
+        name: What the file is called, beside its digest.
+        write: Writes it: all of it or nothing.
+
+    Raises:
+        UsageError: The slice is larger than all files may be together, or the directory
+            cannot be used.
     """
+    directory = user_directory("XDG_CACHE_HOME", ".cache", "slices") / "slices"
+    path = directory / f"{name[:_NAME_LENGTH]}-{fingerprint(query)[:_NAME_DIGITS]}.mcap"
+    if not _use(path):
+        with _writing:
+            if not _use(path):
+                _make_room(directory, payload_bytes(query))
+                write(query, path)
+    return path
 
-    def __init__(self, directory: Path | None = None, *, max_bytes: int = MAX_BYTES) -> None:
-        if directory is None:
-            from hybridlog_storage.disk.files import user_directory
 
-            directory = user_directory("XDG_CACHE_HOME", ".cache", "slices") / "slices"
-        self._directory = directory
-        self._max_bytes = max_bytes
-        self._writing = threading.Lock()
+def _use(path: Path) -> bool:
+    """Note that a file is used now; False if there is none."""
+    try:
+        os.utime(path, ns=(time.time_ns(), path.stat().st_mtime_ns))
+    except FileNotFoundError:
+        return False
+    return True
 
-    def get(self, query: Query, name: str, write: Callable[[Query, Path], None]) -> Path:
-        """The file of a slice; written if there is none.
 
-        Args:
-            query: The slice.
-            name: What the file is called, beside its digest.
-            write: Writes it: all of it or nothing.
-
-        Raises:
-            UsageError: The slice is larger than all files may be together, or the directory
-                cannot be used.
-        """
-        path = self._directory / f"{name[:_NAME_LENGTH]}-{fingerprint(query)[:_NAME_DIGITS]}.mcap"
-        if not self._use(path):
-            with self._writing:  # one at a time: they would compete for the disk
-                if not self._use(path):
-                    self._write(query, path, write)
-        return path
-
-    def _use(self, path: Path) -> bool:
-        """Note that a file is used now; False if there is none."""
-        try:
-            os.utime(path, ns=(time.time_ns(), path.stat().st_mtime_ns))
-        except FileNotFoundError:
-            return False
-        return True
-
-    def _write(self, query: Query, path: Path, write: Callable[[Query, Path], None]) -> None:
-        size = payload_bytes(query)
-        if size > self._max_bytes:
-            raise UsageError(
-                f"This slice has about {size / 1e9:.0f} GB, and at most "
-                f"{self._max_bytes / 1e9:.0f} GB are kept: choose fewer topics or less time."
-            )
-        try:
-            self._directory.mkdir(mode=0o700, parents=True, exist_ok=True)
-        except OSError as error:
-            raise UsageError(f"{self._directory} cannot be made: {error.strerror}.") from error
-        self._make_room(size)
-        write(query, path)
-
-    def _make_room(self, size: int) -> None:
-        """Remove the files that are unused for longest, until `size` bytes fit."""
-        files = [(about.st_atime_ns, about.st_size, path) for path, about in self._files()]
-        total = sum(length for _, length, _ in files) + size
-        for _, length, path in sorted(files):
-            if total <= self._max_bytes:
-                break
-            path.unlink(missing_ok=True)
-            total -= length
-
-    def _files(self) -> list[tuple[Path, os.stat_result]]:
-        found = []
-        for entry in os.scandir(self._directory):
-            try:
-                found.append((Path(entry.path), entry.stat(follow_symlinks=False)))
-            except FileNotFoundError:
-                continue  # another process has removed it
-        return found
+def _make_room(directory: Path, size: int) -> None:
+    """Remove the files that are unused for longest, until `size` bytes fit."""
+    if size > MAX_BYTES:
+        raise UsageError(
+            f"This slice has about {size / 1e9:.0f} GB, and at most {MAX_BYTES / 1e9:.0f} GB are "
+            "kept: choose fewer topics or less time."
+        )
+    try:
+        directory.mkdir(mode=0o700, parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"{directory} cannot be made: {error.strerror}.") from error
+    files = []
+    for path in directory.iterdir():
+        with suppress(FileNotFoundError):  # another process has removed it
+            about = path.lstat()
+            files.append((about.st_atime_ns, about.st_size, path))
+    total = sum(length for _, length, _ in files) + size
+    for _, length, path in sorted(files):
+        if total <= MAX_BYTES:
+            break
+        path.unlink(missing_ok=True)
+        total -= length

@@ -147,14 +147,25 @@ class FeatureMap:
 
     def to_yaml(self) -> str:
         """The map as YAML."""
-        lines = [f"robot_type: {self.robot_type}"] if self.robot_type else []
-        lines += ["features:"] if self.vectors else []
-        for name, parts in self.vectors.items():
-            lines.append(f"  {name}:")
-            lines += [f"    - {_text(one.topic)}: [{', '.join(one.paths)}]" for one in parts]
-        lines += ["images:"] if self.images else []
-        lines += [f"  {name}: {_text(topic)}" for name, topic in self.images.items()]
-        return "\n".join(lines) + "\n"
+        import yaml
+
+        vectors = {
+            name: [{part.topic: [*part.paths]} for part in parts]
+            for name, parts in self.vectors.items()
+        }
+        parts = {"robot_type": self.robot_type, "features": vectors, "images": {**self.images}}
+        return "".join(
+            yaml.dump(
+                {key: value},
+                Dumper=yaml.CSafeDumper,
+                default_flow_style=None if key == "features" else False,
+                sort_keys=False,
+                allow_unicode=True,
+                width=1 << 20,
+            )
+            for key, value in parts.items()
+            if value
+        )
 
 
 def nearly_empty(query: Query) -> dict[str, int]:
@@ -216,10 +227,6 @@ def _mapping(value: object, where: str) -> dict[Any, Any]:
     if not isinstance(value, dict):
         _refuse(where, "write `key: value` lines; --propose-map shows how")
     return value
-
-
-def _text(topic: str) -> str:
-    return topic if re.fullmatch(r"[A-Za-z0-9_/.\-]+", topic) else f'"{topic}"'
 
 
 def _refuse(where: str, what: str) -> NoReturn:

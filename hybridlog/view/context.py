@@ -19,7 +19,6 @@ from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 from starlette.routing import Route
 
-from hybridlog.formats.slices import SliceCache
 from hybridlog.query.answers.match_times import next_time
 from hybridlog.record.losses import extent_of
 from hybridlog.view.params import RequestParams
@@ -59,7 +58,6 @@ class Context:
         turns: Held by each answer that is worked out.
         matching: Held while matches are looked for.
         sql: Answers SQL.
-        slices: MCAP files of selections.
     """
 
     def __init__(self, store: Store) -> None:
@@ -68,7 +66,6 @@ class Context:
         self.turns = threading.BoundedSemaphore(MAX_WORKING)
         self.matching = threading.Lock()
         self.sql = SqlProcess(store)
-        self.slices = SliceCache()
 
     def of_now(self) -> Context:
         """The same context for an answer, whose store is of the moment that begins now."""

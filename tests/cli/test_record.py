@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import struct
@@ -14,7 +13,6 @@ from mcap.writer import Writer
 
 import hybridlog as hl
 from tests import places
-from tests.data import DATA, needs_data
 from tests.independent import read_bag
 from tests.json_schemas import misfit, schema_of
 
@@ -209,15 +207,6 @@ def test_a_log_that_gives_nothing_makes_no_store(tmp_path: Path) -> None:
     assert not (tmp_path / "s").exists()
 
 
-def test_a_damaged_log(logs: Path, store: Path) -> None:
-    (found,) = run("info", "torn", "--json", store=store).json
-    readable = {(m.topic, m.log_time) for m in read_bag(logs / "small.bag")}
-    assert 0 < found["messages"] < len(readable)
-    assert found["losses"]
-    assert found["status"] == "damaged"
-    assert "lost in" in found["coverage"]
-
-
 def test_a_damaged_log_says_where(logs: Path, tmp_path: Path) -> None:
     done = run("record", logs / "torn.bag", "--json", store=tmp_path / "s", code=4)
     assert "torn.bag is damaged" in done.err
@@ -225,22 +214,6 @@ def test_a_damaged_log_says_where(logs: Path, tmp_path: Path) -> None:
     assert damage["file"].endswith("torn.bag")
     assert 0 < damage["offset"] <= (logs / "torn.bag").stat().st_size
     run("verify", store=tmp_path / "s")
-
-
-@needs_data
-@pytest.mark.parametrize(
-    "name",
-    [
-        "real/compressed_image.bag",
-        "odd/rosbag2/split_mcap",
-        "real/auv_ros2_db3",
-        "odd/protobuf.mcap",
-    ],
-)
-def test_real_logs(name: str, tmp_path: Path) -> None:
-    done = run("record", DATA / name, "--json", "--store", tmp_path / "s")
-    assert done.json["messages"] == done.json["messages_indexed"] > 0
-    assert json.loads(run("verify", "--json", store=tmp_path / "s").out)["findings"] == []
 
 
 def test_names_that_are_no_utf_8(logs: Path, tmp_path: Path) -> None:

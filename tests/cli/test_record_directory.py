@@ -99,9 +99,8 @@ def test_one_error_does_not_stop_the_others(top: Path, store: Path) -> None:
     code, _, err = record(store, top, "-q")
     assert code == 3  # of the first error
     assert counts(store) == {"a": 1, "run": 5, "other": 4, "bag": 11, "torn": 3}
-    assert err.count("aa.bag: not a log of a known kind") == 2  # when it is met, and at the end
+    assert err.count("aa.bag: not a log of a known kind") == 1
     assert f"{inner} is a store and is not searched; `hybridlog copy --from {inner}`" in err
-    assert "not recorded: " in err.splitlines()[-1]
 
 
 def test_parts_that_are_there_are_not_recorded_twice(top: Path, store: Path) -> None:
@@ -209,8 +208,8 @@ def test_a_watch_goes_on_after_errors(
     code, _, err = record(store, top, "--watch", "--settle", "0s")
     assert code == 6
     assert counts(store) == {"a": 1, "run_0": 2, "run_1": 3, "other": 4, "bag": 11}
-    assert err.count("MongoDB is on holiday.") == 2
-    assert err.count("not recorded: ") == 2
+    assert err.count("MongoDB is on holiday.") == 1
+    assert "2 not recorded" in err
     assert "bad.db3" in err
 
 

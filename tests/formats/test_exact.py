@@ -24,7 +24,7 @@ def test_mcap_carries_everything(tmp_path: Path) -> None:
     path = tmp_path / "out.mcap"
     channels = [*ros1_channels(), Channel("plain", "json", None), Channel("plain", "", None)]
     first, second = many(400, channels=5), many(300, channels=5, start=2 * 10**18)
-    with McapWriter(path, profile="ros1", chunk_size=2000) as writer:
+    with McapWriter(path, profile="ros1") as writer:
         writer.write(first, channels)
         # The same channels again as other objects, in another order.
         turned = [Channel(c.topic, c.message_encoding, c.schema, c.metadata) for c in channels][
@@ -71,8 +71,7 @@ def test_empty_mcap() -> None:
     assert summary.statistics.message_count == 0
 
 
-@pytest.mark.parametrize("compression", ["none", "bz2", "lz4"])
-def test_bag_carries_everything(tmp_path: Path, compression: str) -> None:
+def test_bag_carries_everything(tmp_path: Path) -> None:
     path = tmp_path / "out.bag"
     channels = ros1_channels()
     # Enough for several chunks of a mebibyte.
@@ -81,12 +80,11 @@ def test_bag_carries_everything(tmp_path: Path, compression: str) -> None:
         [row % 3 for row in range(300)],
         [10**18 + row for row in range(300)],
     )
-    with BagWriter(path, compression=compression) as writer:  # type: ignore[arg-type]
+    with BagWriter(path) as writer:
         writer.write(source.take(slice(0, 150)), channels)
         writer.write(source.take(slice(150, 300)), ros1_channels())
     content = path.read_bytes()
-    if compression == "none":
-        assert b"# caf\xe9, in Latin-1" in content
+    assert b"# caf\xe9, in Latin-1" in content
     assert b"hybridlog" not in content
     # rosbags wants definitions in UTF-8; the bytes of the Latin-1 one were seen above.
     path.write_bytes(content.replace(b"caf\xe9", b"cafe"))

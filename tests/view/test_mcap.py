@@ -17,12 +17,13 @@ from mcap.reader import NonSeekingReader, SeekingReader
 from starlette.testclient import TestClient
 
 import hybridlog as hl
-from hybridlog.formats.slices import SliceCache, payload_bytes, write_mcap
+from hybridlog.formats.slices import cached_slice, payload_bytes, write_mcap
 from hybridlog.view.loopback import Admission
 from hybridlog.view.server import make_app
 from hybridlog_storage.errors import UsageError
 from hybridlog_storage.messages import Channel
 from tests.independent import Seen, read_bag, read_mcap
+from tests.limits import Limit
 from tests.view.conftest import PORT, TOKEN, served
 from tests.waiting import at_once
 
@@ -157,13 +158,12 @@ def test_the_bytes_are_the_same_when_the_file_was_lost(app: TestClient, cache: P
 
 
 def test_more_messages_are_another_file(tmp_path: Path) -> None:
-    slices = SliceCache(tmp_path / "slices")
     with hl.open(tmp_path / "store", create=True) as store:
         files = []
         for count in (1, 2):
             with store.start(f"run {count}") as recording:
                 recording.write(Channel("/n", "json", None), b"{}", log_time=count)
-            files.append(slices.get(store.topic("/n"), "run", write_mcap))
+            files.append(cached_slice(store.topic("/n"), "run", write_mcap))
             assert len(read_mcap(files[-1])) == count
         assert files[0] != files[1]
 
@@ -285,24 +285,23 @@ def test_a_page_of_foxglove_reads_ranges(demo_store: hl.Store, page: Page) -> No
         assert content_range.startswith("bytes 0-7/")
 
 
-def test_the_oldest_slices_make_room(demo_store: hl.Store, tmp_path: Path) -> None:
+def test_the_oldest_slices_make_room(demo_store: hl.Store, cache: Path, limit: Limit) -> None:
+    for path in cache.glob("*"):
+        path.unlink()
     queries = [demo_store.query([topic]) for topic in ("/odom", "/tf", "/joint_states")]
-    room = SliceCache(tmp_path / "slices")
-    first, second = (room.get(query, "a" * 300, write_mcap) for query in queries[:2])
+    first, second = (cached_slice(query, "a" * 300, write_mcap) for query in queries[:2])
     taken = first.stat().st_size + second.stat().st_size
-    small = SliceCache(tmp_path / "slices", max_bytes=taken + payload_bytes(queries[2]) - 1)
-    assert small.get(queries[0], "a" * 300, write_mcap) == first, "it is used again, so newer"
-    third = small.get(queries[2], "c", write_mcap)
-    assert sorted((tmp_path / "slices").iterdir()) == sorted([first, third])
-    assert not second.exists()
-    tiny = SliceCache(tmp_path / "slices", max_bytes=100)
+    limit(cached_slices_bytes=taken + payload_bytes(queries[2]) - 1)
+    assert cached_slice(queries[0], "a" * 300, write_mcap) == first, "it is used again, so newer"
+    third = cached_slice(queries[2], "c", write_mcap)
+    assert sorted(cache.iterdir()) == sorted([first, third])
+    limit(cached_slices_bytes=100)
     with pytest.raises(UsageError, match="choose fewer topics or less time"):
-        tiny.get(queries[1], "b", write_mcap)
+        cached_slice(queries[1], "b", write_mcap)
     assert first.exists(), "a slice that is refused removes nothing"
 
 
-def test_a_slice_is_written_once_and_wholly(demo_store: hl.Store, tmp_path: Path) -> None:
-    slices = SliceCache(tmp_path / "slices")
+def test_a_slice_is_written_once_and_wholly(demo_store: hl.Store) -> None:
     query = demo_store.query(["/odom"])
     writers = []
     together = threading.Barrier(4)
@@ -313,7 +312,7 @@ def test_a_slice_is_written_once_and_wholly(demo_store: hl.Store, tmp_path: Path
 
     def get() -> None:
         together.wait()
-        slices.get(copy(query), "odom", write)
+        cached_slice(copy(query), "once", write)
 
     at_once(*[get] * 4)
     assert len(writers) == 1
@@ -323,8 +322,8 @@ def test_a_slice_is_written_once_and_wholly(demo_store: hl.Store, tmp_path: Path
         raise OSError("no")
 
     with pytest.raises(OSError, match="no"):
-        slices.get(demo_store.query(["/tf"]), "tf", fail)
-    assert slices.get(demo_store.query(["/tf"]), "tf", write).exists()
+        cached_slice(demo_store.query(["/tf"]), "wholly", fail)
+    assert cached_slice(demo_store.query(["/tf"]), "wholly", write).exists()
 
 
 def test_every_parameter_survives_the_manifest(app: TestClient) -> None:

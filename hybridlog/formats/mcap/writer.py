@@ -53,16 +53,9 @@ class McapWriter(LogWriter):
     Args:
         target: Path or binary stream.
         profile: MCAP profile: `ros1`, `ros2` or empty.
-        chunk_size: Uncompressed bytes at which a chunk ends.
     """
 
-    def __init__(
-        self,
-        target: Target,
-        *,
-        profile: str = "",
-        chunk_size: int = 4 << 20,
-    ) -> None:
+    def __init__(self, target: Target, *, profile: str = "") -> None:
         self._sink = Sink(target)
         self._schemas: dict[Schema, int] = {}
         self._ids: dict[_ChannelKey, int] = {}
@@ -70,7 +63,7 @@ class McapWriter(LogWriter):
         try:
             self._writer = _Writer(
                 cast("IO[Any]", self._sink),
-                chunk_size=chunk_size,
+                chunk_size=4 << 20,
                 compression=CompressionType.ZSTD,
             )
             self._writer.start(profile=profile, library="hybridlog")

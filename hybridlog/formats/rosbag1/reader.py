@@ -293,7 +293,10 @@ class Rosbag1Source(Source):
         connections, pos = 0, self._index_pos
         while pos < self.size_bytes:
             record = self._record(pos)
-            if record is None and pos > self._index_pos and (end := self._behind_zeros(pos)):
+            if record is None and pos > self._index_pos:  # zeros, as some recorders write them
+                end = self._search(pos) or self.size_bytes
+                if not self._are_zeros(pos, end):
+                    return
                 pos = end
                 continue
             if record is None or record.end > min(self.size_bytes, record.start + MAX_PAYLOAD):
@@ -354,17 +357,8 @@ class Rosbag1Source(Source):
         """True if a record starts at a position, or the file ends there."""
         return pos == self.size_bytes or self._plain_record(pos) is not None
 
-    def _behind_zeros(self, pos: int) -> int | None:
-        """Position of the record, or end of the file, behind zeros; None without one."""
-        end = pos
-        self._file.seek(pos)
-        while data := self._file.read(_STEP):
-            rest = data.lstrip(b"\0")
-            end += len(data) - len(rest)
-            if rest:
-                break
-        # The first bytes of a record may be zeros, too.
-        return next(filter(self._is_sound, range(max(pos + 1, end - 3), end + 1)), None)
+    def _are_zeros(self, pos: int, end: int) -> bool:
+        return 0 < end - pos <= _WINDOW and not self._read(pos, end - pos).strip(b"\0")
 
     def _search(self, pos: int) -> int | None:
         """First position at or behind `pos` that looks like a record."""
@@ -446,17 +440,17 @@ class Rosbag1Source(Source):
 
     def _skip(self, pos: int, start: int) -> int:
         """Go from damage at `pos` to the first record at or behind `start`."""
-        behind = self._behind_zeros(pos)
-        if self._chunks and behind is not None and not self._listed(pos, behind):
-            self._zeros.append(range(pos, behind))
-            return behind
+        found = self._search(start)
+        end = found or self.size_bytes
+        if self._chunks and self._are_zeros(pos, end) and not self._listed(pos, end):
+            self._zeros.append(range(pos, end))
+            return end
         place = self._place_at(start)
         place.is_torn = place.start < start and place.end <= start
-        found = self._search(start)
         place.is_cut = found is None
         what = "bytes that are no record" if found else "the file ends in a record that starts"
         place.reasons.append(f"{what} at byte {pos}")
-        return found or self.size_bytes
+        return end
 
     # Chunks.
 

@@ -7,7 +7,7 @@ import shutil
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO, Literal, cast
+from typing import TYPE_CHECKING, BinaryIO, cast
 
 from rosbags.rosbag1.reader import RecordType
 from rosbags.rosbag1.writer import Header, WriteChunk
@@ -45,12 +45,9 @@ class BagWriter(LogWriter):
     Args:
         target: Path or binary stream. A bag's header is written last, so for a stream the bag
             is written to a temporary file first.
-        compression: Compression of chunks.
     """
 
-    def __init__(
-        self, target: Target, *, compression: Literal["none", "bz2", "lz4"] = "none"
-    ) -> None:
+    def __init__(self, target: Target) -> None:
         self._stream: BinaryIO | None = None
         self._final: Path | None = None
         self._connections: dict[_ConnectionKey, Connection] = {}
@@ -70,8 +67,6 @@ class BagWriter(LogWriter):
                 self._unfinished = scratch_directory()
                 self._temporary = self._unfinished.path / "output.bag"
             self._writer = _ExactWriter(self._temporary)
-            if compression != "none":
-                self._writer.set_compression(RosbagsWriter.CompressionFormat[compression.upper()])
             try:
                 self._writer.open()
             except BaseException:

@@ -87,13 +87,11 @@ _NO_FILES = {"", ".", ".."}
 # Keys at any depth; the rest, such as the list of topics, is skipped.
 _WANTED = frozenset(
     {
-        "compression_mode",
         "files",
         "message_count",
         "path",
         "relative_file_paths",
         "rosbag2_bagfile_information",
-        "storage_identifier",
     }
 )
 
@@ -106,13 +104,11 @@ class BagMetadata:
         files: Paths of its files in order, below the bag's folder.
         counts: Number of messages of each file, if stated.
         message_count: Total number of messages, None if unknown.
-        packed_messages: Whether each payload is a zstd frame.
     """
 
     files: list[str] = field(default_factory=list)
     counts: dict[str, int] = field(default_factory=dict)
     message_count: int | None = None
-    packed_messages: bool = False
 
 
 def parse_metadata(text: str) -> BagMetadata:
@@ -124,8 +120,7 @@ def parse_metadata(text: str) -> BagMetadata:
     if len(text) > MAX_BYTES:
         raise YamlError(f"it has more than {MAX_BYTES >> 20} MiB")
     bag = _mapping(parse_yaml(text, _WANTED))
-    # The copy in a database has no outer key.
-    bag = bag if "storage_identifier" in bag else _mapping(bag.get("rosbag2_bagfile_information"))
+    bag = _mapping(bag.get("rosbag2_bagfile_information"))
     if not bag:
         raise YamlError("it does not describe a bag")
     listed = _list(bag.get("files"))
@@ -139,12 +134,10 @@ def parse_metadata(text: str) -> BagMetadata:
     if len(files) > MAX_FILES:
         raise YamlError(f"it lists more than {MAX_FILES} files")
     total = _count(bag.get("message_count"))
-    mode = bag.get("compression_mode")
     return BagMetadata(
         files=list(dict.fromkeys(name for name in files if name not in _NO_FILES)),
         counts=counts,
         message_count=total,
-        packed_messages=isinstance(mode, str) and mode.lower() == "message",
     )
 
 

@@ -20,9 +20,7 @@ from hybridlog.formats.reading import (
     Source,
     cannot_open,
 )
-from hybridlog.formats.rosbag2.directory import parse_metadata
 from hybridlog.formats.spool import copy_start
-from hybridlog.formats.yaml_values import YamlError
 from hybridlog.schema.definition_text import interface_of
 from hybridlog.wording import listed
 from hybridlog_storage.errors import SourceError
@@ -107,7 +105,6 @@ class SqliteSource(Source):
         self._select = f"SELECT {chosen} FROM messages WHERE rowid >= ? ORDER BY rowid"  # noqa: S608
         self._db.execute(f"{self._select} LIMIT 0", (0,)).fetchall()
         self._has_publish_time = has_publish_time
-        self._read_metadata(tables)
         self._read_topics(topics, tables)
         self._read_totals(log_time)
 
@@ -124,17 +121,6 @@ class SqliteSource(Source):
 
     def _columns(self, table: str) -> set[str]:
         return {row[1] for row in self._db.execute(f"PRAGMA table_info({table})")}
-
-    def _read_metadata(self, tables: set[str]) -> None:
-        """Read the bag's own metadata if it exists."""
-        if "metadata" in tables:
-            query = "SELECT metadata FROM metadata ORDER BY id DESC LIMIT 1"
-            for (text,) in self._optional(query):
-                try:
-                    found = parse_metadata(text if isinstance(text, str) else "")
-                except YamlError:
-                    continue  # the recorder's copy of what the tables say
-                self.packed_messages = found.packed_messages
 
     def _read_topics(self, columns: set[str], tables: set[str]) -> None:
         definitions: dict[str, tuple[str, bytes]] = {}

@@ -12,7 +12,7 @@ from urllib.parse import urlencode
 
 from starlette.responses import FileResponse
 
-from hybridlog.formats.slices import fingerprint, write_mcap
+from hybridlog.formats.slices import cached_slice, fingerprint, write_mcap
 from hybridlog.query.asked import channels_of, spans_of
 from hybridlog.query.choice import Choice
 from hybridlog.query.predicate.tokens import MAX_TEXT
@@ -38,7 +38,7 @@ _MEDIA_TYPE: Final = "application/octet-stream"
 def slice_file(context: Context, params: RequestParams) -> Response:
     """A selection as an MCAP file; ranges of it can be asked for."""
     query = _query(context, params)
-    path = context.slices.get(query, _name(context, query), write_mcap)
+    path = cached_slice(query, _name(context, query), write_mcap)
     # The name has the digest of the question and of the state of its recordings.
     etag = path.stem.rpartition("-")[2]
     return FileResponse(path, headers={"ETag": f'"{etag}"'}, media_type=_MEDIA_TYPE)
