@@ -20,6 +20,8 @@ import pyarrow as pa
 
 from hybridlog.schema.arrow_columns import numbers
 from hybridlog.schema.arrow_types import COMPUTED_AS, is_number, numpy_type
+from hybridlog.tf.transform import Transform
+from hybridlog.tf.transform import interpolated as slerp
 from hybridlog_storage.times import BEGIN
 
 if TYPE_CHECKING:
@@ -36,7 +38,6 @@ UNKNOWN = BEGIN
 QUATERNIONS: Final = frozenset({"geometry_msgs/Quaternion", "geometry_msgs/msg/Quaternion"})
 _PARTS: Final = ("x", "y", "z", "w")
 _UNIT: Final = 1e-3  # greatest difference of a length from 1
-_STRAIGHT: Final = 0.9995  # cosine above which an arc is taken as a line
 _types = pa.types
 
 
@@ -169,18 +170,12 @@ def _on_the_sphere(
     low: NDArray[np.float64], high: NDArray[np.float64], weight: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Quaternions between quaternions, float64[n, 4]; `low` where one is not of unit length."""
+    none = np.zeros((len(low), 3))
     with np.errstate(invalid="ignore", divide="ignore"):
         lengths = [np.linalg.norm(part, axis=1, keepdims=True) for part in (low, high)]
         unit = np.abs(np.hstack(lengths) - 1).max(axis=1) <= _UNIT
-        begin, end = (part / length for part, length in zip((low, high), lengths, strict=True))
-        cosine = np.sum(begin * end, axis=1, keepdims=True)
-        end = np.where(cosine < 0, -end, end)
-        angle = np.arccos(np.minimum(np.abs(cosine), 1))
-        part = weight[:, np.newaxis]
-        arc = (np.sin((1 - part) * angle) * begin + np.sin(part * angle) * end) / np.sin(angle)
-        line = begin + (end - begin) * part
-        line /= np.linalg.norm(line, axis=1, keepdims=True)
-        between = np.where(np.abs(cosine) > _STRAIGHT, line, arc)
+        begin, end = (Transform(none, low / lengths[0]), Transform(none, high / lengths[1]))
+        between = slerp(begin, end, weight).rotation
     moves = unit & (weight > 0)
     # Where a part is NaN or missing, the result is NaN and not the message before.
     unknown = np.isnan(low).any(axis=1) | np.isnan(high).any(axis=1)

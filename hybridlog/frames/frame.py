@@ -24,7 +24,7 @@ from hybridlog.schema.arrow_types import is_list, is_numeric, is_text, lengths_o
 from hybridlog_storage.errors import MissingDependencyError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterable
 
     import pyarrow as pa
     from numpy.typing import NDArray
@@ -53,33 +53,6 @@ def frame_of_table(table: pa.Table) -> pd.DataFrame:
     """A frame of all columns of an Arrow table, with row numbers as the index."""
     data = {name: _array(table.column(place)) for place, name in enumerate(table.column_names)}
     return pd.DataFrame(data, index=pd.RangeIndex(table.num_rows), copy=False)
-
-
-def frame_of_intervals(
-    names: Sequence[str],
-    recording: NDArray[np.int32],
-    begin: NDArray[np.int64],
-    end: NDArray[np.int64],
-    messages: NDArray[np.int64],
-) -> pd.DataFrame:
-    """A frame of intervals, one in each row.
-
-    Args:
-        names: Ids of recordings.
-        recording: int32[n], index into `names`.
-        begin: int64[n], ns since the epoch.
-        end: int64[n], ns since the epoch.
-        messages: int64[n], number of messages.
-    """
-    chosen = np.array(names, object)[recording] if len(names) else np.empty(0, object)
-    data = {
-        "recording": pd.array(chosen, dtype=_string_dtype()),
-        "begin": pd.DatetimeIndex(begin.view("M8[ns]")).tz_localize("UTC").array,
-        "end": pd.DatetimeIndex(end.view("M8[ns]")).tz_localize("UTC").array,
-        "duration": (end - begin).view("m8[ns]"),
-        "messages": messages,
-    }
-    return pd.DataFrame(data)
 
 
 def _array(column: pa.ChunkedArray[Any]) -> Any:

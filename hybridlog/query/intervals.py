@@ -357,11 +357,20 @@ class Intervals:
 
     def to_pandas(self) -> pd.DataFrame:
         """A frame: `recording`, `begin`, `end` (UTC, ns), `duration`, `messages`."""
-        from hybridlog.frames.frame import frame_of_intervals
+        import pyarrow as pa
 
-        return frame_of_intervals(
-            self._recordings, self._recording, self._begin, self._end, self._messages
-        )
+        from hybridlog.frames.frame import frame_of_table
+        from hybridlog.schema.arrow_columns import numbers
+
+        names = pa.array(self._recordings, pa.string())
+        columns = {
+            "recording": names.take(pa.array(self._recording)),
+            "begin": numbers(self._begin, "time"),
+            "end": numbers(self._end, "time"),
+            "duration": numbers(self._end - self._begin, "duration"),
+            "messages": numbers(self._messages),
+        }
+        return frame_of_table(pa.table(columns))
 
     def _rows(self, recording: str) -> NDArray[np.intp]:
         """Places of the intervals of a recording, in order."""

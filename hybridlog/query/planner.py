@@ -72,8 +72,8 @@ class Planner:
             TimeError: the time range is empty, or outside all recordings.
             TopicError: a topic does not have the requested clock.
         """
-        found = self._ranges.resolve()
-        return self.batch_hint([part for one in found for part in self.parts_in(*one)])
+        found = [part for one in self._ranges.resolve() for part in self.parts_in(*one)]
+        return self.batch_hint(self._rows.fitting(found))
 
     def only_part(self) -> Part | None:
         """The only part of the question; None if it has several, or none.

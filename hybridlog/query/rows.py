@@ -240,7 +240,8 @@ class Rows:
 
     def fitting(self, parts: Sequence[Part]) -> list[Part]:
         """The parts without those of which a file of tables tells that nothing matches."""
-        self._count_by_file([part for part in parts if part.predicate is not None])
+        asked = [part for part in parts if part.predicate is not None and not part.needs_index]
+        self._count_by_file(asked)
         return [part for part in parts if self._counts.get(part) != _Count(0, 0)]
 
     def outcomes(self, part: Part) -> Iterator[MatchColumns]:

@@ -71,16 +71,16 @@ DURATIONS = "write a duration as 5s, 1m30s, 2h, 500ms, 250us, 100ns, or a number
 _NANOSECONDS_FROM = 10**14
 _SECOND = 10**9
 _EARLY_NS = 10**17
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _LONGEST_TEXT = 200
 
 _NUMBER = re.compile(r"([0-9]+)(?:\.([0-9]*))?")
 _NS = re.compile(r"([0-9]+)\s*ns", re.IGNORECASE)
 _ISO = re.compile(
-    r"(?P<year>[0-9]{4})(?:-(?P<month>[0-9]{2})-(?P<day>[0-9]{2})"
-    r"|(?P<month2>[0-9]{2})(?P<day2>[0-9]{2})(?=[Tt]))"
-    r"(?:(?:[Tt]|\s+)(?P<hour>[0-9]{2})"
-    r"(?::?(?P<minute>[0-9]{2})(?::?(?P<second>[0-9]{2})(?:[.,](?P<fraction>[0-9]+))?)?)?"
-    r"\s*(?P<zone>[Zz]|UTC|utc|[+-][0-9]{2}(?::?[0-9]{2})?)?)?"
+    r"(?P<date>[0-9]{4}-[0-9]{2}-[0-9]{2}|[0-9]{8}(?=[Tt]))"
+    r"(?:(?:[Tt]|\s+)(?P<time>[0-9]{2}(?::?[0-9]{2}(?P<second>:?[0-9]{2})?)?)"
+    r"(?(second)(?:[.,](?P<fraction>[0-9]+))?)"
+    r"\s*(?P<zone>[Zz]|UTC|utc|[+-][0-9]{2}(?::?[0-5][0-9])?)?)?"
 )
 _PART = r"(?:([0-9]+)(?:\.([0-9]+))?\s*{}\s*)?"
 _UNITS: tuple[tuple[str, int], ...] = (
@@ -339,27 +339,13 @@ def _nanoseconds(digits: str | None, word: str) -> int:
 
 
 def _from_iso(iso: re.Match[str], word: str) -> int:
+    zone = iso["zone"] or "Z"
+    zone = zone if zone[0] in "+-" else "Z"
     try:
-        moment = datetime(
-            int(iso["year"]),
-            int(iso["month"] or iso["month2"]),
-            int(iso["day"] or iso["day2"]),
-            int(iso["hour"] or 0),
-            int(iso["minute"] or 0),
-            int(iso["second"] or 0),
-            tzinfo=UTC,
-        )
+        moment = datetime.fromisoformat(f"{iso['date']}T{iso['time'] or '00'}{zone}")
     except ValueError as error:
         raise TimeError(f"{_shown(word)} is no valid date: {error}") from None
-    seconds = calendar.timegm(moment.timetuple())
-    zone = iso["zone"]
-    if zone and zone[0] in "+-":
-        digits = zone[1:].replace(":", "").ljust(4, "0")
-        hours, minutes = int(digits[:2]), int(digits[2:])
-        if hours > 23 or minutes > 59:
-            raise TimeError(f"{_shown(word)} has no valid zone: {zone}")
-        shift = hours * 3_600 + minutes * 60
-        seconds -= shift if zone[0] == "+" else -shift
+    seconds = (moment - _EPOCH) // timedelta(seconds=1)
     return seconds * _SECOND + _nanoseconds(iso["fraction"], word)
 
 

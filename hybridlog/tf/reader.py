@@ -12,6 +12,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from hybridlog.frames.answer import stream, to_arrow
+from hybridlog.frames.columns import flat
 from hybridlog.query.answers.lost import completeness_of
 from hybridlog.query.answers.match_times import match_times
 from hybridlog.query.counters import Counters
@@ -204,7 +205,7 @@ def _transforms_of(table: pa.Table) -> pa.Table:
     columns = {name: table[name].combine_chunks() for name in table.column_names}
     if "transforms" in columns:
         times = times.take(pc.list_parent_indices(columns["transforms"]))
-        columns = _leaves(columns["transforms"].flatten())
+        columns = flat(columns["transforms"].flatten())
     is_foxglove = "parent_frame_id" in columns
     stamp, parent, pose = (
         ("timestamp", "parent_frame_id", "")
@@ -224,14 +225,6 @@ def _transforms_of(table: pa.Table) -> pa.Table:
         kind = pa.string() if own in {"parent", "child"} else pa.float64()
         found[own] = columns[name].cast(kind)
     return pa.table(found).drop_null()
-
-
-def _leaves(rows: pa.StructArray) -> dict[str, pa.Array]:
-    """The columns of nested rows, by path."""
-    table = pa.Table.from_struct_array(rows)
-    while any(pa.types.is_struct(one.type) for one in table.schema):
-        table = table.flatten()
-    return {name: table[name].combine_chunks() for name in table.column_names}
 
 
 def _nanoseconds(columns: Mapping[str, pa.Array], name: str) -> pa.Array:

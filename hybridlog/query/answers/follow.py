@@ -169,6 +169,10 @@ class _Arrived(Rows):
     def tabled(self, part: Part, fields: Collection[str] | None = ()) -> None:
         """No tables: they have older messages, too."""
 
+    def fitting(self, parts: Sequence[Part]) -> list[Part]:
+        """All of them."""
+        return [*parts]
+
     def count(self, parts: Sequence[Part]) -> int:
         """Count what has come."""
         return self.count_in_chunks(parts)
