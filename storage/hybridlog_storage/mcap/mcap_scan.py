@@ -10,7 +10,7 @@ import struct
 from bisect import bisect_right
 from contextlib import suppress
 from io import BytesIO
-from typing import TYPE_CHECKING, BinaryIO, Final, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, BinaryIO, Final, TypeAlias
 
 from mcap.opcode import Opcode
 
@@ -18,11 +18,14 @@ from hybridlog_storage.checksum import crc32
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.mcap.mcap_content import (
     LAST_KNOWN,
+    MAX_CHUNK_HEAD,
     MIN_RECORDS,
     RECORD_HEAD,
     ChunkContent,
+    ChunkHead,
     Damage,
     Record,
+    chunk_head_of,
     is_in_summary,
     parse_content,
     parse_parts,
@@ -51,8 +54,7 @@ MAGIC = b"\x89MCAP0\r\n"
 _FOOTER: Final = struct.Struct("<BQQQI")  # head, start of the summary and of its offsets, checksum
 _TAIL: Final = _FOOTER.size + len(MAGIC)
 _DATA_END: Final = RECORD_HEAD.pack(Opcode.DATA_END, 4)
-_CHUNK: Final = struct.Struct("<QQQII")  # start, end, size, checksum, length of codec name
-_CODECS: Final = frozenset({b"", b"zstd", b"lz4"})
+_CODECS: Final = frozenset({"", "zstd", "lz4"})
 _WINDOW: Final = 1 << 20
 _MAX_PLAIN: Final = 1 << 26  # largest record that is neither chunk, message nor attachment
 _MAX_SUMMARY: Final = 1 << 28
@@ -81,16 +83,6 @@ _FIRST_PRIVATE: Final = 0x80
 
 Item: TypeAlias = Record | Attachment | ChunkContent | Damage
 """An item of a scan."""
-
-
-class _Chunk(NamedTuple):
-    """Fields of a chunk record; `data` and `end` are bytes in the file."""
-
-    size: int
-    crc: int
-    codec: str
-    data: int
-    end: int
 
 
 class Scan:
@@ -201,7 +193,7 @@ class Scan:
             yield from self._record(at, opcode, at + HEAD + length)
 
     def _record(self, at: int, opcode: int, end: int) -> Iterator[tuple[int, Item]]:
-        chunk = self._chunk_fields(at)
+        chunk = self._chunk_head(at)
         listed = self._listed.get(at)
         if chunk is not None and chunk.end in {end, listed}:
             if opcode != Opcode.CHUNK or chunk.end != end:
@@ -231,31 +223,25 @@ class Scan:
 
     # Chunks
 
-    def _chunk_fields(self, at: int) -> _Chunk | None:
-        """The fields of a chunk record before its content; None if they are implausible."""
-        raw = self._bytes.at(at + HEAD, _CHUNK.size + 4 + 8)
-        if len(raw) < _CHUNK.size + 8:
+    def _chunk_head(self, at: int) -> ChunkHead | None:
+        """A chunk record with its places in the file; None if its fields are implausible."""
+        head = chunk_head_of(self._bytes.at(at, MAX_CHUNK_HEAD))
+        if head is None or head.codec not in _CODECS:
             return None
-        _, _, size, crc, name = _CHUNK.unpack_from(raw)
-        start = _CHUNK.size + name
-        codec = bytes(raw[_CHUNK.size : start])
-        if codec not in _CODECS or name != len(codec) or start + 8 > len(raw):
-            return None
-        data = at + HEAD + start + 8
-        return _Chunk(
-            size, crc, codec.decode(), data, data + int.from_bytes(raw[start : start + 8], "little")
-        )
+        return head._replace(start=at + head.start, end=at + head.end)
 
-    def _chunk(self, at: int, chunk: _Chunk) -> Iterator[tuple[int, Item]]:
+    def _chunk(self, at: int, chunk: ChunkHead) -> Iterator[tuple[int, Item]]:
         """The messages of a chunk, of its beginning if the file ends in it."""
         self._chunked, self._indexed = True, set()
         self._needs_crc |= not chunk.crc
         end = min(chunk.end, self._bytes.size)
         self._at = self._behind = end
         is_torn = self._is_torn = end < chunk.end
-        part = FilePart(self._file, chunk.data, end - chunk.data)
-        if end - chunk.data <= _WINDOW:
-            part = FilePart(BytesIO(self._bytes.at(chunk.data, len(part), move=True)), 0, len(part))
+        part = FilePart(self._file, chunk.start, end - chunk.start)
+        if end - chunk.start <= _WINDOW:
+            part = FilePart(
+                BytesIO(self._bytes.at(chunk.start, len(part), move=True)), 0, len(part)
+            )
         found = 0
         reason = "the file ends in the middle of a chunk" if is_torn else ""
         try:
@@ -280,9 +266,11 @@ class Scan:
             yield _damage(at, 0, reason, lost)
         yield at, content
 
-    def _damaged_chunk(self, at: int, end: int, chunk: _Chunk | None) -> Iterator[tuple[int, Item]]:
+    def _damaged_chunk(
+        self, at: int, end: int, chunk: ChunkHead | None
+    ) -> Iterator[tuple[int, Item]]:
         """A chunk whose lengths contradict each other."""
-        ends = [end] if chunk is None else [one for one in (chunk.end, end) if one >= chunk.data]
+        ends = [end] if chunk is None else [one for one in (chunk.end, end) if one >= chunk.start]
         right = next((one for one in ends if self._fits(at, one) and self._goes_on(one)), None)
         self._indexed = set()
         if right is None:
@@ -411,7 +399,7 @@ class Scan:
         i = bisect_right(self._starts, at)
         while i < len(self._starts) and self._starts[i] < end:
             start = self._starts[i]
-            listed, chunk = self._listed[start], self._chunk_fields(start)
+            listed, chunk = self._listed[start], self._chunk_head(start)
             head = self._bytes.at(start, HEAD)
             if head == RECORD_HEAD.pack(Opcode.CHUNK, max(listed - start - HEAD, 0)) or (
                 chunk is not None and chunk.end == listed
@@ -440,7 +428,7 @@ class Scan:
     def _is_start(self, at: int) -> bool:
         """True for a record that nothing else looks like, or for three in a row."""
         for _ in range(3):
-            end, chunk = self._end_of(at), self._chunk_fields(at)
+            end, chunk = self._end_of(at), self._chunk_head(at)
             if end is None or end == self._bytes.size:
                 return end is not None
             is_chunk = chunk is not None and chunk.end == end
@@ -457,7 +445,7 @@ class Scan:
         opcode, length = RECORD_HEAD.unpack_from(raw)
         end: int = at + HEAD + length
         if opcode == Opcode.CHUNK:  # it alone may run over the end: nothing else looks like it
-            chunk = self._chunk_fields(at)
+            chunk = self._chunk_head(at)
             return None if chunk is None or chunk.end > end else end
         if end > self._bytes.size or not (opcode in _IN_DATA or opcode >= _FIRST_PRIVATE):
             return None
@@ -471,7 +459,9 @@ class Scan:
         return at in {self._end_of_data, self._bytes.size} or self._end_of(at) is not None
 
 
-def _contents(chunk: _Chunk, part: FilePart, limit: int, *, torn: bool) -> Iterator[ChunkContent]:
+def _contents(
+    chunk: ChunkHead, part: FilePart, limit: int, *, torn: bool
+) -> Iterator[ChunkContent]:
     """The records of a chunk, after comparing its checksum; no checksum covers a torn one.
 
     Raises:

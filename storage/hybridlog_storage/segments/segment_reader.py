@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -26,7 +26,10 @@ from hybridlog_storage.disk.append_file import BLOCK, DIRECT
 from hybridlog_storage.errors import SegmentError, exhausted
 from hybridlog_storage.manifest import hasher
 from hybridlog_storage.mcap.mcap_content import (
+    MAX_CHUNK_HEAD,
     RECORD_HEAD,
+    ChunkHead,
+    chunk_head_of,
     parse_content,
     parse_summary,
 )
@@ -42,7 +45,6 @@ from hybridlog_storage.segments.chunk import StoredChunk
 from hybridlog_storage.segments.chunk_table import ChunkTable
 from hybridlog_storage.segments.compression import FilePart, decompress
 from hybridlog_storage.segments.segment_format import (
-    CHUNK_HEAD,
     CHUNK_TABLE_OPCODE,
     END_METADATA,
     FORMAT_VERSION,
@@ -213,21 +215,6 @@ class SegmentReader:
         """Close."""
         self.close()
 
-    def stream(self) -> BinaryIO:
-        """A new handle of the file for `scan`; the caller closes it.
-
-        Raises:
-            SegmentError: It cannot be opened.
-        """
-        try:
-            files.fetch(self._fd, [(0, self.size)])
-            return os.fdopen(os.dup(self._fd), "rb")
-        except OSError as error:
-            problem = f"{self.path} cannot be read: {error.strerror}."
-            raise (
-                exhausted(error.errno, f"reading {self.path}") or SegmentError(problem)
-            ) from error
-
     def grow(self) -> None:
         """Update the file's size after an append."""
         self.size = os.fstat(self._fd).st_size
@@ -357,15 +344,27 @@ class SegmentReader:
         Raises:
             SegmentError: It is damaged.
         """
-        start, size = index.offset + RECORD_HEAD.size, index.length - RECORD_HEAD.size
-        head = self.read(start, max(min(size, MAX_HEAD), 0))
-        part = FilePart(FileHandle(self._fd), start, size)
         try:
-            found, _ = parse_attachment(head, part, needs_crc=True)
+            found = self.attachment_at(index.offset, index.length)
         except SegmentError as error:
             raise self._lost("attachment", index, str(error)) from error
         if found.index(index.offset, index.length) != index:
             raise self._lost("attachment", index, "another one is there")
+        return found
+
+    def attachment_at(self, offset: int, length: int) -> Attachment:
+        """The attachment of a record, after checking all its bytes.
+
+        Raises:
+            SegmentError: It is damaged.
+        """
+        start, size = offset + RECORD_HEAD.size, length - RECORD_HEAD.size
+        head = self.read(start, max(min(size, MAX_HEAD), 0))
+        found, used = parse_attachment(
+            head, FilePart(FileHandle(self._fd), start, size), needs_crc=True
+        )
+        if used != size:
+            raise SegmentError("an attachment record is longer than its fields")
         return found
 
     def _lost(self, what: str, index: MetadataIndex | AttachmentIndex, why: str) -> SegmentError:
@@ -387,8 +386,8 @@ class SegmentReader:
         check_wanted()
         data = self.read(place.offset, place.length + place.trailer)
         try:
-            content, times, compressed = open_chunk(data[: place.length])
-            if times != (place.first, place.last):
+            content, head = open_chunk(data[: place.length])
+            if (head.first, head.last) != (place.first, place.last):
                 raise SegmentError("its times are not those of the chunk table")
             trailer = trailer_of(data[place.length :], place.offset)
             starts = trailer.starts()
@@ -397,7 +396,7 @@ class SegmentReader:
             seq = trailer.arrivals(len(batch))
         except SegmentError as error:
             raise self._damaged(place, error) from error
-        return place.stored(self.number, batch, seq, compressed)
+        return place.stored(self.number, batch, seq, head.end - head.start)
 
     def _damaged(self, place: ChunkPlace, error: SegmentError) -> SegmentError:
         return SegmentError(f"Chunk at byte {place.offset} of {self.path} is damaged: {error}")
@@ -533,29 +532,18 @@ def check_format(recording: Mapping[str, object], path: Path) -> None:
         )
 
 
-def open_chunk(record: memoryview) -> tuple[Buffer, tuple[int, int], int]:
-    """Content, first and last log time, and compressed size of a whole chunk record.
+def open_chunk(record: memoryview) -> tuple[Buffer, ChunkHead]:
+    """Content of a whole chunk record, and what stands before it.
 
     Raises:
         SegmentError: It is not a chunk record, or damaged.
     """
-    if len(record) < CHUNK_HEAD.size + 4:
-        raise SegmentError("the record is too short")
-    opcode, length, first, last, size, crc = CHUNK_HEAD.unpack_from(record)
-    if opcode != Opcode.CHUNK or length + RECORD_HEAD.size != len(record):
+    head = chunk_head_of(record[:MAX_CHUNK_HEAD])
+    if head is None or head.opcode != Opcode.CHUNK or head.length != len(record):
         raise SegmentError("no chunk record is there")
-    at = CHUNK_HEAD.size
-    (name_length,) = struct.unpack_from("<I", record, at)
-    at += 4
-    if name_length > 16 or at + name_length + 8 > len(record):
-        raise SegmentError("its compression cannot be read")
-    compression = bytes(record[at : at + name_length]).decode("ascii", "replace")
-    at += name_length
-    (compressed,) = struct.unpack_from("<Q", record, at)
-    at += 8
-    if compressed != len(record) - at:
+    if head.end != len(record):
         raise SegmentError("the length of its records is wrong")
-    content = decompress(compression, record[at:], size)
-    if crc32(content) != crc:
+    content = decompress(head.codec, record[head.start :], head.size)
+    if crc32(content) != head.crc:
         raise SegmentError("its checksum differs")
-    return content, (first, last), compressed
+    return content, head

@@ -32,10 +32,8 @@ from hybridlog_storage.segments.compression import Compressor
 from hybridlog_storage.segments.segment_file import Sealed, SegmentFile
 from hybridlog_storage.segments.segment_format import (
     END_METADATA,
-    entries_of,
     json_metadata,
     json_of,
-    last_time_of,
 )
 from hybridlog_storage.segments.segment_group import FIRST, LATCHED, Division, Key, SegmentGroup
 from hybridlog_storage.stopping import safe_point
@@ -598,9 +596,10 @@ class RecordingWriter:
     def _publish(self, chunk: PackedChunk, stored: StoredChunk) -> None:
         """Report that a chunk is in its segment."""
         self.totals.chunks += 1
-        for channel_id, data in chunk.indexes.items():
-            self.written[channel_id] += entries_of(data)
-            self._last_times[channel_id] = last_time_of(data)
+        rows = chunk.parts[["channel", "messages", "last"]].tolist()
+        for channel_id, messages, last in rows:
+            self.written[channel_id] += messages
+            self._last_times[channel_id] = last
         self._on_chunk(stored, self.channels)
         self._stored_bytes += chunk.uncompressed_size
         if self._on_written is not None:
