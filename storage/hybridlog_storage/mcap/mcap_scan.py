@@ -1,13 +1,11 @@
 """Reads an MCAP file forward, also a damaged one.
 
-Behind damage it goes on at the next chunk of the summary, or else where plausible records
-follow one another again.
+Behind damage it goes on where plausible records follow one another again.
 """
 
 from __future__ import annotations
 
 import struct
-from bisect import bisect_right
 from contextlib import suppress
 from io import BytesIO
 from typing import TYPE_CHECKING, BinaryIO, Final, TypeAlias
@@ -107,12 +105,7 @@ class Scan:
         self.summary: Summary | None = None
         self._stop: int | None = None  # end of the data by the summary
         self._read_summary()
-        self._listed: dict[int, int] = {}  # start and end of the chunks of the summary
-        if self.summary is not None:
-            for one in self.summary.chunk_indexes:
-                self._listed[one.chunk_start_offset] = one.chunk_start_offset + one.chunk_length
-        self._starts = sorted(self._listed)
-        self._chunked = bool(self._listed)
+        self._chunked = self.summary is not None and bool(self.summary.chunk_indexes)
         self._at = len(MAGIC)
         # End of the fields of the last record. If its length was wrong, the search for the next
         # one starts here.
@@ -194,16 +187,15 @@ class Scan:
 
     def _record(self, at: int, opcode: int, end: int) -> Iterator[tuple[int, Item]]:
         chunk = self._chunk_head(at)
-        listed = self._listed.get(at)
-        if chunk is not None and chunk.end in {end, listed}:
-            if opcode != Opcode.CHUNK or chunk.end != end:
+        if chunk is not None and chunk.end == end:
+            if opcode != Opcode.CHUNK:
                 yield _damage(
                     at, HEAD, "the head of a chunk is damaged; it is read all the same", 0
                 )
             yield from self._chunk(at, chunk)
         elif opcode == Opcode.CHUNK:
             yield from self._damaged_chunk(at, end, chunk)
-        elif not self._fits(at, end) or not (opcode in _IN_DATA or opcode > LAST_KNOWN):
+        elif end > self._end_of_data or not (opcode in _IN_DATA or opcode > LAST_KNOWN):
             what = f"a record of kind {opcode} claims {end - at - HEAD} bytes"
             yield self._lost(at, what if opcode else "no record starts here")
         elif opcode == Opcode.MESSAGE:
@@ -217,7 +209,7 @@ class Scan:
     def _begin_another(self) -> None:
         """Go on with another log whose bytes follow; its summary counts from its own beginning."""
         self._at = self._behind = self._at + len(MAGIC)
-        self._listed, self._starts, self._stop = {}, [], None
+        self._stop = None
         self._chunked = self._is_first = self._has_ended = False
         self._indexed = None
 
@@ -271,7 +263,7 @@ class Scan:
     ) -> Iterator[tuple[int, Item]]:
         """A chunk whose lengths contradict each other."""
         ends = [end] if chunk is None else [one for one in (chunk.end, end) if one >= chunk.start]
-        right = next((one for one in ends if self._fits(at, one) and self._goes_on(one)), None)
+        right = next((one for one in ends if self._goes_on(one)), None)
         self._indexed = set()
         if right is None:
             yield self._lost(at, f"a chunk record claims {end - at - HEAD} bytes")
@@ -297,8 +289,8 @@ class Scan:
             yield _damage(at, end - at, "a record is marked as a message but is none", 0)
             return
         self._needs_crc = True
-        until = self._next(at, self._end_of_data) or self._end_of_data
-        found = parse_content(self._bytes.rest(at)[: until - at], loose=True)
+        run = self._bytes.rest(at)[: self._end_of_data - at]
+        found = parse_content(run, loose=True)
         self._at = self._behind = at + found.end
         yield from self._given(at, found)
 
@@ -324,7 +316,12 @@ class Scan:
                     else read_record(opcode, head)
                 )
             except SegmentError as error:
-                yield _damage(at, end - at, str(error), 0)
+                is_placed = self._goes_on(end)
+                yield (
+                    _damage(at, end - at, str(error), 0)
+                    if is_placed
+                    else self._lost(at, str(error))
+                )
                 return
             self._behind = start + found[1]
             if found[0] is not None:
@@ -390,35 +387,15 @@ class Scan:
 
     # Behind damage
 
-    def _fits(self, at: int, end: int) -> bool:
-        """True if a record reaches neither into a chunk of the summary nor over the end."""
-        return end <= self._end_of_data and self._next(at, end) is None
-
-    def _next(self, at: int, end: int) -> int | None:
-        """First chunk of the summary in `(at, end)`; entries that are wrong are forgotten."""
-        i = bisect_right(self._starts, at)
-        while i < len(self._starts) and self._starts[i] < end:
-            start = self._starts[i]
-            listed, chunk = self._listed[start], self._chunk_head(start)
-            head = self._bytes.at(start, HEAD)
-            if head == RECORD_HEAD.pack(Opcode.CHUNK, max(listed - start - HEAD, 0)) or (
-                chunk is not None and chunk.end == listed
-            ):
-                return start
-            del self._starts[i], self._listed[start]
-        return None
-
     def _torn(self, at: int, reason: str) -> tuple[int, Item]:
         self._at, self._is_torn = self._bytes.size, True
         return _damage(at, self._bytes.size - at, reason)
 
     def _lost(self, at: int, reason: str) -> tuple[int, Item]:
-        """Skip to the next chunk of the summary, or to the next records that are whole."""
+        """Skip to the next records that are whole."""
         start = self._behind if self._behind < at else at + 1
         kinds = _BETWEEN_CHUNKS if self._chunked else _IN_DATA
-        end = self._end_of_data
-        found = self._next(at, end) or self._bytes.search(start, end, kinds, self._is_start)
-        found = found or self._stop
+        found = self._bytes.search(start, self._end_of_data, kinds, self._is_start) or self._stop
         if found is None:
             return self._torn(at, f"the file ends in the middle of a record: {reason}")
         where = min(at, self._behind, found)

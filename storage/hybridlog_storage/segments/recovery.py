@@ -265,6 +265,7 @@ class _Rest:
         if self._reader.size < end + len(tail):
             segment.cut(end)
             return
-        segment.rewrite(end, tail)
+        if bytes(self._reader.read(end, len(tail))) != tail:
+            segment.rewrite(end, tail)
         segment.cut(end + len(tail))
         segment.note_complete()
