@@ -99,12 +99,13 @@ def repair(
 def _repair_one(directory: StoreDirectory, catalog: Catalog, recording: str) -> list[Repaired]:
     done = _put_manifest_right(directory, recording)
     rebuilt, lost = _segments(directory.recording(recording), take_inventory(directory, recording))
+    done += rebuilt
     inventory = take_inventory(directory, recording)
     for misfit in inventory.misfits:
         place = misfit.file or f"segment {misfit.segment}"
         what = f"{misfit.reason}; restore it from a copy, if there is one"
         done.append(Repaired(inventory.name, place, what, is_cured=False))
-    return [*rebuilt, *done, *lost]
+    return [*done, *lost]
 
 
 def _segments(path: Path, inventory: Inventory) -> tuple[list[Repaired], list[Repaired]]:
