@@ -9,7 +9,7 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 from io import BytesIO
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias, cast
+from typing import TYPE_CHECKING, NamedTuple, cast
 
 import numpy as np
 from mcap import records
@@ -59,18 +59,6 @@ _PART = 4 << 20  # bytes of content that are read together
 
 MIN_RECORDS = 1 << 16
 """Records that a chunk may hold in addition to one a compressed byte."""
-
-Record: TypeAlias = (
-    records.AttachmentIndex
-    | records.Channel
-    | records.ChunkIndex
-    | records.Header
-    | records.Metadata
-    | records.MetadataIndex
-    | records.Schema
-    | records.Statistics
-)
-"""An MCAP record that is parsed into an object."""
 
 
 class ChunkHead(NamedTuple):
@@ -385,7 +373,7 @@ class _Fields(ReadDataStream):
         return data
 
 
-_READERS: dict[int, Callable[[ReadDataStream], Record]] = {
+_READERS: dict[int, Callable[[ReadDataStream], records.McapRecord]] = {
     Opcode.HEADER: records.Header.read,
     Opcode.SCHEMA: records.Schema.read,
     Opcode.CHANNEL: records.Channel.read,
@@ -397,7 +385,7 @@ _READERS: dict[int, Callable[[ReadDataStream], Record]] = {
 }
 
 
-def read_record(opcode: int, content: Buffer) -> tuple[Record | None, int]:
+def read_record(opcode: int, content: Buffer) -> tuple[records.McapRecord | None, int]:
     """Parse one record that is neither a message nor a chunk nor an attachment.
 
     Args:

@@ -11,6 +11,7 @@ from io import BytesIO
 from typing import TYPE_CHECKING, BinaryIO, Final, TypeAlias
 
 from mcap.opcode import Opcode
+from mcap.records import McapRecord
 
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.errors import SegmentError
@@ -22,7 +23,6 @@ from hybridlog_storage.mcap.mcap_content import (
     ChunkContent,
     ChunkHead,
     Damage,
-    Record,
     chunk_head_of,
     is_in_summary,
     parse_content,
@@ -79,7 +79,7 @@ _LEAST: Final[dict[int, int]] = {
 }
 _FIRST_PRIVATE: Final = 0x80
 
-Item: TypeAlias = Record | Attachment | ChunkContent | Damage
+Item: TypeAlias = McapRecord | Attachment | ChunkContent | Damage
 """An item of a scan."""
 
 
@@ -228,16 +228,11 @@ class Scan:
         self._needs_crc |= not chunk.crc
         end = min(chunk.end, self._bytes.size)
         self._at = self._behind = end
-        is_torn = self._is_torn = end < chunk.end
-        part = FilePart(self._file, chunk.start, end - chunk.start)
-        if end - chunk.start <= _WINDOW:
-            part = FilePart(
-                BytesIO(self._bytes.at(chunk.start, len(part), move=True)), 0, len(part)
-            )
+        self._is_torn = end < chunk.end
         found = 0
-        reason = "the file ends in the middle of a chunk" if is_torn else ""
+        reason = "the file ends in the middle of a chunk" if self._is_torn else ""
         try:
-            for content in _contents(chunk, part, self._limit, torn=is_torn):
+            for content in self._contents(chunk, end):
                 found += len(content.batch)
                 yield from self._given(at, content)
         except SegmentError as error:
@@ -245,6 +240,36 @@ class Scan:
         if reason:
             before = f"; {found} messages of its beginning were read" if found else ""
             yield _damage(at, end - at, reason + before)
+
+    def _contents(self, chunk: ChunkHead, end: int) -> Iterator[ChunkContent]:
+        """The records of a chunk, after comparing its checksum; no checksum covers a torn one.
+
+        Raises:
+            SegmentError: The rest does not decompress, or is not believed.
+        """
+        length, is_torn = end - chunk.start, end < chunk.end
+        if not is_torn and max(chunk.size, length) <= _MAX_WHOLE:
+            data = self._bytes.at(chunk.start, length, move=length <= _WINDOW)
+            content = decompress(chunk.codec, data, chunk.size, limit=self._limit)
+            if chunk.crc not in {0, crc32(content)}:
+                raise SegmentError("its checksum differs")
+            yield parse_content(content, most=MIN_RECORDS + length)
+            return
+        if chunk.size > self._limit:
+            raise SegmentError(
+                f"it claims {chunk.size} bytes uncompressed, more than the limit of {self._limit}"
+            )
+        part = FilePart(self._file, chunk.start, length)
+        if not is_torn:
+            if chunk.codec:
+                check_size(chunk.codec, chunk.size, length)
+            crc = 0
+            for piece in decompress_pieces(chunk.codec, part) if chunk.crc else ():
+                crc = crc32(piece, crc)
+            if crc != chunk.crc:
+                raise SegmentError("its checksum differs")
+        pieces = decompress_pieces(chunk.codec, part)
+        yield from parse_parts(pieces, chunk.size, length, torn=is_torn)
 
     def _given(self, at: int, content: ChunkContent) -> Iterator[tuple[int, Item]]:
         for reason in content.unreadable:
@@ -434,35 +459,6 @@ class Scan:
     def _goes_on(self, at: int) -> bool:
         """True if `at` is the start of a record or the end of the data."""
         return at in {self._end_of_data, self._bytes.size} or self._end_of(at) is not None
-
-
-def _contents(
-    chunk: ChunkHead, part: FilePart, limit: int, *, torn: bool
-) -> Iterator[ChunkContent]:
-    """The records of a chunk, after comparing its checksum; no checksum covers a torn one.
-
-    Raises:
-        SegmentError: The rest does not decompress, or is not believed.
-    """
-    if not torn and max(chunk.size, len(part)) <= _MAX_WHOLE:
-        content = decompress(chunk.codec, part.read(), chunk.size, limit=limit)
-        if chunk.crc not in {0, crc32(content)}:
-            raise SegmentError("its checksum differs")
-        yield parse_content(content, most=MIN_RECORDS + len(part))
-        return
-    if chunk.size > limit:
-        raise SegmentError(
-            f"it claims {chunk.size} bytes uncompressed, more than the limit of {limit}"
-        )
-    if not torn:
-        if chunk.codec:
-            check_size(chunk.codec, chunk.size, len(part))
-        crc = 0
-        for piece in decompress_pieces(chunk.codec, part) if chunk.crc else ():
-            crc = crc32(piece, crc)
-        if crc != chunk.crc:
-            raise SegmentError("its checksum differs")
-    yield from parse_parts(decompress_pieces(chunk.codec, part), chunk.size, len(part), torn=torn)
 
 
 def _damage(at: int, length: int, reason: str, messages: int | None = None) -> tuple[int, Item]:

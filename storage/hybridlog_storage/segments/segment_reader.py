@@ -129,7 +129,6 @@ class SegmentSummary:
         recording: Catalog entry of the recording at the start of the segment.
         end: The end of the recording; None except in its last segment.
         channels: Channels by id, and those of messages without payload, see `EXPIRED_IDS`.
-        schema_ids: Id of each channel's schema, 0 without one, by channel id.
         counts: Number of messages by channel id.
         losses: Rows of the loss ledger written with its messages.
         attachments: Attachments of the source, in file order.
@@ -142,7 +141,6 @@ class SegmentSummary:
     recording: dict[str, object]
     end: dict[str, object] | None
     channels: dict[int, Channel]
-    schema_ids: dict[int, int]
     counts: dict[int, int]
     losses: list[dict[str, Any]]
     attachments: list[AttachmentIndex]
@@ -308,7 +306,6 @@ class SegmentReader:
             recording=found[RECORDING_METADATA],
             end=found.get(END_METADATA),
             channels=with_expired(channels, counts),
-            schema_ids={i: r.schema_id for i, r in records.channels.items()},
             counts=counts,
             losses=losses,
             attachments=records.attachment_indexes,

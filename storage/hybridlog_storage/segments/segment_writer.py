@@ -107,7 +107,6 @@ class RecordingTotals:
 
     messages: int = 0
     payload_bytes: int = 0
-    stored_bytes: int = 0
     segments: int = 0
     chunks: int = 0
 
@@ -642,7 +641,6 @@ class RecordingWriter:
         self._on_sealing(group.prepare(sync=self.settings.sync != "never"))
         segments = [*group.segments.values()]
         self._closed += [segment.publish(sync=segment is segments[-1]) for segment in segments]
-        self.totals.stored_bytes += group.position
         self.totals.segments += len(segments)
         self._division.begin()
         self._group = None
