@@ -9,8 +9,8 @@ from __future__ import annotations
 import os
 import stat
 import struct
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -223,64 +223,48 @@ class SegmentReader:
         Raises:
             SegmentError: It is missing, damaged, or has another format.
         """
-        with self._explained():
-            return self._summary(*self._records())
+        return self._summary(*self._records())
 
-    @contextmanager
-    def _explained(self) -> Iterator[None]:
-        try:
-            yield
-        except _NoSummaryError as error:
-            raise SegmentError(
-                f"Segment {self.path} has no readable summary: {error}. It was sealed and has "
-                "changed since. A repair makes the summary again if all chunks are whole; else "
-                "restore the file, or see what is left with `mcap recover`."
-            ) from error
+    def _no_summary(self, why: object) -> SegmentError:
+        return SegmentError(
+            f"Segment {self.path} has no readable summary: {why}. It was sealed and has changed "
+            "since. A repair makes the summary again if all chunks are whole; else restore the "
+            "file, or see what is left with `mcap recover`."
+        )
 
     def _records(self) -> tuple[Summary, Buffer | None, int]:
         """The checked summary, the content of the chunk table, and where they start."""
         if self.size < len(MAGIC) + _TAIL:
-            raise _NoSummaryError("it is too short")
+            raise self._no_summary("it is too short")
         tail = self.read(self.size - _TAIL, _TAIL)
         opcode, length, start, offsets, crc = _FOOTER.unpack_from(tail)
         if bytes(tail[_FOOTER.size :]) != MAGIC or opcode != Opcode.FOOTER or length != 20:
-            raise _NoSummaryError("its end is damaged or missing")
+            raise self._no_summary("its end is damaged or missing")
         end = self.size - _TAIL
         if not len(MAGIC) <= start <= offsets <= end or end - start > _MAX_SUMMARY:
-            raise _NoSummaryError("its footer is damaged")
+            raise self._no_summary("its footer is damaged")
         data = self.read(start, self.size - start)
         if crc32(data[: len(data) - len(MAGIC) - 4]) != crc:
-            raise _NoSummaryError("its checksum differs")
+            raise self._no_summary("its checksum differs")
         try:
             # The chunk table says more than chunk indexes, and is faster to read.
             found, others = parse_summary(data[: len(data) - _TAIL], skipped=Opcode.CHUNK_INDEX)
         except SegmentError as error:
-            raise _NoSummaryError(str(error)) from error
+            raise self._no_summary(error) from error
         return found, others.get(CHUNK_TABLE_OPCODE), start
 
-    def _table(self, records: Summary, body: Buffer | None, start: int) -> ChunkTable:
+    def _table(self, body: Buffer | None, start: int) -> ChunkTable:
         if body is None:
-            self._refuse_other_format(records)
-            if all(index.name != RECORDING_METADATA for index in records.metadata_indexes):
-                raise SegmentError(f"{self.path} is no segment of a hybridlog store.")
-            raise _NoSummaryError("its chunk table is missing")
+            raise self._no_summary("its chunk table is missing")
         try:
             table = ChunkTable.from_bytes(body)
         except SegmentError as error:
-            self._refuse_other_format(records)
-            raise _NoSummaryError(str(error)) from error
+            raise self._no_summary(error) from error
         if table.end > start:
-            raise _NoSummaryError("its chunk table is of another file")
+            raise self._no_summary("its chunk table is of another file")
         return table
 
-    def _refuse_other_format(self, records: Summary) -> None:
-        """Raise if the header names another format."""
-        for index in records.metadata_indexes:
-            if index.name == RECORDING_METADATA:
-                check_format(json_of(self.metadata(index)), self.path)
-
     def _summary(self, records: Summary, body: Buffer | None, start: int) -> SegmentSummary:
-        table = self._table(records, body, start)
         found: dict[str, dict[str, object]] = {}
         losses: list[dict[str, Any]] = []
         for index in records.metadata_indexes:
@@ -294,10 +278,11 @@ class SegmentReader:
                 losses += loss_rows(json_of(self.metadata(index)))
         if RECORDING_METADATA not in found:
             raise SegmentError(f"{self.path} is no segment of a hybridlog store.")
+        table = self._table(body, start)
         stated = records.statistics.channel_message_counts if records.statistics else {}
         is_known = {*table.parts["channel"].tolist()} <= records.channels.keys()
         if _counts(table) != {c: n for c, n in stated.items() if n} or not is_known:
-            raise _NoSummaryError("its statistics and its chunk table differ")
+            raise self._no_summary("its statistics and its chunk table differ")
         if self._added:
             table = table.with_added(self._added)
         counts = _counts(table)
@@ -321,8 +306,7 @@ class SegmentReader:
         Raises:
             SegmentError: As `summary`.
         """
-        with self._explained():
-            return self._records()[0].metadata_indexes
+        return self._records()[0].metadata_indexes
 
     def metadata(self, index: MetadataIndex) -> Metadata:
         """A metadata record.
@@ -476,10 +460,6 @@ class SegmentReader:
             raise SegmentError(f"{self.path} gives {count - ahead} bytes of {length} at {offset}.")
         self.bytes_read += length
         return buffer[ahead:wanted]
-
-
-class _NoSummaryError(SegmentError):
-    """A summary that is missing or damaged."""
 
 
 def _counts(table: ChunkTable) -> dict[int, int]:
