@@ -51,7 +51,6 @@ MESSAGE_HEAD = RowType(
 
 _MESSAGE = int(Opcode.MESSAGE)
 _DEFINITIONS = frozenset({int(Opcode.SCHEMA), int(Opcode.CHANNEL)})
-_HELD = _DEFINITIONS | {_MESSAGE}  # kinds that are read in chunks
 _PAYLOAD = MESSAGE_HEAD.itemsize
 _FIELDS = _PAYLOAD - RECORD_HEAD.size
 _TIME_LIMIT = 1 << 63
@@ -210,7 +209,7 @@ def parse_parts(
         SegmentError: The rest cannot be read.
     """
     held, base, most = bytearray(), 0, MIN_RECORDS + compressed
-    wanted, passed = _PART, 0  # bytes to read at once, and to pass over
+    wanted = _PART  # bytes to read at once
     damage: SegmentError | None = None
     piece: Buffer = b"more"
     while piece:
@@ -218,10 +217,7 @@ def parse_parts(
             piece = next(pieces, b"")
         except SegmentError as error:
             damage, piece = error, b""
-        skipped = min(passed, len(piece))
-        passed -= skipped
-        base += skipped
-        held += memoryview(piece)[skipped:]
+        held += piece
         if base + len(held) > size:
             raise SegmentError(f"it decompresses to more bytes, not {size} as it claims")
         if piece and len(held) < min(wanted, max(size - base, 1)):
@@ -232,12 +228,7 @@ def parse_parts(
         held = held[part.end :]  # the batch keeps the old one
         yield part
         if piece and len(held) >= RECORD_HEAD.size:
-            length = _believed(held, base, size, compressed)
-            wanted = max(_PART, length)
-            if held[0] not in _HELD:
-                wanted, passed = _PART, length - len(held)
-                base += len(held)
-                held = bytearray()
+            wanted = max(_PART, _believed(held, base, size, compressed))
     if damage is not None:
         raise damage
     found = base + len(held)
@@ -260,7 +251,7 @@ def _believed(held: bytearray, base: int, size: int, compressed: int) -> int:
         raise SegmentError(f"{where} has no kind")
     if base + length > size:
         raise SegmentError(f"{where} runs over the end at {size}")
-    if opcode in _HELD and (length > MAX_PAYLOAD or is_implausible(length, compressed)):
+    if length > MAX_PAYLOAD or is_implausible(length, compressed):
         raise SegmentError(f"{where} claims {length} bytes, too many to be believed")
     return int(length)
 

@@ -183,9 +183,6 @@ class SegmentFile:
         self._chunk_indexes = bytearray()  # as records: a long segment has many
         self._attachment_indexes: list[AttachmentIndex] = []
         self._metadata_indexes: list[MetadataIndex] = []
-        self._counts: dict[int, int] = {}
-        self._first: int | None = None
-        self._last = 0
         self._sealed: Sealed | None = None  # once the file is complete
         self._finished = False  # once it is closed
 
@@ -366,11 +363,6 @@ class SegmentFile:
         place = chunk.chunk_start_offset, chunk.chunk_length, trailer
         self.table.chunk(place, span, parts)
         self._chunk_indexes += record_bytes(chunk)
-        counts = zip(parts["channel"].tolist(), parts["messages"].tolist(), strict=True)
-        for channel, count in counts:
-            self._counts[channel] = self._counts.get(channel, 0) + count
-        self._first = span[0] if self._first is None else min(self._first, span[0])
-        self._last = max(self._last, span[1])
 
     def rewrite(self, position: int, data: Buffer) -> None:
         """Overwrite bytes damaged by a crash or the disk."""
@@ -482,14 +474,15 @@ class SegmentFile:
         """The last records of a file with `at` bytes of data: the end of data, the summary."""
         end = record_bytes(DataEnd(data_section_crc=0))
         start = at = at + len(end)
-        body = self.table.build().to_bytes()
+        table = self.table.build()
+        body = table.to_bytes()
         groups: list[tuple[int, bytes]] = [
             (Opcode.SCHEMA, _joined(schema_record(i, s) for i, s in self.schemas.items())),
             (
                 Opcode.CHANNEL,
                 _joined(channel_record(i, sid, c) for i, (sid, c) in self.channels.items()),
             ),
-            (Opcode.STATISTICS, record_bytes(self._statistics())),
+            (Opcode.STATISTICS, record_bytes(self._statistics(table))),
             (Opcode.CHUNK_INDEX, bytes(self._chunk_indexes)),
             (Opcode.ATTACHMENT_INDEX, _joined(self._attachment_indexes)),
             (Opcode.METADATA_INDEX, _joined(self._metadata_indexes)),
@@ -509,15 +502,17 @@ class SegmentFile:
         footer.summary_crc = crc32(covered, crc32(summary))
         return end + summary + record_bytes(footer) + MAGIC
 
-    def _statistics(self) -> Statistics:
+    def _statistics(self, table: ChunkTable) -> Statistics:
+        counts = table.counts()
+        times = table.chunks[["first", "last"]]
         return Statistics(
             attachment_count=len(self._attachment_indexes),
             channel_count=len(self.channels),
-            channel_message_counts=dict(sorted(self._counts.items())),
+            channel_message_counts=counts,
             chunk_count=self.chunks,
-            message_count=sum(self._counts.values()),
-            message_end_time=self._last,
-            message_start_time=self._first or 0,
+            message_count=sum(counts.values()),
+            message_end_time=int(times["last"].max(initial=0)),
+            message_start_time=int(times["first"].min()) if len(times) else 0,
             metadata_count=len(self._metadata_indexes),
             schema_count=len(self.schemas),
         )

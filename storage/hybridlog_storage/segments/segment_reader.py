@@ -281,11 +281,11 @@ class SegmentReader:
         table = self._table(body, start)
         stated = records.statistics.channel_message_counts if records.statistics else {}
         is_known = {*table.parts["channel"].tolist()} <= records.channels.keys()
-        if _counts(table) != {c: n for c, n in stated.items() if n} or not is_known:
+        if table.counts() != {c: n for c, n in stated.items() if n} or not is_known:
             raise self._no_summary("its statistics and its chunk table differ")
         if self._added:
             table = table.with_added(self._added)
-        counts = _counts(table)
+        counts = table.counts()
         channels = {i: channel_of(r, records.schemas) for i, r in records.channels.items()}
         return SegmentSummary(
             recording=found[RECORDING_METADATA],
@@ -460,12 +460,6 @@ class SegmentReader:
             raise SegmentError(f"{self.path} gives {count - ahead} bytes of {length} at {offset}.")
         self.bytes_read += length
         return buffer[ahead:wanted]
-
-
-def _counts(table: ChunkTable) -> dict[int, int]:
-    """Messages of each channel in a table."""
-    totals = table.by_channel()
-    return dict(zip(totals["channel"].tolist(), totals["messages"].tolist(), strict=True))
 
 
 def places_of(table: ChunkTable) -> list[ChunkPlace]:
