@@ -7,7 +7,6 @@ are not opened.
 from __future__ import annotations
 
 import os
-import re
 import time
 from collections.abc import Collection, Mapping
 from collections.abc import Set as AbstractSet
@@ -52,8 +51,6 @@ if TYPE_CHECKING:
     from hybridlog_storage.segments.segment_file import Sealed
     from hybridlog_storage.summary import RecordingSummary, TopicType
 
-_LEFT_OVER = re.compile(r"\.[0-9.]+\.mcap\.([0-9a-f]{16}|rebuilt)")
-"""Names of files that were being written, and were to get another name when they were whole."""
 _RECOVERED_BYTES_PER_S = 200e6
 """Size of the open segments that are recovered in a second, about."""
 
@@ -352,7 +349,6 @@ def recover(directory: StoreDirectory, recording: str, report: RepairReport) -> 
         removed = directory.manifests.remove(recording)  # finishes it, or says that there is none
         report.removed.append(removed.name)
         return False
-    clear_away(directory, recording)
     listing = directory.listing(recording)
     for one in listing.left_over(manifest):
         try:
@@ -393,25 +389,7 @@ def is_unfinished(directory: StoreDirectory, recording: str) -> bool:
 def _is_interrupted(manifest: Manifest, listing: Listing) -> bool:
     """True if a recording goes on, or a process has left something to mend."""
     is_ended = manifest.is_ended and not listing.open
-    return (
-        not is_ended or bool(listing.left_over(manifest)) or any(map(is_left_over, listing.others))
-    )
-
-
-def is_left_over(name: str) -> bool:
-    """True if a file in a recording's directory is left from an interrupted step."""
-    return _LEFT_OVER.fullmatch(name) is not None
-
-
-def clear_away(directory: StoreDirectory, recording: str) -> None:
-    """Remove temporary files."""
-    path = directory.recording(recording)
-    for name in directory.listing(recording).others:
-        if _LEFT_OVER.fullmatch(name):
-            try:
-                files.unlink(path / name)
-            except OSError as error:
-                raise durability.explain(error, path / name, "removing") from error
+    return not is_ended or bool(listing.left_over(manifest))
 
 
 def recover_segments(

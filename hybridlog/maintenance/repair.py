@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -33,7 +33,7 @@ from hybridlog_storage.segments.segment_file import is_rows
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from hybridlog.entries import Inventory, Misfit
+    from hybridlog.entries import Inventory
     from hybridlog.maintenance.report import Progress, RepairReport
     from hybridlog_storage.catalog import Catalog, RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
@@ -98,51 +98,39 @@ def repair(
 
 def _repair_one(directory: StoreDirectory, catalog: Catalog, recording: str) -> list[Repaired]:
     done = _put_manifest_right(directory, recording)
-    done += _put_segments_right(directory, recording)
+    rebuilt, lost = _segments(directory.recording(recording), take_inventory(directory, recording))
+    done += rebuilt
     inventory = take_inventory(directory, recording)
     for misfit in inventory.misfits:
         place = misfit.file or f"segment {misfit.segment}"
         what = f"{misfit.reason}; restore it from a copy, if there is one"
         done.append(Repaired(inventory.name, place, what, is_cured=False))
-    return [*done, *_damage(directory.recording(recording), inventory)]
+    return [*done, *lost]
 
 
-def _damage(path: Path, inventory: Inventory) -> Iterator[Repaired]:
-    """Read every byte of segments and columns; damage in them can only be restored."""
-    for file, problem in damaged_files(path, inventory):
-        what = f"{problem}; {RESTORE}"
-        yield Repaired(inventory.name, file, what, is_cured=False)
-    for number in inventory.summaries:
-        name = inventory.listing.sealed[number]
+def _segments(path: Path, inventory: Inventory) -> tuple[list[Repaired], list[Repaired]]:
+    """Read every byte of segments and files of rows; make summaries again.
+
+    Returns:
+        What was repaired, and the damage that only a copy can restore.
+    """
+    rebuilt = []
+    lost = [*damaged_files(path, inventory)]
+    for number, name in inventory.listing.sealed.items():
+        log = inventory.logs.get(number)
         if is_rows(name):
             continue
-        digest = inventory.digest(number)
-        problems, _ = damage_of(path / name, digest)
-        if problems and rebuild_summary(path / name, digest):
-            yield Repaired(inventory.name, name, "its summary was rebuilt")
-        else:
-            for offset, problem, _ in problems:
-                what = f"{problem}; {RESTORE}"
-                yield Repaired(inventory.name, f"{name} byte {offset}", what, is_cured=False)
-
-
-def _put_segments_right(directory: StoreDirectory, recording: str) -> list[Repaired]:
-    """Rebuild damaged summaries."""
-    path = directory.recording(recording)
-    inventory = take_inventory(directory, recording)
-    return [
-        Repaired(inventory.name, misfit.file, "its summary was rebuilt")
-        for misfit in inventory.misfits
-        if misfit.file and _rebuild(inventory, misfit, path)
+        digest = log.digest if log is not None and log.name == name else ""
+        found, _ = damage_of(path / name, digest)
+        if found and digest and rebuild_summary(path / name, digest):
+            rebuilt.append(Repaired(inventory.name, name, "its summary was rebuilt"))
+        elif number in inventory.summaries:  # others are misfits
+            lost += [(f"{name} byte {offset}", problem) for offset, problem, _ in found]
+    told = [
+        Repaired(inventory.name, place, f"{problem}; {RESTORE}", is_cured=False)
+        for place, problem in lost
     ]
-
-
-def _rebuild(inventory: Inventory, misfit: Misfit, path: Path) -> bool:
-    """Rebuild a damaged summary, if the result has the digest in the manifest."""
-    log = inventory.logs.get(misfit.segment)
-    if log is None or log.name != misfit.file:
-        return False
-    return rebuild_summary(path / misfit.file, log.digest)
+    return rebuilt, told
 
 
 def _put_manifest_right(directory: StoreDirectory, recording: str) -> list[Repaired]:

@@ -338,10 +338,12 @@ def test_messages_without_definitions_are_counted(put: Callable[[bytes], Path]) 
 def test_times_past_int64_are_counted(put: Callable[[bytes], Path]) -> None:
     channel = Channel(1, "/x", "cdr", {}, 0)
     late = Message(1, 1 << 63, b"late", 0, 0)
-    found = read(put(raw(channel, message(1, 0), late, late, message(1, 3))))
-    assert [m.log_time for m in found.messages] == [0, 3]
-    assert found.lost == [2]
-    assert "2^63" in found.damage[0].reason
+    unpublished = Message(1, 5, b"5", (1 << 64) - 1, 3)
+    found = read(put(raw(channel, message(1, 0), late, late, unpublished, message(1, 9))))
+    # The log time stands for a publish time that is none.
+    assert [(m.log_time, m.publish_time) for m in found.messages] == [(0, 0), (5, 5), (9, 9)]
+    assert found.lost == [2, 0]
+    assert all("2^63" in damage.reason for damage in found.damage)
 
 
 def test_a_summary_that_counts_more_than_there_is_raises_suspicion(

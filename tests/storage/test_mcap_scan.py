@@ -162,21 +162,6 @@ def test_cut_contents_are_an_error_or_a_prefix(records: list[Any], data: st.Data
             parse_content(whole[:cut])
 
 
-def test_times_past_int64_are_left_out_and_named() -> None:
-    good = Message(1, 2**63 - 1, b"good", 0, 1)
-    late = Message(1, 2**63, b"late", 0, 2)
-    later = Message(1, 5, b"later", 2**64 - 1, 3)
-    channel = Channel(1, "t", "e", {}, 0)
-    content = parse_content(content_of(late, good, channel, later, good))
-    payloads = [bytes(content.batch.payload(i)) for i in range(len(content.batch))]
-    assert payloads == [b"good", b"later", b"good"]
-    # The log time stands for a publish time that is none.
-    assert content.batch.publish_time.tolist() == [0, 5, 0]
-    assert content.unpublished == 1
-    assert content.invalid.tolist() == [0]
-    assert [d.row for d in content.definitions] == [1]
-
-
 def test_messages_without_a_head_are_left_out_wherever_they_stand() -> None:
     good = content_of(Message(1, 2, b"", 3, 4))
     tiny = struct.pack("<BQ", Opcode.MESSAGE, 0)

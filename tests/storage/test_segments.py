@@ -867,8 +867,11 @@ def test_the_summary_says_where_the_chunk_table_is(tmp_path: Path) -> None:
 
 
 def test_a_table_that_does_not_end_before_the_summary_is_refused(tmp_path: Path) -> None:
-    whole, chunks = sample(tmp_path / "a")
-    path = tmp_path / "000000.mcap"
+    chunks: list[StoredChunk] = []
+    writer = recorder(tmp_path, chunks, SegmentSettings(chunk_size=1024))
+    writer.append(batch_of(many(50)), CHANNELS)
+    (path,) = writer.close()  # nothing follows the last chunk
+    whole = path.read_bytes()
     start, offsets = struct.unpack_from("<QQ", whole, len(whole) - 28)
     gone = start - chunks[-1].offset
     tail = bytearray(whole[start:-8])

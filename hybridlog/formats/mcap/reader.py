@@ -237,19 +237,16 @@ class _Definitions:
     def __init__(self, channels: list[Channel], summary: Summary | None) -> None:
         self.table = np.full(_IDS, _UNDEFINED, np.int32)
         self._channels = channels
-        # The summary repeats all definitions, also those in unreadable chunks.
-        self._schemas: dict[int, records.Schema] = dict(summary.schemas) if summary else {}
-        self._records: dict[int, records.Channel] = dict(summary.channels) if summary else {}
+        self._schemas: dict[int, records.Schema] = {}
+        self._records: dict[int, records.Channel] = {}
         self._schema_ids = np.zeros(_IDS, np.int32)  # by channel id
-        self._used: set[int] = set()  # schemas that channels have named
-        for record in self._records.values():
-            self._names(record)
         self._made: dict[tuple[object, ...], int] = {}  # indexes of channels by what they say
-        self._shared: dict[tuple[str, str, bytes], Schema] = {}
-
-    def _names(self, record: records.Channel) -> None:
-        self._schema_ids[record.id] = record.schema_id
-        self._used.add(record.schema_id)
+        # The summary repeats all definitions, also those in unreadable chunks.
+        if summary is not None:
+            for schema in summary.schemas.values():
+                self.add(schema)
+            for channel in summary.channels.values():
+                self.add(channel)
 
     def changes(self, record: records.Schema | records.Channel) -> bool:
         """True if this definition changes the meaning of an id."""
@@ -258,24 +255,22 @@ class _Definitions:
 
     def add(self, record: records.Schema | records.Channel) -> None:
         """Apply this definition from now on."""
-        known = self._known(record)
-        if known is not None and known == record:
+        if self._known(record) == record:
             return
         if isinstance(record, records.Channel):
             self._records[record.id] = record
-            self._names(record)
+            self._schema_ids[record.id] = record.schema_id
             self.table[record.id] = _UNDEFINED
         elif record.id:  # MCAP: a schema with id 0 is to be ignored
             self._schemas[record.id] = record
-            if record.id in self._used:
-                self.table[self._schema_ids == record.id] = _UNDEFINED
+            self.table[self._schema_ids == record.id] = _UNDEFINED
 
     def _known(
         self, record: records.Schema | records.Channel
     ) -> records.Schema | records.Channel | None:
-        if isinstance(record, records.Schema):
-            return self._schemas.get(record.id)
-        return self._records.get(record.id)
+        return (self._schemas if isinstance(record, records.Schema) else self._records).get(
+            record.id
+        )
 
     def use(self, channel_id: int) -> str:
         """Enter this id into the table, if it is defined.
@@ -286,9 +281,10 @@ class _Definitions:
         record = self._records.get(channel_id)
         if record is None or self.table[channel_id] != _UNDEFINED:
             return ""
-        schema = self._share(self._schemas.get(record.schema_id))
+        said = self._schemas.get(record.schema_id)
+        schema = None if said is None else Schema(said.name, said.encoding, said.data)
         metadata = tuple(sorted(record.metadata.items()))
-        key = (channel_id, record.topic, record.message_encoding, metadata, id(schema))
+        key = (channel_id, record.topic, record.message_encoding, metadata, schema)
         index = self._made.get(key)
         if index is not None:
             self.table[channel_id] = index
@@ -297,14 +293,8 @@ class _Definitions:
             self.table[channel_id] = _TOO_MANY
             return ""
         self.table[channel_id] = self._made[key] = len(self._channels)
-        self._channels.append(
-            Channel(
-                topic=record.topic,
-                message_encoding=record.message_encoding,
-                schema=schema,
-                metadata=record.metadata,
-            )
-        )
+        made = Channel(record.topic, record.message_encoding, schema, record.metadata)
+        self._channels.append(made)
         if schema is None and record.schema_id:
             return (
                 f"schema {record.schema_id} of channel {channel_id} ({record.topic}) is not "
@@ -318,9 +308,3 @@ class _Definitions:
         for number in rest:
             self.use(number)
         return int((self.table[rest] == _TOO_MANY).sum())
-
-    def _share(self, record: records.Schema | None) -> Schema | None:
-        if record is None:
-            return None
-        key = (record.name, record.encoding, record.data)
-        return self._shared.setdefault(key, Schema(*key))

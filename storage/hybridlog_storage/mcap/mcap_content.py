@@ -9,7 +9,7 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 from io import BytesIO
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias, cast
+from typing import TYPE_CHECKING, NamedTuple, cast
 
 import numpy as np
 from mcap import records
@@ -33,6 +33,12 @@ if TYPE_CHECKING:
 RECORD_HEAD = struct.Struct("<BQ")
 """Opcode and length of the content, at the start of every record."""
 
+CHUNK_HEAD = struct.Struct("<BQQQQII")
+"""A chunk record up to the name of its compression, whose length comes last."""
+MAX_CHUNK_HEAD = CHUNK_HEAD.size + 16 + 8
+"""Most bytes of a chunk record before its content."""
+_MAX_NAME = 16
+
 MESSAGE_HEAD = RowType(
     ("opcode", "u1"),
     ("length", "<u8"),
@@ -45,7 +51,6 @@ MESSAGE_HEAD = RowType(
 
 _MESSAGE = int(Opcode.MESSAGE)
 _DEFINITIONS = frozenset({int(Opcode.SCHEMA), int(Opcode.CHANNEL)})
-_HELD = _DEFINITIONS | {_MESSAGE}  # kinds that are read in chunks
 _PAYLOAD = MESSAGE_HEAD.itemsize
 _FIELDS = _PAYLOAD - RECORD_HEAD.size
 _TIME_LIMIT = 1 << 63
@@ -54,17 +59,46 @@ _PART = 4 << 20  # bytes of content that are read together
 MIN_RECORDS = 1 << 16
 """Records that a chunk may hold in addition to one a compressed byte."""
 
-Record: TypeAlias = (
-    records.AttachmentIndex
-    | records.Channel
-    | records.ChunkIndex
-    | records.Header
-    | records.Metadata
-    | records.MetadataIndex
-    | records.Schema
-    | records.Statistics
-)
-"""An MCAP record that is parsed into an object."""
+
+class ChunkHead(NamedTuple):
+    """A chunk record before its content.
+
+    Attributes:
+        opcode: Kind of the record.
+        length: Bytes of the record by its length field, the head included.
+        first: Smallest log time, ns.
+        last: Largest log time, ns.
+        size: Bytes of the content, uncompressed.
+        crc: CRC-32 of the content, 0 for none.
+        codec: MCAP name of the compression.
+        start: Bytes of the record before the compressed content.
+        end: Bytes of the record by the length of that content.
+    """
+
+    opcode: int
+    length: int
+    first: int
+    last: int
+    size: int
+    crc: int
+    codec: str
+    start: int
+    end: int
+
+
+def chunk_head_of(record: Buffer) -> ChunkHead | None:
+    """The beginning of a chunk record; None if it is too short, or no name of a codec is there."""
+    if len(record) < CHUNK_HEAD.size:
+        return None
+    opcode, length, first, last, size, crc, named = CHUNK_HEAD.unpack_from(record)
+    at = CHUNK_HEAD.size + named
+    name = bytes(record[CHUNK_HEAD.size : min(at, CHUNK_HEAD.size + _MAX_NAME)])
+    if named > _MAX_NAME or at + 8 > len(record) or not name.isascii():
+        return None
+    start = at + 8
+    end = start + int.from_bytes(record[at:start], "little")
+    length += RECORD_HEAD.size
+    return ChunkHead(opcode, length, first, last, size, crc, name.decode(), start, end)
 
 
 class Definition(NamedTuple):
@@ -175,7 +209,7 @@ def parse_parts(
         SegmentError: The rest cannot be read.
     """
     held, base, most = bytearray(), 0, MIN_RECORDS + compressed
-    wanted, passed = _PART, 0  # bytes to read at once, and to pass over
+    wanted = _PART  # bytes to read at once
     damage: SegmentError | None = None
     piece: Buffer = b"more"
     while piece:
@@ -183,10 +217,7 @@ def parse_parts(
             piece = next(pieces, b"")
         except SegmentError as error:
             damage, piece = error, b""
-        skipped = min(passed, len(piece))
-        passed -= skipped
-        base += skipped
-        held += memoryview(piece)[skipped:]
+        held += piece
         if base + len(held) > size:
             raise SegmentError(f"it decompresses to more bytes, not {size} as it claims")
         if piece and len(held) < min(wanted, max(size - base, 1)):
@@ -197,12 +228,7 @@ def parse_parts(
         held = held[part.end :]  # the batch keeps the old one
         yield part
         if piece and len(held) >= RECORD_HEAD.size:
-            length = _believed(held, base, size, compressed)
-            wanted = max(_PART, length)
-            if held[0] not in _HELD:
-                wanted, passed = _PART, length - len(held)
-                base += len(held)
-                held = bytearray()
+            wanted = max(_PART, _believed(held, base, size, compressed))
     if damage is not None:
         raise damage
     found = base + len(held)
@@ -225,7 +251,7 @@ def _believed(held: bytearray, base: int, size: int, compressed: int) -> int:
         raise SegmentError(f"{where} has no kind")
     if base + length > size:
         raise SegmentError(f"{where} runs over the end at {size}")
-    if opcode in _HELD and (length > MAX_PAYLOAD or is_implausible(length, compressed)):
+    if length > MAX_PAYLOAD or is_implausible(length, compressed):
         raise SegmentError(f"{where} claims {length} bytes, too many to be believed")
     return int(length)
 
@@ -282,27 +308,46 @@ def _batch(buffer: Buffer, starts: NDArray[np.int64]) -> tuple[Batch, NDArray[np
     # With a last record shorter than a head, the gather below would read over the end.
     good = starts + _PAYLOAD <= len(buffer)
     chosen = starts[good]
-    heads = np.empty(0, MESSAGE_HEAD)
-    if len(chosen):
-        # A view of a head at every byte of the buffer; only the needed ones are copied.
-        every = np.ndarray((len(buffer) - _PAYLOAD + 1,), MESSAGE_HEAD, buffer=buffer, strides=(1,))
-        heads = every[chosen]
+    heads = heads_at(buffer, chosen)
     right = (heads["length"] >= _FIELDS) & (heads["log_time"] < _TIME_LIMIT)
     if not right.all():
         heads, chosen = heads[right], chosen[right]
         good[good] = right
     late = heads["publish_time"] >= _TIME_LIMIT
-    publish_time = np.where(late, heads["log_time"], heads["publish_time"]).astype(np.int64)
-    batch = Batch(
+    if late.any():
+        heads["publish_time"] = np.where(late, heads["log_time"], heads["publish_time"])
+    return batch_of(buffer, chosen, heads), good, int(late.sum())
+
+
+def heads_at(buffer: Buffer, starts: NDArray[np.int64]) -> NDArray[np.void]:
+    """The heads of message records.
+
+    Args:
+        buffer: The content of a chunk.
+        starts: int64[n], where the records start; no head runs over the end.
+
+    Returns:
+        `MESSAGE_HEAD`[n].
+    """
+    if not len(starts):
+        return np.empty(0, MESSAGE_HEAD)
+    # A view of a head at every byte of the buffer; only the needed ones are copied.
+    places = (len(buffer) - _PAYLOAD + 1,)
+    every: NDArray[np.void] = np.ndarray(places, MESSAGE_HEAD, buffer=buffer, strides=(1,))
+    return every[starts]
+
+
+def batch_of(buffer: Buffer, starts: NDArray[np.int64], heads: NDArray[np.void]) -> Batch:
+    """The messages of a chunk with their heads, from `heads_at`."""
+    return Batch(
         buffer,
-        chosen + _PAYLOAD,
+        starts + _PAYLOAD,
         heads["length"].astype(np.int64) - _FIELDS,
         heads["channel"].astype(np.int32),
         heads["log_time"].astype(np.int64),
-        publish_time,
+        heads["publish_time"].astype(np.int64),
         heads["sequence"].astype(np.uint32),
     )
-    return batch, good, int(late.sum())
 
 
 class _Fields(ReadDataStream):
@@ -319,7 +364,7 @@ class _Fields(ReadDataStream):
         return data
 
 
-_READERS: dict[int, Callable[[ReadDataStream], Record]] = {
+_READERS: dict[int, Callable[[ReadDataStream], records.McapRecord]] = {
     Opcode.HEADER: records.Header.read,
     Opcode.SCHEMA: records.Schema.read,
     Opcode.CHANNEL: records.Channel.read,
@@ -331,7 +376,7 @@ _READERS: dict[int, Callable[[ReadDataStream], Record]] = {
 }
 
 
-def read_record(opcode: int, content: Buffer) -> tuple[Record | None, int]:
+def read_record(opcode: int, content: Buffer) -> tuple[records.McapRecord | None, int]:
     """Parse one record that is neither a message nor a chunk nor an attachment.
 
     Args:

@@ -1,28 +1,29 @@
 """Reads an MCAP file forward, also a damaged one.
 
-Behind damage it goes on at the next chunk of the summary, or else where plausible records
-follow one another again.
+Behind damage it goes on where plausible records follow one another again.
 """
 
 from __future__ import annotations
 
 import struct
-from bisect import bisect_right
 from contextlib import suppress
 from io import BytesIO
-from typing import TYPE_CHECKING, BinaryIO, Final, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, BinaryIO, Final, TypeAlias
 
 from mcap.opcode import Opcode
+from mcap.records import McapRecord
 
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.mcap.mcap_content import (
     LAST_KNOWN,
+    MAX_CHUNK_HEAD,
     MIN_RECORDS,
     RECORD_HEAD,
     ChunkContent,
+    ChunkHead,
     Damage,
-    Record,
+    chunk_head_of,
     is_in_summary,
     parse_content,
     parse_parts,
@@ -51,8 +52,7 @@ MAGIC = b"\x89MCAP0\r\n"
 _FOOTER: Final = struct.Struct("<BQQQI")  # head, start of the summary and of its offsets, checksum
 _TAIL: Final = _FOOTER.size + len(MAGIC)
 _DATA_END: Final = RECORD_HEAD.pack(Opcode.DATA_END, 4)
-_CHUNK: Final = struct.Struct("<QQQII")  # start, end, size, checksum, length of codec name
-_CODECS: Final = frozenset({b"", b"zstd", b"lz4"})
+_CODECS: Final = frozenset({"", "zstd", "lz4"})
 _WINDOW: Final = 1 << 20
 _MAX_PLAIN: Final = 1 << 26  # largest record that is neither chunk, message nor attachment
 _MAX_SUMMARY: Final = 1 << 28
@@ -79,18 +79,8 @@ _LEAST: Final[dict[int, int]] = {
 }
 _FIRST_PRIVATE: Final = 0x80
 
-Item: TypeAlias = Record | Attachment | ChunkContent | Damage
+Item: TypeAlias = McapRecord | Attachment | ChunkContent | Damage
 """An item of a scan."""
-
-
-class _Chunk(NamedTuple):
-    """Fields of a chunk record; `data` and `end` are bytes in the file."""
-
-    size: int
-    crc: int
-    codec: str
-    data: int
-    end: int
 
 
 class Scan:
@@ -115,12 +105,7 @@ class Scan:
         self.summary: Summary | None = None
         self._stop: int | None = None  # end of the data by the summary
         self._read_summary()
-        self._listed: dict[int, int] = {}  # start and end of the chunks of the summary
-        if self.summary is not None:
-            for one in self.summary.chunk_indexes:
-                self._listed[one.chunk_start_offset] = one.chunk_start_offset + one.chunk_length
-        self._starts = sorted(self._listed)
-        self._chunked = bool(self._listed)
+        self._chunked = self.summary is not None and bool(self.summary.chunk_indexes)
         self._at = len(MAGIC)
         # End of the fields of the last record. If its length was wrong, the search for the next
         # one starts here.
@@ -201,17 +186,16 @@ class Scan:
             yield from self._record(at, opcode, at + HEAD + length)
 
     def _record(self, at: int, opcode: int, end: int) -> Iterator[tuple[int, Item]]:
-        chunk = self._chunk_fields(at)
-        listed = self._listed.get(at)
-        if chunk is not None and chunk.end in {end, listed}:
-            if opcode != Opcode.CHUNK or chunk.end != end:
+        chunk = self._chunk_head(at)
+        if chunk is not None and chunk.end == end:
+            if opcode != Opcode.CHUNK:
                 yield _damage(
                     at, HEAD, "the head of a chunk is damaged; it is read all the same", 0
                 )
             yield from self._chunk(at, chunk)
         elif opcode == Opcode.CHUNK:
             yield from self._damaged_chunk(at, end, chunk)
-        elif not self._fits(at, end) or not (opcode in _IN_DATA or opcode > LAST_KNOWN):
+        elif end > self._end_of_data or not (opcode in _IN_DATA or opcode > LAST_KNOWN):
             what = f"a record of kind {opcode} claims {end - at - HEAD} bytes"
             yield self._lost(at, what if opcode else "no record starts here")
         elif opcode == Opcode.MESSAGE:
@@ -225,41 +209,30 @@ class Scan:
     def _begin_another(self) -> None:
         """Go on with another log whose bytes follow; its summary counts from its own beginning."""
         self._at = self._behind = self._at + len(MAGIC)
-        self._listed, self._starts, self._stop = {}, [], None
+        self._stop = None
         self._chunked = self._is_first = self._has_ended = False
         self._indexed = None
 
     # Chunks
 
-    def _chunk_fields(self, at: int) -> _Chunk | None:
-        """The fields of a chunk record before its content; None if they are implausible."""
-        raw = self._bytes.at(at + HEAD, _CHUNK.size + 4 + 8)
-        if len(raw) < _CHUNK.size + 8:
+    def _chunk_head(self, at: int) -> ChunkHead | None:
+        """A chunk record with its places in the file; None if its fields are implausible."""
+        head = chunk_head_of(self._bytes.at(at, MAX_CHUNK_HEAD))
+        if head is None or head.codec not in _CODECS:
             return None
-        _, _, size, crc, name = _CHUNK.unpack_from(raw)
-        start = _CHUNK.size + name
-        codec = bytes(raw[_CHUNK.size : start])
-        if codec not in _CODECS or name != len(codec) or start + 8 > len(raw):
-            return None
-        data = at + HEAD + start + 8
-        return _Chunk(
-            size, crc, codec.decode(), data, data + int.from_bytes(raw[start : start + 8], "little")
-        )
+        return head._replace(start=at + head.start, end=at + head.end)
 
-    def _chunk(self, at: int, chunk: _Chunk) -> Iterator[tuple[int, Item]]:
+    def _chunk(self, at: int, chunk: ChunkHead) -> Iterator[tuple[int, Item]]:
         """The messages of a chunk, of its beginning if the file ends in it."""
         self._chunked, self._indexed = True, set()
         self._needs_crc |= not chunk.crc
         end = min(chunk.end, self._bytes.size)
         self._at = self._behind = end
-        is_torn = self._is_torn = end < chunk.end
-        part = FilePart(self._file, chunk.data, end - chunk.data)
-        if end - chunk.data <= _WINDOW:
-            part = FilePart(BytesIO(self._bytes.at(chunk.data, len(part), move=True)), 0, len(part))
+        self._is_torn = end < chunk.end
         found = 0
-        reason = "the file ends in the middle of a chunk" if is_torn else ""
+        reason = "the file ends in the middle of a chunk" if self._is_torn else ""
         try:
-            for content in _contents(chunk, part, self._limit, torn=is_torn):
+            for content in self._contents(chunk, end):
                 found += len(content.batch)
                 yield from self._given(at, content)
         except SegmentError as error:
@@ -267,6 +240,36 @@ class Scan:
         if reason:
             before = f"; {found} messages of its beginning were read" if found else ""
             yield _damage(at, end - at, reason + before)
+
+    def _contents(self, chunk: ChunkHead, end: int) -> Iterator[ChunkContent]:
+        """The records of a chunk, after comparing its checksum; no checksum covers a torn one.
+
+        Raises:
+            SegmentError: The rest does not decompress, or is not believed.
+        """
+        length, is_torn = end - chunk.start, end < chunk.end
+        if not is_torn and max(chunk.size, length) <= _MAX_WHOLE:
+            data = self._bytes.at(chunk.start, length, move=length <= _WINDOW)
+            content = decompress(chunk.codec, data, chunk.size, limit=self._limit)
+            if chunk.crc not in {0, crc32(content)}:
+                raise SegmentError("its checksum differs")
+            yield parse_content(content, most=MIN_RECORDS + length)
+            return
+        if chunk.size > self._limit:
+            raise SegmentError(
+                f"it claims {chunk.size} bytes uncompressed, more than the limit of {self._limit}"
+            )
+        part = FilePart(self._file, chunk.start, length)
+        if not is_torn:
+            if chunk.codec:
+                check_size(chunk.codec, chunk.size, length)
+            crc = 0
+            for piece in decompress_pieces(chunk.codec, part) if chunk.crc else ():
+                crc = crc32(piece, crc)
+            if crc != chunk.crc:
+                raise SegmentError("its checksum differs")
+        pieces = decompress_pieces(chunk.codec, part)
+        yield from parse_parts(pieces, chunk.size, length, torn=is_torn)
 
     def _given(self, at: int, content: ChunkContent) -> Iterator[tuple[int, Item]]:
         for reason in content.unreadable:
@@ -280,10 +283,12 @@ class Scan:
             yield _damage(at, 0, reason, lost)
         yield at, content
 
-    def _damaged_chunk(self, at: int, end: int, chunk: _Chunk | None) -> Iterator[tuple[int, Item]]:
+    def _damaged_chunk(
+        self, at: int, end: int, chunk: ChunkHead | None
+    ) -> Iterator[tuple[int, Item]]:
         """A chunk whose lengths contradict each other."""
-        ends = [end] if chunk is None else [one for one in (chunk.end, end) if one >= chunk.data]
-        right = next((one for one in ends if self._fits(at, one) and self._goes_on(one)), None)
+        ends = [end] if chunk is None else [one for one in (chunk.end, end) if one >= chunk.start]
+        right = next((one for one in ends if self._goes_on(one)), None)
         self._indexed = set()
         if right is None:
             yield self._lost(at, f"a chunk record claims {end - at - HEAD} bytes")
@@ -309,8 +314,8 @@ class Scan:
             yield _damage(at, end - at, "a record is marked as a message but is none", 0)
             return
         self._needs_crc = True
-        until = self._next(at, self._end_of_data) or self._end_of_data
-        found = parse_content(self._bytes.rest(at)[: until - at], loose=True)
+        run = self._bytes.rest(at)[: self._end_of_data - at]
+        found = parse_content(run, loose=True)
         self._at = self._behind = at + found.end
         yield from self._given(at, found)
 
@@ -336,7 +341,12 @@ class Scan:
                     else read_record(opcode, head)
                 )
             except SegmentError as error:
-                yield _damage(at, end - at, str(error), 0)
+                is_placed = self._goes_on(end)
+                yield (
+                    _damage(at, end - at, str(error), 0)
+                    if is_placed
+                    else self._lost(at, str(error))
+                )
                 return
             self._behind = start + found[1]
             if found[0] is not None:
@@ -402,35 +412,15 @@ class Scan:
 
     # Behind damage
 
-    def _fits(self, at: int, end: int) -> bool:
-        """True if a record reaches neither into a chunk of the summary nor over the end."""
-        return end <= self._end_of_data and self._next(at, end) is None
-
-    def _next(self, at: int, end: int) -> int | None:
-        """First chunk of the summary in `(at, end)`; entries that are wrong are forgotten."""
-        i = bisect_right(self._starts, at)
-        while i < len(self._starts) and self._starts[i] < end:
-            start = self._starts[i]
-            listed, chunk = self._listed[start], self._chunk_fields(start)
-            head = self._bytes.at(start, HEAD)
-            if head == RECORD_HEAD.pack(Opcode.CHUNK, max(listed - start - HEAD, 0)) or (
-                chunk is not None and chunk.end == listed
-            ):
-                return start
-            del self._starts[i], self._listed[start]
-        return None
-
     def _torn(self, at: int, reason: str) -> tuple[int, Item]:
         self._at, self._is_torn = self._bytes.size, True
         return _damage(at, self._bytes.size - at, reason)
 
     def _lost(self, at: int, reason: str) -> tuple[int, Item]:
-        """Skip to the next chunk of the summary, or to the next records that are whole."""
+        """Skip to the next records that are whole."""
         start = self._behind if self._behind < at else at + 1
         kinds = _BETWEEN_CHUNKS if self._chunked else _IN_DATA
-        end = self._end_of_data
-        found = self._next(at, end) or self._bytes.search(start, end, kinds, self._is_start)
-        found = found or self._stop
+        found = self._bytes.search(start, self._end_of_data, kinds, self._is_start) or self._stop
         if found is None:
             return self._torn(at, f"the file ends in the middle of a record: {reason}")
         where = min(at, self._behind, found)
@@ -440,7 +430,7 @@ class Scan:
     def _is_start(self, at: int) -> bool:
         """True for a record that nothing else looks like, or for three in a row."""
         for _ in range(3):
-            end, chunk = self._end_of(at), self._chunk_fields(at)
+            end, chunk = self._end_of(at), self._chunk_head(at)
             if end is None or end == self._bytes.size:
                 return end is not None
             is_chunk = chunk is not None and chunk.end == end
@@ -457,7 +447,7 @@ class Scan:
         opcode, length = RECORD_HEAD.unpack_from(raw)
         end: int = at + HEAD + length
         if opcode == Opcode.CHUNK:  # it alone may run over the end: nothing else looks like it
-            chunk = self._chunk_fields(at)
+            chunk = self._chunk_head(at)
             return None if chunk is None or chunk.end > end else end
         if end > self._bytes.size or not (opcode in _IN_DATA or opcode >= _FIRST_PRIVATE):
             return None
@@ -469,33 +459,6 @@ class Scan:
     def _goes_on(self, at: int) -> bool:
         """True if `at` is the start of a record or the end of the data."""
         return at in {self._end_of_data, self._bytes.size} or self._end_of(at) is not None
-
-
-def _contents(chunk: _Chunk, part: FilePart, limit: int, *, torn: bool) -> Iterator[ChunkContent]:
-    """The records of a chunk, after comparing its checksum; no checksum covers a torn one.
-
-    Raises:
-        SegmentError: The rest does not decompress, or is not believed.
-    """
-    if not torn and max(chunk.size, len(part)) <= _MAX_WHOLE:
-        content = decompress(chunk.codec, part.read(), chunk.size, limit=limit)
-        if chunk.crc not in {0, crc32(content)}:
-            raise SegmentError("its checksum differs")
-        yield parse_content(content, most=MIN_RECORDS + len(part))
-        return
-    if chunk.size > limit:
-        raise SegmentError(
-            f"it claims {chunk.size} bytes uncompressed, more than the limit of {limit}"
-        )
-    if not torn:
-        if chunk.codec:
-            check_size(chunk.codec, chunk.size, len(part))
-        crc = 0
-        for piece in decompress_pieces(chunk.codec, part) if chunk.crc else ():
-            crc = crc32(piece, crc)
-        if crc != chunk.crc:
-            raise SegmentError("its checksum differs")
-    yield from parse_parts(decompress_pieces(chunk.codec, part), chunk.size, len(part), torn=torn)
 
 
 def _damage(at: int, length: int, reason: str, messages: int | None = None) -> tuple[int, Item]:

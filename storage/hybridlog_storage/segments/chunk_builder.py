@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import struct
 import time
+from array import array
 from threading import Lock
 from typing import TYPE_CHECKING
 
@@ -13,7 +14,7 @@ from mcap.opcode import Opcode
 
 from hybridlog_storage.buffers import buffers
 from hybridlog_storage.disk.copying import COPIED_AT_ONCE, copy_payloads, windows
-from hybridlog_storage.mcap.mcap_content import MESSAGE_HEAD
+from hybridlog_storage.mcap.mcap_content import MESSAGE_HEAD, batch_of, heads_at
 from hybridlog_storage.messages import Batch, Buffer, LooseBatch
 
 if TYPE_CHECKING:
@@ -40,8 +41,8 @@ class ChunkBuilder:
         self._buffer = np.empty(0, np.uint8)
         self._used = 0
         self._expected = capacity  # expected bytes of the next chunk
-        self._pieces: list[tuple[Batch, NDArray[np.int64]]] = []
-        self._rows: list[tuple[int, int, int, int, int, int, int]] = []
+        self._starts = array("q")  # of the message records
+        self._seq = array("q")  # arrival numbers
         self.copying: list[Lock] = []
         """A lock for each placed message; it is held until the payload is copied."""
         self.messages = 0
@@ -62,7 +63,6 @@ class ChunkBuilder:
             batch: n messages, n > 0.
             seq: int64[n], their arrival numbers.
         """
-        self._settle()
         if not self._used:
             self.first_log_time = int(batch.log_time[0])
             self.opened = time.monotonic()
@@ -73,20 +73,8 @@ class ChunkBuilder:
         copy_payloads(batch, self._buffer.data, starts + _HEAD)
         self._used = int(ends[-1])
         self.messages += len(batch)
-        self._pieces.append(
-            (
-                Batch(
-                    self._buffer.data,
-                    starts + _HEAD,
-                    batch.length,
-                    batch.channel,
-                    batch.log_time,
-                    batch.publish_time,
-                    batch.sequence,
-                ),
-                seq,
-            )
-        )
+        self._starts.frombytes(starts.tobytes())
+        self._seq.frombytes(seq.tobytes())
 
     def place_one(
         self,
@@ -132,9 +120,10 @@ class ChunkBuilder:
             log_time,
             publish_time,
         )
+        self._starts.append(self._used)
+        self._seq.append(seq)
         self._used = start + length
         self.messages += 1
-        self._rows.append((start, length, channel, log_time, publish_time, sequence, seq))
         if length < COPIED_AT_ONCE:
             view[start : start + length] = payload
             return _nothing
@@ -160,42 +149,13 @@ class ChunkBuilder:
             The messages, over the chunk's uncompressed content; their arrival numbers;
             the content's size in bytes (the batch's buffer may be longer).
         """
-        self._settle()
+        content, used = self._buffer.data[: self._used], self._used
+        starts, seq = np.array(self._starts), np.array(self._seq)
         self.copying, self.messages, self.opened = [], 0, math.inf
-        buffer, used, pieces = self._buffer, self._used, self._pieces
-        self._buffer, self._used, self._pieces = np.empty(0, np.uint8), 0, []
+        self._buffer, self._used = np.empty(0, np.uint8), 0
+        self._starts, self._seq = array("q"), array("q")
         self._expected = _GROWTH * used
-        batches = [batch for batch, _ in pieces]
-        content = buffer.data[:used]
-        whole = Batch(
-            content,
-            np.concatenate([b.offset for b in batches]),
-            np.concatenate([b.length for b in batches]),
-            np.concatenate([b.channel for b in batches]),
-            np.concatenate([b.log_time for b in batches]),
-            np.concatenate([b.publish_time for b in batches]),
-            np.concatenate([b.sequence for b in batches]),
-        )
-        return whole, np.concatenate([seq for _, seq in pieces]), used
-
-    def _settle(self) -> None:
-        """Convert messages that were appended one by one into columns."""
-        if not self._rows:
-            return
-        offset, length, channel, log_time, publish_time, sequence, seq = zip(
-            *self._rows, strict=True
-        )
-        self._rows = []
-        batch = Batch(
-            self._buffer.data,
-            np.array(offset, np.int64),
-            np.array(length, np.int64),
-            np.array(channel, np.int32),
-            np.array(log_time, np.int64),
-            np.array(publish_time, np.int64),
-            np.array(sequence, np.uint32),
-        )
-        self._pieces.append((batch, np.array(seq, np.int64)))
+        return batch_of(content, starts, heads_at(content, starts)), seq, used
 
     def _room(self) -> int:
         """Buffer size for the next chunk, from the size of the one before.

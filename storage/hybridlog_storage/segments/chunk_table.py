@@ -121,6 +121,10 @@ class ChunkTable:
             found[name] = np.maximum.reduceat(rows[name], starts)
         return found
 
+    def counts(self) -> dict[int, int]:
+        """Messages of each channel that has any, by channel id."""
+        return dict(self.by_channel()[["channel", "messages"]].tolist())
+
     def to_bytes(self) -> bytes:
         """The content of the table's record: row counts, then the rows as one zstd frame."""
         rows = self.chunks, self.parts

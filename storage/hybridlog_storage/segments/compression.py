@@ -78,13 +78,26 @@ def decompress(
             f"its {len(data)} bytes of {compression}"
         )
     try:
-        if compression == "zstd":
-            return _unpack_zstd(data, uncompressed_size)
-        return _unpack_lz4(data, uncompressed_size)
+        if compression == "zstd" and zstandard.frame_content_size(data) == uncompressed_size:
+            return _decompressor().decompress(data, allow_extra_data=False)
+        return _joined(decompress_pieces(compression, data), uncompressed_size)
     except MemoryError as error:
         raise SegmentError(f"there is no memory for its {uncompressed_size} bytes") from error
-    except (zstandard.ZstdError, RuntimeError) as error:
+    except zstandard.ZstdError as error:
         raise SegmentError(f"its {compression} data is damaged ({error})") from error
+
+
+def _joined(pieces: Iterator[bytes | memoryview], size: int) -> memoryview:
+    """The content of a frame that does not say its size, or of several."""
+    out, filled = memoryview(bytearray(size)), 0
+    for piece in pieces:
+        filled += len(piece)
+        if filled > size:
+            raise SegmentError(f"it decompresses to more bytes, not {size} as it claims")
+        out[filled - len(piece) : filled] = piece
+    if filled != size:
+        raise SegmentError(f"it decompresses to only {filled} bytes, not {size} as it claims")
+    return out.toreadonly()
 
 
 def check_size(compression: str, uncompressed_size: int, size: int) -> None:
@@ -186,38 +199,6 @@ def _decompressor() -> zstandard.ZstdDecompressor:
     except AttributeError:
         found = _per_thread.decompressor = zstandard.ZstdDecompressor()
     return found
-
-
-def _unpack_zstd(data: Buffer, size: int) -> bytes | memoryview:
-    claimed = zstandard.frame_content_size(data)
-    if claimed > size:
-        raise SegmentError(f"its zstd frame holds {claimed} bytes, not {size} as it claims")
-    if claimed == size:
-        return _decompressor().decompress(data, allow_extra_data=False)
-    # No size in the frame, or several frames one after the other.
-    out = bytearray(size)
-    reader = _decompressor().stream_reader(memoryview(data), read_across_frames=True)
-    view, filled = memoryview(out), 0
-    while filled < size and (count := reader.readinto(view[filled:])):
-        filled += count
-    if filled != size or reader.read(1):
-        more = "more" if filled == size else "only " + str(filled)
-        raise SegmentError(f"it decompresses to {more} bytes, not {size} as it claims")
-    return view.toreadonly()
-
-
-def _unpack_lz4(data: Buffer, size: int) -> bytes:
-    frame = lz4.frame.LZ4FrameDecompressor()
-    # One byte more than expected shows data that goes on.
-    out: bytes = frame.decompress(data, max_length=size + 1)
-    if len(out) < size and frame.eof and frame.unused_data:
-        pieces = _lz4_pieces(frame.unused_data)  # several frames, one after the other
-        while len(out) <= size and (piece := next(pieces, b"")):
-            out += piece
-    if len(out) != size:
-        more = "more" if len(out) > size else "only " + str(len(out))
-        raise SegmentError(f"it decompresses to {more} bytes, not {size} as it claims")
-    return out
 
 
 def _slices(data: Buffer | FilePart) -> Iterator[bytes | memoryview]:

@@ -12,9 +12,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from hybridlog_storage.errors import SegmentError
+from hybridlog_storage.mcap.mcap_content import CHUNK_HEAD
 from hybridlog_storage.segments.chunk_table import ChunkTable, TableBuilder
 from hybridlog_storage.segments.segment_file import OPEN_SUFFIX, sealed_name
-from hybridlog_storage.segments.segment_format import CHUNK_HEAD, OUR_NAMES, START
+from hybridlog_storage.segments.segment_format import OUR_NAMES, START
 from hybridlog_storage.segments.segment_reader import SegmentReader
 from hybridlog_storage.segments.walk import Walk
 

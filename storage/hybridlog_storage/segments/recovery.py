@@ -31,7 +31,6 @@ from hybridlog_storage.segments.segment_format import (
     END_METADATA,
     INDEX_HEAD,
     START,
-    compression_of,
     damaged_head,
     group_of,
     index_offsets,
@@ -183,12 +182,12 @@ class _Rest:
         offset, length, trailer, _ = chunk
         data = self._reader.read(offset, length + trailer)
         try:
-            content, times, compressed = open_chunk(data[:length])
+            content, head = open_chunk(data[:length])
             batch = parse_content(content).batch
             behind = trailer_of(data[length:], offset)
             behind.arrivals(len(batch))
             parts, *span = parts_of(batch, index_order(batch.channel, batch.log_time))
-            if times != (*span,):
+            if [head.first, head.last] != span:
                 raise SegmentError("its times are not those of its messages")
         except SegmentError as error:
             reason = f"a chunk is damaged: {error}"
@@ -200,14 +199,14 @@ class _Rest:
             self._damage.append(Damage(offset + length, size, "message indexes are damaged"))
         self._segment.note_chunk(
             ChunkIndex(
-                message_start_time=times[0],
-                message_end_time=times[1],
+                message_start_time=head.first,
+                message_end_time=head.last,
                 chunk_start_offset=offset,
                 chunk_length=length,
                 message_index_offsets=index_offsets(indexes, offset + length),
                 message_index_length=sum(indexes.values()),
-                compression=compression_of(data)[0],
-                compressed_size=compressed,
+                compression=head.codec,
+                compressed_size=head.end - head.start,
                 uncompressed_size=len(content),
             ),
             parts,
@@ -240,7 +239,7 @@ class _Rest:
             elif one.offset < walk.end:
                 segment.rewrite(one.offset, damaged_head(one.length))
         if not is_new:
-            self._note_summary()
+            self._put_summary(segment.tail(walk.end))
         on_sealing(segment.prepare(sync=True))
         return segment.publish()
 
@@ -256,20 +255,17 @@ class _Rest:
         found.update(tail)
         if found.hexdigest() != digest:
             return False
-        if self._reader.size < end + len(tail):
-            segment.cut(end)
-        else:
-            segment.rewrite(end, tail)
-            segment.cut(end + len(tail))
-            segment.note_complete()
+        self._put_summary(tail)
         segment.prepare(sync=True)
         return True
 
-    def _note_summary(self) -> None:
-        """Note the summary if it is there, or cut what is left of it."""
+    def _put_summary(self, tail: bytes) -> None:
+        """Write the summary in place, if the file is long enough; else it is appended later."""
         segment, end = self._segment, self._walk.end
-        tail = segment.tail(end)
-        there = bytes(self._reader.read(end, min(len(tail), self._reader.size - end)))
-        segment.cut(end + len(tail) if there == tail else end)
-        if there == tail:
-            segment.note_complete()
+        if self._reader.size < end + len(tail):
+            segment.cut(end)
+            return
+        if bytes(self._reader.read(end, len(tail))) != tail:
+            segment.rewrite(end, tail)
+        segment.cut(end + len(tail))
+        segment.note_complete()

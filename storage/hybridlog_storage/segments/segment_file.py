@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -183,9 +183,6 @@ class SegmentFile:
         self._chunk_indexes = bytearray()  # as records: a long segment has many
         self._attachment_indexes: list[AttachmentIndex] = []
         self._metadata_indexes: list[MetadataIndex] = []
-        self._counts: dict[int, int] = {}
-        self._first: int | None = None
-        self._last = 0
         self._sealed: Sealed | None = None  # once the file is complete
         self._finished = False  # once it is closed
 
@@ -222,7 +219,8 @@ class SegmentFile:
             segment._append([START])
             segment.add_recording(recording)
             if sync:
-                segment._sync_folder()
+                with segment._explained("creating"):
+                    files.sync_folder(directory)
         except BaseException:
             file.close()
             with suppress(OSError):
@@ -365,32 +363,21 @@ class SegmentFile:
         place = chunk.chunk_start_offset, chunk.chunk_length, trailer
         self.table.chunk(place, span, parts)
         self._chunk_indexes += record_bytes(chunk)
-        counts = zip(parts["channel"].tolist(), parts["messages"].tolist(), strict=True)
-        for channel, count in counts:
-            self._counts[channel] = self._counts.get(channel, 0) + count
-        self._first = span[0] if self._first is None else min(self._first, span[0])
-        self._last = max(self._last, span[1])
 
     def rewrite(self, position: int, data: Buffer) -> None:
         """Overwrite bytes damaged by a crash or the disk."""
-        try:
+        with self._explained("recovering"):
             self._file.rewrite(position, data)
-        except OSError as error:
-            raise durability.explain(error, self.path, "recovering") from error
 
     def cut(self, position: int) -> None:
         """Truncate the file at a position; the next record is written there."""
-        try:
+        with self._explained("cutting"):
             self._file.cut(position)
-        except OSError as error:
-            raise durability.explain(error, self.path, "cutting") from error
 
     def sync(self) -> None:
         """Force the written bytes to the disk."""
-        try:
+        with self._explained("syncing"):
             self._file.sync()
-        except OSError as error:
-            raise durability.explain(error, self.path, "syncing") from error
 
     def prepare(self, *, sync: bool) -> Sealed:
         """Write the summary, and close the file; may be repeated.
@@ -403,7 +390,7 @@ class SegmentFile:
             DiskFullError: No room for the summary; the file is unchanged.
         """
         final = self.path.with_name(sealed_name(self.number))
-        try:
+        with self._explained("sealing"):
             if self.path != final and _is_there(final):
                 raise StoreError(
                     f"{final} is there already, so {self.path} cannot be sealed. "
@@ -413,8 +400,6 @@ class SegmentFile:
             if not self._finished:
                 self._file.finish(sync=sync)
                 self._finished = True
-        except OSError as error:
-            raise durability.explain(error, final, "sealing") from error
         return sealed
 
     def publish(self, *, sync: bool = True) -> Path:
@@ -424,14 +409,12 @@ class SegmentFile:
             sync: Return once the name is on the disk.
         """
         final = self.path.with_name(sealed_name(self.number))
-        try:
+        with self._explained("sealing"):
             if self.path != final:
                 files.rename(self.path, final)
                 self.path = final
             if sync:
                 files.sync_folder(final.parent)
-        except OSError as error:
-            raise durability.explain(error, final, "sealing") from error
         return final
 
     def complete(self) -> Sealed:
@@ -446,11 +429,13 @@ class SegmentFile:
     def note_complete(self) -> None:
         """Note that the summary is in the file."""
         channels = {number: channel for number, (_, channel) in self.channels.items()}
+        with self._explained("reading"):
+            digest = self._file.digest()
         self._sealed = Sealed(
             self.number,
             sealed_name(self.number),
             self.position,
-            self._digest(),
+            digest,
             sealed_channels(self.table.build(), channels),
             self.group,
             any(index.name == LOSSES_METADATA for index in self._metadata_indexes),
@@ -458,12 +443,9 @@ class SegmentFile:
 
     def trim(self) -> None:
         """Give a complete file its length: of several, before the first is forced to the disk."""
-        if self._finished:
-            return
-        try:
-            self._file.trim()
-        except OSError as error:
-            raise durability.explain(error, self.path, "sealing") from error
+        with self._explained("sealing"):
+            if not self._finished:
+                self._file.trim()
 
     def abandon(self) -> None:
         """Close without sealing; the next opening of the store recovers the file."""
@@ -478,35 +460,29 @@ class SegmentFile:
         return padding_record(least + self._file.room_before(content, at + least + head))
 
     def _append(self, parts: Sequence[Buffer]) -> None:
-        try:
+        with self._explained("writing"):
             self._file.append(parts)
-        except OSError as error:
-            raise durability.explain(error, self.path, "writing") from error
 
-    def _digest(self) -> str:
+    @contextmanager
+    def _explained(self, doing: str) -> Iterator[None]:
         try:
-            return self._file.digest()
+            yield
         except OSError as error:
-            raise durability.explain(error, self.path, "reading") from error
-
-    def _sync_folder(self) -> None:
-        try:
-            files.sync_folder(self.path.parent)
-        except OSError as error:
-            raise durability.explain(error, self.path, "creating") from error
+            raise durability.explain(error, self.path, doing) from error
 
     def tail(self, at: int) -> bytes:
         """The last records of a file with `at` bytes of data: the end of data, the summary."""
         end = record_bytes(DataEnd(data_section_crc=0))
         start = at = at + len(end)
-        body = self.table.build().to_bytes()
+        table = self.table.build()
+        body = table.to_bytes()
         groups: list[tuple[int, bytes]] = [
             (Opcode.SCHEMA, _joined(schema_record(i, s) for i, s in self.schemas.items())),
             (
                 Opcode.CHANNEL,
                 _joined(channel_record(i, sid, c) for i, (sid, c) in self.channels.items()),
             ),
-            (Opcode.STATISTICS, record_bytes(self._statistics())),
+            (Opcode.STATISTICS, record_bytes(self._statistics(table))),
             (Opcode.CHUNK_INDEX, bytes(self._chunk_indexes)),
             (Opcode.ATTACHMENT_INDEX, _joined(self._attachment_indexes)),
             (Opcode.METADATA_INDEX, _joined(self._metadata_indexes)),
@@ -526,15 +502,17 @@ class SegmentFile:
         footer.summary_crc = crc32(covered, crc32(summary))
         return end + summary + record_bytes(footer) + MAGIC
 
-    def _statistics(self) -> Statistics:
+    def _statistics(self, table: ChunkTable) -> Statistics:
+        counts = table.counts()
+        times = table.chunks[["first", "last"]]
         return Statistics(
             attachment_count=len(self._attachment_indexes),
             channel_count=len(self.channels),
-            channel_message_counts=dict(sorted(self._counts.items())),
+            channel_message_counts=counts,
             chunk_count=self.chunks,
-            message_count=sum(self._counts.values()),
-            message_end_time=self._last,
-            message_start_time=self._first or 0,
+            message_count=sum(counts.values()),
+            message_end_time=int(times["last"].max(initial=0)),
+            message_start_time=int(times["first"].min()) if len(times) else 0,
             metadata_count=len(self._metadata_indexes),
             schema_count=len(self.schemas),
         )

@@ -25,12 +25,14 @@ from mcap.records import Header, McapRecord, Metadata
 from mcap.records import Schema as SchemaRecord
 
 from hybridlog_storage.checksum import crc32
-from hybridlog_storage.disk.copying import windows
 from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.lazy import RowType
 from hybridlog_storage.mcap.mcap_content import (
+    CHUNK_HEAD,
     MESSAGE_HEAD,
     RECORD_HEAD,
+    batch_of,
+    heads_at,
     read_record,
 )
 from hybridlog_storage.messages import Batch, Buffer, Channel, Schema
@@ -64,7 +66,6 @@ DAMAGED_OPCODE: Final = 0x93
 METADATA_CHECK: Final = "hybridlog.crc32"
 """Last key of each metadata record: eight hexadecimal digits of a CRC-32."""
 
-CHUNK_HEAD: Final = struct.Struct("<BQQQQI")
 INDEX_HEAD: Final = struct.Struct("<BQHI")
 ARRIVALS: Final = struct.Struct("<QII")
 """Fields of an arrival record: byte of its chunk, CRC-32 of the chunk's head and of its indexes."""
@@ -199,27 +200,11 @@ def chunk_head(
     body = 8 + 8 + 8 + 4 + 4 + len(name) + 8 + compressed_size
     return b"".join(
         (
-            CHUNK_HEAD.pack(Opcode.CHUNK, body, first, last, uncompressed_size, crc),
-            struct.pack("<I", len(name)),
+            CHUNK_HEAD.pack(Opcode.CHUNK, body, first, last, uncompressed_size, crc, len(name)),
             name,
             struct.pack("<Q", compressed_size),
         )
     )
-
-
-def compression_of(record: Buffer) -> tuple[str, int]:
-    """Compression of a checked chunk record, and bytes of its compressed content."""
-    at = CHUNK_HEAD.size
-    (length,) = struct.unpack_from("<I", record, at)
-    name = bytes(record[at + 4 : at + 4 + length]).decode("ascii", "replace")
-    (compressed,) = struct.unpack_from("<Q", record, at + 4 + length)
-    return name, int(compressed)
-
-
-def head_length(record: Buffer) -> int:
-    """Bytes of a chunk record before its content."""
-    (name,) = struct.unpack_from("<I", record, CHUNK_HEAD.size)
-    return int(CHUNK_HEAD.size + 4 + name + 8)
 
 
 def padding_record(size: int) -> bytes:
@@ -272,16 +257,6 @@ def message_indexes(
 def index_offsets(sizes: Mapping[int, int], start: int) -> dict[int, int]:
     """Start of the message index of each channel, by channel id."""
     return dict(zip(sizes, accumulate(sizes.values(), initial=start), strict=False))
-
-
-def entries_of(index: bytes) -> int:
-    """Number of messages in a message index record."""
-    return (len(index) - INDEX_HEAD.size) // _INDEX_ENTRY.itemsize
-
-
-def last_time_of(index: bytes) -> int:
-    """Log time of the last message in a message index record, ns."""
-    return int(np.frombuffer(index, _INDEX_ENTRY, offset=len(index) - _INDEX_ENTRY.itemsize)[0][0])
 
 
 def definitions_chunk(content: bytes, offset: int) -> bytes:
@@ -430,19 +405,11 @@ def messages_at(content: Buffer, starts: NDArray[np.int64]) -> Batch | None:
     """
     if not len(starts) or starts[0] != 0 or int(starts[-1]) + MESSAGE_HEAD.itemsize > len(content):
         return None
-    heads = windows(content, MESSAGE_HEAD.itemsize)[starts].view(MESSAGE_HEAD)
+    heads = heads_at(content, starts)
     sizes = heads["length"].astype(np.int64)
     ends = starts + sizes + RECORD_HEAD.size
     whole = bool((heads["opcode"] == int(Opcode.MESSAGE)).all())
     whole = whole and bool((ends[:-1] == starts[1:]).all()) and int(ends[-1]) == len(content)
     if not whole or bool((sizes < MESSAGE_HEAD.itemsize - RECORD_HEAD.size).any()):
         return None
-    return Batch(
-        content,
-        starts + MESSAGE_HEAD.itemsize,
-        sizes - (MESSAGE_HEAD.itemsize - RECORD_HEAD.size),
-        heads["channel"].astype(np.int32),
-        heads["log_time"].astype(np.int64),
-        heads["publish_time"].astype(np.int64),
-        heads["sequence"].astype(np.uint32),
-    )
+    return batch_of(content, starts, heads)

@@ -9,11 +9,11 @@ from __future__ import annotations
 import os
 import stat
 import struct
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -26,7 +26,10 @@ from hybridlog_storage.disk.append_file import BLOCK, DIRECT
 from hybridlog_storage.errors import SegmentError, exhausted
 from hybridlog_storage.manifest import hasher
 from hybridlog_storage.mcap.mcap_content import (
+    MAX_CHUNK_HEAD,
     RECORD_HEAD,
+    ChunkHead,
+    chunk_head_of,
     parse_content,
     parse_summary,
 )
@@ -42,7 +45,6 @@ from hybridlog_storage.segments.chunk import StoredChunk
 from hybridlog_storage.segments.chunk_table import ChunkTable
 from hybridlog_storage.segments.compression import FilePart, decompress
 from hybridlog_storage.segments.segment_format import (
-    CHUNK_HEAD,
     CHUNK_TABLE_OPCODE,
     END_METADATA,
     FORMAT_VERSION,
@@ -127,7 +129,6 @@ class SegmentSummary:
         recording: Catalog entry of the recording at the start of the segment.
         end: The end of the recording; None except in its last segment.
         channels: Channels by id, and those of messages without payload, see `EXPIRED_IDS`.
-        schema_ids: Id of each channel's schema, 0 without one, by channel id.
         counts: Number of messages by channel id.
         losses: Rows of the loss ledger written with its messages.
         attachments: Attachments of the source, in file order.
@@ -140,7 +141,6 @@ class SegmentSummary:
     recording: dict[str, object]
     end: dict[str, object] | None
     channels: dict[int, Channel]
-    schema_ids: dict[int, int]
     counts: dict[int, int]
     losses: list[dict[str, Any]]
     attachments: list[AttachmentIndex]
@@ -213,21 +213,6 @@ class SegmentReader:
         """Close."""
         self.close()
 
-    def stream(self) -> BinaryIO:
-        """A new handle of the file for `scan`; the caller closes it.
-
-        Raises:
-            SegmentError: It cannot be opened.
-        """
-        try:
-            files.fetch(self._fd, [(0, self.size)])
-            return os.fdopen(os.dup(self._fd), "rb")
-        except OSError as error:
-            problem = f"{self.path} cannot be read: {error.strerror}."
-            raise (
-                exhausted(error.errno, f"reading {self.path}") or SegmentError(problem)
-            ) from error
-
     def grow(self) -> None:
         """Update the file's size after an append."""
         self.size = os.fstat(self._fd).st_size
@@ -238,64 +223,48 @@ class SegmentReader:
         Raises:
             SegmentError: It is missing, damaged, or has another format.
         """
-        with self._explained():
-            return self._summary(*self._records())
+        return self._summary(*self._records())
 
-    @contextmanager
-    def _explained(self) -> Iterator[None]:
-        try:
-            yield
-        except _NoSummaryError as error:
-            raise SegmentError(
-                f"Segment {self.path} has no readable summary: {error}. It was sealed and has "
-                "changed since. A repair makes the summary again if all chunks are whole; else "
-                "restore the file, or see what is left with `mcap recover`."
-            ) from error
+    def _no_summary(self, why: object) -> SegmentError:
+        return SegmentError(
+            f"Segment {self.path} has no readable summary: {why}. It was sealed and has changed "
+            "since. A repair makes the summary again if all chunks are whole; else restore the "
+            "file, or see what is left with `mcap recover`."
+        )
 
     def _records(self) -> tuple[Summary, Buffer | None, int]:
         """The checked summary, the content of the chunk table, and where they start."""
         if self.size < len(MAGIC) + _TAIL:
-            raise _NoSummaryError("it is too short")
+            raise self._no_summary("it is too short")
         tail = self.read(self.size - _TAIL, _TAIL)
         opcode, length, start, offsets, crc = _FOOTER.unpack_from(tail)
         if bytes(tail[_FOOTER.size :]) != MAGIC or opcode != Opcode.FOOTER or length != 20:
-            raise _NoSummaryError("its end is damaged or missing")
+            raise self._no_summary("its end is damaged or missing")
         end = self.size - _TAIL
         if not len(MAGIC) <= start <= offsets <= end or end - start > _MAX_SUMMARY:
-            raise _NoSummaryError("its footer is damaged")
+            raise self._no_summary("its footer is damaged")
         data = self.read(start, self.size - start)
         if crc32(data[: len(data) - len(MAGIC) - 4]) != crc:
-            raise _NoSummaryError("its checksum differs")
+            raise self._no_summary("its checksum differs")
         try:
             # The chunk table says more than chunk indexes, and is faster to read.
             found, others = parse_summary(data[: len(data) - _TAIL], skipped=Opcode.CHUNK_INDEX)
         except SegmentError as error:
-            raise _NoSummaryError(str(error)) from error
+            raise self._no_summary(error) from error
         return found, others.get(CHUNK_TABLE_OPCODE), start
 
-    def _table(self, records: Summary, body: Buffer | None, start: int) -> ChunkTable:
+    def _table(self, body: Buffer | None, start: int) -> ChunkTable:
         if body is None:
-            self._refuse_other_format(records)
-            if all(index.name != RECORDING_METADATA for index in records.metadata_indexes):
-                raise SegmentError(f"{self.path} is no segment of a hybridlog store.")
-            raise _NoSummaryError("its chunk table is missing")
+            raise self._no_summary("its chunk table is missing")
         try:
             table = ChunkTable.from_bytes(body)
         except SegmentError as error:
-            self._refuse_other_format(records)
-            raise _NoSummaryError(str(error)) from error
+            raise self._no_summary(error) from error
         if table.end > start:
-            raise _NoSummaryError("its chunk table is of another file")
+            raise self._no_summary("its chunk table is of another file")
         return table
 
-    def _refuse_other_format(self, records: Summary) -> None:
-        """Raise if the header names another format."""
-        for index in records.metadata_indexes:
-            if index.name == RECORDING_METADATA:
-                check_format(json_of(self.metadata(index)), self.path)
-
     def _summary(self, records: Summary, body: Buffer | None, start: int) -> SegmentSummary:
-        table = self._table(records, body, start)
         found: dict[str, dict[str, object]] = {}
         losses: list[dict[str, Any]] = []
         for index in records.metadata_indexes:
@@ -309,19 +278,19 @@ class SegmentReader:
                 losses += loss_rows(json_of(self.metadata(index)))
         if RECORDING_METADATA not in found:
             raise SegmentError(f"{self.path} is no segment of a hybridlog store.")
+        table = self._table(body, start)
         stated = records.statistics.channel_message_counts if records.statistics else {}
         is_known = {*table.parts["channel"].tolist()} <= records.channels.keys()
-        if _counts(table) != {c: n for c, n in stated.items() if n} or not is_known:
-            raise _NoSummaryError("its statistics and its chunk table differ")
+        if table.counts() != {c: n for c, n in stated.items() if n} or not is_known:
+            raise self._no_summary("its statistics and its chunk table differ")
         if self._added:
             table = table.with_added(self._added)
-        counts = _counts(table)
+        counts = table.counts()
         channels = {i: channel_of(r, records.schemas) for i, r in records.channels.items()}
         return SegmentSummary(
             recording=found[RECORDING_METADATA],
             end=found.get(END_METADATA),
             channels=with_expired(channels, counts),
-            schema_ids={i: r.schema_id for i, r in records.channels.items()},
             counts=counts,
             losses=losses,
             attachments=records.attachment_indexes,
@@ -337,8 +306,7 @@ class SegmentReader:
         Raises:
             SegmentError: As `summary`.
         """
-        with self._explained():
-            return self._records()[0].metadata_indexes
+        return self._records()[0].metadata_indexes
 
     def metadata(self, index: MetadataIndex) -> Metadata:
         """A metadata record.
@@ -357,15 +325,27 @@ class SegmentReader:
         Raises:
             SegmentError: It is damaged.
         """
-        start, size = index.offset + RECORD_HEAD.size, index.length - RECORD_HEAD.size
-        head = self.read(start, max(min(size, MAX_HEAD), 0))
-        part = FilePart(FileHandle(self._fd), start, size)
         try:
-            found, _ = parse_attachment(head, part, needs_crc=True)
+            found = self.attachment_at(index.offset, index.length)
         except SegmentError as error:
             raise self._lost("attachment", index, str(error)) from error
         if found.index(index.offset, index.length) != index:
             raise self._lost("attachment", index, "another one is there")
+        return found
+
+    def attachment_at(self, offset: int, length: int) -> Attachment:
+        """The attachment of a record, after checking all its bytes.
+
+        Raises:
+            SegmentError: It is damaged.
+        """
+        start, size = offset + RECORD_HEAD.size, length - RECORD_HEAD.size
+        head = self.read(start, max(min(size, MAX_HEAD), 0))
+        found, used = parse_attachment(
+            head, FilePart(FileHandle(self._fd), start, size), needs_crc=True
+        )
+        if used != size:
+            raise SegmentError("an attachment record is longer than its fields")
         return found
 
     def _lost(self, what: str, index: MetadataIndex | AttachmentIndex, why: str) -> SegmentError:
@@ -387,8 +367,8 @@ class SegmentReader:
         check_wanted()
         data = self.read(place.offset, place.length + place.trailer)
         try:
-            content, times, compressed = open_chunk(data[: place.length])
-            if times != (place.first, place.last):
+            content, head = open_chunk(data[: place.length])
+            if (head.first, head.last) != (place.first, place.last):
                 raise SegmentError("its times are not those of the chunk table")
             trailer = trailer_of(data[place.length :], place.offset)
             starts = trailer.starts()
@@ -397,7 +377,7 @@ class SegmentReader:
             seq = trailer.arrivals(len(batch))
         except SegmentError as error:
             raise self._damaged(place, error) from error
-        return place.stored(self.number, batch, seq, compressed)
+        return place.stored(self.number, batch, seq, head.end - head.start)
 
     def _damaged(self, place: ChunkPlace, error: SegmentError) -> SegmentError:
         return SegmentError(f"Chunk at byte {place.offset} of {self.path} is damaged: {error}")
@@ -482,16 +462,6 @@ class SegmentReader:
         return buffer[ahead:wanted]
 
 
-class _NoSummaryError(SegmentError):
-    """A summary that is missing or damaged."""
-
-
-def _counts(table: ChunkTable) -> dict[int, int]:
-    """Messages of each channel in a table."""
-    totals = table.by_channel()
-    return dict(zip(totals["channel"].tolist(), totals["messages"].tolist(), strict=True))
-
-
 def places_of(table: ChunkTable) -> list[ChunkPlace]:
     """Position of each chunk of a table, in file order."""
     bounds = table.part_bounds()
@@ -533,29 +503,18 @@ def check_format(recording: Mapping[str, object], path: Path) -> None:
         )
 
 
-def open_chunk(record: memoryview) -> tuple[Buffer, tuple[int, int], int]:
-    """Content, first and last log time, and compressed size of a whole chunk record.
+def open_chunk(record: memoryview) -> tuple[Buffer, ChunkHead]:
+    """Content of a whole chunk record, and what stands before it.
 
     Raises:
         SegmentError: It is not a chunk record, or damaged.
     """
-    if len(record) < CHUNK_HEAD.size + 4:
-        raise SegmentError("the record is too short")
-    opcode, length, first, last, size, crc = CHUNK_HEAD.unpack_from(record)
-    if opcode != Opcode.CHUNK or length + RECORD_HEAD.size != len(record):
+    head = chunk_head_of(record[:MAX_CHUNK_HEAD])
+    if head is None or head.opcode != Opcode.CHUNK or head.length != len(record):
         raise SegmentError("no chunk record is there")
-    at = CHUNK_HEAD.size
-    (name_length,) = struct.unpack_from("<I", record, at)
-    at += 4
-    if name_length > 16 or at + name_length + 8 > len(record):
-        raise SegmentError("its compression cannot be read")
-    compression = bytes(record[at : at + name_length]).decode("ascii", "replace")
-    at += name_length
-    (compressed,) = struct.unpack_from("<Q", record, at)
-    at += 8
-    if compressed != len(record) - at:
+    if head.end != len(record):
         raise SegmentError("the length of its records is wrong")
-    content = decompress(compression, record[at:], size)
-    if crc32(content) != crc:
+    content = decompress(head.codec, record[head.start :], head.size)
+    if crc32(content) != head.crc:
         raise SegmentError("its checksum differs")
-    return content, (first, last), compressed
+    return content, head

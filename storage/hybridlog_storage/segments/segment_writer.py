@@ -32,10 +32,8 @@ from hybridlog_storage.segments.compression import Compressor
 from hybridlog_storage.segments.segment_file import Sealed, SegmentFile
 from hybridlog_storage.segments.segment_format import (
     END_METADATA,
-    entries_of,
     json_metadata,
     json_of,
-    last_time_of,
 )
 from hybridlog_storage.segments.segment_group import FIRST, LATCHED, Division, Key, SegmentGroup
 from hybridlog_storage.stopping import safe_point
@@ -109,7 +107,6 @@ class RecordingTotals:
 
     messages: int = 0
     payload_bytes: int = 0
-    stored_bytes: int = 0
     segments: int = 0
     chunks: int = 0
 
@@ -598,9 +595,10 @@ class RecordingWriter:
     def _publish(self, chunk: PackedChunk, stored: StoredChunk) -> None:
         """Report that a chunk is in its segment."""
         self.totals.chunks += 1
-        for channel_id, data in chunk.indexes.items():
-            self.written[channel_id] += entries_of(data)
-            self._last_times[channel_id] = last_time_of(data)
+        rows = chunk.parts[["channel", "messages", "last"]].tolist()
+        for channel_id, messages, last in rows:
+            self.written[channel_id] += messages
+            self._last_times[channel_id] = last
         self._on_chunk(stored, self.channels)
         self._stored_bytes += chunk.uncompressed_size
         if self._on_written is not None:
@@ -643,7 +641,6 @@ class RecordingWriter:
         self._on_sealing(group.prepare(sync=self.settings.sync != "never"))
         segments = [*group.segments.values()]
         self._closed += [segment.publish(sync=segment is segments[-1]) for segment in segments]
-        self.totals.stored_bytes += group.position
         self.totals.segments += len(segments)
         self._division.begin()
         self._group = None

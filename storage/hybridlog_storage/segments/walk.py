@@ -6,7 +6,6 @@ goes on where the damaged record ends, or at the next record that proves itself.
 
 from __future__ import annotations
 
-import struct
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
@@ -16,14 +15,19 @@ from mcap.records import Schema as SchemaRecord
 
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.errors import SegmentError
-from hybridlog_storage.mcap.mcap_content import MESSAGE_HEAD, RECORD_HEAD, Damage, parse_content
+from hybridlog_storage.mcap.mcap_content import (
+    MAX_CHUNK_HEAD,
+    MESSAGE_HEAD,
+    RECORD_HEAD,
+    ChunkHead,
+    Damage,
+    chunk_head_of,
+    parse_content,
+)
 from hybridlog_storage.mcap.record_file import HEAD, RecordFile
-from hybridlog_storage.segments.attachments import MAX_HEAD, parse_attachment
 from hybridlog_storage.segments.chunk_table import PART, parts_of
-from hybridlog_storage.segments.compression import FilePart
 from hybridlog_storage.segments.segment_format import (
     ARRIVAL_OPCODE,
-    CHUNK_HEAD,
     DAMAGED_OPCODE,
     END_METADATA,
     LOSSES_METADATA,
@@ -32,8 +36,6 @@ from hybridlog_storage.segments.segment_format import (
     START,
     Trailer,
     channel_of,
-    compression_of,
-    head_length,
     index_order,
     json_of,
     metadata_of,
@@ -52,7 +54,6 @@ _WINDOW: Final = 4096  # bytes read at once around the heads of records
 _SEARCHED: Final = 1 << 20  # bytes searched at once for the next record
 _MAX_RECORD: Final = 1 << 28  # bytes of what is read into memory as a whole
 _MAX_PADDING: Final = 2 * _WINDOW  # bytes
-_CHUNK_HEAD_SIZE: Final = CHUNK_HEAD.size + 16  # with the longest name of a compression
 _UNKNOWN: Final = np.iinfo(np.int64)  # publish times stand in the messages only
 _ORPHAN: Final = "it belongs to no chunk"
 
@@ -177,7 +178,8 @@ class Walk:
             if opcode == Opcode.METADATA:
                 self._take_metadata(at, end)
             elif opcode == Opcode.ATTACHMENT:
-                self._take_attachment(at, end)
+                found = self._reader.attachment_at(at, end - at)
+                self.attachments.append(found.index(at, end - at))
             elif opcode == DAMAGED_OPCODE:
                 self._damage(at, end, "it was damaged when the recording was recovered")
             elif end - at > _MAX_PADDING or any(self._reader.read(at, end - at)[HEAD:]):
@@ -199,51 +201,35 @@ class Walk:
         self.has_end |= record.name == END_METADATA
         self.metadata.append(MetadataIndex(offset=at, length=end - at, name=record.name))
 
-    def _take_attachment(self, at: int, end: int) -> None:
-        start, size = at + HEAD, end - at - HEAD
-        head = self._reader.read(start, min(size, MAX_HEAD))
-        with self._reader.stream() as file:
-            found, used = parse_attachment(head, FilePart(file, start, size), needs_crc=True)
-        if used != size:
-            raise SegmentError("an attachment record is longer than its fields")
-        self.attachments.append(found.index(at, end - at))
-
     # Chunks
 
     def _take_chunk(self, at: int, end: int) -> int:
-        self._check_head(at, end)
-        head = self._chunk_head(at)
-        trailer = self._trailer(at, end, head)
-        if crc32(head) != trailer.head_crc:
+        head = self._chunk_head(at, end)
+        trailer = self._trailer(at, end, head.size)
+        if crc32(self._peek(at, head.start)) != trailer.head_crc:
             raise SegmentError("the head of a chunk changed: its checksum differs")
         if trailer.indexes == []:
             self._define(at, end)
             return end + trailer.length
-        parts = self._parts(at, end, head, trailer)
+        parts = self._parts(at, end, head.size, trailer)
         lost = {*parts["channel"].tolist()} - self.channels.keys()
         if lost:
             raise SegmentError(f"the definition of its channel {min(lost)} is lost")
         self.chunks.append(WalkedChunk(at, end - at, trailer.length, parts))
         return end + trailer.length
 
-    def _check_head(self, at: int, end: int) -> None:
-        """Raise if the head of a chunk contradicts itself, or the file ends in the chunk."""
-        if end - at < _CHUNK_HEAD_SIZE:
-            raise SegmentError("a chunk record is too short")
-        try:
-            head = self._chunk_head(at)
-            is_right = at + len(head) + compression_of(head)[1] == end
-        except struct.error:
-            is_right = False
-        if not is_right and len(self._peek(at, _CHUNK_HEAD_SIZE)) == _CHUNK_HEAD_SIZE:
-            raise SegmentError("the lengths of a chunk contradict each other")
-        if end > self._reader.size:
-            raise _TornError("the file ends in the middle of a chunk")
+    def _chunk_head(self, at: int, end: int) -> ChunkHead:
+        """A chunk record before its content.
 
-    def _chunk_head(self, at: int) -> bytes:
-        """A chunk record before its content."""
-        head = bytes(self._peek(at, _CHUNK_HEAD_SIZE))
-        return head[: head_length(head)]
+        Raises:
+            SegmentError: It contradicts itself, or the file ends in the chunk.
+        """
+        head = chunk_head_of(self._peek(at, MAX_CHUNK_HEAD))
+        if head is not None and at + head.end == end <= self._reader.size:
+            return head
+        if end > self._reader.size and (head is None or at + head.end == end):
+            raise _TornError("the file ends in the middle of a chunk")
+        raise SegmentError("the lengths of a chunk contradict each other")
 
     def _define(self, at: int, end: int) -> None:
         """Take a chunk of definitions."""
@@ -259,7 +245,7 @@ class Walk:
             raise SegmentError("a chunk is too large")
         return open_chunk(self._reader.read(at, end - at))[0]
 
-    def _trailer(self, at: int, end: int, head: bytes) -> Trailer:
+    def _trailer(self, at: int, end: int, content: int) -> Trailer:
         """The records behind a chunk, also if its message indexes are damaged."""
         behind, opcode = end, int(Opcode.MESSAGE_INDEX)
         size = self._reader.size
@@ -268,7 +254,6 @@ class Walk:
         is_whole = opcode == ARRIVAL_OPCODE and behind <= size
         if not is_whole:
             # Message indexes have at most as many bytes as the messages.
-            content = CHUNK_HEAD.unpack_from(head)[4]
             behind = min(size, end + content + _WINDOW)
         try:
             if behind - end > _MAX_RECORD:
@@ -279,10 +264,10 @@ class Walk:
                 raise _TornError(str(error)) from error
             raise
 
-    def _parts(self, at: int, end: int, head: bytes, trailer: Trailer) -> NDArray[np.void]:
+    def _parts(self, at: int, end: int, content: int, trailer: Trailer) -> NDArray[np.void]:
         """Statistics of each channel in a chunk; by its messages if its indexes are damaged."""
         if trailer.indexes:
-            return _parts_by_index(trailer.indexes, CHUNK_HEAD.unpack_from(head)[4])
+            return _parts_by_index(trailer.indexes, content)
         batch = parse_content(self._content(at, end)).batch
         if not len(batch):
             raise SegmentError("it has no messages")
@@ -329,9 +314,9 @@ class Walk:
             if opcode == Opcode.METADATA:
                 metadata_of(self._reader.read(at, end - at), at)
                 return True
-            self._check_head(at, end)
-            head = self._chunk_head(at)
-            return crc32(head) == self._trailer(at, end, head).head_crc
+            head = self._chunk_head(at, end)
+            trailer = self._trailer(at, end, head.size)
+            return crc32(self._peek(at, head.start)) == trailer.head_crc
         except SegmentError:
             return False
 
