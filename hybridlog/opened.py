@@ -6,6 +6,7 @@ import math
 import threading
 import time
 from contextlib import suppress
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from hybridlog.index.access import IndexAccess
@@ -81,7 +82,7 @@ class OpenStore(Shared):
             self._changed = self.directory.changed()
             self._names = self.directory.ids()
             try:
-                found = self._files.look_at_all(mends=mends)
+                found = replace(self._files, mends=mends).look_at_all()
             except DiskFullError as error:
                 # The store remains readable, and recordings can be removed.
                 self.repairs.disk_full = error
@@ -182,7 +183,7 @@ class OpenStore(Shared):
 
         repairs = self.repairs
         self.now()  # notes what this process has changed
-        mended = self._files.mend(until)
+        mended = replace(self._files, mends=True).mend(until)
         if mended:
             with self.following:
                 for recording in mended:

@@ -563,8 +563,8 @@ def test_names_are_text(made: Made) -> None:
 def opened(directory: StoreDirectory) -> tuple[list[RecordingEntry], RepairReport]:
     report = RepairReport()
     with closing(Catalog(directory.path, directory.settings.store_id)) as catalog:
-        store = StoreFiles(directory, catalog, report)
-        found = store.look_at_all(mends=True).summaries
+        store = StoreFiles(directory, catalog, report, mends=True)
+        found = store.look_at_all().summaries
         entries = [store.current_entry(summary)[0] for summary in found]
         return [entry for entry in entries if entry is not None], report
 
