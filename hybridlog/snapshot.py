@@ -194,9 +194,9 @@ class Snapshot:
         """A recording of each log, and of each part of one, by the fingerprint of its content."""
         found: dict[str, RecordingSummary] = {}
         for summary in self.summaries:
-            parts = summary.source.get("parts", ())
-            for fingerprint in (summary.source.get("fingerprint"), *parts):
-                found.setdefault(fingerprint, summary)
+            parts = summary.source.get("parts")  # a catalog from elsewhere may have anything there
+            known = summary.source.get("fingerprint"), *(parts if isinstance(parts, list) else ())
+            found.update((one, summary) for one in known if isinstance(one, str))
         return found
 
     def topics_of(self, summary: RecordingSummary) -> set[str]:
