@@ -19,7 +19,7 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Final, Literal, cast
 
 import numpy as np
-from msgspec import UNSET, ValidationError, convert, to_builtins
+from msgspec import UNSET, ValidationError, convert, structs, to_builtins
 
 from hybridlog.record.losses import Cause, extent_of, joined, topics_of
 from hybridlog.record.marks import mark_channel
@@ -557,9 +557,10 @@ def topic_of(rows: File, manifest: Manifest) -> str:
 
 
 def _said(manifest: Manifest) -> dict[str, Any]:
+    marks = [structs.asdict(mark) for mark in manifest.marks]
     return {
-        "notes": [{"at": note.at, "text": note.text} for note in manifest.notes],
-        "marks": [mark_values(mark) for mark in manifest.marks],
+        "notes": [structs.asdict(note) for note in manifest.notes],
+        "marks": [{k: v for k, v in mark.items() if v is not None} for mark in marks],
         "pins": [pin_values(pin) for pin in manifest.pins],
     }
 
@@ -617,24 +618,9 @@ def end_values(manifest: Manifest) -> dict[str, Any]:
 
 def loss_values(loss: truth.Loss) -> dict[str, Any]:
     """A row of the loss ledger as entries and segments have it."""
-    return {
-        "cause": loss.cause,
-        "count": loss.count,
-        "file": loss.file,
-        "from": loss.first,
-        "length": loss.length,
-        "offset": loss.offset,
-        "reason": loss.reason,
-        "to": loss.last,
-        "topic": loss.topic or None,
-    }
-
-
-def mark_values(mark: truth.Mark) -> dict[str, Any]:
-    """A mark as entries have it."""
-    until = {} if mark.end is None else {"end": mark.end}
-    tags = dict(mark.tags)
-    return {"id": mark.id, "time": mark.time, "text": mark.text, "tags": tags, **until}
+    values = structs.asdict(loss)
+    span = {"from": values.pop("first"), "to": values.pop("last"), "topic": loss.topic or None}
+    return dict(sorted({**values, **span}.items()))
 
 
 def pin_values(pin: truth.Pin) -> dict[str, Any]:

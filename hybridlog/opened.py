@@ -6,6 +6,7 @@ import math
 import threading
 import time
 from contextlib import suppress
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from hybridlog.index.access import IndexAccess
@@ -81,7 +82,7 @@ class OpenStore(Shared):
             self._changed = self.directory.changed()
             self._names = self.directory.ids()
             try:
-                found = self._files.look_at_all(mends=mends)
+                found = replace(self._files, mends=mends).look_at_all()
             except DiskFullError as error:
                 # The store remains readable, and recordings can be removed.
                 self.repairs.disk_full = error
@@ -101,13 +102,9 @@ class OpenStore(Shared):
         return not is_same
 
     def has_changed(self) -> bool:
-        """True if files of recordings that were read look different by now."""
+        """True if recordings look different by now."""
         latest = self._latest
-        if latest is None or self._has_names_changed():
-            return True
-        read = [one for one in latest.snapshot().summaries if one.id in self._entries]
-        looks = self.directory.looks([one.id for one in read])
-        return any(looks.get(one.id) != one.look for one in read)
+        return latest is None or self.newest() is not latest.snapshot()
 
     def replace_latest(self, before: Snapshot, now: Session) -> None:
         """Let later questions begin with what one has seen, unless there is a newer state."""
@@ -147,8 +144,10 @@ class OpenStore(Shared):
         with self.following:
             known = {one.id: one.look for one in self.now().snapshot().summaries}
             looks = self.directory.looks(list(known))
-            self._changed = 0, False  # ids are compared in any case
-            self.catch_up(*(one for one, look in known.items() if looks.get(one) != look))
+            changed = [one for one, look in known.items() if looks.get(one) != look]
+            if changed or self.directory.ids() != self._names:
+                self._changed = 0, False  # another one may have come at the same time
+                self.catch_up(*changed)
             return self.now().snapshot()
 
     def invalidate(self) -> None:
@@ -182,7 +181,7 @@ class OpenStore(Shared):
 
         repairs = self.repairs
         self.now()  # notes what this process has changed
-        mended = self._files.mend(until)
+        mended = replace(self._files, mends=True).mend(until)
         if mended:
             with self.following:
                 for recording in mended:

@@ -12,7 +12,7 @@ from collections.abc import (
 )
 from contextlib import suppress
 from itertools import accumulate
-from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Protocol, TypeVar
+from typing import TYPE_CHECKING, Concatenate, ParamSpec, Protocol, TypeVar
 
 import numpy as np
 
@@ -58,11 +58,12 @@ if TYPE_CHECKING:
 _MAX_NAMES = 5  # recordings in a message
 _ROW_BYTES = 44  # of a message's columns in a chunk
 _MAX_COLUMNS = 4096  # sets of chunks that are at hand
-_MAX_MEANINGS = 128  # topic patterns and predicates that are cached
+_MAX_RESOLVED = 128  # topic patterns
 
 _P = ParamSpec("_P")
-_S = TypeVar("_S")
 _T = TypeVar("_T")
+_Topics = tuple[tuple[str, ...], tuple[str, ...] | None]
+"""Topics, and the ids of the recordings that have any; None for all."""
 
 
 class Asked(Protocol):
@@ -88,7 +89,7 @@ class Session:
     Args:
         shared: What all moments of the store share.
         recordings: All recordings; running ones as they were at the last look.
-        meanings: Of patterns and predicates, as long as the topics are the same.
+        resolved: Topics of patterns, as long as the topics are the same.
 
     Attributes:
         shared: As above.
@@ -99,12 +100,12 @@ class Session:
         self,
         shared: Shared,
         recordings: Snapshot,
-        meanings: dict[Any, Any] | None = None,
+        resolved: dict[tuple[str, ...], _Topics] | None = None,
     ) -> None:
         self.shared = shared
         self.directory = shared.directory
         self._recordings = recordings
-        self._meanings: dict[Any, Any] = {} if meanings is None else meanings
+        self._resolved = {} if resolved is None else resolved
         self._entries: dict[str, RecordingEntry] = {}  # that were asked about, by id
         self._newer: dict[str, Session] = {}  # has the files of a recording, by its id
 
@@ -115,7 +116,7 @@ class Session:
 
     def again(self) -> Session:
         """The same recordings, of which nothing was asked yet."""
-        return Session(self.shared, self._recordings, self._meanings)
+        return Session(self.shared, self._recordings, self._resolved)
 
     @property
     def catalog(self) -> Catalog:
@@ -170,7 +171,7 @@ class Session:
             now = summary_of(entry, summary.look)
             if now != summary:
                 if now.topics != summary.topics:
-                    self._meanings = {}
+                    self._resolved = {}
                 self._recordings = snapshot.with_changes([now], {now.topics: running.topics})
                 shared.replace_latest(snapshot, self)
             return entry
@@ -359,10 +360,7 @@ class Session:
             recordings: Ids; None for all.
         """
         snapshot = self.look(recordings)
-        places = snapshot.having(topics)
-        if recordings is not None:
-            own = (snapshot.by_id.get(recording, -1) for recording in recordings)
-            places = np.intersect1d(places, np.array([*own], np.intp))
+        places = snapshot.having(topics, recordings)
         # Recordings with equal topics and types have equal fields.
         return field_types(
             tuple(
@@ -374,15 +372,12 @@ class Session:
 
     def having(
         self, topics: Sequence[str], recordings: Iterable[str | RecordingEntry] | None = None
-    ) -> tuple[tuple[str, ...], tuple[str, ...] | None]:
+    ) -> _Topics:
         """Topics, and the ids of the recordings that have any of them.
 
         Args:
             topics: Full names.
             recordings: Ids, names or entries; None for all.
-
-        Returns:
-            The topics, and the ids; None for every recording that has a topic.
 
         Raises:
             TopicError: no recording has any of the topics.
@@ -392,10 +387,7 @@ class Session:
             known = self._recordings.summaries
             ids = [known[place].id for place in self.named(recordings)]
         snapshot = self.look(ids)
-        places = snapshot.having(topics)
-        if ids is not None:
-            own = [snapshot.by_id.get(recording, -1) for recording in ids]
-            places = np.intersect1d(places, np.array(own, np.intp))
+        places = snapshot.having(topics, ids)
         if topics and not len(places):
             raise TopicError(f"No recording chosen has {', '.join(sorted(set(topics)))}.")
         if recordings is None:
@@ -418,21 +410,23 @@ class Session:
             names |= {c.schema: c.type for c in channels if c.schema is not None}
         return names
 
-    def resolve(self, names: tuple[str, ...]) -> tuple[tuple[str, ...], tuple[str, ...] | None]:
+    def resolve(self, names: tuple[str, ...]) -> _Topics:
         """The topics that patterns match, and the recordings that have them.
 
         Raises:
             TopicError: a pattern matches no topic, or several; lists the candidates.
         """
-        self.look()
-        return self._meant(names, self._resolve)
-
-    def _resolve(self, names: tuple[str, ...]) -> tuple[tuple[str, ...], tuple[str, ...] | None]:
         known = self.topics()
         if not names:
             there = f"There are: {listed(known)}." if known else self.when_empty
             raise TopicError(f"Name a topic. {there}")
-        return self.having(resolve(names, known))
+        found = self._resolved.get(names)
+        if found is None:
+            found = self.having(resolve(names, known))
+            if len(self._resolved) >= _MAX_RESOLVED:
+                self._resolved.clear()
+            self._resolved[names] = found
+        return found
 
     def topics_of(self, recordings: Sequence[str]) -> list[str]:
         """Names of all topics of some recordings, sorted.
@@ -475,30 +469,15 @@ class Session:
         Raises:
             WhereError: it cannot be parsed, does not fit the fields, or is not allowed.
         """
-        return self._meant((text, topics, recordings), self._parse)
-
-    def _parse(self, said: tuple[str, tuple[str, ...], tuple[str, ...] | None]) -> Predicate:
         from hybridlog.query.predicate.mongo_filter import from_json, mongo_filter
         from hybridlog.query.predicate.parser import parse
         from hybridlog.query.predicate.tokens import is_filter
         from hybridlog.query.predicate.types import check
 
-        text, topics, recordings = said
         if is_filter(text):
             return mongo_filter(from_json(text), self.field_types(topics, recordings))
         found = parse(text)
         check(found, self.field_types(topics, recordings))
-        return found
-
-    def _meant(self, said: _S, find: Callable[[_S], _T]) -> _T:
-        """The meaning of a pattern or predicate, which takes half of a small count to find."""
-        if said in self._meanings:
-            known: _T = self._meanings[said]
-            return known
-        found = find(said)
-        if len(self._meanings) >= _MAX_MEANINGS:
-            self._meanings.clear()
-        self._meanings[said] = found
         return found
 
     def definitions(self, recording: RecordingEntry) -> Mapping[int, Channel]:

@@ -194,9 +194,9 @@ class Snapshot:
         """A recording of each log, and of each part of one, by the fingerprint of its content."""
         found: dict[str, RecordingSummary] = {}
         for summary in self.summaries:
-            parts = summary.source.get("parts", ())
-            for fingerprint in (summary.source.get("fingerprint"), *parts):
-                found.setdefault(fingerprint, summary)
+            parts = summary.source.get("parts")  # a catalog from elsewhere may have anything there
+            known = summary.source.get("fingerprint"), *(parts if isinstance(parts, list) else ())
+            found.update((one, summary) for one in known if isinstance(one, str))
         return found
 
     def topics_of(self, summary: RecordingSummary) -> set[str]:
@@ -221,8 +221,10 @@ class Snapshot:
         held = {topic for topics in self._topics.values() for topic in topics}
         return tuple(sorted({one.topic for one in held if one.schema in schemas}))
 
-    def having(self, topics: Collection[str]) -> NDArray[np.intp]:
-        """Positions of the recordings that have any of some topics, in order."""
+    def having(
+        self, topics: Collection[str], ids: Collection[str] | None = None
+    ) -> NDArray[np.intp]:
+        """Positions of recordings, all or some by id, that have any of some topics, in order."""
         wanted = frozenset(topics)
         found = self._having.get(wanted)
         if found is None:
@@ -231,7 +233,10 @@ class Snapshot:
             if len(self._having) >= _MAX_CACHED:
                 self._having.clear()
             self._having[wanted] = found
-        return found
+        if ids is None:
+            return found
+        own = [self.by_id[one] for one in ids if one in self.by_id]
+        return np.intersect1d(found, np.array(own, np.intp))
 
     def between(self, places: NDArray[np.intp], begin: int, end: int) -> NDArray[np.intp]:
         """Those of some recordings that overlap a range of log time.

@@ -191,7 +191,7 @@ def _target(to: str | Path, options: CopyOptions, store: Store) -> Iterator[Targ
 
         with Server(str(to), options.ssh) as server:
             server.begin()
-            yield Target(server, lambda name, _: free_name(name, server.names()))
+            yield Target(server, lambda name: free_name(name, server.names()))
         return
     if address is not None:
         from hybridlog.maintenance.bucket_derived import bring_derived
@@ -201,11 +201,7 @@ def _target(to: str | Path, options: CopyOptions, store: Store) -> Iterator[Targ
             raise UsageError(f"{address} is this very store: there is nothing to copy.")
         target = RemoteDirectory.create_in(address)
         place = BucketStore(target.bucket, target.manifests)
-
-        def named(name: str, recording: str) -> str:
-            return free_name_in(target.manifests.each(target.ids()), name, recording)
-
-        found = Target(place, named)
+        found = Target(place, lambda name: free_name_in(target.manifests.each(target.ids()), name))
         try:
             yield found
         finally:
@@ -216,11 +212,9 @@ def _target(to: str | Path, options: CopyOptions, store: Store) -> Iterator[Targ
         raise UsageError(f"{to} lies inside the store {source.path}: copy to another directory.")
     with open_store(path, create=True) as other:
         _ = other.session  # what a crash has left is mended before
-        directory, catalog = other.directory, other.catalog
         found = Target(
             Directory(path.absolute()),
-            lambda name, one: free_name_in(other.shared.newest().summaries, name, one),
-            partial(put_entry, directory, catalog),
+            lambda name: free_name_in(other.shared.newest().summaries, name),
         )
         yield found
         other.shared.catch_up()
@@ -1053,7 +1047,6 @@ class Store:
             UsageError: A rule is malformed, or not for a bucket.
             StoreError: Another process deletes here, too; or the store is read-only.
         """
-        from hybridlog.entries import put_entry
         from hybridlog.maintenance.edit import remove_if
         from hybridlog.maintenance.keep import Keeper, KeepReport
         from hybridlog.maintenance.retention import Rules

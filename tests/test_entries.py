@@ -36,7 +36,7 @@ from hybridlog.maintenance.opening import StoreFiles
 from hybridlog.maintenance.report import RepairReport
 from hybridlog_storage.catalog import CATALOG, Catalog, RecordingEntry
 from hybridlog_storage.disk.directory import StoreDirectory
-from hybridlog_storage.errors import CatalogError, ManifestError, SegmentError, StoreError
+from hybridlog_storage.errors import CatalogError, ManifestError, SegmentError
 from hybridlog_storage.manifest import File, Loss, Manifest, Note, Part, Source, new_id, with_rows
 from hybridlog_storage.manifest import replace as changed
 from hybridlog_storage.manifests import MANIFEST_OLD
@@ -529,29 +529,6 @@ def test_nothing_says_what_recording_it_is(directory: StoreDirectory) -> None:
         made_again(take_inventory(directory, "x"), None)
 
 
-def test_a_manifest_that_cannot_be_read_is_told(made: Made, tmp_path: Path) -> None:
-    places.manifest_of(made.path).rename(tmp_path / "elsewhere")
-    places.manifest_of(made.path).symlink_to(tmp_path / "elsewhere")
-    with pytest.raises(StoreError, match="is a link"):
-        made.inventory()
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        "1.mcap",
-        "0000001.mcap",
-        "\u0660\u0660\u0660\u0660\u0660\u0661.mcap",
-        "-00001.mcap",
-        "x.mcap",
-    ],
-)
-def test_names_that_are_no_segments_are_passed_over(made: Made, name: str) -> None:
-    shutil.copy(made.segments[1], made.path / name)
-    assert made.inventory().listing.others == (name,)
-    check(made.entry())
-
-
 def test_names_are_text(made: Made) -> None:
     assert text("ä") == "ä"
     assert text(os.fsdecode(b"a\xff")) == "a\\xff"
@@ -563,8 +540,8 @@ def test_names_are_text(made: Made) -> None:
 def opened(directory: StoreDirectory) -> tuple[list[RecordingEntry], RepairReport]:
     report = RepairReport()
     with closing(Catalog(directory.path, directory.settings.store_id)) as catalog:
-        store = StoreFiles(directory, catalog, report)
-        found = store.look_at_all(mends=True).summaries
+        store = StoreFiles(directory, catalog, report, mends=True)
+        found = store.look_at_all().summaries
         entries = [store.current_entry(summary)[0] for summary in found]
         return [entry for entry in entries if entry is not None], report
 

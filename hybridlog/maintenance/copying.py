@@ -87,14 +87,12 @@ class Target:
 
     Attributes:
         place: The store.
-        named: Makes a name that no recording there has, but for the one of an id.
-        made: Called with the id of each new one.
+        named: Makes a name that no recording there has.
         arrived: Ids of the recordings of which something was copied.
     """
 
     place: Place
-    named: Callable[[str, str], str]
-    made: Callable[[str], object] = lambda _: None
+    named: Callable[[str], str]
     arrived: list[str] = field(default_factory=list)
 
 
@@ -169,7 +167,6 @@ class Copying:
             options.check,
             options.limit_rate,
             self.target.named,
-            self.target.made,
             progress,
             partial(self._let_go, one) if options.then_expire else None,
         )

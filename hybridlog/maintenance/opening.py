@@ -73,50 +73,45 @@ class StoreFiles:
         directory: The store.
         catalog: Its catalog.
         report: Collects problems and repairs.
+        mends: Whether what a crash has left is repaired, or else noted.
     """
 
     directory: StoreDirectory
     catalog: Catalog
     report: RepairReport
+    mends: bool = False
 
-    def look_at_all(self, *, mends: bool = False) -> Snapshot:
+    def look_at_all(self) -> Snapshot:
         """All recordings.
 
         The files of a recording are read if it is new, or looks different from outside. All
         others are compared with their files before they first answer, see `current_entry`.
-
-        Args:
-            mends: Repair what a crash has left, as when a store is opened; otherwise it is noted.
         """
         from hybridlog.maintenance import tables
 
         directory, catalog, report = self.directory, self.catalog, self.report
-        mends = mends and not catalog.is_in_memory
+        mends = self.mends and not catalog.is_in_memory
         # A recording has its manifest before it has tables.
         gone = tables.unfinished(directory) if mends else set()
         rows = catalog.summaries()
         report.unreadable.clear()
         ids = directory.ids()
-        found = self._find(directory.looks(ids), {one.id: one for one in rows}, mends=mends)
-        self._note_lost(mends=mends)
+        found = self._find(directory.looks(ids), {one.id: one for one in rows})
+        if mends:
+            directory.manifests.clear()  # what killed processes left
+        for name in directory.manifests.without():
+            report.unreadable[name] = _lost(directory, name)
         for summary in rows if mends or catalog.is_in_memory else ():
             # The row of a recording that is unreadable now may be valid again later.
             if summary.id not in found and summary.id not in report.unreadable:
                 catalog.remove(summary.id)
                 gone.add(summary.id)
-        snapshot = snapshot_of(catalog, found.values())
+        topics = {one.topics: catalog.topics(one.topics) for one in found.values()}
+        snapshot = Snapshot(found.values(), topics)
         if gone and mends and not report.unreadable:
             tables.remove_unfinished(directory, snapshot)
             tables.remove_all(directory, gone - found.keys())
         return snapshot
-
-    def _note_lost(self, *, mends: bool) -> None:
-        """Note folders without a manifest, and remove what killed processes left of others."""
-        manifests = self.directory.manifests
-        if mends:
-            manifests.clear()
-        for name in manifests.without():
-            self.report.unreadable[name] = _lost(self.directory, name)
 
     def catch_up(self, snapshot: Snapshot, recordings: AbstractSet[str]) -> Snapshot | None:
         """All recordings after changes of some of them, as of `look_at_all`.
@@ -146,15 +141,12 @@ class StoreFiles:
         self,
         looks: Mapping[str, str],
         known: Mapping[str, RecordingSummary],
-        *,
-        mends: bool = False,
     ) -> dict[str, RecordingSummary]:
         """Summaries of recordings by id.
 
         Args:
             looks: The look of each directory, by id.
             known: Summaries in the catalog, by id.
-            mends: Repair what a crash has left; otherwise it is noted.
         """
         found: dict[str, RecordingSummary] = {}
         due = set[str]()
@@ -167,7 +159,7 @@ class StoreFiles:
         whole = self._by_manifests({one: looks[one] for one in due}, known)
         for recording in sorted(due - whole.keys()):
             try:
-                summary = self._look_again(recording, mends=mends)
+                summary = self._look_again(recording)
             except DiskFullError:
                 raise
             except StoreError as error:
@@ -198,11 +190,11 @@ class StoreFiles:
             self.catalog.put_summaries(found.values(), topics, is_change=is_change)
         return found
 
-    def _look_again(self, recording: str, *, mends: bool) -> RecordingSummary | None:
+    def _look_again(self, recording: str) -> RecordingSummary | None:
         """The summary of a recording as its files are now; None if it is gone."""
         known = self._known(recording)
         if known is None:
-            described = self._refresh(recording, mends=mends)
+            described = self._refresh(recording)
             return described.summary if described is not None else None
         found = described_of(*known)
         is_noted = self.catalog.recording(recording) == (found.files, found.entry)
@@ -245,7 +237,7 @@ class StoreFiles:
         described = self._refresh(summary.id)
         return (described.entry if described is not None else None), True
 
-    def _refresh(self, recording: str, *, mends: bool = False) -> Described | None:
+    def _refresh(self, recording: str) -> Described | None:
         """Read what is whole of a recording, and put it into the catalog; None if it is gone.
 
         What a crash has left is mended, or else noted.
@@ -254,7 +246,7 @@ class StoreFiles:
         can_write = not catalog.is_in_memory and os.access(directory.recording(recording), os.W_OK)
         may_mend = can_write and self.report.disk_full is None
         try:
-            if mends and may_mend:
+            if self.mends and may_mend:
                 with suppress(HeldError, TopicError), directory.writing(recording):
                     if not recover(directory, recording, self.report):
                         return None
@@ -262,7 +254,7 @@ class StoreFiles:
                     catalog.put(described)
                     return described
             is_open = directory.is_recorded(recording)
-            if may_mend and not (mends or is_open) and is_unfinished(directory, recording):
+            if may_mend and not (self.mends or is_open) and is_unfinished(directory, recording):
                 self.report.noted.add(recording)
             described = describe_now(directory, catalog, recording, is_open=is_open)
         except RecordingGoneError:
@@ -275,7 +267,7 @@ class StoreFiles:
         return described
 
     def mend(self, until: float) -> set[str]:
-        """Recover the recordings that were noted, and update their catalog rows.
+        """With `mends`, recover the recordings that were noted, and update their catalog rows.
 
         Args:
             until: When this should end, by `time.monotonic`; what would take longer stays noted.
@@ -293,7 +285,7 @@ class StoreFiles:
             report.noted.discard(recording)
             report.unreadable.pop(recording, None)
             try:
-                described = self._refresh(recording, mends=True)
+                described = self._refresh(recording)
             except DiskFullError:
                 raise
             except StoreError as error:
@@ -303,12 +295,6 @@ class StoreFiles:
             if described is not None:
                 mended.add(described.entry.id)
         return mended
-
-
-def snapshot_of(catalog: Catalog, summaries: Collection[RecordingSummary]) -> Snapshot:
-    """Some recordings with their topics."""
-    hashes = {summary.topics for summary in summaries}
-    return Snapshot(summaries, {digest: catalog.topics(digest) for digest in hashes})
 
 
 def _lost(directory: StoreDirectory, name: str) -> str:

@@ -146,7 +146,7 @@ def _put_manifest_right(directory: StoreDirectory, recording: str) -> list[Repai
             inventory = inventory_of(directory, recording, directory.listing(recording), None)
             made = made_again(inventory, old)
             others = manifests.each(directory.ids())
-            return replace(made, name=free_name_in(others, made.name, recording))
+            return replace(made, name=free_name_in(others, made.name))
 
         made = manifests.restore(recording, make)
         return [Repaired(made.name, "manifest", "made again")]

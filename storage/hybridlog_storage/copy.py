@@ -40,9 +40,8 @@ class How:
             in its place; None to send the files as they are.
         check: Prove what is there already, too, and send it again if it is wrong.
         limit_rate: Bytes a second, at most; None for no limit.
-        named: Makes a free name there of the name here, for the recording of an id.
-        made: Called with the id of a recording that is new there. Meanwhile, as in `named`, nobody
-            else begins one, where there are locks.
+        named: Makes a free name there of the name here. Meanwhile nobody else begins a recording,
+            where there are locks.
         progress: Called with the bytes done, and those in all.
         proved: Called with the digests here of logs that were proved there just now, by number;
             where there are locks, nobody changes the copy meanwhile.
@@ -51,8 +50,7 @@ class How:
     prepare: Callable[[Manifest, list[File]], AbstractContextManager[Prepared]] | None = None
     check: bool = False
     limit_rate: float | None = None
-    named: Callable[[str, str], str] = lambda name, _: name
-    made: Callable[[str], object] = lambda _: None
+    named: Callable[[str], str] = lambda name: name
     progress: Callable[[int, int], None] = lambda *_: None
     proved: Callable[[Mapping[int, str]], None] | None = None
 
@@ -186,7 +184,7 @@ class _Copy:
                     f"{here.name} in {target.address} has lost its manifest, and has payloads "
                     f"that are not here, in {', '.join(more)}. It stays as it is."
                 )
-            return replace(here, name=self._how.named(here.name, here.id), files=())
+            return replace(here, name=self._how.named(here.name), files=())
 
         if target.mends:
             return target.manifests.restore(here.id, make)
@@ -260,9 +258,8 @@ class _Copy:
         if there is None:
             try:
                 with manifests.creating() as create:
-                    made = replace(here, name=self._how.named(here.name, here.id))
+                    made = replace(here, name=self._how.named(here.name))
                     create(made)
-                    self._how.made(here.id)
                 return made
             except RecordingExistsError:
                 pass  # another process was faster

@@ -386,17 +386,9 @@ def hasher(data: bytes = b"") -> blake3:
 
 def loss_of(row: Mapping[str, Any]) -> Loss:
     """A row of the loss ledger as a log has it."""
-    return Loss(
-        row["cause"],
-        row["topic"] or "",
-        row["count"],
-        row["from"],
-        row["to"],
-        row["reason"],
-        row["file"] or "",
-        row["offset"],
-        row["length"],
-    )
+    same = {name: row[name] for name in ("cause", "count", "reason", "offset", "length")}
+    topic, file = row["topic"] or "", row["file"] or ""
+    return Loss(first=row["from"], last=row["to"], topic=topic, file=file, **same)
 
 
 def with_totals(manifest: Manifest) -> Manifest:

@@ -22,10 +22,9 @@ from hybridlog_storage.errors import (
     DiskFullError,
     HeldError,
     HybridlogError,
-    RecordingGoneError,
     StoreError,
 )
-from hybridlog_storage.manifest import Manifest, Note, encode, new_id, replace
+from hybridlog_storage.manifest import Manifest, encode, new_id, replace
 from hybridlog_storage.manifests import DiskManifests
 from tests.calls import Calls
 from tests.limits import Limit
@@ -376,23 +375,6 @@ def test_a_store_that_only_others_may_write_is_read(store: Path, calls: Calls) -
     assert manifests.read(ONE.id).name == "first"
     with pytest.raises(StoreError, match="Not allowed to write"):
         manifests.change(ONE.id, tagged)
-
-
-def test_removal_leaves_other_recordings_alone(store: Path) -> None:
-    manifests = DiskManifests(store)
-    manifests.create(OTHER)
-    kept = {name for name in names(store) if OTHER.id in name}
-    manifests.remove(ONE.id)
-    assert {*names(store)} == {*kept, "hybridlog.toml", "manifests/.lock"}
-    with pytest.raises(RecordingGoneError):
-        manifests.read(ONE.id)
-
-
-def test_notes_are_kept_in_order(store: Path) -> None:
-    manifests = DiskManifests(store)
-    for at in (3, 1, 2):
-        manifests.change(ONE.id, lambda now, at=at: replace(now, notes=(*now.notes, Note(at, ""))))
-    assert [note.at for note in manifests.read(ONE.id).notes] == [3, 1, 2]
 
 
 def test_no_two_manifests_look_alike(store: Path) -> None:
