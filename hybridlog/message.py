@@ -10,7 +10,7 @@ import numpy as np
 from hybridlog.query.times import format_time
 from hybridlog.schema.codec import columns_of, readable
 from hybridlog.schema.column import Records
-from hybridlog.schema.states import GONE, State
+from hybridlog.schema.states import State
 from hybridlog_storage.errors import HybridlogError
 
 if TYPE_CHECKING:
@@ -158,7 +158,7 @@ class Message:
             PayloadError: the payload does not fit its definition.
             DefinitionError: no usable definition exists.
         """
-        if self.state in GONE:
+        if self.is_reduced:
             self._documents.refuse(self._row)
         return self._codec.decode(self._view)
 
@@ -235,12 +235,15 @@ class Documents:
             PayloadError: Always.
         """
         from hybridlog.schema.left import missing_payload
+        from hybridlog.schema.reduced_codec import size_and_digest
 
         left = self._batch.left
-        assert left is not None
-        digest = left.parts[left.part[row]].sha256(int(left.row[row]))
-        state = self._channels[int(self._batch.channel[row])].state
-        raise missing_payload(state, int(left.length[row]), digest)
+        channel = self._channels[int(self._batch.channel[row])]
+        if left is None or left.part[row] < 0:
+            about = size_and_digest(self._batch.payload(row))
+        else:
+            about = left.parts[left.part[row]].about(int(left.row[row]))
+        raise missing_payload(channel.state, *about)
 
     def _make(self, index: int) -> None:
         from hybridlog.schema.index_bodies import bodies_of

@@ -66,11 +66,10 @@ class Columns:
         demand(seal[1] == b"%08x" % zlib.crc32(blank), "the checksum of a footer")
         file = pq.ParquetFile(pa.BufferReader(data), page_checksum_verification=True)
         about = json.loads(file.metadata.metadata[b"hybridlog"])
-        demand(about["version"] == 2, "the version of a file")
-        (section,) = about["recordings"]
+        demand(about["version"] == 3, "the version of a file")
+        (section,) = about["sections"]
         demand(section["id"] == self._recording, "a file of another recording")
-        (counts,) = section["topics"].values()
         rows = sum(part[0] for part in listed["parts"].values())
-        demand(counts == [rows, 0, 0, 0], "the rows of a file")
+        demand(section["counts"] == [rows, 0, 0], "the rows of a file")
         demand(about["of_rows"]["parts"] == listed["parts"], "the parts of a file")
         return file, about

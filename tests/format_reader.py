@@ -415,7 +415,7 @@ class GoneSegment(Segment):
             ref = row["ref"]
             demand((ref["seg"], ref["chunk"]) == (self.line["number"], number), "a row")
             about = row["seq"], row["channel"], row["t"], row["pub"]
-            yield ref["off"], self._told(*about, ref["sequence"], ref.get("reduced", row))
+            yield ref["off"], self._told(*about, ref["sequence"], row)
 
 
 # --- recordings -----------------------------------------------------------------------

@@ -34,7 +34,7 @@ ALLOWED = {
     "av": ("hybridlog.arrays.video",),
     "blake3": ("hybridlog_storage.disk.append_file", "hybridlog_storage.manifest"),
     "bson": (
-        "hybridlog.columns.rows_file",
+        "hybridlog.columns.left_rows",
         "hybridlog.query.predicate.mongo_filter",
         "hybridlog.query.predicate.tree",
         "hybridlog.schema.index_bodies",

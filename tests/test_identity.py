@@ -438,9 +438,10 @@ def content_of(store: Path, recording: str) -> dict[str, bytes]:
         if path.is_file() and path.name not in _LOCKS:
             found[str(path.relative_to(top))] = path.read_bytes()
     for file in files_of(store):
-        for section in file.about.recordings:
+        for section in file.about.sections:
             if section.id == recording:
-                found[str(file.path.relative_to(store))] = repr(section).encode()
+                name = str(file.path.relative_to(store))
+                found[name] = found.get(name, b"") + repr(section).encode()
     return found
 
 

@@ -304,8 +304,8 @@ def _tables_of(store: Store, channels: Collection[RecordedChannel]) -> list[dict
     folders: dict[Path, dict[str, Any]] = {}
     others: set[Path] = set()
     for file in files_of(store.directory.path, prefixes) if prefixes else ():
-        sections = [one for one in file.about.recordings if name in one.topics]
-        rows = sum(one.topics[name].rows for one in sections if one.id in recordings)
+        sections = [one for one in file.about.sections if one.topic == name]
+        rows = sum(one.rows for one in sections if one.id in recordings)
         if not all(one.id in recordings for one in sections):
             others.add(file.path.parent)
         if rows:

@@ -5,13 +5,11 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from collections.abc import Collection, Iterator, Sequence
-from itertools import chain
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-import numpy as np
 import pyarrow as pa
 
-from hybridlog.columns.fields import SUMMARY_FIELDS, is_of_bytes
+from hybridlog.columns.fields import SUMMARY_FIELDS, is_of_bytes, names_of
 from hybridlog.columns.layout import Section, TopicCounts
 from hybridlog.columns.parquet_file import Leaf, ParquetFileReader, leaves
 from hybridlog_storage.disk import files
@@ -22,13 +20,10 @@ if TYPE_CHECKING:
 
 _OPEN_FILES: Final = 256
 _MAX_FIELD_SETS: Final = 64  # sets of fields whose columns are known for a file
-FIRST: Final = -(1 << 63), -(1 << 63)
-"""Lower bound of all keys."""
-LAST: Final = (1 << 63) - 1, (1 << 63) - 1
-"""Upper bound of all keys."""
-
-Key = tuple[int, int]
-"""Log time and arrival number: the order of messages."""
+FIRST: Final = -(1 << 63)
+"""Lower bound of all log times."""
+LAST: Final = (1 << 63) - 1
+"""Upper bound of all log times."""
 
 
 class TablePart(NamedTuple):
@@ -39,16 +34,16 @@ class TablePart(NamedTuple):
         group: Number of the row group.
         begin: First row of the topic in it.
         rows: Number of its rows.
-        first: Key of the first row, or a lower bound of it.
-        last: Key of the last row, or an upper bound of it.
+        first: A lower bound of their log times, ns.
+        last: An upper bound of these.
     """
 
     file: ColumnFile
     group: int
     begin: int
     rows: int
-    first: Key
-    last: Key
+    first: int = FIRST
+    last: int = LAST
 
 
 class ColumnFile(ParquetFileReader):
@@ -179,41 +174,33 @@ class ColumnFile(ParquetFileReader):
         )
 
     def sections(self) -> Iterator[tuple[int, Section]]:
-        """The recordings in it, each with its first row."""
+        """The rows in it, each section with its first row."""
         before = 0
-        for section in self.about.recordings:
+        for section in self.about.sections:
             yield before, section
             before += section.rows
 
     def parts(self, begin: int, rows: int) -> Iterator[TablePart]:
         """Row groups with some rows of one topic."""
+        time = next(number for number, leaf in enumerate(self.leaves) if leaf.top == "t")
         before = 0
-        for group, (count, *keys) in enumerate(self.about.bounds):
+        for group, count in enumerate(self.groups):
             low, high = max(begin, before), min(begin + rows, before + count)
             if low < high:
-                is_known = any(keys)
-                first = (keys[0], keys[1]) if is_known else FIRST
-                last = (keys[2], keys[3]) if is_known else LAST
-                yield TablePart(self, group, low - before, high - low, first, last)
+                bounds = self.bounds(group, time) or (FIRST, LAST)
+                yield TablePart(self, group, low - before, high - low, *bounds)
             before += count
 
     @lazy
     def counts(self) -> TopicCounts:
         """Counts of all its rows."""
-        topics = [section.topics.values() for section in self.about.recordings]
         return TopicCounts(
-            *np.array([*chain(*topics)], np.int64)
-            .reshape(-1, len(TopicCounts._fields))
-            .sum(axis=0)
-            .tolist()
+            *map(sum, zip(*(one.counts for one in self.about.sections), strict=True))
         )
 
     def all_parts(self) -> list[TablePart]:
         """All rows, as if they were of one topic."""
-        return [
-            TablePart(self, group, 0, bound[0], FIRST, LAST)
-            for group, bound in enumerate(self.about.bounds)
-        ]
+        return [TablePart(self, group, 0, rows) for group, rows in enumerate(self.groups)]
 
 
 class OpenFiles:
@@ -248,8 +235,3 @@ class OpenFiles:
         self._cache.drop("column")
         with self._lock:
             self._open.clear()
-
-
-def names_of(path: str) -> tuple[str, ...]:
-    """Names on a dotted path of a field, without brackets."""
-    return tuple(path.replace("[]", "").split("."))

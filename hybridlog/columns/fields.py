@@ -301,3 +301,8 @@ def without(array: Array, rows: Any, total: int) -> Array:
     missing = np.ones(total, np.bool_)
     missing[rows] = False
     return array.take(pa.array(places, mask=missing))
+
+
+def names_of(path: str) -> tuple[str, ...]:
+    """Names on a dotted path of a field, without brackets."""
+    return tuple(path.replace("[]", "").split("."))

@@ -3,9 +3,9 @@
 All changes are made under a lock on the folder `tables`. A shared file is replaced by one
 rename, so readers find the old rows or the new ones.
 
-Beside a folder lies a list, `.<folder>.recordings`, which tells the shared files of a recording
-without opening any. Each line has an id, names of files and a checksum. It is written before
-the rows, so it lacks no file of a recording that it lists. Lines of removed recordings stay.
+The number in the name of a shared file is when the recording that began it was created; of the
+first file 0. A recording comes to the last file of its time or before, and begins another one if
+that is full. So one that is looked for is in that file, or else in one of those in front.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ import logging
 import os
 import re
 import time
-from collections import defaultdict
+from bisect import bisect_right
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from stat import S_ISDIR
 from typing import Any, Final
@@ -29,7 +29,6 @@ from hybridlog.columns.layout import (
     SUFFIX,
     TABLES,
     Section,
-    TopicCounts,
     is_of_folder,
     parts_folder,
 )
@@ -39,8 +38,7 @@ from hybridlog.columns.parquet_file import (
     ParquetFileWriter,
     ReusedBytes,
 )
-from hybridlog_storage.checksum import crc32
-from hybridlog_storage.disk import durability, files
+from hybridlog_storage.disk import files
 from hybridlog_storage.errors import StoreError, unreadable
 
 MAX_SHARED_ROWS: Final = 50_000
@@ -49,12 +47,11 @@ MAX_SHARED_BYTES: Final = 4 << 20
 """Size from which a shared file gets no more recordings."""
 MAX_SHARED_RECORDINGS: Final = 256
 """Maximum number of recordings in one file: each one that comes costs a look at all of them."""
-_SHARED_NAME: Final = re.compile(rf"{SHARED}(\d{{6,}}){re.escape(SUFFIX)}", re.ASCII)
-_MAX_LIST_BYTES: Final = 256 << 20
+_SHARED_NAME: Final = re.compile(rf"{SHARED}(\d{{20}}){re.escape(SUFFIX)}", re.ASCII)
 _STABLE_NS: Final = 100_000_000  # a time of change that is older tells of every later change
 _log = logging.getLogger(__name__)
 _Piece = tuple[Section, Any]
-"""Rows of a recording, and what they are."""
+"""Rows of a topic of a recording, and what they are."""
 
 
 @dataclass(slots=True)
@@ -62,13 +59,11 @@ class Addition:
     """Rows of one recording for a folder.
 
     Attributes:
-        rows: Rows for a shared file, by topic, with all columns; empty for none.
-        section: What they are; None without such rows.
+        pieces: Rows of topics for a shared file, with all columns, and what they are.
         files: Finished files of long topics.
     """
 
-    rows: Any = None
-    section: Section | None = None
+    pieces: list[_Piece] = field(default_factory=list)
     files: list[Path] = field(default_factory=list)
 
 
@@ -78,20 +73,23 @@ class TableFolders:
     Args:
         root: The store.
         recording: Id of the recording.
+        created: When it was created, ns; None if unknown: then it is looked for in all files.
         digests: Digests of its segments; rows of others go.
     """
 
     def __init__(
-        self, root: Path, recording: str, digests: Mapping[str, str] | None = None
+        self,
+        root: Path,
+        recording: str,
+        created: int | None,
+        digests: Mapping[str, str] | None = None,
     ) -> None:
         self._root = root
         self._recording = recording
+        self._created = created
         self._digests = digests or {}
         self._numbers = 0
         self._keeps_bytes = True
-        # Of the folder that is changed:
-        self._is_listed = False
-        self._shared: set[str] = set()  # shared files that may have rows of the recording
 
     def add(
         self,
@@ -149,53 +147,21 @@ class TableFolders:
         """
         place = self._root / TABLES / folder
         names = [n for n in files.names(place) if n.endswith(SUFFIX)]
-        shared = sorted(name for name in names if name.startswith(SHARED))
-        is_new = goes is None  # and in no file yet
-        listed = None if is_new else shared_files(self._root, folder, self._recording)
-        self._is_listed = bool(listed)
-        self._shared = set() if not listed else listed[self._recording]
+        shared = [*shared_for(shared_times(names), self._created)]
         waiting, old = addition, []
         if goes is not None:
             old = self._own_files(place, names, goes)
-            for path, reader in self._shared_with_rows(place, shared):
-                self._rewrite(path, reader, waiting, goes)
-                waiting = Addition()
-        if waiting.section is not None:
+            for name in shared:
+                reader = _reader(place / name)
+                if reader is not None and reader.about.has(self._recording):
+                    self._rewrite(place / name, reader, waiting, goes)
+                    waiting = Addition()
+                    break
+        if waiting.pieces:
             self._merge(place, shared, waiting)
-        elif addition.files and not self._is_listed:
-            self._list(place)
         self._publish(place, addition.files, [name for name in names if name not in old], old)
         with suppress(OSError), files.folder(place.parent) as fd:
             files.system.rmdir(folder, folder=fd)
-            files.system.unlink(_list_of(place).name, folder=fd)
-
-    def _shared_with_rows(
-        self, place: Path, shared: Sequence[str]
-    ) -> list[tuple[Path, ParquetFileReader]]:
-        """The shared files with rows of the recording; all are opened only if it is not listed."""
-        found = []
-        for name in shared:
-            is_other = self._is_listed and name not in self._shared
-            if is_other and _SHARED_NAME.fullmatch(name):
-                continue
-            reader = _reader(place / name)
-            if reader is not None and reader.about.section(self._recording) is not None:
-                found.append((place / name, reader))
-        self._shared.update(path.name for path, _ in found)
-        return found
-
-    def _list(self, place: Path, *names: str) -> None:
-        """List shared files of the recording, before they have rows of it."""
-        self._shared.update(names)
-        line = " ".join([self._recording, *sorted(self._shared)]).encode()
-        flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT
-        fd = files.open_file(_list_of(place), flags)
-        try:
-            # A line before it may have been cut by a crash.
-            durability.write_all(fd, [b"\n%b %b\n" % (line, _checksum(line))])
-        finally:
-            os.close(fd)
-        self._is_listed = True
 
     def _own_files(
         self, place: Path, names: Iterable[str], goes: Callable[[str], bool]
@@ -206,7 +172,7 @@ class TableFolders:
             if name.startswith(f"{self._recording}-"):
                 try:
                     about = ParquetFileReader(place / name).about
-                    topics = [topic for one in about.recordings for topic in one.topics]
+                    topics = [one.topic for one in about.sections]
                 except (OSError, StoreError):
                     found.append(name)
                     continue
@@ -215,24 +181,20 @@ class TableFolders:
         return found
 
     def _merge(self, place: Path, shared: Sequence[str], addition: Addition) -> None:
-        """Add rows to the newest shared file, or to a new one."""
-        assert addition.section is not None
-        number = 0
-        numbers = [int(found[1]) for name in shared if (found := _SHARED_NAME.fullmatch(name))]
-        if numbers:
-            path = place / f"{SHARED}{max(numbers):06d}{SUFFIX}"
-            reader = _reader(path)
-            number = max(numbers) + (reader is not None)
-            if (
-                reader is not None
-                and len(reader.about.recordings) < MAX_SHARED_RECORDINGS
+        """Add rows to the shared file that may have them, or to a new one."""
+        reader = next(filter(None, (_reader(place / name) for name in shared)), None)
+        own = _shared_name(0 if reader is None else max(self._created or 0, 0))
+        if reader is not None and (
+            reader.path.name == own
+            or (
+                len({one.id for one in reader.about.sections}) < MAX_SHARED_RECORDINGS
                 and reader.size_bytes < MAX_SHARED_BYTES
-                and reader.about.rows + addition.section.rows <= MAX_SHARED_ROWS
-            ):
-                self._rewrite(path, reader, addition, lambda _: False)
-                return
-        path = place / f"{SHARED}{number:06d}{SUFFIX}"
-        self._write(path, [(addition.section, addition.rows)])
+                and reader.rows + sum(one.rows for one, _ in addition.pieces) <= MAX_SHARED_ROWS
+            )
+        ):
+            self._rewrite(reader.path, reader, addition, lambda _: False)
+        else:
+            self._write(place / own, addition.pieces)
 
     def _rewrite(
         self,
@@ -248,27 +210,17 @@ class TableFolders:
             # Its other recordings get their tables again when they are asked about.
             _log.info("%s", error)
             files.unlink(path)
-            if addition.section is not None:
-                self._write(path, [(addition.section, addition.rows)])
+            if addition.pieces:
+                self._write(path, addition.pieces)
             return
-        pieces: list[_Piece] = []
-        before = 0
-        for section in reader.about.recordings:
-            piece = section, table.slice(before, section.rows)
+        pieces, before = [*addition.pieces], 0
+        new = {section.topic for section, _ in pieces}
+        for section in reader.about.sections:
+            is_fresh = section.segments.items() <= self._digests.items()
+            stays = is_fresh and section.topic not in new and not goes(section.topic)
+            if section.id != self._recording or stays:
+                pieces.append((section, table.slice(before, section.rows)))
             before += section.rows
-            if section.id != self._recording:
-                pieces.append(piece)
-            elif section.segments.items() <= self._digests.items():  # else it is stale
-                pieces += (one for one in _by_topic(*piece) if not goes(*one[0].topics))
-        if addition.section is not None:
-            new = addition.section
-            is_replaced = new.topics.__contains__
-            pieces = [
-                (replace(section, begin=new.begin) if section.id == new.id else section, rows)
-                for section, rows in pieces
-                if section.id != new.id or not any(map(is_replaced, section.topics))
-            ]
-            pieces += _by_topic(new, addition.rows)
         if pieces:
             self._write(path, pieces, reader)
         else:
@@ -284,17 +236,8 @@ class TableFolders:
             pieces: What it has, in any order.
             before: The file that it replaces.
         """
-        pieces = sorted(pieces, key=lambda piece: (piece[0].place, *piece[0].topics))
-        sections = {section.id: section for section, _ in pieces}
-        segments: defaultdict[str, dict[str, str]] = defaultdict(dict)
-        topics: defaultdict[str, dict[str, TopicCounts]] = defaultdict(dict)
-        for section, _ in pieces:
-            segments[section.id] |= section.segments
-            topics[section.id] |= section.topics
-        found = [
-            replace(section, segments=segments[name], topics=topics[name])
-            for name, section in sections.items()
-        ]
+        pieces = sorted(pieces, key=lambda piece: piece[0].place)
+        found = [section for section, _ in pieces]
         schema = pieces[0][1].schema
         table = pa.concat_tables(
             [rows if rows.schema.equals(schema) else rows.cast(schema) for _, rows in pieces]
@@ -302,14 +245,12 @@ class TableFolders:
         reused = before.reusable() if before is not None and self._keeps_bytes else None
         in_front = False
         if reused is not None and before is not None:
-            size = len(reused.data) * table.num_rows / max(before.about.rows, 1)
+            size = len(reused.data) * table.num_rows / max(before.rows, 1)
             in_front = size < reused.offset
         try:
             part = self._part(found, table, reused, in_front=in_front)
         except NoRoomError:
             part = self._part(found, table, reused, in_front=False)
-        if self._recording in sections and not (self._is_listed and path.name in self._shared):
-            self._list(path.parent, path.name)
         files.rename(part, path)
 
     def _part(
@@ -369,41 +310,24 @@ def _folders(root: Path) -> list[str]:
     return sorted(name for name, about in found if "~" in name and S_ISDIR(about.st_mode))
 
 
-def shared_files(root: Path, folder: str, recording: str = "") -> dict[str, set[str]]:
-    """Names of the shared files of a folder, by the recordings in its list.
+def shared_times(names: Iterable[str]) -> list[int]:
+    """The numbers in the names of shared files, in order."""
+    return sorted(int(found[1]) for found in map(_SHARED_NAME.fullmatch, names) if found)
 
-    A recording that is not listed may be in any of them.
+
+def shared_for(times: Sequence[int], created: int | None) -> Iterator[str]:
+    """Names of shared files that may have rows of a recording, the likeliest first.
 
     Args:
-        root: The store.
-        folder: Name of the folder.
-        recording: Only this one; empty for all.
+        times: As of `shared_times`.
+        created: When it was created, ns; None if unknown.
     """
-    found: dict[str, set[str]] = {}
-    path, wanted = _list_of(root / TABLES / folder), recording.encode()
-    with suppress(OSError):
-        for line in files.read_file(path, _MAX_LIST_BYTES).splitlines():
-            content, _, checksum = line.rpartition(b" ")
-            if line.startswith(wanted) and checksum == _checksum(content):
-                known, *names = content.decode().split(" ")
-                found.setdefault(known, set()).update(names)
-    return found
+    end = len(times) if created is None else bisect_right(times, max(created, 0))
+    return map(_shared_name, reversed(times[:end]))
 
 
-def list_bytes(folder: Path) -> int:
-    """Bytes of the list beside a folder; 0 without one."""
-    try:
-        return files.status(_list_of(folder)).st_size
-    except OSError:
-        return 0
-
-
-def _list_of(folder: Path) -> Path:
-    return folder.with_name(f".{folder.name}.recordings")
-
-
-def _checksum(content: bytes) -> bytes:
-    return f"{crc32(content):08x}".encode()
+def _shared_name(time: int) -> str:
+    return f"{SHARED}{time:020d}{SUFFIX}"
 
 
 class Listing:
@@ -455,7 +379,7 @@ def files_of(root: Path, prefixes: Collection[str] = ("",)) -> Iterator[ParquetF
 
 def recordings_of(root: Path) -> set[str]:
     """Ids of all recordings with tables."""
-    return {section.id for file in files_of(root) for section in file.about.recordings}
+    return {section.id for file in files_of(root) for section in file.about.sections}
 
 
 def _reader(path: Path) -> ParquetFileReader | None:
@@ -477,11 +401,3 @@ def _reader(path: Path) -> ParquetFileReader | None:
 
 def _all(_: str) -> bool:
     return True
-
-
-def _by_topic(section: Section, rows: Any) -> Iterator[_Piece]:
-    """Rows of a recording, those of each topic on their own."""
-    before = 0
-    for topic, counts in section.topics.items():
-        yield replace(section, topics={topic: counts}), rows.slice(before, counts.rows)
-        before += counts.rows

@@ -1,7 +1,7 @@
 """Names of files of columns: folders, files, columns and the metadata of a file.
 
 ```
-tables/<type>~<shape8>/shared-<number>.parquet   several recordings
+tables/<type>~<shape8>/shared-<time>.parquet     several recordings
 tables/<type>~<shape8>/<id>-<number>.parquet     a long topic of one recording
 tables.part/r<id>/                               unfinished files
 tables.part/r<id>/<type>~<shape8>/               sealed segments of a recording in progress
@@ -63,7 +63,7 @@ OWN: Final = b"hybridlog.own"
 """Metadata of a column that is none of a field, besides `OWN_COLUMNS`."""
 ABOUT: Final = b"hybridlog"
 """Metadata of a file: an `About` as JSON."""
-VERSION: Final = 2
+VERSION: Final = 3
 RESERVED: Final = frozenset(OWN_COLUMNS)
 """Names that no column of a field has."""
 POINTS: Final = "points"
@@ -169,13 +169,11 @@ class TopicCounts(NamedTuple):
     Attributes:
         rows: All rows.
         unreadable: Rows without fields, because their messages do not fit their definition.
-        reduced: Rows without fields, because their messages were reduced under pressure.
         arrays: Rows with arrays in full.
     """
 
     rows: int
     unreadable: int = 0
-    reduced: int = 0
     arrays: int = 0
 
     @property
@@ -190,29 +188,31 @@ class TopicCounts(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """The rows of one recording in a file.
+    """The rows of one topic of one recording in a file.
 
     Attributes:
         id: Id of the recording.
-        begin: Log time at which it begins, ns: recordings are in this order.
-        segments: Digest of each segment that has rows in the file, by its number as text.
-        topics: Rows of each topic, in the order of the file.
+        topic: Full name of the topic.
+        begin: Log time at which the recording begins, ns.
+        segments: Digest of each segment that has rows in it, by its number as text.
+        counts: Its rows.
     """
 
     id: str
+    topic: str
     begin: int
     segments: Mapping[str, str]
-    topics: Mapping[str, TopicCounts]
+    counts: TopicCounts
 
     @property
     def rows(self) -> int:
-        """Rows of all topics."""
-        return sum(counts.rows for counts in self.topics.values())
+        """All rows."""
+        return self.counts.rows
 
     @property
-    def place(self) -> tuple[int, str]:
+    def place(self) -> tuple[int, str, str]:
         """Its place in the order of a file."""
-        return self.begin, self.id
+        return self.begin, self.id, self.topic
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,28 +220,20 @@ class About:
     """The description of a file of tables, stored in the file itself.
 
     Attributes:
-        recordings: The recordings with rows in the file, in its order.
-        bounds: For each row group: its rows, then log time and arrival number of its first and
-            last row. The keys are zeros in a file of several topics or recordings.
+        sections: The rows in the file, in its order.
         span: First byte of the row groups, and the one after their end.
         version: Version of the format.
         of_rows: What a file of rows says of them besides; empty in a table.
     """
 
-    recordings: Sequence[Section]
-    bounds: tuple[tuple[int, int, int, int, int], ...]
+    sections: Sequence[Section]
     span: tuple[int, int] = (0, 0)
     version: int = VERSION
     of_rows: Mapping[str, Any] = field(default_factory=dict, repr=False)
 
-    @property
-    def rows(self) -> int:
-        """Rows of all recordings."""
-        return sum(bound[0] for bound in self.bounds)
-
-    def section(self, recording: str) -> Section | None:
-        """The rows of a recording; None without any."""
-        return next((one for one in self.recordings if one.id == recording), None)
+    def has(self, recording: str) -> bool:
+        """True if it has rows of a recording."""
+        return any(one.id == recording for one in self.sections)
 
     def to_json(self) -> str:
         """The description as JSON text."""
@@ -261,7 +253,6 @@ class About:
         if about.version != VERSION:
             raise StoreError("the table has another version")
         begin, end = about.span
-        rows = sum(section.rows for section in about.recordings)
-        if not 0 <= begin <= end or rows != about.rows:
+        if not 0 <= begin <= end:
             raise StoreError("the description of the table contradicts itself")
         return about

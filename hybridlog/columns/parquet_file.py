@@ -85,7 +85,6 @@ class ParquetFileWriter:
         front: bytes = b"",
     ) -> None:
         self.path = path
-        self._bounds: list[tuple[int, int, int, int, int]] = []
         self._sink = _Sink(path)
         kinds = {leaf.path: leaf.kind for leaf in leaves(schema)}
         running = [path for path, kind in kinds.items() if _runs(path, kind)]
@@ -125,9 +124,6 @@ class ParquetFileWriter:
             OSError: the row group cannot be written.
         """
         self._writer.write_table(table, row_group_size=max(table.num_rows, 1))
-        time, seq = (table.column(name).to_numpy() for name in ("t", "seq"))
-        first, last = ((int(time[row]), int(seq[row])) if len(time) else (0, 0) for row in (0, -1))
-        self._bounds.append((len(time), *first, *last))
 
     def close(
         self,
@@ -139,7 +135,7 @@ class ParquetFileWriter:
         """Finish the file.
 
         Args:
-            sections: The recordings with rows in it, in its order.
+            sections: The rows in it, in its order.
             rows: What a file of rows says of them besides.
             sync: True to force it to the disk.
 
@@ -158,10 +154,7 @@ class ParquetFileWriter:
                     raise NoRoomError
                 self._put(self._behind)
             self._sink.end_body()
-            # Keys of rows of several topics are no bounds.
-            is_one = sum(len(section.topics) for section in sections) == 1
-            bounds = self._bounds if is_one else [(one[0], 0, 0, 0, 0) for one in self._bounds]
-            about = About(sections, tuple(bounds), span, of_rows=dict(rows or {}))
+            about = About(sections, span, of_rows=dict(rows or {}))
             self._writer.add_key_value_metadata(
                 {ABOUT.decode(): about.to_json(), _SEALED_BY: _BLANK.decode()}
             )
@@ -280,9 +273,11 @@ class ParquetFileReader:
                 page_checksum_verification=True,
             )
             self.schema: pa.Schema = self._parquet.schema_arrow
-            groups = [metadata.row_group(n).num_rows for n in range(metadata.num_row_groups)]
-            if groups != [bound[0] for bound in self.about.bounds]:
-                raise StoreError("its row groups differ from its description")
+            numbers = range(metadata.num_row_groups)
+            self.groups = [int(metadata.row_group(number).num_rows) for number in numbers]
+            """Rows of each row group."""
+            if sum(self.groups) != sum(section.rows for section in self.about.sections):
+                raise StoreError("its rows differ from its description")
         except FileNotFoundError:
             raise
         except (OSError, StoreError, pa.ArrowException, KeyError) as error:
@@ -298,9 +293,9 @@ class ParquetFileReader:
         return self._source.size
 
     @property
-    def groups(self) -> int:
-        """Number of row groups."""
-        return len(self.about.bounds)
+    def rows(self) -> int:
+        """Rows of all recordings."""
+        return sum(self.groups)
 
     def size(self, group: int, leaves: Sequence[int]) -> int:
         """Stored bytes of some columns of a row group."""
@@ -311,6 +306,11 @@ class ParquetFileReader:
         """Number of nulls in a column of a row group; None if unknown."""
         found = self._parquet.metadata.row_group(group).column(leaf).statistics
         return found.null_count if found is not None and found.has_null_count else None
+
+    def bounds(self, group: int, leaf: int) -> tuple[int, int] | None:
+        """Least and greatest value in a column of a row group; None if unknown."""
+        found = self._parquet.metadata.row_group(group).column(leaf).statistics
+        return (found.min, found.max) if found is not None and found.has_min_max else None
 
     def values(self, group: int, leaf: int) -> int:
         """Number of values in a column of a row group, nulls included."""
@@ -335,7 +335,7 @@ class ParquetFileReader:
             StoreError: they are damaged.
         """
         numbers = range(len(list(leaves(self.schema))))
-        groups = [self.read(group, numbers) for group in range(self.groups)]
+        groups = [self.read(group, numbers) for group in range(len(self.groups))]
         table = pa.concat_tables(groups) if groups else self.schema.empty_table()
         return table.replace_schema_metadata(None)
 
@@ -361,7 +361,7 @@ class ParquetFileReader:
                 )
         except (OSError, StoreError, pa.ArrowException, ValueError) as error:
             raise self._damaged(error) from error
-        if group is not None and table.num_rows != self.about.bounds[group][0]:
+        if group is not None and table.num_rows != self.groups[group]:
             raise self._damaged(StoreError("a row group has the wrong number of rows"))
         return table
 

@@ -77,10 +77,10 @@ class RecordingRows:
         Raises:
             SegmentError: It is missing or damaged.
         """
-        from hybridlog.columns.rows_file import messages_left
+        from hybridlog.columns.left_rows import messages_left
 
         try:
-            found = [file.rows(chunk) for file in self._of(log) if chunk in file.places]
+            found = [file.of_chunk(chunk) for file in self._of(log) if chunk in file.places]
             if not found:
                 raise SegmentError(self._problems.get(log) or "its rows are in no file")
             return messages_left(found)
@@ -93,12 +93,12 @@ class RecordingRows:
         self, topic: str, chunks: Collection[tuple[int, int]], opened: OpenFiles
     ) -> TopicTable:
         """The fields of a topic in chunks of logs that are gone as a table, in no order."""
-        from hybridlog.columns.column_file import FIRST, LAST, TablePart
+        from hybridlog.columns.column_file import TablePart
         from hybridlog.columns.layout import TopicCounts
         from hybridlog.columns.topic_table import TopicTable
 
         parts = [
-            TablePart(file, *file.places[chunk], FIRST, LAST)
+            TablePart(file, *file.places[chunk])
             for log, chunk in chunks
             for file in self._of(log)
             if file.topic == topic and chunk in file.places

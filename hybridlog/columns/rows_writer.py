@@ -4,14 +4,19 @@ from __future__ import annotations
 
 from collections import defaultdict
 from dataclasses import dataclass, field
+from hashlib import sha256
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 import pyarrow as pa
 
+from hybridlog.columns.fields import FieldShape
 from hybridlog.columns.layout import Section, TopicCounts, table_schema_of
 from hybridlog.columns.parquet_file import ParquetFileWriter
-from hybridlog.columns.rows_file import RowColumns
+from hybridlog.columns.rows import Places, as_table, columns_from, piece_of
+from hybridlog.schema.arrow_columns import structs
+from hybridlog.schema.codecs import codec_for
+from hybridlog.schema.reduced_codec import ReducedCodec, parsed
 from hybridlog.schema.states import State, state_of
 from hybridlog_storage.disk import durability
 from hybridlog_storage.manifest import Part, rows_line
@@ -57,6 +62,51 @@ class _OpenFile:
     pending: list[tuple[int, int]] = field(default_factory=list)
     chunks: list[list[tuple[int, int]]] = field(default_factory=list)
     parts: defaultdict[int, list[Part]] = field(default_factory=lambda: defaultdict(list))
+
+
+class RowColumns:
+    """Turns messages of one type into rows of what is left of them."""
+
+    def __init__(self, channel: Channel) -> None:
+        self._codec = codec_for(channel)
+        self._shape = FieldShape()
+
+    def table(
+        self, chunk: StoredChunk, rows: NDArray[np.intp], has_publish_time: Mapping[int, bool]
+    ) -> pa.Table:
+        """Rows of messages, in the order of the chunk.
+
+        Args:
+            chunk: The chunk that holds them.
+            rows: Their rows in it, ascending; one at least.
+            has_publish_time: Whether messages of a channel have a publish time, by channel id.
+        """
+        batch = chunk.batch.take(rows)
+        is_reduced = isinstance(self._codec, ReducedCodec)
+        piece = piece_of(
+            chunk.segment,
+            batch,
+            Places.of([chunk]).take(rows),
+            self._codec,
+            State.REDUCED if is_reduced else State.EXPIRED,
+            has_publish_time=has_publish_time,
+            columns=lambda decoded: columns_from(decoded, self._shape),
+        )
+        surplus = np.zeros(len(rows), np.bool_)
+        surplus[piece.surplus] = True
+        payloads = map(batch.payload, range(len(batch)))
+        about = [parsed(p)[:2] if is_reduced else (len(p), sha256(p).digest()) for p in payloads]
+        more = {
+            "sequence": pa.array(batch.sequence),
+            "size": pa.array([size for size, _ in about], pa.uint64()),
+            "sha256": pa.array([digest for _, digest in about], pa.binary()),
+            "surplus": pa.array(surplus),
+        }
+        own = {**piece.own, "pub": pa.array(batch.publish_time)}
+        ref = own["ref"]
+        names = [field.name for field in ref.type]
+        own["ref"] = structs({**dict(zip(names, ref.flatten(), strict=True)), **more}, len(rows))
+        return as_table(own, piece.fields)
 
 
 class RowsWriter:
@@ -163,7 +213,7 @@ class RowsWriter:
         parts = {number: _joined(own) for number, own in sorted(file.parts.items())}
         rows = sum(part.messages for part in parts.values())
         digests = {str(self._log.number): self._log.digest}
-        section = Section(self._folder.name, 0, digests, {file.topic: TopicCounts(rows)})
+        section = Section(self._folder.name, file.topic, 0, digests, TopicCounts(rows))
         about = {
             "chunks": file.chunks,
             "parts": {n: [p.messages, p.bytes, p.first, p.last] for n, p in parts.items()},

@@ -34,10 +34,11 @@ from hybridlog.columns.layout import (
     topics_of,
     type_prefix,
 )
-from hybridlog.columns.rows import Messages, Piece, as_table, own_columns
+from hybridlog.columns.rows import Piece, Places, as_table, columns_from, piece_of
 from hybridlog.index.indexing import rows_by_channel
 from hybridlog.schema.codec import Codec
 from hybridlog.schema.codecs import codec_for
+from hybridlog.schema.left import LeftFields
 from hybridlog.schema.states import State, encoding_of, state_of
 from hybridlog_storage.disk import files
 from hybridlog_storage.disk.copying import joined
@@ -49,8 +50,9 @@ if TYPE_CHECKING:
 
     from hybridlog.columns.fields import FieldShape
     from hybridlog.columns.parquet_file import ParquetFileWriter
+    from hybridlog.schema.codec import Decoded
     from hybridlog_storage.catalog import RecordingEntry
-    from hybridlog_storage.messages import Buffer, Channel
+    from hybridlog_storage.messages import Channel
     from hybridlog_storage.segments.chunk import StoredChunk
 
 GROUP_ROWS: Final = 131_072
@@ -135,7 +137,16 @@ class _Topic:
                 file.discard()
         self.files.clear()
 
-    def table(self, pieces: list[Piece], has_publish_time: Mapping[int, bool]) -> Any:
+    def columns(self, decoded: Decoded) -> Any:
+        """The fields of decoded messages as columns."""
+        from hybridlog.columns.fields import copied
+
+        columns = columns_from(decoded, self.shape)
+        if self.points is not None and not isinstance(decoded.records, LeftFields):
+            columns = self.points.with_points(columns, decoded.arrow())
+        return copied(columns)
+
+    def table(self, pieces: list[Piece]) -> Any:
         """Rows in order of log time and arrival.
 
         Raises:
@@ -145,11 +156,6 @@ class _Topic:
 
         from hybridlog.columns.fields import joined as joined_columns
 
-        messages = Messages.joined([piece.messages for piece in pieces])
-        segment = np.repeat(
-            np.array([piece.segment for piece in pieces], np.int32),
-            [piece.rows for piece in pieces],
-        )
         with_fields = [piece.fields for piece in pieces if piece.fields is not None]
         kind = self.kind if self.kind is not None or not with_fields else with_fields[0].type
         fields = None
@@ -159,13 +165,15 @@ class _Topic:
                 for piece in pieces
             ]
             fields = joined_columns([pa.nulls(0, kind), *found])
+        own = {
+            name: pa.concat_arrays([piece.own[name] for piece in pieces]) for name in pieces[0].own
+        }
         columns = {
-            name: pa.repeat(pa.scalar(value), len(segment))
+            name: pa.repeat(pa.scalar(value), len(own["t"]))
             for name, value in (("recording", self.recording), ("topic", self.name))
         }
-        columns |= own_columns(pieces, messages, segment, fields, has_publish_time)
-        table = as_table(columns, fields)
-        order = order_of(messages.log_time, messages.seq)
+        table = as_table(columns | own, fields)
+        order = order_of(own["t"].to_numpy(), own["seq"].to_numpy())
         return table if order is None else table.take(pa.array(order))
 
 
@@ -186,8 +194,7 @@ def _encoding_of(channel: Channel) -> str:
 def _counts(pieces: Sequence[Piece]) -> TopicCounts:
     return TopicCounts(
         sum(piece.rows for piece in pieces),
-        sum(len(rows) for piece in pieces for rows, _ in piece.errors),
-        sum(piece.rows for piece in pieces if piece.state is State.REDUCED),
+        sum(piece.unreadable for piece in pieces),
         sum(piece.rows for piece in pieces if piece.has_arrays),
     )
 
@@ -195,13 +202,12 @@ def _counts(pieces: Sequence[Piece]) -> TopicCounts:
 class _File:
     """An unfinished file of one topic."""
 
-    def __init__(self, path: Path, topic: _Topic, has_publish_time: Mapping[int, bool]) -> None:
+    def __init__(self, path: Path, topic: _Topic) -> None:
         self.path = path
         self.schema: Any = None
         self._topic = topic
         self._segments: set[int] = set()
         self._counts = TopicCounts(0)
-        self._has_publish_time = has_publish_time
         self._writer: ParquetFileWriter | None = None
 
     def write(self, pieces: list[Piece]) -> None:
@@ -213,7 +219,7 @@ class _File:
         """
         from hybridlog.columns.parquet_file import ParquetFileWriter
 
-        table = self._topic.table(pieces, self._has_publish_time)
+        table = self._topic.table(pieces)
         if self._writer is None:
             self.schema = table.schema
             self._writer = ParquetFileWriter(self.path, table.schema)
@@ -242,7 +248,7 @@ class _File:
         """Finish the file."""
         assert self._writer is not None
         segments = {str(number): digests[number] for number in sorted(self._segments)}
-        section = Section(self._topic.recording, 0, segments, {self._topic.name: self._counts})
+        section = Section(self._topic.recording, self._topic.name, 0, segments, self._counts)
         self._writer.close([section])
 
     def discard(self) -> None:
@@ -305,10 +311,7 @@ class TableWriter:
             return
         with self._harmless():
             self._channels.update(channels)
-            if chunk.batch.left is None:
-                self._collect(chunk)
-            else:
-                self._add_expired(chunk)
+            self._collect(chunk)
             self._seen.add(chunk.segment)
             self._spill(chunk.segment)
 
@@ -371,14 +374,19 @@ class TableWriter:
             return
         self._has_grown = True
         held, self._held = self._held, []
-        batch = joined([chunk.batch for chunk in held])
-        messages = Messages.joined([*map(Messages.of, held)])._replace(at=batch.offset)
-        for topic, codec, state, rows in self._by_topic(messages.channel):
-            piece = Piece(held[0].segment, messages.take(rows), None, state=state)
-            piece.has_arrays = topic.has_arrays
+        batch, places = joined([chunk.batch for chunk in held]), Places.of(held)
+        for topic, codec, state, rows in self._by_topic(batch.channel):
             with self._only(topic):
-                if codec.indexed and state is State.WHOLE:
-                    self._add_fields(piece, topic, codec, batch.buffer)
+                piece = piece_of(
+                    held[0].segment,
+                    batch.take(rows),
+                    places.take(rows),
+                    codec,
+                    state,
+                    has_publish_time=self._has_publish_time,
+                    columns=topic.columns,
+                )
+                piece.has_arrays = topic.has_arrays and state is State.WHOLE
                 topic.add(piece)
 
     def _by_topic(
@@ -408,33 +416,6 @@ class TableWriter:
             found = self._of_channel[number] = topic, codec_for(channel), state
             self._has_publish_time[number] = channel.has_publish_time
         return found
-
-    def _add_fields(self, piece: Piece, topic: _Topic, codec: Codec, buffer: Buffer) -> None:
-        from hybridlog.columns.fields import copied, without
-
-        decoded = codec.columns(buffer, piece.messages.at, piece.messages.length)
-        piece.errors += [(bad.rows, bad.reason) for bad in decoded.unreadable]
-        if not len(decoded.rows):
-            return
-        records = decoded.arrow()
-        columns = topic.shape.columns(records)
-        if topic.points is not None:
-            columns = topic.points.with_points(columns, records)
-        piece.fields = without(copied(columns), decoded.rows, piece.rows)
-
-    def _add_expired(self, chunk: StoredChunk) -> None:
-        """Make rows of what is left of expired messages."""
-        messages = Messages.of(chunk)
-        for topic, _, state, own in self._by_topic(chunk.batch.channel):
-            left = chunk.batch.take(own).left
-            assert left is not None
-            if state is State.REDUCED:
-                topic.add(Piece(chunk.segment, messages.take(own), None, state=state))
-            for part, at, rows in left.by_part():
-                piece = Piece(chunk.segment, messages.take(own[at]), None, state=state)
-                piece.fields, piece.errors = part.columns(rows), part.errors(rows)
-                topic.add(piece)
-        self._has_grown = True
 
     @contextmanager
     def _only(self, topic: _Topic) -> Iterator[None]:
@@ -493,7 +474,7 @@ class TableWriter:
                 pass
             else:
                 return 0
-        file = _File(self._new_part(), topic, self._has_publish_time)
+        file = _File(self._new_part(), topic)
         unfinished.append(file)
         file.write(pieces)
         return 1
@@ -541,7 +522,7 @@ class TableWriter:
             if digest is not None:
                 self._cut_segment(number, digest)
         incomplete = self._incomplete(entry)
-        waiting: dict[str, list[tuple[_Topic, Any, list[Piece]]]] = {}
+        begin = min((first for _, first, _ in entry.spans), default=entry.created)
         additions: dict[str, Addition] = {}
         for topic in sorted(self._topics.values(), key=lambda topic: topic.name):
             if topic.name in incomplete:
@@ -552,14 +533,14 @@ class TableWriter:
                     self._write(topic, max(self._cut), pieces)
                     self._finish(topic)
                 elif pieces:
-                    table = topic.table(pieces, self._has_publish_time)
+                    table = topic.table(pieces)
+                    numbers = sorted({piece.segment for piece in pieces})
+                    digests = {str(number): self._cut[number] for number in numbers}
+                    section = Section(self._recording, topic.name, begin, digests, _counts(pieces))
                     folder = shape_folder(topic.type, table.schema)
-                    waiting.setdefault(folder, []).append((topic, table, pieces))
+                    additions.setdefault(folder, Addition()).pieces.append((section, table))
             for folder, path in topic.finished:
                 additions.setdefault(folder, Addition()).files.append(path)
-        for folder, found in waiting.items():
-            addition = additions.setdefault(folder, Addition())
-            addition.section, addition.rows = self._joined(entry, found)
         replaced: set[str] = set()
         if not self._is_new:
             # An older table may be the only copy of fields in a damaged chunk.
@@ -568,24 +549,8 @@ class TableWriter:
             self._check_room()
             types = {type_prefix(c.type) for c in entry.channels if c.topic in replaced}
             self._has_parts = True
-            folders = TableFolders(self._root, self._recording, entry.digests)
+            folders = TableFolders(self._root, self._recording, entry.created, entry.digests)
             folders.add(additions, replaced, types)
-
-    def _joined(
-        self, entry: RecordingEntry, found: Sequence[tuple[_Topic, Any, list[Piece]]]
-    ) -> tuple[Section, Any]:
-        """Rows of topics of one shape, one topic after the other."""
-        import pyarrow as pa
-
-        counts: dict[str, TopicCounts] = {}
-        segments: set[int] = set()
-        for topic, _, pieces in found:
-            counts[topic.name] = _counts(pieces).plus(counts.get(topic.name, TopicCounts(0)))
-            segments.update(piece.segment for piece in pieces)
-        begin = min((first for _, first, _ in entry.spans), default=entry.created)
-        digests = {str(number): self._cut[number] for number in sorted(segments)}
-        section = Section(self._recording, begin, digests, counts)
-        return section, pa.concat_tables([table for _, table, _ in found])
 
     def _incomplete(self, entry: RecordingEntry) -> set[str]:
         """Topics that can have no table."""

@@ -13,19 +13,17 @@ from __future__ import annotations
 import os
 import threading
 from collections import OrderedDict, defaultdict
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from itertools import accumulate
 from pathlib import Path
 from stat import S_ISDIR
 from typing import TYPE_CHECKING, Final
 
 from hybridlog.columns.column_file import ColumnFile, OpenFiles, TablePart
 from hybridlog.columns.fields import UnfitError
-from hybridlog.columns.folders import Listing, shared_files
+from hybridlog.columns.folders import Listing, shared_for, shared_times
 from hybridlog.columns.layout import (
-    SHARED,
     SUFFIX,
     TABLES,
     Section,
@@ -38,7 +36,6 @@ from hybridlog.columns.layout import (
 from hybridlog.columns.topic_table import TopicTable
 from hybridlog_storage.cache import Cache
 from hybridlog_storage.errors import StoreError
-from hybridlog_storage.lazy import lazy
 from hybridlog_storage.messages import EXPIRED_IDS, MARKS_CHANNEL
 
 if TYPE_CHECKING:
@@ -50,27 +47,21 @@ _MAX_FOUND: Final = 65_536  # tables that are kept
 
 @dataclass(frozen=True)
 class _Rows:
-    """The rows of a recording in a file.
+    """The rows of a topic of a recording in a file.
 
     Attributes:
         file: The file.
         begin: Its first row.
-        section: Digests and topics.
+        section: What they are.
     """
 
     file: ColumnFile
     begin: int
     section: Section
 
-    @lazy
-    def _begins(self) -> dict[str, int]:
-        """First row of each topic."""
-        rows = (counts.rows for counts in self.section.topics.values())
-        return dict(zip(self.section.topics, accumulate(rows, initial=self.begin), strict=False))
-
-    def of(self, topic: str) -> Iterator[TablePart]:
-        """The rows of a topic."""
-        return self.file.parts(self._begins[topic], self.section.topics[topic].rows)
+    def is_of(self, recording: RecordingEntry) -> bool:
+        """True if they are of segments that the catalog confirms."""
+        return self.section.segments.items() <= recording.digests.items()
 
 
 class _Folder:
@@ -85,32 +76,30 @@ class _Folder:
         self._path = path
         self._opened = opened
         self._listing = Listing(path)
-        self._shared: list[str] = []
+        self._shared: list[int] = []  # numbers in the names of shared files
         self._own: dict[str, list[str]] = {}  # files of long topics, by recording
-        self._listed: Mapping[str, Collection[str]] = {}
         self._files: dict[str, tuple[tuple[int, int, int], ColumnFile | None]] = {}
-        self._rows: dict[str, list[_Rows]] = {}
+        self._rows: dict[tuple[str, str], list[_Rows]] = {}  # by recording and topic
 
     @property
     def damaged(self) -> list[str]:
         """Files that were looked at and cannot be read."""
         return [str(self._path / name) for name, (_, file) in self._files.items() if file is None]
 
-    def rows(self, recording: str) -> list[_Rows]:
-        """The rows of a recording in the files that were looked at."""
-        return self._rows.get(recording, [])
+    def rows(self, recording: str, topic: str) -> list[_Rows]:
+        """The rows of a topic in the files that were looked at."""
+        return self._rows.get((recording, topic), [])
 
-    def look(self, recording: str, *, everywhere: bool) -> None:
-        """Open files that may have rows of a recording, if they are new or were replaced.
-
-        Args:
-            recording: Id of the recording.
-            everywhere: True for all shared files, False for those that are listed for it.
-        """
+    def look(self, recording: RecordingEntry) -> None:
+        """Open files that may have rows of a recording, if they are new or were replaced."""
         self._look()
-        listed = self._shared if everywhere else self._listed.get(recording, ())
-        for name in (*self._own.get(recording, ()), *sorted(listed)):
+        for name in self._own.get(recording.id, ()):
             self._open(name)
+        for name in shared_for(self._shared, recording.created):
+            self._open(name)
+            file = self._files[name][1] if name in self._files else None
+            if file is not None and file.about.has(recording.id):
+                break
 
     def look_at_all(self) -> None:
         """Open all files that are new or were replaced."""
@@ -135,12 +124,10 @@ class _Folder:
             for _, file in self._files.values():
                 self._add(file)
         tables = sorted(name for name in names if name.endswith(SUFFIX))
-        self._shared = [name for name in tables if name.startswith(SHARED)]
+        self._shared = shared_times(tables)
         self._own = {}
         for name in tables:
             self._own.setdefault(name.rpartition("-")[0], []).append(name)
-        root, folder = self._path.parent.parent, self._path.name
-        self._listed = shared_files(root, folder) if self._shared else {}
 
     def _open(self, name: str) -> None:
         status = self._listing.names.get(name)
@@ -158,7 +145,8 @@ class _Folder:
     def _add(self, file: ColumnFile | None) -> None:
         if file is not None:
             for begin, section in file.sections():
-                self._rows.setdefault(section.id, []).append(_Rows(file, begin, section))
+                key = section.id, section.topic
+                self._rows.setdefault(key, []).append(_Rows(file, begin, section))
 
 
 def _identity(status: os.stat_result) -> tuple[int, int, int]:
@@ -309,8 +297,7 @@ class Tables:
         with self._lock:
             self._look(recording, topics)
             known = [rows for topic in topics for rows in self._known_rows(recording, topic)]
-        found = {id(rows): (rows.file, rows.begin, rows.section) for rows in known}
-        return [*found.values()]
+        return [(rows.file, rows.begin, rows.section) for rows in known]
 
     def lacking(self, recording: RecordingEntry, topics: Collection[str]) -> set[str]:
         """Topics of which files lack messages, whatever their definitions are."""
@@ -322,41 +309,30 @@ class Tables:
             return set(topics)
 
     def _has_all(self, recording: RecordingEntry, topic: str) -> bool:
-        own = [one.section for one in self._known_rows(recording, topic)]
-        return self._has_rows(recording, topic) and all(
-            one.segments.items() <= recording.digests.items() for one in own if topic in one.topics
-        )
+        own = self._known_rows(recording, topic)
+        return self._has_rows(recording, topic) and all(one.is_of(recording) for one in own)
 
     def _look(self, recording: RecordingEntry, topics: Collection[str]) -> None:
-        """Look at the folders of some topics, once for all, if rows of them are missing.
-
-        Shared files that are not listed for it are opened only if rows are missing otherwise.
-        """
-        left = [
-            topic
-            for topic in topics
-            if not self._types_of(recording, topic) <= self._looked_at
-            or not self._has_rows(recording, topic)
-        ]
-        for everywhere in (False, True):
-            if not left:
-                return
-            types = set().union(*(self._types_of(recording, topic) for topic in left))
+        """Look at the folders of some topics, once for all, if rows of them are missing."""
+        types = set[str]()
+        for topic in topics:
+            own = self._types_of(recording, topic)
+            if not own <= self._looked_at or not self._has_rows(recording, topic):
+                types |= own
+        if types:
             self._folders.look()
             for folder in self._folders.of(types):
-                folder.look(recording.id, everywhere=everywhere)
+                folder.look(recording)
             self._looked_at |= types
-            left = [topic for topic in left if not self._has_rows(recording, topic)]
 
     def _has_rows(self, recording: RecordingEntry, topic: str) -> bool:
         """True if the files that were looked at have as many rows as the catalog messages."""
         rows = self._known_rows(recording, topic)
-        found = sum(one.section.topics.get(topic, TopicCounts(0)).rows for one in rows)
-        return found == self._messages_of(recording, topic)
+        return sum(one.section.rows for one in rows) == self._messages_of(recording, topic)
 
     def _known_rows(self, recording: RecordingEntry, topic: str) -> list[_Rows]:
         folders = self._folders.of(self._types_of(recording, topic))
-        return [rows for folder in folders for rows in folder.rows(recording.id)]
+        return [rows for folder in folders for rows in folder.rows(recording.id, topic)]
 
     def _damaged(self, recording: RecordingEntry, topic: str) -> list[str]:
         folders = self._folders.of(self._types_of(recording, topic))
@@ -376,16 +352,13 @@ class Tables:
         Raises:
             StoreError: its files do not fit together.
         """
-        own = [rows for rows in found if topic in rows.section.topics]
-        if not own:
+        if not found or not all(rows.is_of(recording) for rows in found):
             return None
         counts = TopicCounts(0)
         parts: list[TablePart] = []
-        for rows in own:
-            if not rows.section.segments.items() <= recording.digests.items():
-                return None
-            counts = counts.plus(rows.section.topics[topic])
-            parts += rows.of(topic)
+        for rows in found:
+            counts = counts.plus(rows.section.counts)
+            parts += rows.file.parts(rows.begin, rows.section.rows)
         if any(one.id >= EXPIRED_IDS for one in self._channels_of(recording, topic)):
             counts = counts._replace(arrays=0)  # what has expired is in no answer
         table = TopicTable(topic, parts, counts, self.opened)
@@ -418,15 +391,14 @@ class Tables:
             folders = known.of(self._types_of(recording, topic))
             for folder in folders:
                 folder.look_at_all()
-            rows = [rows for folder in folders for rows in folder.rows(recording.id)]
+            rows = [rows for folder in folders for rows in folder.rows(recording.id, topic)]
             while len(self._sealed) > _MAX_RUNNING:
                 self._sealed.popitem(last=False)
         try:
             table = self._table(recording, topic, rows)
         except StoreError:
             return None
-        own = [one.section for one in rows if topic in one.section.topics]
-        segments = frozenset(int(number) for section in own for number in section.segments)
+        segments = frozenset(int(number) for one in rows for number in one.section.segments)
         if table is None or table.rows != sum(messages.get(number, 0) for number in segments):
             return None  # its files are just getting their names
         return table, segments

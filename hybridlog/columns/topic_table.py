@@ -4,20 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from hybridlog.columns.column_file import FIRST, names_of
-from hybridlog.columns.fields import alike, records_of
+from hybridlog.columns.column_file import FIRST
+from hybridlog.columns.fields import alike, names_of, records_of
 from hybridlog.columns.layout import POINTS
 from hybridlog.schema.arrow_columns import structs
 from hybridlog.schema.arrow_types import is_list
 from hybridlog.schema.column import ranges
 from hybridlog.schema.states import State
-from hybridlog_storage.lazy import lazy
 from hybridlog_storage.ordering import order_of
 from hybridlog_storage.stopping import check_wanted
 from hybridlog_storage.times import placed, span_of
@@ -25,7 +25,7 @@ from hybridlog_storage.times import placed, span_of
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog.columns.column_file import ColumnFile, Key, OpenFiles, TablePart
+    from hybridlog.columns.column_file import ColumnFile, OpenFiles, TablePart
     from hybridlog.columns.layout import TopicCounts
     from hybridlog.query.intervals import Span
 
@@ -75,14 +75,6 @@ class TableRows:
             return np.zeros(len(self), np.bool_)
         return np.asarray(pc.equal(state, State.UNREADABLE.value).to_numpy(zero_copy_only=False))
 
-    def behind(self, key: Key) -> int:
-        """Index of the first row after a log time and arrival number."""
-        first, end = (int(np.searchsorted(self.t, key[0], side)) for side in _SIDES)
-        return first + int(np.searchsorted(self.seq[first:end], key[1], "right"))
-
-
-_SIDES: Final[tuple[Any, Any]] = ("left", "right")
-
 
 class TopicTable:
     """All messages of a topic in a recording.
@@ -91,7 +83,6 @@ class TopicTable:
         topic: Full name.
         rows: Number of messages.
         unreadable: Messages without fields, because they do not fit their definition.
-        reduced: Messages without fields, because they were reduced under pressure.
         has_arrays: True if arrays are there in full, but for those of bytes.
         files: The files with its rows.
     """
@@ -100,17 +91,13 @@ class TopicTable:
         self, topic: str, parts: Sequence[TablePart], counts: TopicCounts, opened: OpenFiles
     ) -> None:
         self.topic = topic
-        self.rows, self.unreadable, self.reduced, _ = counts
+        self.rows, self.unreadable, _ = counts
         self.has_arrays = counts.has_arrays
         self.files = list({part.file.number: part.file for part in parts}.values())
         self._opened = opened
         self._parts = parts
         self._types: dict[frozenset[str] | None, Any] = {}
         self._summarised: dict[tuple[str, ...], bool] = {}
-
-    @lazy
-    def _runs(self) -> list[list[TablePart]]:
-        return list(_runs(self._parts))
 
     def fields(self, paths: Collection[str] | None = None) -> Any:
         """Type of `TableRows.records`.
@@ -189,35 +176,36 @@ class TopicTable:
         """
         kind = self.empty(paths)
 
-        def read(part: TablePart) -> TableRows:
-            return self._read(part, paths, own, kind)
+        if all(part.first == FIRST for part in self._parts):  # in order, whatever they are
+            yield from (self._read(part, paths, own, kind) for part in self._parts)
+            return
+        held: TableRows | None = None
+        for part in self.parts:
+            rows = self._within(part, spans, partial(self._read, part, paths, own, kind))
+            if rows is not None and held is not None:
+                end = int(np.searchsorted(held.t, part.first))
+                if end:
+                    yield held.slice(0, end)
+                if end < len(held):
+                    rows = _in_order([held.slice(end, len(held)), rows])
+            held = held if rows is None else rows
+        if held is not None:
+            yield held
 
-        streams = [self._read_run(run, spans, read) for run in self._runs]
-        return streams[0] if len(streams) == 1 else _merged(streams)
-
-    def _read_run(
-        self,
-        run: Sequence[TablePart],
-        spans: Sequence[Span] | None,
-        read: Callable[[TablePart], TableRows],
-    ) -> Iterator[TableRows]:
-        for part in run:
-            if spans is None:
-                yield read(part)
-                continue
-            low, high = span_of(part.first[0], part.last[0])
-            near = [span for span in spans if span[0] < high and span[1] > low]
-            if not near:
-                continue
-            rows = read(part)
-            bounds = np.searchsorted(placed(rows.t), np.array(near, np.int64).reshape(-1, 2))
-            begins, counts = bounds[:, 0], bounds[:, 1] - bounds[:, 0]
-            if len(near) == 1:
-                rows = rows.slice(int(bounds[0, 0]), int(bounds[0, 1]))
-            else:
-                rows = rows.take(ranges(begins, counts))
-            if len(rows):
-                yield rows
+    def _within(
+        self, part: TablePart, spans: Sequence[Span] | None, read: Callable[[], TableRows]
+    ) -> TableRows | None:
+        """The rows of a part in some spans; None without any."""
+        if spans is None:
+            return read()
+        low, high = span_of(part.first, part.last)
+        near = [span for span in spans if span[0] < high and span[1] > low]
+        if not near:
+            return None
+        rows = read()
+        bounds = np.searchsorted(placed(rows.t), np.array(near, np.int64).reshape(-1, 2))
+        rows = rows.take(ranges(bounds[:, 0], bounds[:, 1] - bounds[:, 0]))
+        return rows if len(rows) else None
 
     def _read(
         self,
@@ -233,7 +221,7 @@ class TopicTable:
     @property
     def parts(self) -> list[TablePart]:
         """Its row groups, by the log time of their first rows."""
-        return sorted((part for run in self._runs for part in run), key=lambda part: part.first)
+        return sorted(self._parts, key=lambda part: part.first)
 
     def read(
         self, part: TablePart, paths: Collection[str] | None, own: Collection[str]
@@ -326,46 +314,7 @@ def _has_values(column: Any) -> bool:
     return bool(column.null_count < len(column))
 
 
-def _runs(parts: Sequence[TablePart]) -> Iterator[list[TablePart]]:
-    """Row groups in as few ordered sequences as possible."""
-    if all(part.first == FIRST for part in parts):
-        yield list(parts)  # of a file in which the topic's rows are in order
-        return
-    runs: list[list[TablePart]] = []
-    for part in sorted(parts, key=lambda part: part.first):
-        for run in runs:
-            if run[-1].last < part.first:
-                run.append(part)
-                break
-        else:
-            runs.append([part])
-    yield from runs
-
-
-def _merged(streams: Sequence[Iterator[TableRows]]) -> Iterator[TableRows]:
-    """Rows of several ordered sequences, merged in order."""
-    heads: list[tuple[TableRows, Iterator[TableRows]]] = []
-    for stream in streams:
-        head = next(stream, None)
-        if head is not None:
-            heads.append((head, stream))
-    while heads:
-        key = min((int(rows.t[-1]), int(rows.seq[-1])) for rows, _ in heads)
-        ready, left = [], []
-        for rows, stream in heads:
-            end = rows.behind(key)
-            if end:
-                ready.append(rows.slice(0, end))
-            rest = rows.slice(end, len(rows)) if end < len(rows) else next(stream, None)
-            if rest is not None:
-                left.append((rest, stream))
-        heads = left
-        yield _in_order(ready)
-
-
 def _in_order(parts: Sequence[TableRows]) -> TableRows:
-    if len(parts) == 1:
-        return parts[0]
     own = {name: pa.concat_arrays([part.own[name] for part in parts]) for name in parts[0].own}
     t, seq = np.concatenate([p.t for p in parts]), np.concatenate([p.seq for p in parts])
     rows = TableRows(t, seq, own, pa.concat_arrays([part.records for part in parts]))

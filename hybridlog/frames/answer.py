@@ -15,7 +15,7 @@ from hybridlog.schema.arrow_columns import TIME, numbers, structs
 from hybridlog.schema.arrow_types import common_schema
 from hybridlog.schema.codec import columns_of, stamp_array
 from hybridlog.schema.column import STAMP
-from hybridlog.schema.left import LeftFields, without_lacking
+from hybridlog.schema.left import LeftFields
 from hybridlog_storage.errors import DefinitionError
 from hybridlog_storage.messages import Batch
 
@@ -195,7 +195,6 @@ class Decoder:
         self._chosen = planner.question.fields
         self._own = _own(planner)
         self._tags = tag_columns(planner.question.tags)
-        self._takes_reduced = _are_single(planner)
         self._ranks = {key: rank << _SEQ_BITS for key, rank in planner.ranks.items()}
         self._fields: list[frozenset[str] | None] = []
         self.read(planner.examples)
@@ -210,32 +209,24 @@ class Decoder:
         """A block without rows for each example: columns exist even without messages."""
         none = np.empty(0, np.int64)
         batch = Batch(b"", none, none, np.empty(0, np.int32), none, none, none.astype(np.uint32))
-        for number, channel in enumerate(self.channels):
-            if channel.is_typed:
-                yield self.block(number, batch, none, self.decoded(number, batch))
+        for number in range(len(self.channels)):
+            yield self.block(number, batch, none, self.decoded(number, batch))
 
     def blocks(self, run: MessageRun) -> Iterator[Block]:
         """The messages of a run, by channel."""
         self.read(run.channels)
         for number, rows in rows_by_channel(run.batch.channel):
-            if not self.channels[number].is_typed and not self._takes_reduced:
-                self._counters.reduced += len(rows)
-            else:
-                batch = run.batch.take(rows)
-                yield self.block(number, batch, run.seq[rows], self.decoded(number, batch))
+            batch = run.batch.take(rows)
+            yield self.block(number, batch, run.seq[rows], self.decoded(number, batch))
 
     def decoded(self, number: int, batch: Batch) -> Decoded:
         """The fields of messages of one channel; those that cannot be read are counted."""
         found = columns_of(self.channels[number].codec, batch, self._fields[number])
         self._counters.unreadable += len(batch) - len(found.rows)
-        channel, records = self.channels[number], found.records
-        if isinstance(records, LeftFields) and records.is_typed:
+        if isinstance(found.records, LeftFields):
             requested = {path.replace("[]", "") for path in self._chosen or ()}
             summarised = {path.rpartition(".")[0] for path in requested} - requested
-            self._counters.lacking += int(records.lacking(summarised).sum())
-        elif isinstance(records, LeftFields):
-            found, lacking = without_lacking(found)
-            self._counters.leave_out(lacking, channel.state)
+            self._counters.lacking += int(found.records.lacking(summarised).sum())
         return found
 
     def block(self, number: int, batch: Batch, seq: NDArray[np.int64], decoded: Decoded) -> Block:
@@ -280,19 +271,10 @@ class Decoder:
         return own | _tags_of(channel.recording, self._tags, len(batch))
 
 
-def _are_single(planner: Planner) -> bool:
-    """True if only single values are asked for; reduced messages have those, too."""
-    fields = planner.question.fields
-    known = planner.session.field_types(planner.question.topics, planner.question.recordings)
-    if not fields or known is None:
-        return False
-    return all(path in known and not known[path].endswith("]") for path in fields)
-
-
 def _own(planner: Planner) -> list[str]:
     """Built-in columns of a table, without the log time."""
     question, channels = planner.question, planner.examples
-    defined = {path.path for c in channels if c.is_typed for path in c.codec.paths()}
+    defined = {path.path for c in channels for path in c.codec.paths()}
     requested = own_columns(question.fields, defined)
     added = []
     if len(question.topics) > 1:

@@ -50,9 +50,6 @@ def _lines_of(run: MessageRun, decoder: Decoder, planner: Planner) -> list[Line]
     found: list[Line | None] = [None] * len(run.batch)
     for number, rows in rows_by_channel(run.batch.channel):
         channel = decoder.channels[number]
-        if not channel.is_typed:
-            planner.counters.reduced += len(rows)
-            continue
         batch, seq = run.batch.take(rows), run.seq[rows]
         decoded = decoder.decoded(number, batch)
         if decoded.is_typed:

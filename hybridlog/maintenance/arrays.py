@@ -84,10 +84,10 @@ def _differs(known: Tables, entry: RecordingEntry, found: ArraysOfTopic, *, off:
 
     topic, differs = found.topic, None
     for file, _, section in known.sections_of(entry):
-        if topic in section.topics:
+        if section.topic == topic:
             can_have = has_long_arrays(file.schema)
             found.has_arrays = found.has_arrays or can_have
-            is_other = can_have and bool(section.topics[topic].arrays) is off
+            is_other = can_have and bool(section.counts.arrays) is off
             differs = differs or is_other
     is_expired = any(one.id >= EXPIRED_IDS for one in entry.channels if one.topic == topic)
     return differs is not False and (off or not is_expired)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
+from collections import defaultdict
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -94,6 +95,7 @@ def _bring_tables(source: Shared, target: RemoteDirectory, entry: RecordingEntry
 def _tables(source: Shared, entry: RecordingEntry, root: Path) -> list[Path]:
     """Files with the fields of a recording; of shared ones its rows alone, below `root`."""
     found = []
+    shared = defaultdict[str, Addition](Addition)
     for file, begin, section in source.tables.sections_of(entry):
         if not section.segments.items() <= entry.digests.items():
             continue  # they are of what it was before
@@ -102,5 +104,6 @@ def _tables(source: Shared, entry: RecordingEntry, root: Path) -> list[Path]:
             continue
         with suppress(StoreError):  # what is damaged is left out: messages answer, too
             rows = file.table().slice(begin, section.rows)
-            TableFolders(root, entry.id).add({file.path.parent.name: Addition(rows, section)})
+            shared[file.path.parent.name].pieces.append((section, rows))
+    TableFolders(root, entry.id, entry.created).add(shared)
     return found + [reader.path for reader in files_of(root)]

@@ -248,7 +248,7 @@ def remove_if(
                 raise gone(entry.name) from error
             shared.catalog.remove(entry.id)
             with suppress(OSError, StoreError):  # the next connection removes them
-                tables.remove(directory, entry.id, {c.type for c in entry.channels})
+                tables.remove(directory, entry.id, entry)
             if database is not None:
                 _clear(database, entry)
     except ConnectionLostError:

@@ -285,6 +285,6 @@ def _remove_arrays(directory: StoreDirectory, manifest: Manifest, going: Collect
     gone = {one.topic: one.type for one in channels if one.topic in directory.settings.arrays}
     if gone:
         digests = {str(number): log.digest for number, log in manifest.logs.items()}
-        folders = TableFolders(directory.path, manifest.id, digests)
+        folders = TableFolders(directory.path, manifest.id, manifest.created, digests)
         with suppress(OSError):
             folders.add({}, {*gone}, {type_prefix(kind) for kind in gone.values()})

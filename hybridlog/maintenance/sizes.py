@@ -204,22 +204,15 @@ def _chunk_shares(table: ChunkTable) -> NDArray[np.float64]:
 
 def table_bytes(root: Path, entries: Sequence[RecordingEntry]) -> Mapping[tuple[str, str], int]:
     """Bytes of the tables by recording and topic: their share of the rows of each file."""
-    from hybridlog.columns.folders import files_of, list_bytes
+    from hybridlog.columns.folders import files_of
 
     found: Counter[tuple[str, str]] = Counter()
     types = {type_prefix(channel.type) for entry in entries for channel in entry.channels}
-    seen: set[Path] = set()
     for file in files_of(root, types):
-        size, folder = file.size_bytes, file.path.parent
-        if folder not in seen:  # its list counts with its first file
-            seen.add(folder)
-            size += list_bytes(folder)
-        rows = {
-            (section.id, topic): counts.rows
-            for section in file.about.recordings
-            for topic, counts in section.topics.items()
-        }
-        found.update(_divided(size, rows))
+        rows = Counter[tuple[str, str]]()
+        for section in file.about.sections:
+            rows[section.id, section.topic] += section.rows
+        found.update(_divided(file.size_bytes, rows))
     return found
 
 

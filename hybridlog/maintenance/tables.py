@@ -218,7 +218,7 @@ def announce_removal(directory: StoreDirectory, recording: str) -> None:
         files.make_folders(parts_folder(directory.path, recording))
 
 
-def remove(directory: StoreDirectory, recording: str, types: Collection[str] | None = None) -> None:
+def remove(directory: StoreDirectory, recording: str, entry: RecordingEntry | None = None) -> None:
     """Remove all tables of a recording.
 
     Raises:
@@ -227,8 +227,9 @@ def remove(directory: StoreDirectory, recording: str, types: Collection[str] | N
     from hybridlog.columns.folders import TableFolders
 
     announce_removal(directory, recording)
-    prefixes = [""] if types is None else [type_prefix(one) for one in types]
-    TableFolders(directory.path, recording).remove(prefixes)
+    prefixes = [""] if entry is None else {type_prefix(one.type) for one in entry.channels}
+    created = None if entry is None else entry.created
+    TableFolders(directory.path, recording, created).remove(prefixes)
     with suppress(FileNotFoundError):
         files.remove_tree(parts_folder(directory.path, recording))
 

@@ -61,9 +61,9 @@ class MessageFilter:
             batch: The messages.
             seq: int64[n], their arrival numbers.
         """
-        if channel.is_expired and channel.codec.indexed:
-            return self._of_expired(channel, batch, seq)
-        if channel.is_reduced or not channel.codec.indexed:
+        if channel.is_reduced and channel.codec.indexed:
+            return self._of_left(channel, batch, seq)
+        if not channel.codec.indexed:
             return self._one_by_one(channel, batch, seq, np.arange(len(batch)))
         from hybridlog.query.predicate.to_mask import to_mask
 
@@ -85,10 +85,8 @@ class MessageFilter:
             return Matches(holds, rest.unreadable)
         return Matches(holds, 0)
 
-    def _of_expired(
-        self, channel: RecordedChannel, batch: Batch, seq: NDArray[np.int64]
-    ) -> Matches:
-        """Decide on expired messages; not on those that lack an array that is asked for."""
+    def _of_left(self, channel: RecordedChannel, batch: Batch, seq: NDArray[np.int64]) -> Matches:
+        """Decide on messages without payload; not where an array that is asked for is lacking."""
         from hybridlog.schema.left import LeftFields
 
         fields = self._elements

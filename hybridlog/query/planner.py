@@ -410,7 +410,7 @@ class Planner:
                     raise
 
     def _check_clock(self, channel: RecordedChannel) -> None:
-        if self.question.bounds is None or not channel.is_typed:
+        if self.question.bounds is None:
             return
         topic, clock = channel.channel.topic, self.question.clock
         if clock == "header" and not any(p.path == STAMP for p in channel.codec.paths()):
@@ -423,7 +423,7 @@ class Planner:
 
 def _has_no_fields(channel: RecordedChannel) -> bool:
     """True if the messages of a channel are not decoded, for example without a definition."""
-    return channel.is_typed and not channel.codec.indexed
+    return not channel.codec.indexed
 
 
 def _after(item: _Rows, key: tuple[int, int]) -> _Rows | None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from hybridlog.query.times import TimeLike
-from hybridlog.schema.states import GONE, State, encoding_of, state_of
+from hybridlog.schema.states import State, encoding_of, state_of
 from hybridlog_storage.lazy import lazy
 from hybridlog_storage.times import END, span_of
 
@@ -117,16 +117,6 @@ class RecordedChannel:
     def is_reduced(self) -> bool:
         """True if its messages have their fields but not their payloads."""
         return self.state is not State.WHOLE
-
-    @property
-    def is_typed(self) -> bool:
-        """True if it tells the types of fields; those of reduced messages other channels tell."""
-        return self.state is not State.REDUCED
-
-    @property
-    def is_expired(self) -> bool:
-        """True if the payloads of its messages were deleted to make room, or not copied yet."""
-        return self.state in GONE
 
     @property
     def encoding(self) -> str:
@@ -253,8 +243,6 @@ def field_types(channels: tuple[RecordedChannel, ...]) -> dict[str, str] | None:
     """Types of the fields of some channels, by path; None where no definition fixes them."""
     types: dict[str, str] = {}
     for channel in channels:
-        if not channel.is_typed:
-            continue  # its fields are those of complete messages
         paths = channel.codec.paths()
         if not paths:
             return None

@@ -175,7 +175,7 @@ class Rows:
         else:
             table = self.session.table(part.recording, part.topic)
             found = None if table is None else Tabled(table, part)
-        if found is None or found.table.reduced:
+        if found is None:
             return None
         if found.table.unreadable and part.predicate is None:
             return None  # fields of such messages are not in the table
@@ -464,7 +464,7 @@ class Rows:
         """The fields of messages; those that cannot be read, or lack some, are counted."""
         found = columns_of(channel.codec, batch, fields)
         self._counters.unreadable += len(batch) - len(found.rows)
-        if channel.is_expired:
+        if channel.is_reduced:
             from hybridlog.schema.left import without_lacking
 
             found, lacking = without_lacking(found)
@@ -477,9 +477,7 @@ class Rows:
             changes = np.flatnonzero(np.diff(run.batch.channel)) + 1
             for own in map(run.take, np.split(np.arange(len(run.batch)), changes)):
                 channel = plan.channels[int(own.batch.channel[0])]
-                if not channel.is_typed:
-                    self._counters.reduced += len(own.batch)
-                elif len(own.batch):
+                if len(own.batch):
                     yield channel, own
 
     # Times alone.

@@ -232,9 +232,9 @@ class ObjectCodec(ABC):
 
 def columns_of(codec: Codec, batch: Batch, fields: Collection[str] | None = None) -> Decoded:
     """Decode messages of one channel, with or without their payloads; see `Codec.columns`."""
-    if batch.left is not None and len(batch) and batch.left.part[0] >= 0:
-        of_rows: Any = codec  # a `LeftCodec`
-        found: Decoded = of_rows.columns_of(batch.left, fields)
+    of_rows: Any = getattr(codec, "columns_of", None)  # of a `LeftCodec`
+    if of_rows is not None:
+        found: Decoded = of_rows(batch, fields)
         return found
     return codec.columns(batch.buffer, batch.offset, batch.length, fields)
 

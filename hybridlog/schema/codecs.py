@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, cast
 from hybridlog.schema.codec import Codec, ObjectCodec, OpaqueCodec
 from hybridlog.schema.completion import has_hidden_fields
 from hybridlog.schema.definition_text import canonical
-from hybridlog.schema.states import GONE, State, encoding_of, state_of
+from hybridlog.schema.states import State, encoding_of, state_of
 from hybridlog_storage.errors import DefinitionError, PayloadError
 
 if TYPE_CHECKING:
@@ -30,11 +30,13 @@ def codec_for(channel: Channel) -> Codec:
     """
     schema = channel.schema
     state = state_of(channel.message_encoding)
-    if state in GONE:
+    if state is not State.WHOLE:
         from hybridlog.schema.left import LeftCodec
+        from hybridlog.schema.reduced_codec import ReducedCodec
 
         encoding = encoding_of(channel.message_encoding, channel.metadata)
-        return LeftCodec(codec_for(replace(channel, message_encoding=encoding)), state)
+        original = codec_for(replace(channel, message_encoding=encoding))
+        return ReducedCodec(original) if state is State.REDUCED else LeftCodec(original, state)
     if schema is not None and has_hidden_fields(channel):
         return OpaqueCodec(
             f"{schema.name}: the definition in the source is empty, but its md5sum says that it "
@@ -54,10 +56,6 @@ def _codec(encoding: str, schema: Schema | None) -> Codec:
 def _made(encoding: str, schema: Schema | None) -> Codec:
     if encoding == "json":
         return JsonCodec()
-    if state_of(encoding) is State.REDUCED:
-        from hybridlog.schema.reduced_codec import ReducedCodec
-
-        return ReducedCodec()
     return _defined(encoding, schema)
 
 

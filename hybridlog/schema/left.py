@@ -6,28 +6,28 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 
-from hybridlog.schema.codec import Decoded, Unreadable
+from hybridlog.schema.codec import Decoded, Unreadable, no_rows
 from hybridlog.schema.column import Records
 from hybridlog.schema.objects import Objects
 from hybridlog.schema.states import CAUSES, State
 from hybridlog_storage.errors import PayloadError
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Sequence
+    from collections.abc import Callable, Collection, Sequence
 
     import pyarrow as pa
     from numpy.typing import NDArray
 
     from hybridlog.schema.codec import Codec
     from hybridlog.schema.definition import FieldPath
-    from hybridlog_storage.messages import Buffer, Left
+    from hybridlog_storage.messages import Batch, Buffer, Left
 
 
 class LeftFields(Objects):
     """Fields of messages whose payloads are gone.
 
     Args:
-        places: Where their rows are; parts are `hybridlog.columns.rows_file.LeftRows`.
+        places: Where their rows are; parts are `hybridlog.columns.left_rows.LeftRows`.
         fields: Dotted paths of those wanted in `arrow`, each with all below it; None for all.
         empty: No messages, as the codec of the payloads decodes them.
     """
@@ -52,9 +52,12 @@ class LeftFields(Objects):
 
     def plain(self, *, whole: bool) -> list[dict[str, object]]:
         """The messages as plain values, long arrays and bytes as summaries."""
+        return self._documents(summaries=True)
+
+    def _documents(self, *, summaries: bool) -> list[dict[str, object]]:
         found: list[dict[str, object]] = [{}] * len(self)
         for part, own, rows in self._places.by_part():
-            made = part.documents(rows, typed=self.is_typed)
+            made = part.documents(rows, typed=self.is_typed, summaries=summaries)
             for at, one in zip(own.tolist(), made, strict=True):
                 found[at] = one
         return found
@@ -62,9 +65,33 @@ class LeftFields(Objects):
     def arrow(self) -> pa.StructArray:
         """The messages as an Arrow array; arrays of which only a summary is left are null."""
         if not self.is_typed:
-            return super().arrow()
+            from hybridlog.schema.arrow_objects import objects_array
+
+            return objects_array(self._documents(summaries=False), self.wanted())
         found = [part.records(rows) for part, _, rows in self._places.by_part()]
         return _placed(self._places, found, self._empty.arrow().type)
+
+    def columns(self) -> pa.StructArray:
+        """The messages as columns of tables.
+
+        Raises:
+            UnfitError: They have no common type.
+        """
+        return self._joined(lambda part, rows: part.columns(rows))
+
+    def summarised(self) -> pa.StructArray:
+        """The messages as an Arrow array in which arrays are summaries.
+
+        Raises:
+            UnfitError: They have no common type.
+        """
+        return self._joined(lambda part, rows: part.records(rows, None))
+
+    def _joined(self, made: Callable[[Any, NDArray[np.int64]], pa.StructArray]) -> pa.StructArray:
+        from hybridlog.columns.fields import joined
+
+        found = [made(part, rows) for part, _, rows in self._places.by_part()]
+        return _in_order(self._places, joined(found))
 
     def statistic(self, path: str, what: str) -> pa.Array[Any] | None:
         """One number of the summary of an array in each message; None if there is none.
@@ -100,11 +127,17 @@ def _placed(places: Left, found: Sequence[Any], kind: Any) -> Any:
 
     from hybridlog.schema.arrow_types import narrowed
 
-    arrays, order = [pa.nulls(0, kind)], []
+    arrays = [pa.nulls(0, kind)]
     for array, (_, own, _) in zip(found, places.by_part(), strict=True):
         arrays.append(pa.nulls(len(own), kind) if array is None else narrowed(array, kind))
-        order.append(own)
-    whole = pa.concat_arrays(arrays)
+    return _in_order(places, pa.concat_arrays(arrays))
+
+
+def _in_order(places: Left, whole: Any) -> Any:
+    """Values of one part after the other, in the order of the messages."""
+    import pyarrow as pa
+
+    order = [own for _, own, _ in places.by_part()]
     if len(order) < 2:
         return whole
     row = np.empty(len(whole), np.int64)
@@ -121,14 +154,14 @@ class LeftCodec:
     """
 
     def __init__(self, original: Codec, state: State) -> None:
-        self._original = original
+        self.original = original
         self.state = state
         self.indexed = original.indexed
         self.reason = original.reason
 
     def paths(self) -> list[FieldPath]:
         """The fields of the messages."""
-        return self._original.paths()
+        return self.original.paths()
 
     def columns(
         self,
@@ -138,10 +171,13 @@ class LeftCodec:
         fields: Collection[str] | None = None,
     ) -> Decoded:
         """No messages, since none has a payload; see `Codec.columns`."""
-        return self._original.columns(buffer, offset, length, fields)
+        return self.original.columns(buffer, offset, length, fields)
 
-    def columns_of(self, places: Left, fields: Collection[str] | None = None) -> Decoded:
+    def columns_of(self, batch: Batch, fields: Collection[str] | None = None) -> Decoded:
         """The fields that are left; see `Codec.columns`."""
+        places = batch.left
+        if places is None:
+            return self.columns(b"", no_rows(), no_rows(), fields)
         bad: dict[str, list[NDArray[np.intp]]] = {}
         is_good = np.ones(len(places.row), np.bool_)
         has_surplus = np.zeros(len(places.row), np.bool_)
@@ -150,8 +186,7 @@ class LeftCodec:
             for of, reason in part.errors(rows):
                 bad.setdefault(reason, []).append(own[of])
                 is_good[own[of]] = False
-        none = np.empty(0, np.int64)
-        empty = self._original.columns(b"", none, none, fields)
+        empty = self.original.columns(b"", no_rows(), no_rows(), fields)
         records = LeftFields(places.take(is_good), fields, empty)
         unreadable = [Unreadable(np.sort(np.concatenate(r)), text) for text, r in bad.items()]
         return Decoded(np.flatnonzero(is_good), records, unreadable, np.flatnonzero(has_surplus))

@@ -88,5 +88,4 @@ def without_fields(messages: int, state: State, cause: str = "") -> str:
     if state is State.UNREADABLE:
         return f"{unfit(messages)}; the fields are null, and error says why"
     have, its = ("has", "its payload was") if messages == 1 else ("have", "their payloads were")
-    what = "fields" if state is State.REDUCED else "long arrays"
-    return f"{counted(messages, 'message')} {have} no {what}: {its} {cause or CAUSES[state]}"
+    return f"{counted(messages, 'message')} {have} no long arrays: {its} {cause or CAUSES[state]}"

@@ -17,13 +17,14 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from hybridlog.columns.clouds import NEEDED, PointColumns, is_cloud
+from hybridlog.columns.column_file import FIRST
 from hybridlog.columns.fields import without
 from hybridlog.columns.layout import POINTS
-from hybridlog.columns.rows import Messages, Piece, own_columns
+from hybridlog.columns.rows import Places, piece_of
 from hybridlog.query.question import RecordedChannel
-from hybridlog.query.rows import places_of
 from hybridlog.record.losses import lost_spans
 from hybridlog.schema.arrow_types import has_empty
+from hybridlog.schema.left import LeftFields
 from hybridlog.schema.states import GONE, State
 from hybridlog.sql.columns import whole_message
 from hybridlog_storage.errors import StoreError
@@ -37,8 +38,10 @@ if TYPE_CHECKING:
 
     from hybridlog.columns.column_file import TablePart
     from hybridlog.columns.topic_table import TopicTable
+    from hybridlog.schema.codec import Decoded
     from hybridlog.session import Session
     from hybridlog_storage.catalog import RecordingEntry
+    from hybridlog_storage.messages import Batch
     from hybridlog_storage.segments.chunk import StoredChunk
     from hybridlog_storage.segments.segment_reader import ChunkPlace
 
@@ -152,9 +155,14 @@ class TopicOfRecording:
     def is_fixed(self) -> bool:
         """True if definitions fix the fields of all messages."""
         return all(
-            not channel.is_typed or channel.codec.reason is not None or _is_fixed(channel)
+            channel.codec.reason is not None or _is_fixed(channel)
             for channel in self.channels.values()
         )
+
+    @property
+    def has_reduced(self) -> bool:
+        """True if it has messages that were dropped under pressure."""
+        return any(channel.state is State.REDUCED for channel in self.channels.values())
 
     @lazy
     def kinds(self) -> list[Any]:
@@ -165,11 +173,7 @@ class TopicOfRecording:
                 for source in self.sources
                 for kind in source.kinds(None)
             ]
-        return [
-            channel.arrow_type()
-            for channel in self.channels.values()
-            if channel.is_typed and channel.codec.indexed
-        ]
+        return [channel.arrow_type() for channel in self.channels.values() if channel.codec.indexed]
 
     @lazy
     def table(self) -> TopicTable | None:
@@ -195,11 +199,13 @@ class TopicOfRecording:
                 table, covered = made
                 found += [_TableRows(self, table, part) for part in table.parts]
         left = [chunk for chunk in chunks if chunk.segment not in covered]
-        found += [
-            _ChunkRows(self, chunk.segment, chunk.place, (chunk.first, chunk.last))
-            for chunk in left
-            if not chunk.place.is_expired
-        ]
+        for chunk in left:
+            if not chunk.place.is_expired:
+                span = chunk.first, chunk.last
+                there = [self.channels[i] for i in chunk.place.channels if i in self.channels]
+                for is_reduced in {one.is_reduced for one in there}:
+                    own = [one for one in there if one.is_reduced is is_reduced]
+                    found.append(_ChunkRows(self, chunk.segment, chunk.place, span, own))
         gone = {(c.segment, c.number) for c in left if c.place.is_expired}
         if gone:
             fields = self.session.expired_fields(self.entry, self.topic, gone)
@@ -213,14 +219,13 @@ class TopicOfRecording:
         return {(chunk.segment, chunk.number): chunk.place for chunk in chunks}
 
     @lazy
-    def expired(self) -> dict[State, NDArray[np.int64]]:
-        """Keys of its expired chunks by state, see `_keys`."""
-        found = {}
-        for kind, state in enumerate(GONE, 1):
-            places = self.places.items()
-            gone = [key for key, place in places if place.channels[0] // EXPIRED_IDS == kind]
-            if gone:
-                found[state] = _keys(*np.array(gone, np.int64).T)
+    def expired(self) -> dict[State, set[int]]:
+        """Segments whose payloads are gone, by state."""
+        found: dict[State, set[int]] = {}
+        for (segment, _), place in self.places.items():
+            if place.is_expired:
+                state = GONE[place.channels[0] // EXPIRED_IDS - 1]
+                found.setdefault(state, set()).add(segment)
         return found
 
     def first_points(self) -> Any:
@@ -240,7 +245,11 @@ class TopicOfRecording:
 
     def chunk_rows(self, segment: int, number: int) -> _ChunkRows:
         """The messages in a chunk, with all arrays."""
-        return _ChunkRows(self, segment, self.places[segment, number], None)
+        place = self.places[segment, number]
+        whole = [
+            one for i, one in self.channels.items() if i in place.channels and not one.is_reduced
+        ]
+        return _ChunkRows(self, segment, place, (place.first, place.last), whole)
 
     def chunk(self, segment: int, number: int, counts: ScanCounts) -> StoredChunk:
         """A chunk; see `Session.chunk`."""
@@ -249,18 +258,12 @@ class TopicOfRecording:
         )
 
 
-def _keys(segment: NDArray[np.int64], chunk: NDArray[np.int64]) -> NDArray[np.int64]:
-    """A number for each chunk."""
-    return (segment << 32) | chunk
-
-
-def _with_expired(states: Any, ref: Any, expired: Mapping[State, NDArray[np.int64]]) -> Any:
-    """States of rows, by their chunks: payloads may have gone, or come, since they were made."""
-    keys = _keys(*places_of(ref)[:, :2].T)
+def _with_expired(states: Any, segment: Any, expired: Mapping[State, set[int]]) -> Any:
+    """States of rows, by their segments: payloads may have gone, or come, since they were made."""
     was_gone = pc.is_in(states, pa.array([*map(str, GONE)]))
     states = pc.if_else(was_gone, State.WHOLE.value, states)
     for state, gone in expired.items():
-        is_gone = pa.array(np.isin(keys, gone))
+        is_gone = pc.is_in(segment, pa.array([*gone], segment.type))
         is_gone = pc.and_(is_gone, pc.equal(states, State.WHOLE.value))
         states = pc.if_else(is_gone, state.value, states)
     return states
@@ -282,11 +285,11 @@ class _TableRows:
         self._source = source
         self._table = table
         self._part = part
-        is_known = part.first[0] > -(1 << 63)
+        is_known = part.first > FIRST
         self.has_summaries = table.has_arrays
         self.has_points = table.points is not None
-        self.first = part.first[0] if is_known else None
-        self.last = part.last[0] if is_known else None
+        self.first = part.first if is_known else None
+        self.last = part.last if is_known else None
 
     def kinds(self, paths: Paths) -> Sequence[Any]:
         try:
@@ -300,7 +303,7 @@ class _TableRows:
     def read(self, paths: Paths, own: Collection[str], counts: ScanCounts) -> Iterator[Rows]:
         counts.add_group(self._part.file.path, self._part.group)
         expired = self._source.expired
-        is_whole = not (self._table.unreadable or self._table.reduced or expired)
+        is_whole = not (self._table.unreadable or expired or self._source.has_reduced)
         wanted = {*own} if is_whole else {*own, "state"}
         if "state" in wanted:
             wanted.add("ref")
@@ -309,7 +312,7 @@ class _TableRows:
         except StoreError as error:
             raise self._damaged(error) from error
         if "state" in wanted:
-            ours["state"] = _with_expired(ours["state"], ours["ref"], expired)
+            ours["state"] = _with_expired(ours["state"], ours["ref"].field("seg"), expired)
         yield Rows(ours, records, self._part.rows)
 
 
@@ -323,21 +326,22 @@ class _FieldRows(_TableRows):
 class _ChunkRows:
     """The messages of a topic in a chunk."""
 
-    is_whole = True
     has_summaries = False
-    has_points = True
 
     def __init__(
         self,
         source: TopicOfRecording,
         segment: int,
         place: ChunkPlace,
-        span: tuple[int, int] | None,
+        span: tuple[int, int],
+        channels: Sequence[RecordedChannel],
     ) -> None:
+        self._channels = channels
+        self.is_whole = self.has_points = not channels[0].is_reduced
         self._source = source
         self._segment = segment
         self._place = place
-        self.first, self.last = span or (place.first, place.last)
+        self.first, self.last = span
 
     def kinds(self, paths: Paths) -> Sequence[Any]:
         return self._kinds
@@ -357,38 +361,46 @@ class _ChunkRows:
         chosen = np.ones(len(chunk.batch), np.bool_)
         if offsets is not None:
             chosen = np.isin(chunk.batch.places[0], offsets)
-        for number, channel in self._source.channels.items():
-            rows = np.flatnonzero(chosen & (chunk.batch.channel == number))
+        for channel in self._channels:
+            rows = np.flatnonzero(chosen & (chunk.batch.channel == channel.channel_id))
             if len(rows):
-                messages = Messages.of(chunk).take(rows)
-                counts.payload_bytes += int(messages.length.sum()) * channel.codec.indexed
-                yield self._rows(chunk, channel, messages, paths, own)
+                batch, places = chunk.batch.take(rows), Places.of([chunk]).take(rows)
+                if channel.codec.indexed and not channel.is_reduced:
+                    counts.payload_bytes += batch.payload_bytes
+                yield self._rows(channel, batch, places, paths, own)
 
     def _rows(
         self,
-        chunk: StoredChunk,
         channel: RecordedChannel,
-        messages: Messages,
+        batch: Batch,
+        places: Places,
         paths: Paths,
         own: Collection[str],
     ) -> Rows:
-        count = len(messages.seq)
-        piece = Piece(self._segment, messages, None, state=channel.state)
-        records, points = pa.nulls(count, pa.struct([])), None
-        if channel.codec.indexed and not channel.is_reduced:
-            wanted = None if paths is None else {*paths, "header.stamp"}
-            if wanted is not None and POINTS in own:
-                wanted.update(NEEDED)
-            data = chunk.batch.buffer
-            decoded = channel.codec.columns(data, messages.at, messages.length, wanted)
-            piece.errors += [(bad.rows, bad.reason) for bad in decoded.unreadable]
-            if len(decoded.rows):
-                records = without(decoded.arrow(), decoded.rows, count)
-                points = PointColumns().points(decoded.arrow()) if POINTS in own else None
-        segment = np.full(count, self._segment, np.int32)
-        publishes = {channel.channel_id: channel.channel.has_publish_time}
-        fields = records if records.type.num_fields else None
-        columns = dict(own_columns([piece], messages, segment, fields, publishes))
-        if points is not None:
-            columns[POINTS] = without(points, decoded.rows, count)
-        return Rows(columns, records, count)
+        has_points, points = POINTS in own, None
+
+        def records_of(decoded: Decoded) -> pa.StructArray:
+            nonlocal points
+            if isinstance(decoded.records, LeftFields):
+                return decoded.records.summarised()
+            records = decoded.arrow()
+            if has_points:
+                points = without(PointColumns().points(records), decoded.rows, len(batch))
+            return records
+
+        wanted = None if paths is None else {*paths, "header.stamp"}
+        if wanted is not None and has_points:
+            wanted.update(NEEDED)
+        piece = piece_of(
+            self._segment,
+            batch,
+            places,
+            channel.codec,
+            channel.state,
+            has_publish_time={channel.channel_id: channel.channel.has_publish_time},
+            columns=records_of,
+            fields=wanted,
+        )
+        columns = piece.own if points is None else {**piece.own, POINTS: points}
+        none = pa.nulls(len(batch), pa.struct([]))
+        return Rows(columns, none if piece.fields is None else piece.fields, len(batch))

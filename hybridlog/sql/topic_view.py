@@ -152,7 +152,7 @@ class TopicView:
         remarks.recordings[recording.entry.id] = recording.entry
         remarks.topics.add(self.topic)
         for channel in recording.channels.values():
-            if channel.codec.reason is not None and channel.is_typed:
+            if channel.codec.reason is not None:
                 remarks.undefined[self.topic] = channel.codec.reason
 
 
@@ -396,7 +396,7 @@ class _Plan:
             return  # all are whole
         for found in pc.value_counts(states).to_pylist():
             state = State(found["values"])
-            is_told = lacks_arrays or state in {State.REDUCED, State.UNREADABLE}
+            is_told = lacks_arrays or state is State.UNREADABLE
             if is_told and state is not State.WHOLE:
                 self._reading.remarks.absent[topic, state] += found["counts"]
 

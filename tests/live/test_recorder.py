@@ -169,9 +169,10 @@ def test_a_reduced_message_says_what_it_was(store: hl.Store, limit: Limit, tmp_p
     batches = [batch for batch, _ in query.batches()]
     assert sum(map(len, batches)) == 1
     assert query.counters.reduced == 2
-    frame = store.topic("/scan").to_pandas()
-    assert frame["id"].tolist() == [5]
-    # Single fields come from the index, which has them all.
+    # Frames have the fields of all, and say how many lack arrays; one had none.
+    query = store.topic("/scan")
+    assert query.to_pandas()["id"].tolist() == [5, 5]
+    assert (query.counters.unreadable, query.counters.lacking) == (1, 1)
     assert store.topic("/scan").fields("near").to_pandas()["near"].dropna().tolist() == [2.5, 2.5]
 
 

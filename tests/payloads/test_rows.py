@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+import struct
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +16,11 @@ from hypothesis import strategies as st
 import hybridlog as hl
 from hybridlog.columns.recording_logs import RecordingRows
 from hybridlog.columns.rows_file import RowsFile
+from hybridlog.entries import put_entry
 from hybridlog.maintenance.expiry import expire, write_rows
+from hybridlog.schema.codecs import codec_for
+from hybridlog.schema.index_bodies import index_fields
+from hybridlog.schema.reduced_codec import reduce, reduced_channel
 from hybridlog_storage import manifest as truth
 from hybridlog_storage.errors import PayloadError, SegmentError, StoreError
 from hybridlog_storage.manifest import File
@@ -156,3 +162,58 @@ def test_fields_of_json_are_left(tmp_path: Path) -> None:
         assert store.topic("said").where("deep.x[0] == 1").count() == 1
         with pytest.raises(PayloadError, match=r"deleted to make room.*65 bytes"):
             bytes(left[0].payload)
+
+
+CUT = Schema(
+    "a/Cut",
+    "ros1msg",
+    b"float32[] r\nuint64 u\na/In[] e\n" + b"=" * 80 + b"\nMSG: a/In\nuint8[] b\ntime t",
+)
+
+
+def test_what_pressure_cut_answers_as_what_expired(tmp_path: Path) -> None:
+    """With tables, from chunks, and when the log has gone, too."""
+    fields = struct.pack("<100fQI", *range(100), (1 << 64) - 1, 1) + bytes(4) + bytes(8)
+    payload = struct.pack("<I", 100) + fields
+    json_text = b'{"r": [%s], "s": [1.5], "d": {"n": 5}, "e": []}' % b", ".join([b"2"] * 50)
+    with hl.open(tmp_path / "store", create=True, mongo="none") as store:
+        with store.start("log") as recording:
+            for own, message in ((Channel("/cut", "ros1", CUT), payload), (CHANNELS[2], json_text)):
+                codec, small = codec_for(own), reduced_channel(own)
+                recording.write(small, reduce(codec, message), log_time=1)
+                recording.write(small, reduce(codec, message[:-1]), log_time=2)
+        before = answers_of(store)
+        assert before["/cut"][0] == index_fields(codec_for(Channel("", "ros1", CUT)), payload)
+        assert before["/said"][0] == index_fields(codec_for(CHANNELS[2]), json_text)
+        shutil.rmtree(tmp_path / "store" / "tables")
+        (entry,) = store.recordings()
+    with hl.open(tmp_path / "store", mongo="none") as store:
+        assert answers_of(store) == before
+        with store.directory.writing(entry.id, entry.name):
+            expire(store.directory, entry.id, [*store.directory.manifests.read(entry.id).logs])
+            put_entry(store.directory, store.catalog, entry.id)
+    with hl.open(tmp_path / "store", mongo="none") as store:
+        assert answers_of(store) == before
+    assert before["sql"] == [(99.0, None, (1 << 64) - 1), (None, None, None)]
+    assert before["/cut"][-1] == (1, 1)
+
+
+def answers_of(store: hl.Store) -> dict[str, list[object]]:
+    found: dict[str, list[object]] = {}
+    for topic in ("/cut", "/said"):
+        query = store.topic(topic).fields("r.max", "r", "e")
+        rows = query.to_arrow().to_pylist()
+        about = [(message.fields, message.state) for message in store.topic(topic)]
+        for message in store.topic(topic):
+            with pytest.raises(
+                PayloadError, match=r"pressure.* \(\d+ bytes, SHA-256 [0-9a-f]{64}\)"
+            ):
+                message.raw  # noqa: B018
+        found[topic] = [
+            *(fields for fields, _ in about),
+            rows,
+            store.topic(topic).where("r.max > 2").count(),
+        ]
+        found[topic] += [(query.counters.lacking, query.counters.unreadable)]
+    found["sql"] = store.sql("select r_summary.max, r, u from cut order by t").rows()
+    return found

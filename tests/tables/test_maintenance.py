@@ -41,9 +41,7 @@ def contents(store: hl.Store) -> dict[str, str]:
     found = {}
     for path in root.glob("*/*.parquet"):
         reader = ParquetFileReader(path)
-        found[str(path.relative_to(root))] = (
-            f"{reader.about.recordings} {reader.table().to_pylist()}"
-        )
+        found[str(path.relative_to(root))] = f"{reader.about.sections} {reader.table().to_pylist()}"
     return found
 
 
@@ -145,9 +143,13 @@ def test_rows_of_another_segment_are_not_kept(few: hl.Store) -> None:
     stale = dict.fromkeys(entry.digests, "0" * 64)
     path = next((few.directory.path / TABLES).glob("*/*.parquet"))
     reader = ParquetFileReader(path)
-    (section,) = reader.about.recordings
-    folders = TableFolders(few.directory.path, entry.id, entry.digests)
-    folders._write(path, [(replace(section, segments=stale), reader.table())])
+    sections = reader.about.sections
+    folders = TableFolders(few.directory.path, entry.id, entry.created, entry.digests)
+    table, before, pieces = reader.table(), 0, []
+    for section in sections:
+        pieces.append((replace(section, segments=stale), table.slice(before, section.rows)))
+        before += section.rows
+    folders._write(path, pieces)
     assert not making.TableChecker(few.directory).damage(entry)
     assert making.missing(few.directory, entry) == {"/a", "/b"}
     assert making.make(few.directory, entry, ["/a"])

@@ -46,7 +46,7 @@ def write(path: Path, table: pa.Table, groups: int = 2, **about: str) -> Section
     writer = ParquetFileWriter(path, table.schema)
     for _ in range(groups):
         writer.write(table)
-    section = Section("id", 0, {"0": about.get("digest", "d")}, {"/a": TopicCounts(rows * groups)})
+    section = Section("id", "/a", 0, {"0": about.get("digest", "d")}, TopicCounts(rows * groups))
     writer.close([section])
     return section
 
@@ -61,8 +61,8 @@ def path(tmp_path: Path) -> Path:
 def test_what_is_written_is_read(path: Path, table: pa.Table) -> None:
     said = write(path, table)
     reader = ParquetFileReader(path)
-    assert reader.about.recordings == [said]
-    assert reader.groups == 2
+    assert reader.about.sections == [said]
+    assert reader.groups == [ROWS, ROWS]
     names = [leaf.names for leaf in leaves(reader.schema)]
     assert names == [("t",), ("x",), ("point", "x"), ("point", "list"), ("text",), ("seq",)]
     assert reader.read(1, [0, 1, 2, 3, 4, 5]).equals(table)
@@ -150,7 +150,7 @@ def test_what_a_file_replaces_keeps_its_place(path: Path) -> None:
         in_front = kept is not None and len(kept.data) * 1.3 < kept.offset
         writer = ParquetFileWriter(path, table.schema, reused=kept, in_front=in_front)
         writer.write(table)
-        section = Section("id", 0, {}, {"/a": TopicCounts(table.num_rows)})
+        section = Section("id", "/a", 0, {}, TopicCounts(table.num_rows))
         writer.close([section])
         assert pq.read_table(path).equals(table)
         if before is not None:

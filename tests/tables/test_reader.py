@@ -7,15 +7,19 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import pyarrow as pa
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import hybridlog as hl
+from hybridlog.columns.column_file import ColumnFile, OpenFiles, TablePart
 from hybridlog.columns.fields import FieldShape, joined, records_of
+from hybridlog.columns.layout import Section, TopicCounts
+from hybridlog.columns.parquet_file import ParquetFileWriter
 from hybridlog.columns.tables import Tables
 from hybridlog.columns.topic_table import TopicTable
 from hybridlog.maintenance import tables as making
@@ -68,6 +72,43 @@ def test_only_what_is_wanted_is_read(recorded: hl.Store) -> None:
     assert table.has("points[].X")
     assert not table.has("seq")
     assert not table.has("header.stamp.sec")
+
+
+INTEGERS = pa.schema([(name, pa.int64()) for name in ("t", "seq", "n")])
+keys = st.lists(st.tuples(st.integers(0, 9), st.integers(0, 99)), max_size=20, unique=True)
+
+
+@given(runs=st.lists(keys.map(sorted), max_size=4), size=st.integers(1, 5))
+@settings(deadline=None)
+def test_parts_are_merged(runs: list[list[tuple[int, int]]], size: int) -> None:
+    """Those of several files, in the order of the log, whatever their times are."""
+    seen: set[tuple[int, int]] = set()
+    with TemporaryDirectory() as folder:
+        parts: list[TablePart] = []
+        for number, run in enumerate(runs):
+            own = [key for key in run if key not in seen]
+            seen.update(own)
+            table = pa.table({"t": [t for t, _ in own], "seq": [seq for _, seq in own]})
+            table = table.append_column("n", table["seq"]).cast(INTEGERS)
+            writer = ParquetFileWriter(Path(folder) / f"{number}.parquet", table.schema)
+            for begin in range(0, len(own), size):
+                writer.write(table.slice(begin, size))
+            writer.close([Section("r", "t", 0, {}, TopicCounts(len(own)))])
+            parts += ColumnFile(writer.path).parts(0, len(own))
+        if not parts:
+            return
+        table_of = TopicTable("t", parts, TopicCounts(len(seen)), OpenFiles(Cache()))
+        for spans in (None, [(2, 4), (7, 8)]):
+            want = [
+                k for k in sorted(seen) if spans is None or any(a <= k[0] < b for a, b in spans)
+            ]
+            found = list(table_of.scan(["n"], spans=spans))
+            have = [
+                (t, seq, record["n"])
+                for rows in found
+                for t, seq, record in zip(rows.t, rows.seq, rows.records.to_pylist(), strict=True)
+            ]
+            assert have == [(t, seq, seq) for t, seq in want]
 
 
 # --- what is believed -----------------------------------------------------------------

@@ -176,10 +176,7 @@ def _of_tables(planner: Planner) -> dict[str, dict[str, _Running]]:
         if (
             not fields
             or not {*fields} <= {*numbers}
-            or not all(
-                part.field_types == types and all(channel.is_typed for channel in part.channels)
-                for part in parts
-            )
+            or not all(part.field_types == types for part in parts)
         ):
             continue
         read = planner.values_of_tables(parts, fields)

@@ -208,7 +208,7 @@ class IntervalQueries:
 
         summaries = _summaries(part, paths)
         read = {path.rpartition(".")[0] if path in summaries else path for path in paths}
-        types = {c.arrow_type(read) for c in part.channels if c.is_typed}
+        types = {c.arrow_type(read) for c in part.channels}
         if part.field_types is None or len(types) > 1:
             for times, objects in self._planner.objects(part):
                 yield times, [with_statistics(each, summaries) for each in objects]

@@ -70,7 +70,7 @@ def _about_stamps(session: Session, question: Question) -> Iterator[str]:
     missing = 0
     for channel in _channels(session, question):
         stats = channel.stats
-        if channel.recording.is_decoded and channel.is_typed:
+        if channel.recording.is_decoded:
             missing += stats.messages - stats.stamped
         first, last = stats.first_stamp, stats.last_stamp
         if is_noted or first is None or last is None or stats.first is None or stats.last is None:

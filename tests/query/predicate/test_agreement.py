@@ -515,9 +515,9 @@ def part(values: Message) -> object:
 
 @pytest.mark.parametrize(
     ("where", "holds"),
-    [("r > 5", True), ("r > 999", False), ("r.max > 5", True), ("r.n == 1000", True)]
+    [("r.max > 5", True), ("r.n == 1000", True), ("r.max > 999", False)]
     # What a summary cannot decide is told, with `not` in front of it, too.
-    + [(f"{word}{test}", False) for word in ("", "not ") for test in ("r == 5", "r != 5")],
+    + [(f"{word}{test}", False) for word in ("", "not ") for test in ("r > 5", "r == 5", "r != 5")],
 )
 def test_reduced_json_has_summaries(where: str, holds: bool) -> None:
     channel = Channel("/r", "json", None, {}, has_publish_time=False)
@@ -528,4 +528,4 @@ def test_reduced_json_has_summaries(where: str, holds: bool) -> None:
     recorded = RecordedChannel(entry, 0, reduced_channel(channel), ChannelStats(), None)
     found = MessageFilter(parse(where), None).matches(recorded, batch, zero)
     assert found.holds.tolist() == [holds]
-    assert found.unreadable == found.expired == ("5" in where and "=" in where)
+    assert found.unreadable == found.expired == ("r." not in where)
