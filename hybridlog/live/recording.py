@@ -216,6 +216,8 @@ class LiveRecording:
         """Messages that are missing from this recording."""
         self.cut_off: Counter[str] = Counter()
         """Messages that a full disk cost, by topic; known after the end."""
+        self.make_room: Callable[[], bool] = lambda: False
+        """Called when the disk is full; returns whether to try again."""
         self._capture = Capture(
             directory,
             catalog,
@@ -227,6 +229,7 @@ class LiveRecording:
             settings=options.settings,
             no_index=options.no_index,
             is_ring=options.is_ring,
+            make_room=self._when_full,
             pressure=Backpressure(
                 skip_compression=lambda: self._is_under_pressure(self._compression_pressure),
                 pause_indexing=lambda: self._is_under_pressure(self._index_pressure),
@@ -509,6 +512,9 @@ class LiveRecording:
             self._taken_bytes -= appended
             self._beyond = self._closed_beyond()
             self._room.notify()
+
+    def _when_full(self) -> bool:
+        return self.make_room()
 
     def _wake(self) -> None:
         """Wake the writing thread."""

@@ -9,13 +9,11 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Callable, Collection, Hashable, Mapping
-from contextlib import suppress
 from typing import TYPE_CHECKING, Final
 
+from hybridlog.maintenance.expiry import let_go
 from hybridlog.maintenance.retention import is_pinned
 from hybridlog.query.latching import depth_of, publisher_of
-from hybridlog_storage.disk import durability, files
-from hybridlog_storage.manifest import LetGo, replace, with_totals
 
 if TYPE_CHECKING:
     from hybridlog_storage.disk.directory import StoreDirectory
@@ -80,31 +78,9 @@ class Ring:
         Raises:
             StoreError: The manifest cannot be changed, or a file cannot be deleted.
         """
-        gone: list[File] = []
-
-        def how(now: Manifest) -> Manifest:
-            gone[:] = self._going(now, groups)
-            if not gone:
-                return now
-            count = sum(
-                part.messages for log in gone if log.kind == "log" for part in log.parts.values()
-            )
-            left = tuple(file for file in now.files if file not in gone)
-            before = LetGo(0, 0) if now.let_go is None else now.let_go
-            through = max(before.through, *(file.number for file in gone))
-            let_go = LetGo(before.messages + count, through)
-            return with_totals(replace(now, files=left, let_go=let_go))
-
-        changed = self._directory.manifests.change(self._recording, how)
+        changed = let_go(self._directory, self._recording, lambda now: self._going(now, groups))
         self._kept.update(groups)  # what is left of them stays, until another group is sealed
         self.messages = 0 if changed.let_go is None else changed.let_go.messages
-        path = self._directory.recording(self._recording)
-        try:
-            for file in gone:
-                with suppress(FileNotFoundError):
-                    files.unlink(path / file.name)
-        except OSError as error:
-            raise durability.explain(error, path, "deleting files of") from error
 
     def _going(self, now: Manifest, groups: Collection[int]) -> list[File]:
         logs = [log for log in now.logs.values() if log.group in groups]
