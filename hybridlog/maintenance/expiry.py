@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Final
 from hybridlog.maintenance.report import reporter
 from hybridlog.record.losses import Cause
 from hybridlog_storage.disk import durability, files
-from hybridlog_storage.errors import DiskFullError, StoreError
+from hybridlog_storage.errors import ChangedError, DiskFullError, SegmentError, StoreError
 from hybridlog_storage.manifest import LetGo, Loss, Manifest, replace, with_rows, with_totals
 from hybridlog_storage.segments.gone_log import front
 from hybridlog_storage.segments.segment_reader import SegmentReader
@@ -46,11 +46,13 @@ class Expired:
         segments: Numbers of the logs that went.
         messages: Number of messages whose payloads went, by topic.
         freed: Bytes of the disk that became free, what was written subtracted.
+        damaged: Why logs could not go, by number.
     """
 
     segments: list[int] = field(default_factory=list)
     messages: dict[str, int] = field(default_factory=dict)
     freed: int = 0
+    damaged: dict[int, str] = field(default_factory=dict)
 
 
 def expire(
@@ -67,7 +69,8 @@ def expire(
     """Delete sealed logs of a recording that this process has locked.
 
     Logs that are gone already are left out, and those without messages. Those that have their
-    rows go first. Where there is no room for rows, a log goes without, and is lost.
+    rows go first. Where there is no room for rows, a log goes without, and is lost. Damaged ones
+    without rows stay.
 
     Args:
         directory: The store.
@@ -86,7 +89,7 @@ def expire(
     manifest, done = directory.manifests.read(recording), Expired()
     logs = [manifest.logs.get(number) for number in sorted(segments)]
     if any(log is None or digests.get(log.number, log.digest) != log.digest for log in logs):
-        raise StoreError(f"{manifest.name}: a segment was replaced meanwhile.")
+        raise ChangedError(f"{manifest.name}: a segment was replaced meanwhile.")
     going = [log for log in logs if log is not None and log.is_here and log.parts]
     if manifest.is_ended:
         _remove_arrays(directory, manifest, going)
@@ -105,7 +108,10 @@ def expire(
             done.freed -= sum(one.bytes for one in made)
         except DiskFullError:
             let_go(directory, recording, partial(_lines_of, log.number), check, NO_ROOM)
+        except SegmentError as error:
+            done.damaged[log.number] = str(error)
         before += log.bytes
+    going = [log for log in going if log.number not in done.damaged]
     done.freed += sum(log.bytes for log in going)
     done.segments = [log.number for log in going]
     for log in going:
@@ -136,7 +142,8 @@ def make_rows(
     manifest = directory.manifests.read(recording)
     for log in manifest.logs.values():
         if may_go(log) and log.number not in manifest.rows and is_wanted():
-            _list(directory, recording, {log.number: _rows_of(directory, recording, log)})
+            with suppress(SegmentError):  # it stays
+                _list(directory, recording, {log.number: _rows_of(directory, recording, log)})
 
 
 def _rows_of(
@@ -264,7 +271,8 @@ def write_rows(
         The lines of the files, which are on the disk, the first one first.
 
     Raises:
-        StoreError: The log is damaged, or has what rows cannot keep; or files cannot be written.
+        SegmentError: The log is damaged, or has what rows cannot keep.
+        StoreError: Files cannot be written.
         DiskFullError: There is no room.
     """
     from hybridlog.columns.rows_writer import RowsWriter
@@ -272,12 +280,9 @@ def write_rows(
     with SegmentReader(recording / line.name, line.number) as reader:
         summary = reader.summary()
         if summary.size != line.bytes:
-            raise StoreError(
-                f"{reader.path} is not the segment that the manifest lists; nothing was deleted. "
-                "Run `hybridlog verify --repair` first."
-            )
+            raise SegmentError(f"{reader.path} is not the segment that the manifest lists")
         if summary.attachments:
-            raise StoreError(f"{reader.path} has attachments of its log, and stays.")
+            raise SegmentError(f"{reader.path} has attachments of its log")
         begin = front(reader, summary, line)
         writer = RowsWriter(into, line, summary.channels, begin, version)
         try:

@@ -11,13 +11,14 @@ import os
 import shutil
 import threading
 import time
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
-from hybridlog.maintenance.expiry import expire, let_go, make_rows
+from hybridlog.maintenance.expiry import Expired, expire, let_go, make_rows
 from hybridlog.maintenance.retention import (
     Held,
     Plan,
@@ -33,11 +34,10 @@ from hybridlog.wording import listed
 from hybridlog_storage.disk import files
 from hybridlog_storage.disk.directory import LOCK_WAIT_S
 from hybridlog_storage.errors import (
+    ChangedError,
     DiskFullError,
     HeldError,
     HybridlogError,
-    RecordingGoneError,
-    SegmentError,
     StoreError,
     TopicError,
 )
@@ -115,8 +115,8 @@ class Keeper:
         self._own = own
         self._is_wanted = is_wanted
         self._changed = changed
-        # Ids and segments that this pass could not change; -1 for the whole recording.
-        self._failed: set[tuple[str, int]] = set()
+        # Segments that this pass could not change, by recording; -1 for all of it.
+        self._failed: defaultdict[str, set[int]] = defaultdict(set)
         self._unproven: set[str] = set()  # names of recordings whose manifests were made again
 
     def plan(self, rules: Rules) -> Plan:
@@ -141,6 +141,8 @@ class Keeper:
             DiskFullError: There is no room, not even that of the spare file.
         """
         with self._alone():
+            if not self._directory.is_remote:
+                _lay_spare(self._directory, rules)  # counts among what is used
             found = KeepReport(self.plan(rules))
             planned = found.plan
             for _ in range(_MAX_ROUNDS):
@@ -153,8 +155,6 @@ class Keeper:
                 planned = self.plan(rules)
                 found.plan.steps += planned.steps
             found.plan.warnings, found.plan.is_short = planned.warnings, planned.is_short
-            if not self._directory.is_remote:
-                _lay_spare(self._directory, rules)
         return found
 
     def expire_all(
@@ -181,14 +181,10 @@ class Keeper:
             found = KeepReport(self.plan(Rules()))
             for held in self._held(time.time_ns()):
                 if held.id == recording and not rules.is_never(held.tags):
-                    going = [s for s in held.segments if s.number in digests and not s.is_pinned]
-                    if going:
-                        numbers = tuple(one.number for one in going)
-                        size = sum(one.size for one in going)
-                        reason = f"it was copied to {copy}"
-                        step = Step(held.name, held.id, numbers, (), size, reason)
-                        found.plan.steps.append(step)
-                        how = {"digests": digests, "copy": copy, "progress": progress}
+                    own = (s.number for s in held.segments if s.may_go and not s.is_pinned)
+                    step = Step(held.name, held.id, tuple(digests.keys() & {*own}), (), 0, "")
+                    how = {"digests": digests, "copy": copy, "progress": progress}
+                    if step.segments:
                         self._do(step, rules, found, how)
         return found
 
@@ -209,15 +205,13 @@ class Keeper:
             if manifest.status == "unproven":
                 self._unproven.add(manifest.name)
                 continue
-            held = held_of(manifest, now)
-            if (held.id, _WHOLE) in self._failed:
-                continue
-            left = [s for s in held.segments if (held.id, s.number) not in self._failed]
+            held, failed = held_of(manifest, now), self._failed[manifest.id]
+            left = [s for s in held.segments if s.number not in failed]
             if self._own is not None and held.id == self._own.recording:
                 unread = self._own.first_unread()
                 left = [s for s in left if s.number < unread]
-            elif not held.is_ended and self._directory.is_recorded(held.id):
-                left = []
+            elif _WHOLE in failed or (not held.is_ended and self._directory.is_recorded(held.id)):
+                left, held = [], replace(held, is_ended=False)
             yield replace(held, segments=left)
 
     def _do(self, step: Step, rules: Rules, found: KeepReport, how: Mapping[str, Any]) -> None:
@@ -232,54 +226,44 @@ class Keeper:
         check = partial(_check, step, rules)
         try:
             try:
-                freed = self._freed_by(step, check, how)
+                done = self._done(step, check, how)
             except DiskFullError:
                 if not _use_spare(self._directory):
                     raise
-                freed = self._freed_by(step, check, how)
-            found.freed_bytes += freed
+                done = self._done(step, check, how)
         except DiskFullError:
             raise
+        except ChangedError as error:  # the next plan judges again
+            found.problems.append(str(error))
         except (StoreError, TopicError) as error:
-            is_held = isinstance(error, HeldError | RecordingGoneError | TopicError)
-            if len(step.segments) > 1 and not is_held:  # one of them may be damaged
-                for number in step.segments:
-                    self._do(replace(step, segments=(number,)), rules, found, how)
-                return
-            numbers = (_WHOLE,) if is_held else step.segments or (_WHOLE,)
-            self._failed.update((step.id, number) for number in numbers)
-            cure = ""
-            if isinstance(error, SegmentError):
-                cure = ". Its payloads stay until the file is restored from a copy"
-            found.problems.append(f"{error}{cure}")
+            found.problems.append(str(error))
+            self._failed[step.id].add(_WHOLE)
+        else:
+            found.freed_bytes += done.freed
+            for number, reason in done.damaged.items():
+                cure = "Its payloads stay until the file is restored from a copy"
+                found.problems.append(f"{reason}. {cure}")
+                self._failed[step.id].add(number)
 
-    def _freed_by(
+    def _done(
         self, step: Step, check: Callable[[Manifest], None], how: Mapping[str, Any]
-    ) -> int:
-        """Do a step; returns the bytes that became free."""
+    ) -> Expired:
         if not step.segments and not step.groups:
             self._remove(step.id, check)
-            return step.bytes
-        with self._locked(step):
+            return Expired(freed=step.bytes)
+        with ExitStack() as held:
+            if self._own is None or step.id != self._own.recording:
+                lock = self._directory.writing(step.id, step.recording, wait_s=LOCK_WAIT_S)
+                held.enter_context(lock)
             if step.groups:
                 let_go(self._directory, step.id, partial(_of_groups, step.groups), check)
-                freed = step.bytes
+                done = Expired(freed=step.bytes)
             else:
                 at_hand = self._directory.at_hand(step.id, step.segments, check)
                 with at_hand as (here, version):
                     done = expire(here, step.id, step.segments, check=check, version=version, **how)
-                    freed = done.freed
             self._changed(step.id)
-        return freed
-
-    @contextmanager
-    def _locked(self, step: Step) -> Iterator[None]:
-        """Let nobody else write a recording."""
-        if self._own is not None and step.id == self._own.recording:
-            yield
-            return
-        with self._directory.writing(step.id, step.recording, wait_s=LOCK_WAIT_S):
-            yield
+        return done
 
 
 def _of_groups(groups: Sequence[int], manifest: Manifest) -> list[File]:
@@ -290,18 +274,18 @@ def _check(step: Step, rules: Rules, manifest: Manifest) -> None:
     """Raise if what goes in a step must stay by now.
 
     Raises:
-        StoreError: It must.
+        ChangedError: It must.
     """
     if rules.is_never(manifest.tags):
-        raise StoreError(f"{step.recording}: a tag that keeps it was set meanwhile.")
+        raise ChangedError(f"{step.recording}: a tag that keeps it was set meanwhile.")
     if manifest.pins and not step.segments and not step.groups:
-        raise StoreError(f"{step.recording}: a pin was set meanwhile.")
+        raise ChangedError(f"{step.recording}: a pin was set meanwhile.")
     if not manifest.logs.keys() >= {*step.segments}:
-        raise StoreError(f"{step.recording}: a segment was replaced meanwhile.")
+        raise ChangedError(f"{step.recording}: a segment was replaced meanwhile.")
     for number, log in manifest.logs.items():
         goes = number in step.segments or log.group in step.groups
         if goes and is_pinned(log, manifest):
-            raise StoreError(f"{step.recording}: a pin was set meanwhile.")
+            raise ChangedError(f"{step.recording}: a pin was set meanwhile.")
 
 
 def _lay_spare(directory: StoreDirectory, rules: Rules) -> None:

@@ -171,39 +171,26 @@ def _topic_rule(topic: str, topics: Mapping[str, Any]) -> TopicRule:
 
 @dataclass(frozen=True, slots=True)
 class HeldSegment:
-    """A log that may go before its recording.
+    """A log, or what is left of it.
 
     Attributes:
         number: Its number.
-        written: When it was written, or the time of its last message if that is later, ns.
-        size: Bytes of its file.
-        topics: Its topics.
         group: Number of its group.
+        written: When it was written, or the time of its last message if that is later, ns.
+        size: Bytes of its file; 0 if it is gone.
+        row_bytes: Bytes of its files of rows.
+        topics: Its topics.
+        may_go: Whether its payloads may go before its group: not those of small topics.
         is_pinned: Whether a pin keeps messages of it.
     """
 
     number: int
-    written: int
-    size: int
-    topics: frozenset[str]
     group: int
-    is_pinned: bool
-
-
-@dataclass(frozen=True, slots=True)
-class HeldGroup:
-    """A group of files, which may go with all that is left of it.
-
-    Attributes:
-        number: Its number.
-        written: When the last one of its logs was written, ns.
-        size: Bytes of its files.
-        is_pinned: Whether a pin keeps messages of it.
-    """
-
-    number: int
     written: int
     size: int
+    row_bytes: int
+    topics: frozenset[str]
+    may_go: bool
     is_pinned: bool
 
 
@@ -218,8 +205,7 @@ class Held:
         written: When its last segment was written, or its last message if that is later, ns.
         tags: Its tags.
         size: Bytes of all its files.
-        segments: Logs that may go, in their order: not those of small topics.
-        groups: Groups that may go when no such logs are left.
+        segments: Its logs, in their order.
         is_ended: Whether it has ended.
         pins: Number of its pins.
     """
@@ -231,7 +217,6 @@ class Held:
     tags: Mapping[str, str]
     size: int
     segments: Sequence[HeldSegment]
-    groups: Sequence[HeldGroup] = ()
     is_ended: bool = True
     pins: int = 0
 
@@ -244,24 +229,24 @@ def held_of(manifest: Manifest, now: int) -> Held:
         now: The time, ns.
     """
     found: list[HeldSegment] = []
-    groups: dict[int, HeldGroup] = {}
-    # A segment is not newer than those that follow it, whatever the clock was.
-    later, last = now, 0
-    for _, log in sorted(manifest.logs.items(), reverse=True):
+    later, last, rows = now, 0, manifest.rows
+    for number, log in sorted(manifest.logs.items(), reverse=True):
         parts = _parts_of(log, manifest)
         times = [part.last for _, part in parts if part.last is not None]
-        written, pinned = min(max([log.written, *times]), now), is_pinned(log, manifest)
+        written = min(max([log.written, *times]), now)
+        # A segment is not newer than those that follow it, whatever the clock was.
         later, last = min(later, written), max(last, written)
-        if may_go(log):
-            topics = frozenset(topic for topic, _ in parts)
-            found.append(HeldSegment(log.number, later, log.bytes, topics, log.group, pinned))
-        files = (file for file in manifest.files if file.number == log.number and file.is_here)
-        size, before = sum(file.bytes for file in files), groups.get(log.group)
-        groups[log.group] = HeldGroup(
-            log.group,
-            later if before is None else before.written,
-            size + (0 if before is None else before.size),
-            pinned or (before is not None and before.is_pinned),
+        found.append(
+            HeldSegment(
+                number,
+                log.group,
+                later,
+                log.bytes if log.is_here else 0,
+                sum(file.bytes for file in rows.get(number, ())),
+                frozenset(topic for topic, _ in parts),
+                may_go(log),
+                is_pinned(log, manifest),
+            )
         )
     return Held(
         manifest.id,
@@ -269,9 +254,8 @@ def held_of(manifest: Manifest, now: int) -> Held:
         manifest.created,
         last,
         manifest.tags,
-        sum(group.size for group in groups.values()),
+        sum(one.size + one.row_bytes for one in found),
         found[::-1],
-        [*groups.values()][::-1] if manifest.is_ended else (),
         manifest.is_ended,
         len(manifest.pins),
     )
@@ -391,14 +375,20 @@ class _Planning:
     def made(self) -> Plan:
         kept = [one for one in self._held if self._rules.is_never(one.tags)]
         others = [one for one in self._held if not self._rules.is_never(one.tags)]
-        pinned = [s for one in others for s in one.segments if s.is_pinned]
+        pinned = [s for one in others for s in one.segments if s.may_go and s.is_pinned]
         self._plan.pins = sum(one.pins for one in self._held)
-        self._plan.pinned_bytes = sum(s.size for one in kept for s in one.segments)
+        self._plan.pinned_bytes = sum(s.size for one in kept for s in one.segments if s.may_go)
         self._plan.pinned_bytes += sum(s.size for s in pinned)
         self._others = others
         self._whole_recordings(others)
         self._pieces = sorted(
-            (_Piece(o, s) for o in others if o.id not in self._gone for s in o.segments),
+            (
+                _Piece(o, s)
+                for o in others
+                if o.id not in self._gone
+                for s in o.segments
+                if s.may_go
+            ),
             key=lambda piece: piece.order,
         )
         self._by_age()
@@ -444,23 +434,25 @@ class _Planning:
             self._groups()
 
     def _groups(self) -> None:
-        """Let whole groups go, the oldest first, until enough is free."""
+        """Let whole groups of ended recordings go, the oldest first, until enough is free."""
         reason = f"{self._reason(_SEGMENTS_FROM, 1.0)}, and no payloads are left to go"
         need = self._short(_TOPICS_FROM, _TOPICS_BELOW)
-        held = [one for one in self._others if one.id not in self._gone]
-        found = [(one, group) for one in held for group in one.groups if not group.is_pinned]
-        found.sort(key=lambda pair: (pair[1].written, pair[0].created, pair[0].id))
-        chosen: dict[str, dict[int, int]] = {}  # what becomes free besides, by group
-        for one, group in found:
-            if need > 0:
-                own = (s for s in one.segments if s.group == group.number)
-                going = sum(s.size for s in own if (one.id, s.number) in self._going)
-                chosen.setdefault(one.id, {})[group.number] = group.size - going
-                need -= group.size - going
+        found: dict[tuple[int, int, str, int], list[_Piece]] = {}
+        held = [one for one in self._others if one.is_ended and one.id not in self._gone]
         for one in held:
-            groups = chosen.get(one.id, {})
-            is_whole = len(groups) == len(one.groups) and not one.pins
-            if groups:
+            for number in {segment.group for segment in one.segments}:
+                own = [_Piece(one, s) for s in one.segments if s.group == number]
+                found[min(piece.order for piece in own)] = own
+        chosen: dict[str, dict[int, int]] = {}  # what becomes free besides, by group
+        for _, own in sorted(found.items()):
+            if need > 0 and not any(piece.segment.is_pinned for piece in own):
+                left = (p for p in own if (p.held.id, p.segment.number) not in self._going)
+                size = sum(p.segment.size for p in left) + sum(p.segment.row_bytes for p in own)
+                chosen.setdefault(own[0].held.id, {})[own[0].segment.group] = size
+                need -= size
+        for one in held:
+            if groups := chosen.get(one.id):
+                is_whole = groups.keys() == {s.group for s in one.segments} and not one.pins
                 numbers = () if is_whole else tuple(groups)
                 self._step(Step(one.name, one.id, (), (), sum(groups.values()), reason, numbers))
 
