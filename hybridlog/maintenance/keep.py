@@ -58,6 +58,7 @@ SPARE: Final = "spare"
 """File whose room a pass uses for manifests and rows when the disk is full."""
 _SPARE_BYTES: Final = 8 << 20
 _SPARE_SHARE: Final = 64  # of the quota, at most
+_LEAST_SPARE: Final = 1 << 16
 
 
 @dataclass(frozen=True, slots=True)
@@ -294,10 +295,11 @@ def _lay_spare(directory: StoreDirectory, rules: Rules) -> None:
     if rules.quota is not None:
         size = min(size, rules.quota // _SPARE_SHARE)
     with suppress(OSError):
-        if shutil.disk_usage(directory.path).free > 4 * size and not path.exists():
+        is_apt = size >= _LEAST_SPARE and shutil.disk_usage(directory.path).free > 4 * size
+        if is_apt and not path.exists():
             fd = files.open_file(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL)
             try:
-                os.posix_fallocate(fd, 0, max(size, 1))
+                os.posix_fallocate(fd, 0, size)
             finally:
                 os.close(fd)
 

@@ -20,16 +20,18 @@ import pytest
 import hybridlog as hl
 from hybridlog.live.recorder import Recorder, RecorderOptions, make_room
 from hybridlog_storage.errors import DiskFullError, PayloadError
+from tests import places
 from tests.live.speaker import Speaker
 from tests.live.test_play import CHANNELS, payload
-from tests.live.test_retention import store_with
+from tests.live.test_retention import has_expired, store_with
+from tests.waiting import wait_for
 
 FLUSH_S = 0.3
 SLACK_S = 2.0
 RESERVE = 10 << 20
 QUOTA = 200_000_000
 TOPICS = {"/camera": 1, "/points": 3, "/arm": 1}
-"""A message of each in so many steps of 5 ms."""
+"""A message of each in so many steps."""
 
 
 @pytest.fixture
@@ -50,7 +52,7 @@ def disk(tmp_path: Path) -> Iterator[Path]:
         subprocess.run(["umount", "-l", place], check=True)
 
 
-def drive(path: str, log: str, name: str) -> None:
+def drive(path: str, log: str, name: str, pause: str) -> None:
     """Record until nobody wants more; each message is written down before it is sent."""
     sent = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     with hl.open(path, mongo="none", recover=False) as store:
@@ -63,7 +65,7 @@ def drive(path: str, log: str, name: str) -> None:
         print("begun", flush=True)
         os.set_blocking(0, False)
         step = 0
-        while not recorder.wait(0.005):
+        while not recorder.wait(float(pause)):
             with suppress(BlockingIOError):
                 os.read(0, 1)
                 break
@@ -87,10 +89,10 @@ def fill(path: Path) -> None:
             pass
 
 
-def begin(store: Path, log: Path, name: str) -> subprocess.Popen[str]:
+def begin(store: Path, log: Path, name: str, pause: float = 0.005) -> subprocess.Popen[str]:
     code = "import sys; from tests.live.test_full import drive; drive(*sys.argv[1:])"
     process = subprocess.Popen(
-        [sys.executable, "-c", code, str(store), str(log), name],
+        [sys.executable, "-c", code, str(store), str(log), name, str(pause)],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
@@ -160,3 +162,31 @@ def test_a_recorder_outlives_a_disk_that_is_filled(disk: Path, tmp_path: Path) -
                 assert told >= len(own), (name, topic, told, len(own))
         assert gone
         assert opened.verify().findings == []
+
+
+@pytest.mark.exhaustive
+def test_500_questions_are_answered_while_a_recorder_deletes(tmp_path: Path) -> None:
+    store, log = tmp_path / "store", tmp_path / "sent"
+    store_with(store, quota="20MB").close()
+    process = begin(store, log, "drive", 0.03)
+    wait_for(lambda: has_expired(places.folder(store, "drive")))
+    counts, gone = [0], 0
+    with hl.open(store, mongo="none") as lasting:
+        for number in range(500):
+            asked = lasting if number % 2 else hl.open(store, mongo="none")
+            assert [one.name for one in asked.recordings()] == ["drive"]
+            arms = asked.topic("/arm")
+            found = [message.fields["n"] for message in arms.where("n >= 0")]
+            assert found == [*range(len(found))]
+            assert counts[-1] <= len(found) <= arms.count()
+            counts.append(len(found))
+            if number % 10 == 0:
+                state = [one.state for one in asked.topic("/camera")]
+                gone = state.count("expired")
+                assert state == ["expired"] * gone + ["whole"] * (len(state) - gone)
+                assert gone
+            if asked is not lasting:
+                asked.close()
+    stop(process)
+    with hl.open(store, mongo="none") as again:
+        assert [m.state for m in again.topic("/camera")].count("expired") > gone
