@@ -41,7 +41,7 @@ from hybridlog.live.state import RecorderState, StateFile
 from hybridlog.live.statistics import Lateness, Tally, TopicRates
 from hybridlog.live.triggers import Trigger, Triggers
 from hybridlog.maintenance.edit import remove_if
-from hybridlog.maintenance.keep import Own, RetentionThread
+from hybridlog.maintenance.keep import RetentionThread
 from hybridlog.maintenance.retention import Rules
 from hybridlog.query.times import format_duration, format_time
 from hybridlog.record.losses import Cause, Loss
@@ -220,7 +220,8 @@ class Recorder:
         self._target = store.start(options.name, self._live_options())
         self.name = self._target.name
         self._says = StateFile(store.directory, self._target.id)
-        self._ring = self._make_ring()
+        ring_s = options.ring_s
+        self._ring = None if ring_s is None else Ring(self._directory, self._target, ring_s)
         self._triggers = Triggers(options.triggers, say)
         self._incidents = Incidents(
             partial(self._directory.manifests.change, self._target.id),
@@ -233,11 +234,7 @@ class Recorder:
             self._retention = RetentionThread(
                 store.directory,
                 partial(remove_if, store.shared),
-                Own(
-                    self._target.id,
-                    lambda: self._target.first_unread,
-                    lambda: self._target.sealed,
-                ),
+                self._target,
                 options.reserve_bytes,
                 self.say,
             )
@@ -264,18 +261,6 @@ class Recorder:
             settings=settings,
             no_index=options.no_index,
             is_ring=options.ring_s is not None,
-        )
-
-    def _make_ring(self) -> Ring | None:
-        if self._options.ring_s is None:
-            return None
-        target = self._target
-        return Ring(
-            self._directory,
-            target.id,
-            self._options.ring_s,
-            lambda: target.sealed,
-            target.channels,
         )
 
     # Methods for the program that runs the recorder.

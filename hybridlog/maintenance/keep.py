@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from hybridlog.maintenance.expiry import Expired, expire, let_go, make_rows
 from hybridlog.maintenance.retention import (
@@ -61,19 +61,22 @@ _SPARE_SHARE: Final = 64  # of the quota, at most
 _LEAST_SPARE: Final = 1 << 16
 
 
-@dataclass(frozen=True, slots=True)
-class Own:
+class Own(Protocol):
     """The recording that this process makes; it holds the lock of it.
 
     Attributes:
-        recording: Its id.
-        first_unread: Returns the number of the first segment that it still reads.
-        sealed: Returns the number of segments sealed so far.
+        id: Its id.
     """
 
-    recording: str
-    first_unread: Callable[[], int]
-    sealed: Callable[[], int]
+    id: str
+
+    @property
+    def first_unread(self) -> int:
+        """Number of the first segment that it still reads."""
+
+    @property
+    def sealed(self) -> int:
+        """Number of segments sealed so far."""
 
 
 @dataclass(slots=True)
@@ -208,8 +211,8 @@ class Keeper:
                 continue
             held, failed = held_of(manifest, now), self._failed[manifest.id]
             left = [s for s in held.segments if s.number not in failed]
-            if self._own is not None and held.id == self._own.recording:
-                unread = self._own.first_unread()
+            if self._own is not None and held.id == self._own.id:
+                unread = self._own.first_unread
                 left = [s for s in left if s.number < unread]
             elif _WHOLE in failed or (not held.is_ended and self._directory.is_recorded(held.id)):
                 left, held = [], replace(held, is_ended=False)
@@ -253,7 +256,7 @@ class Keeper:
             self._remove(step.id, check)
             return Expired(freed=step.bytes)
         with ExitStack() as held:
-            if self._own is None or step.id != self._own.recording:
+            if self._own is None or step.id != self._own.id:
                 lock = self._directory.writing(step.id, step.recording, wait_s=LOCK_WAIT_S)
                 held.enter_context(lock)
             if step.groups:
@@ -420,7 +423,7 @@ class RetentionThread:
         looked = last_pass = -_AGES_S
         sealed = 0
         while not self._over.wait(_TICK_S):
-            now, count, is_low = time.monotonic(), self._own.sealed(), False
+            now, count, is_low = time.monotonic(), self._own.sealed, False
             is_asked = self._asked > self._passes
             freed = 0
             try:
@@ -434,7 +437,7 @@ class RetentionThread:
                 last_pass, sealed = now, count
                 if not self._rules.is_empty:
                     freed = self._make_pass()
-                    make_rows(self._directory, self._own.recording, lambda: not self._over.is_set())
+                    make_rows(self._directory, self._own.id, lambda: not self._over.is_set())
             except HeldError:
                 sealed, freed = -1, 1  # another process makes room: see later what is left
             except (HybridlogError, OSError) as error:
