@@ -168,25 +168,25 @@ def test_a_recorder_outlives_a_disk_that_is_filled(disk: Path, tmp_path: Path) -
 def test_500_questions_are_answered_while_a_recorder_deletes(tmp_path: Path) -> None:
     store, log = tmp_path / "store", tmp_path / "sent"
     store_with(store, quota="20MB").close()
-    process = begin(store, log, "drive", 0.03)
+    process = begin(store, log, "drive", 0.01)
     wait_for(lambda: has_expired(places.folder(store, "drive")))
-    counts, gone = [0], 0
+    counts, expired = [0], [0]
     with hl.open(store, mongo="none") as lasting:
         for number in range(500):
             asked = lasting if number % 2 else hl.open(store, mongo="none")
             assert [one.name for one in asked.recordings()] == ["drive"]
             arms = asked.topic("/arm")
-            found = [message.fields["n"] for message in arms.where("n >= 0")]
-            assert found == [*range(len(found))]
-            assert counts[-1] <= len(found) <= arms.count()
-            counts.append(len(found))
-            if number % 10 == 0:
+            counts.append(arms.count())
+            assert counts[-1] >= counts[-2]
+            assert [m.fields["n"] for m in arms.between("-1s", "end")]
+            if number % 20 == 0:
+                found = [message.fields["n"] for message in arms]
+                assert found == [*range(len(found))]
+                assert len(found) >= counts[-1]
                 state = [one.state for one in asked.topic("/camera")]
-                gone = state.count("expired")
+                expired.append(gone := state.count("expired"))
                 assert state == ["expired"] * gone + ["whole"] * (len(state) - gone)
-                assert gone
             if asked is not lasting:
                 asked.close()
     stop(process)
-    with hl.open(store, mongo="none") as again:
-        assert [m.state for m in again.topic("/camera")].count("expired") > gone
+    assert len({*expired}) > 3, expired  # files went while it was asked
