@@ -256,7 +256,7 @@ def inventory_of(
     rows = {} if manifest is None else manifest.rows
     for number, file in listed.items():
         if number not in found.summaries and number not in listing.open:
-            found.lost += rows.get(number) or [file]
+            found.lost += [file] if file.is_here else rows[number]
             if number not in listing.sealed:
                 what = file.name if file.is_here else f"what is left of {file.name}"
                 found.misfits.append(Misfit(number, "", f"{what} is missing"))
@@ -665,8 +665,8 @@ def _losses_of_rows(inventory: Inventory) -> list[dict[str, Any]]:
     """Rows of the loss ledger for missing or changed files of rows, where others are there."""
     rows = []
     for file in inventory.rows:
-        size = inventory.listing.rows.get(file.name)
-        if size != file.bytes and file.number in inventory.summaries:
+        size, log = inventory.listing.rows.get(file.name), inventory.logs[file.number]
+        if size != file.bytes and not log.is_here and file.number in inventory.summaries:
             problem = "is missing" if size is None else "has another size"
             rows += _losses_of_file(inventory, file, f"a file of rows {problem}")
     return rows

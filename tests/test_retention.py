@@ -153,9 +153,27 @@ def test_the_first_log_of_a_group_stays() -> None:
     first = held("old", sealed(0, 50, group=0), sealed(1, 50, group=0))
     assert told(made({"max-age": "30d"}, first)) == [("old", (1,), (), "older than 30d")]
     found = made({"quota": "1MB"}, first, used=100 * MB)
-    assert [one.segments for one in found.steps] == [(1,)]
+    # When nothing else is left, it goes with its group.
+    assert told(found) == [
+        ("old", (1,), (), "more than 90% of 1.0 MB is used"),
+        ("old", (), (), "more than 90% of 1.0 MB is used, and no payloads are left to go"),
+    ]
+    assert [one.bytes for one in found.steps] == [2 * MB, 8 * MB]
     assert found.is_short
-    assert "small topics" in found.warnings[0]
+
+
+def test_whole_groups_go_the_oldest_first() -> None:
+    """When no payloads are left to go; not those that a pin touches, or that are recorded."""
+    first = [sealed(n, 50 - n, CAMERA, group=n) for n in range(3)]
+    rules = {"quota": "100MB"}
+    (step,) = made(rules, held("old", *first), used=96 * MB).steps
+    assert (step.segments, step.groups, step.bytes) == ((), (0, 1), 16 * MB)
+    pin = pin_of("a", (NOW - 51 * DAY, NOW - 50 * DAY), None, "")
+    (step,) = made(rules, held("old", *first, pins=(pin,)), used=99 * MB).steps
+    assert (step.groups, step.bytes) == ((1, 2), 16 * MB)
+    (step,) = made(rules, held("old", *first), used=120 * MB).steps
+    assert (step.segments, step.groups, step.bytes) == ((), (), 24 * MB)
+    assert made(rules, held("old", *first, ended=False), used=120 * MB).steps == []
 
 
 def test_a_topic_that_shares_its_log_goes_with_it() -> None:

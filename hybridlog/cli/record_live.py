@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import signal
 import socket
 import sys
@@ -58,7 +57,7 @@ def record_live(choices: RecordChoices) -> None:
 
 def _record(choices: RecordChoices) -> None:
     from hybridlog.live.memory import frozen_objects
-    from hybridlog.live.recorder import Recorder, check_room
+    from hybridlog.live.recorder import Recorder, make_room
 
     # Wrong options are found before a store is made.
     options = recorder_options(choices)
@@ -70,7 +69,7 @@ def _record(choices: RecordChoices) -> None:
         for source in sources:
             held.enter_context(source).check()
         store = held.enter_context(opened_to_record(choices, recover=False))
-        check_room(shutil.disk_usage(store.directory.path).free, options.reserve_bytes)
+        make_room(store, options.reserve_bytes)
         recovery = threading.Thread(target=_recover, args=(choices, store), daemon=True)
         with _stop_flag() as stop, frozen_objects():
             full = ""

@@ -41,7 +41,8 @@ from hybridlog.live.state import RecorderState, StateFile
 from hybridlog.live.statistics import Lateness, Tally, TopicRates
 from hybridlog.live.triggers import Trigger, Triggers
 from hybridlog.maintenance.edit import remove_if
-from hybridlog.maintenance.keep import Own, RetentionThread
+from hybridlog.maintenance.keep import RetentionThread
+from hybridlog.maintenance.retention import Rules
 from hybridlog.query.times import format_duration, format_time
 from hybridlog.record.losses import Cause, Loss
 from hybridlog.record.marks import CLOCK_SET, CONTRACT
@@ -49,7 +50,13 @@ from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.completion import completed
 from hybridlog.schema.reduced_codec import reduce, reduced_channel
 from hybridlog_storage.disk import files
-from hybridlog_storage.errors import DiskFullError, HybridlogError, StoreError, UsageError
+from hybridlog_storage.errors import (
+    DiskFullError,
+    HeldError,
+    HybridlogError,
+    StoreError,
+    UsageError,
+)
 from hybridlog_storage.manifest import Mark, new_random, with_mark
 from hybridlog_storage.manifest import replace as replaced
 from hybridlog_storage.manifests import MANIFESTS
@@ -213,7 +220,8 @@ class Recorder:
         self._target = store.start(options.name, self._live_options())
         self.name = self._target.name
         self._says = StateFile(store.directory, self._target.id)
-        self._ring = self._make_ring()
+        ring_s = options.ring_s
+        self._ring = None if ring_s is None else Ring(self._directory, self._target, ring_s)
         self._triggers = Triggers(options.triggers, say)
         self._incidents = Incidents(
             partial(self._directory.manifests.change, self._target.id),
@@ -226,13 +234,11 @@ class Recorder:
             self._retention = RetentionThread(
                 store.directory,
                 partial(remove_if, store.shared),
-                Own(
-                    self._target.id,
-                    lambda: self._target.first_unread,
-                    lambda: self._target.sealed,
-                ),
+                self._target,
+                options.reserve_bytes,
                 self.say,
             )
+            self._target.make_room = self._retention.make_room
         except BaseException:
             self._target.abort()
             raise
@@ -255,18 +261,6 @@ class Recorder:
             settings=settings,
             no_index=options.no_index,
             is_ring=options.ring_s is not None,
-        )
-
-    def _make_ring(self) -> Ring | None:
-        if self._options.ring_s is None:
-            return None
-        target = self._target
-        return Ring(
-            self._directory,
-            target.id,
-            self._options.ring_s,
-            lambda: target.sealed,
-            target.channels,
         )
 
     # Methods for the program that runs the recorder.
@@ -757,7 +751,8 @@ class Recorder:
         try:
             check_room(state.free_bytes, options.reserve_bytes, coming)
         except DiskFullError as error:
-            self._refuse(Cause.DISK, str(error))
+            if not self._retention.wants(round(options.reserve_bytes + coming)):
+                self._refuse(Cause.DISK, str(error))
         failure = self._target.failure
         if isinstance(failure, DiskFullError):
             self._refuse(Cause.DISK, str(failure))
@@ -796,6 +791,22 @@ class Recorder:
 def _cause_of(error: HybridlogError) -> Cause:
     """The cause of the loss of a message that could not be written."""
     return Cause.DISK if isinstance(error, DiskFullError) else Cause.QUEUE
+
+
+def make_room(store: Store, reserve_bytes: int) -> None:
+    """Check that a disk has as much free space as the reserve, once the store's rules made room.
+
+    Raises:
+        DiskFullError: It has less.
+    """
+    path, settings = store.directory.path, store.directory.settings
+    rules = Rules.of(settings.retention)
+    if rules.makes_room and shutil.disk_usage(path).free < reserve_bytes:
+        with suppress(HeldError):
+            store.keep(
+                {**settings.retention, "min-free": f"{rules.with_free(reserve_bytes).min_free}B"}
+            )
+    check_room(shutil.disk_usage(path).free, reserve_bytes)
 
 
 def check_room(free_bytes: int, reserve_bytes: int, coming_bytes: float = 0) -> None:

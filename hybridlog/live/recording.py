@@ -17,7 +17,6 @@ from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
 from operator import index as index_of
 from queue import Empty, SimpleQueue
-from threading import Lock
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
@@ -43,37 +42,6 @@ if TYPE_CHECKING:
     from hybridlog_storage.catalog import Catalog
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.messages import Buffer
-
-
-class FairSemaphore:
-    """Admits a limited number of threads, in the order in which they arrive.
-
-    Python's own locks let later threads overtake a waiting one any number of times.
-    """
-
-    def __init__(self, limit: int) -> None:
-        self._lock = Lock()
-        self._free = limit
-        self._waiting: deque[Lock] = deque()
-
-    def __enter__(self) -> None:
-        """Wait for admission."""
-        with self._lock:
-            if self._free:
-                self._free -= 1
-                return
-            admitted = Lock()
-            admitted.acquire()
-            self._waiting.append(admitted)
-        admitted.acquire()
-
-    def __exit__(self, *_: object) -> None:
-        """Admit the thread that has waited longest."""
-        with self._lock:
-            if self._waiting:
-                self._waiting.popleft().release()
-            else:
-                self._free += 1
 
 
 _LARGE = 1 << 17  # bytes from which a payload is copied into its chunk at once
@@ -201,7 +169,7 @@ class LiveRecording:
         self._lock = threading.Lock()
         self._room = threading.Condition(self._lock)
         self._laying = threading.Lock()  # guards the open chunks; taken before `_lock`
-        self._copying = FairSemaphore(_MAX_COPYING)
+        self._copying = threading.BoundedSemaphore(_MAX_COPYING)
         # No event: a thread that is interrupted in `set` may leave it locked forever.
         self._calls: SimpleQueue[None] = SimpleQueue()
         self._ended = False
@@ -216,6 +184,8 @@ class LiveRecording:
         """Messages that are missing from this recording."""
         self.cut_off: Counter[str] = Counter()
         """Messages that a full disk cost, by topic; known after the end."""
+        self.make_room: Callable[[], bool] = lambda: False
+        """Called when the disk is full; returns whether to try again."""
         self._capture = Capture(
             directory,
             catalog,
@@ -227,6 +197,7 @@ class LiveRecording:
             settings=options.settings,
             no_index=options.no_index,
             is_ring=options.is_ring,
+            make_room=self._when_full,
             pressure=Backpressure(
                 skip_compression=lambda: self._is_under_pressure(self._compression_pressure),
                 pause_indexing=lambda: self._is_under_pressure(self._index_pressure),
@@ -509,6 +480,9 @@ class LiveRecording:
             self._taken_bytes -= appended
             self._beyond = self._closed_beyond()
             self._room.notify()
+
+    def _when_full(self) -> bool:
+        return self.make_room()
 
     def _wake(self) -> None:
         """Wake the writing thread."""

@@ -8,19 +8,17 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Hashable, Mapping
-from contextlib import suppress
+from collections.abc import Collection, Hashable
 from typing import TYPE_CHECKING, Final
 
+from hybridlog.maintenance.expiry import let_go
 from hybridlog.maintenance.retention import is_pinned
 from hybridlog.query.latching import depth_of, publisher_of
-from hybridlog_storage.disk import durability, files
-from hybridlog_storage.manifest import LetGo, replace, with_totals
 
 if TYPE_CHECKING:
+    from hybridlog.live.recording import LiveRecording
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.manifest import File, Manifest
-    from hybridlog_storage.messages import Channel
 
 GROUPS: Final = 10
 """Groups of files in the time of a ring, about."""
@@ -32,10 +30,8 @@ class Ring:
 
     Args:
         directory: The store.
-        recording: Id of the recording, which this process makes.
+        recording: The recording, which this process makes.
         span_s: Seconds after its end when a group goes.
-        sealed: Returns the number of files sealed so far.
-        channels: Channels by the numbers that they have in the files.
 
     Attributes:
         messages: Messages that have gone.
@@ -44,17 +40,13 @@ class Ring:
     def __init__(
         self,
         directory: StoreDirectory,
-        recording: str,
+        recording: LiveRecording,
         span_s: float,
-        sealed: Callable[[], int],
-        channels: Mapping[int, Channel],
     ) -> None:
         self.messages = 0
         self._directory = directory
         self._recording = recording
         self._span_s = span_s + _LATE_S
-        self._count = sealed
-        self._channels = channels
         self._seen = 0
         self._ended: dict[int, float] = {}  # when each group was first seen sealed
         self._kept: set[int] = set()  # must stay, as long as no other group is sealed
@@ -65,9 +57,9 @@ class Ring:
         Args:
             now: The time, by `time.monotonic`.
         """
-        sealed = self._count()
+        sealed = self._recording.sealed
         if sealed != self._seen:
-            logs = self._directory.manifests.read(self._recording).logs.values()
+            logs = self._directory.manifests.read(self._recording.id).logs.values()
             seen = time.monotonic()
             self._ended = {log.group: self._ended.get(log.group, seen) for log in logs}
             self._seen, self._kept = sealed, set()
@@ -80,31 +72,9 @@ class Ring:
         Raises:
             StoreError: The manifest cannot be changed, or a file cannot be deleted.
         """
-        gone: list[File] = []
-
-        def how(now: Manifest) -> Manifest:
-            gone[:] = self._going(now, groups)
-            if not gone:
-                return now
-            count = sum(
-                part.messages for log in gone if log.kind == "log" for part in log.parts.values()
-            )
-            left = tuple(file for file in now.files if file not in gone)
-            before = LetGo(0, 0) if now.let_go is None else now.let_go
-            through = max(before.through, *(file.number for file in gone))
-            let_go = LetGo(before.messages + count, through)
-            return with_totals(replace(now, files=left, let_go=let_go))
-
-        changed = self._directory.manifests.change(self._recording, how)
+        changed = let_go(self._directory, self._recording.id, lambda now: self._going(now, groups))
         self._kept.update(groups)  # what is left of them stays, until another group is sealed
         self.messages = 0 if changed.let_go is None else changed.let_go.messages
-        path = self._directory.recording(self._recording)
-        try:
-            for file in gone:
-                with suppress(FileNotFoundError):
-                    files.unlink(path / file.name)
-        except OSError as error:
-            raise durability.explain(error, path, "deleting files of") from error
 
     def _going(self, now: Manifest, groups: Collection[int]) -> list[File]:
         logs = [log for log in now.logs.values() if log.group in groups]
@@ -123,7 +93,7 @@ class Ring:
         for number, log in sorted(now.logs.items(), reverse=True):
             came: Counter[Hashable] = Counter()
             for one, part in log.parts.items():
-                channel = self._channels.get(one)
+                channel = self._recording.channels.get(one)
                 depth = 0 if channel is None else depth_of(channel)
                 if channel is not None and depth and part.messages:
                     publisher = publisher_of(channel)

@@ -1,10 +1,10 @@
-"""Deletes logs of a recording to make room; fields, counts and times of their messages stay.
+"""Deletes logs of a recording to make room: a change of its manifest, then an unlink.
 
-First the rows of a log are written to files of their own: the fields as in tables, times, sizes
-and hashes (`columns/rows_file.py`). They are forced to the disk, and read and compared. Then one
-change of the manifest lists them, and says that the log is gone; from then on they are the truth.
-Then the log is deleted. A crash on either side of that change leaves files that the next opening
-removes.
+What is left of the messages of a log are files of rows: the fields as in tables, times, sizes and
+hashes (`columns/rows_file.py`). They are written once and listed beside the log, as soon as it is
+sealed where a store has rules, else before it goes. Then one change of the manifest says that logs
+are gone; from then on their rows are the truth. A crash on either side of a change leaves files
+that the next opening removes.
 """
 
 from __future__ import annotations
@@ -12,19 +12,16 @@ from __future__ import annotations
 import secrets
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import partial
 from types import MappingProxyType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
-import numpy as np
-
-from hybridlog.columns.recording_logs import RecordingRows
 from hybridlog.maintenance.report import reporter
-from hybridlog_storage.checksum import crc32
+from hybridlog.record.losses import Cause
 from hybridlog_storage.disk import durability, files
-from hybridlog_storage.errors import SegmentError, StoreError
-from hybridlog_storage.manifest import Manifest, replace, with_rows
-from hybridlog_storage.messages import EXPIRED_IDS
-from hybridlog_storage.segments.gone_log import front, open_log
+from hybridlog_storage.errors import ChangedError, DiskFullError, SegmentError, StoreError
+from hybridlog_storage.manifest import LetGo, Loss, Manifest, replace, with_rows, with_totals
+from hybridlog_storage.segments.gone_log import front
 from hybridlog_storage.segments.segment_reader import SegmentReader
 
 if TYPE_CHECKING:
@@ -34,9 +31,11 @@ if TYPE_CHECKING:
     from hybridlog.maintenance.report import Progress
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.manifest import File
-    from hybridlog_storage.manifests import Manifests
-    from hybridlog_storage.segments.chunk import StoredChunk
-    from hybridlog_storage.segments.segment_reader import SegmentSummary
+
+    Check = Callable[[Manifest], object]
+
+NO_ROOM: Final = "deleted without its fields: the disk was full"
+"""Reason in the loss ledger."""
 
 
 @dataclass(slots=True)
@@ -47,13 +46,13 @@ class Expired:
         segments: Numbers of the logs that went.
         messages: Number of messages whose payloads went, by topic.
         freed: Bytes of the disk that became free, what was written subtracted.
-        row_bytes: Bytes of the files of rows that were written.
+        damaged: Why logs could not go, by number.
     """
 
     segments: list[int] = field(default_factory=list)
     messages: dict[str, int] = field(default_factory=dict)
     freed: int = 0
-    row_bytes: int = 0
+    damaged: dict[int, str] = field(default_factory=dict)
 
 
 def expire(
@@ -63,13 +62,15 @@ def expire(
     *,
     digests: Mapping[int, str] = MappingProxyType({}),
     copy: str = "",
-    check: Callable[[Manifest], object] = lambda _: None,
+    check: Check = lambda _: None,
     version: int = 0,
     progress: Progress | None = None,
 ) -> Expired:
     """Delete sealed logs of a recording that this process has locked.
 
-    Logs that are gone already are left out, and those without messages.
+    Logs that are gone already are left out, and those without messages. Those that have their
+    rows go first. Where there is no room for rows, a log goes without, and is lost. Damaged ones
+    without rows stay.
 
     Args:
         directory: The store.
@@ -79,64 +80,174 @@ def expire(
         copy: Address of a store with a proven copy of them.
         check: Part of each change of the manifest; raises if they must stay by now.
         version: As of `RowsWriter`.
-        progress: Called after each chunk.
+        progress: Called after each chunk of which rows are written.
 
     Raises:
         StoreError: Files cannot be read or written; a log that is listed is as before.
-        DiskFullError: There is no room for the rows.
+        DiskFullError: There is no room to change the manifest.
     """
-    path = directory.recording(recording)
     manifest, done = directory.manifests.read(recording), Expired()
     logs = [manifest.logs.get(number) for number in sorted(segments)]
     if any(log is None or digests.get(log.number, log.digest) != log.digest for log in logs):
-        raise StoreError(f"{manifest.name}: a segment was replaced meanwhile.")
+        raise ChangedError(f"{manifest.name}: a segment was replaced meanwhile.")
     going = [log for log in logs if log is not None and log.is_here and log.parts]
-    report = reporter(progress, manifest.name, sum(log.bytes for log in going))
     if manifest.is_ended:
         _remove_arrays(directory, manifest, going)
-    before = 0
-    for log in going:
+    ready = [log for log in going if log.number in manifest.rows]
+    _go(directory, recording, {log.number: () for log in ready}, check, copy)
+    late, before = [log for log in going if log not in ready], 0
+    report = reporter(progress, manifest.name, sum(log.bytes for log in late))
+    for log in late:
 
         def tell(at: int, before: int = before) -> None:
             report(before + at)
 
-        line = replace(log, gone="expired", copy=copy)
-        _remove(path, [n for n in directory.listing(recording).rows if int(n[:6]) == log.number])
-        made = write_rows(path, line, path, version=version, report=tell)
-        _list(path, directory.manifests, line, made, check)
-        _remove(path, [log.name])
+        try:
+            made = _rows_of(directory, recording, log, version, tell)
+            _go(directory, recording, {log.number: made}, check, copy)
+            done.freed -= sum(one.bytes for one in made)
+        except DiskFullError:
+            let_go(directory, recording, partial(_lines_of, log.number), check, NO_ROOM)
+        except SegmentError as error:
+            done.damaged[log.number] = str(error)
         before += log.bytes
-        rows = sum(one.bytes for one in made)
-        done.segments.append(log.number)
-        done.freed += log.bytes - rows
-        done.row_bytes += rows
+    going = [log for log in going if log.number not in done.damaged]
+    done.freed += sum(log.bytes for log in going)
+    done.segments = [log.number for log in going]
+    for log in going:
         for number, part in log.parts.items():
             topic = manifest.channels[number].topic
             done.messages[topic] = done.messages.get(topic, 0) + part.messages
     return done
 
 
-def _list(
-    path: Path,
-    manifests: Manifests,
-    line: File,
-    made: tuple[File, ...],
-    check: Callable[[Manifest], object],
+def _lines_of(number: int, manifest: Manifest) -> list[File]:
+    return [file for file in manifest.files if file.number == number]
+
+
+def make_rows(
+    directory: StoreDirectory, recording: str, is_wanted: Callable[[], bool] = lambda: True
 ) -> None:
-    """Let the manifest say that a log is gone, and list its rows."""
+    """Write the rows that logs which may go lack, as long as they are wanted.
+
+    Args:
+        directory: The store.
+        recording: Id of a recording that this process has locked, or records.
+        is_wanted: Returns whether to go on.
+
+    Raises:
+        StoreError: Files cannot be read or written.
+        DiskFullError: There is no room.
+    """
+    manifest = directory.manifests.read(recording)
+    for log in manifest.logs.values():
+        if may_go(log) and log.number not in manifest.rows and is_wanted():
+            with suppress(SegmentError):  # it stays
+                _list(directory, recording, {log.number: _rows_of(directory, recording, log)})
+
+
+def _rows_of(
+    directory: StoreDirectory,
+    recording: str,
+    log: File,
+    version: int = 0,
+    report: Callable[[int], None] = lambda _: None,
+) -> tuple[File, ...]:
+    """Write the rows of a log, in place of what a crash has left of such."""
+    path, left = directory.recording(recording), directory.listing(recording).rows
+    _remove(path, [name for name in left if int(name[:6]) == log.number])
+    return write_rows(path, replace(log, gone="expired"), path, version=version, report=report)
+
+
+def _go(
+    directory: StoreDirectory,
+    recording: str,
+    made: Mapping[int, tuple[File, ...]],
+    check: Check,
+    copy: str,
+) -> None:
+    """Let the manifest say that logs are gone, then delete them."""
+    if made:
+        now = _list(directory, recording, made, check, {"gone": "expired", "copy": copy})
+        _remove(directory.recording(recording), [now.logs[number].name for number in made])
+
+
+def _list(
+    directory: StoreDirectory,
+    recording: str,
+    made: Mapping[int, tuple[File, ...]],
+    check: Check = lambda _: None,
+    values: Mapping[str, str] = MappingProxyType({}),
+) -> Manifest:
+    """List the rows of logs, unless others are listed, and change the lines of the logs."""
+    path, manifests = directory.recording(recording), directory.manifests
 
     def how(now: Manifest) -> Manifest:
         check(now)
-        return with_rows(now, line, made)
+        for number, rows in made.items():
+            line = replace(now.logs[number], **values)
+            now = with_rows(now, line, now.rows.get(number) or rows)
+        return now
 
     try:
         files.sync_folder(path)
-        manifests.change(path.name, how)
-    except BaseException:
-        with suppress(StoreError):  # the next opening does it
-            if manifests.read(path.name).logs[line.number].is_here:
-                _remove(path, [one.name for one in made])
-        raise
+        return manifests.change(recording, how)
+    finally:
+        with suppress(StoreError):  # or else the next opening does it
+            listed = {file.name for file in manifests.read(recording).files}
+            _remove(path, [f.name for rows in made.values() for f in rows if f.name not in listed])
+
+
+def let_go(
+    directory: StoreDirectory,
+    recording: str,
+    choose: Callable[[Manifest], Collection[File]],
+    check: Check = lambda _: None,
+    lost: str = "",
+) -> Manifest:
+    """Delete files of a recording with all that is left of them.
+
+    Args:
+        directory: The store.
+        recording: Id of a recording that this process has locked, or records.
+        choose: Returns the files; called with each manifest that is changed.
+        check: Raises if they must stay.
+        lost: Reason of a row of the loss ledger; empty if they are counted as let go.
+
+    Returns:
+        The manifest without them.
+
+    Raises:
+        StoreError: The manifest cannot be changed, or a file cannot be deleted.
+    """
+    gone: list[File] = []
+
+    def how(now: Manifest) -> Manifest:
+        check(now)
+        gone[:] = choose(now)
+        if not gone:
+            return now
+        parts = [(n, part) for f in gone if f.kind == "log" for n, part in f.parts.items()]
+        before = now.let_go or LetGo(0, 0)
+        count = 0 if lost else sum(part.messages for _, part in parts)
+        rows = [
+            Loss(Cause.DISK, now.channels[n].topic, part.messages, part.first, part.last, lost)
+            for n, part in (parts if lost else ())
+        ]
+        return with_totals(
+            replace(
+                now,
+                files=tuple(file for file in now.files if file not in gone),
+                losses=(*now.losses, *rows),
+                let_go=LetGo(
+                    before.messages + count, max(before.through, *(f.number for f in gone))
+                ),
+            )
+        )
+
+    changed = directory.manifests.change(recording, how)
+    _remove(directory.recording(recording), [file.name for file in gone])
+    return changed
 
 
 def write_rows(
@@ -147,7 +258,7 @@ def write_rows(
     version: int = 0,
     report: Callable[[int], None] = lambda _: None,
 ) -> tuple[File, ...]:
-    """Write what is left of the messages of a log, and compare it with them.
+    """Write what is left of the messages of a log.
 
     Args:
         recording: The folder of its recording; it stays as it is.
@@ -160,7 +271,8 @@ def write_rows(
         The lines of the files, which are on the disk, the first one first.
 
     Raises:
-        StoreError: The log is damaged, or has what rows cannot keep; or files cannot be written.
+        SegmentError: The log is damaged, or has what rows cannot keep.
+        StoreError: Files cannot be written.
         DiskFullError: There is no room.
     """
     from hybridlog.columns.rows_writer import RowsWriter
@@ -168,62 +280,22 @@ def write_rows(
     with SegmentReader(recording / line.name, line.number) as reader:
         summary = reader.summary()
         if summary.size != line.bytes:
-            raise StoreError(
-                f"{reader.path} is not the segment that the manifest lists; nothing was deleted. "
-                "Run `hybridlog verify --repair` first."
-            )
-        if summary.attachments or summary.metadata:
-            raise StoreError(f"{reader.path} has attachments or metadata of its log, and stays.")
+            raise SegmentError(f"{reader.path} is not the segment that the manifest lists")
+        if summary.attachments:
+            raise SegmentError(f"{reader.path} has attachments of its log")
         begin = front(reader, summary, line)
         writer = RowsWriter(into, line, summary.channels, begin, version)
         try:
             for place in summary.chunks:
                 writer.add(reader.read_chunk(place))
                 report(place.offset + place.length)
-            made = writer.close()
-            _prove(into, line, made, reader, summary)
+            return writer.close()
         except BaseException as error:
             writer.discard()
             _remove(into, writer.names)
             if isinstance(error, OSError):
                 raise durability.explain(error, into, "writing rows to") from error
             raise
-    return made
-
-
-def _prove(
-    folder: Path,
-    line: File,
-    made: tuple[File, ...],
-    reader: SegmentReader,
-    summary: SegmentSummary,
-) -> None:
-    """Compare files of rows with their log.
-
-    Raises:
-        StoreError: They differ.
-    """
-    with open_log(folder / made[0].name, line.number, RecordingRows(folder, made)) as rows:
-        found = rows.summary()
-        is_same = (
-            (found.recording, found.end, found.losses, found.size)
-            == (summary.recording, summary.end, summary.losses, summary.size)
-            and np.array_equal(found.table.as_stored().parts, summary.table.parts)
-            and all(
-                _left_of(rows.read_chunk(there)) == _left_of(reader.read_chunk(here))
-                for there, here in zip(found.chunks, summary.chunks, strict=True)
-            )
-        )
-    if not is_same:
-        raise SegmentError(f"What was written of {reader.path} does not come back.")
-
-
-def _left_of(chunk: StoredChunk) -> list[int]:
-    """Checksums of what an expiry keeps of messages besides their fields."""
-    batch = chunk.batch
-    columns = (batch.log_time, batch.publish_time, batch.sequence, *batch.places, chunk.seq)
-    stored = (*columns, (batch.channel % EXPIRED_IDS).astype(np.int32))
-    return [crc32(np.ascontiguousarray(column).tobytes()) for column in stored]
 
 
 def without_payloads(

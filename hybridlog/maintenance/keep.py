@@ -1,21 +1,24 @@
-"""Passes of retention: takes stock, makes the plan, and lets `expire` do each step.
+"""Passes of retention: takes stock, makes the plan, and does each step of it.
 
-A pass reads manifests only. A recorder makes passes for its own recording and for those that
-have ended; what others record is left to them.
+A pass reads manifests only; a step is a change of a manifest, then an unlink. A recorder makes
+passes for its own recording and for those that nobody records; what others record is left to
+them.
 """
 
 from __future__ import annotations
 
+import os
 import shutil
 import threading
 import time
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
-from hybridlog.maintenance.expiry import expire
+from hybridlog.maintenance.expiry import Expired, expire, let_go, make_rows
 from hybridlog.maintenance.retention import (
     Held,
     Plan,
@@ -28,13 +31,13 @@ from hybridlog.maintenance.retention import (
 from hybridlog.maintenance.sizes import disk_bytes
 from hybridlog.record.losses import extent_of
 from hybridlog.wording import listed
-from hybridlog_storage.disk.directory import LOCK_WAIT_S, is_stable
+from hybridlog_storage.disk import files
+from hybridlog_storage.disk.directory import LOCK_WAIT_S
 from hybridlog_storage.errors import (
+    ChangedError,
     DiskFullError,
     HeldError,
     HybridlogError,
-    RecordingGoneError,
-    SegmentError,
     StoreError,
     TopicError,
 )
@@ -45,26 +48,35 @@ if TYPE_CHECKING:
     from hybridlog.maintenance.report import Progress
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
-    from hybridlog_storage.manifest import Manifest
+    from hybridlog_storage.manifest import File, Manifest
 
+    Remove = Callable[[str, Callable[[Manifest], None]], None]
 
 _WHOLE: Final = -1
-_MAX_ROUNDS: Final = 20  # fields take room, too: then a little more has to go
+_MAX_ROUNDS: Final = 20  # rows take room, too: then a little more has to go
+SPARE: Final = "spare"
+"""File whose room a pass uses for manifests and rows when the disk is full."""
+_SPARE_BYTES: Final = 8 << 20
+_SPARE_SHARE: Final = 64  # of the quota, at most
+_LEAST_SPARE: Final = 1 << 16
 
 
-@dataclass(frozen=True, slots=True)
-class Own:
+class Own(Protocol):
     """The recording that this process makes; it holds the lock of it.
 
     Attributes:
-        recording: Its id.
-        first_unread: Returns the number of the first segment that it still reads.
-        sealed: Returns the number of segments sealed so far.
+        id: Its id.
     """
 
-    recording: str
-    first_unread: Callable[[], int]
-    sealed: Callable[[], int]
+    id: str
+
+    @property
+    def first_unread(self) -> int:
+        """Number of the first segment that it still reads."""
+
+    @property
+    def sealed(self) -> int:
+        """Number of segments sealed so far."""
 
 
 @dataclass(slots=True)
@@ -96,7 +108,7 @@ class Keeper:
     def __init__(
         self,
         directory: StoreDirectory,
-        remove: Callable[[str, Callable[[Manifest], None]], None],
+        remove: Remove,
         own: Own | None = None,
         *,
         is_wanted: Callable[[], bool] = lambda: True,
@@ -107,9 +119,8 @@ class Keeper:
         self._own = own
         self._is_wanted = is_wanted
         self._changed = changed
-        self._known: dict[str, tuple[str, Held]] = {}  # by id, with its look
-        # Ids and segments that this pass could not change; -1 for the whole recording.
-        self._failed: set[tuple[str, int]] = set()
+        # Segments that this pass could not change, by recording; -1 for all of it.
+        self._failed: defaultdict[str, set[int]] = defaultdict(set)
         self._unproven: set[str] = set()  # names of recordings whose manifests were made again
 
     def plan(self, rules: Rules) -> Plan:
@@ -131,8 +142,11 @@ class Keeper:
 
         Raises:
             HeldError: Another process makes a pass.
+            DiskFullError: There is no room, not even that of the spare file.
         """
         with self._alone():
+            if not self._directory.is_remote:
+                _lay_spare(self._directory, rules)  # counts among what is used
             found = KeepReport(self.plan(rules))
             planned = found.plan
             for _ in range(_MAX_ROUNDS):
@@ -141,7 +155,7 @@ class Keeper:
                 for step in planned.steps:
                     if not self._is_wanted():
                         return found
-                    self._do(step, rules, found, progress)
+                    self._do(step, rules, found, {"progress": progress})
                 planned = self.plan(rules)
                 found.plan.steps += planned.steps
             found.plan.warnings, found.plan.is_short = planned.warnings, planned.is_short
@@ -162,25 +176,20 @@ class Keeper:
             digests: The segments that have a copy elsewhere: digests by number.
             rules: Rules whose `never_tag` holds.
             copy: Address of the store with the copies.
-            progress: Called while payloads are replaced.
+            progress: Called while rows are written.
 
         Raises:
             HeldError: Another process makes a pass.
         """
         with self._alone():
-            found, now = KeepReport(self.plan(Rules())), time.time_ns()
-            for held in self._held(now):
+            found = KeepReport(self.plan(Rules()))
+            for held in self._held(time.time_ns()):
                 if held.id == recording and not rules.is_never(held.tags):
-                    going = [s for s in held.segments if s.number in digests and not s.is_pinned]
-                    numbers = tuple(one.number for one in going)
-                    size = sum(one.size for one in going)
-                    if numbers:
-                        reason = f"it was copied to {copy}"
-                        step = Step(
-                            held.name, held.id, numbers, (), size, reason, now, digests, copy
-                        )
-                        found.plan.steps.append(step)
-                        self._do(step, rules, found, progress)
+                    own = (s.number for s in held.segments if s.may_go and not s.is_pinned)
+                    step = Step(held.name, held.id, tuple(digests.keys() & {*own}), (), 0, "")
+                    how = {"digests": digests, "copy": copy, "progress": progress}
+                    if step.segments:
+                        self._do(step, rules, found, how)
         return found
 
     @contextmanager
@@ -194,101 +203,117 @@ class Keeper:
             yield
 
     def _held(self, now: int) -> Iterator[Held]:
-        """The content of the recordings; damaged and unproven ones are left alone."""
+        """What may go of the recordings; damaged and unproven ones are left alone."""
         self._unproven.clear()
-        looks = self._directory.looks(self._directory.ids())
-        self._known = {one: known for one, known in self._known.items() if one in looks}
-        for recording, look in looks.items():
-            before, held = self._known.get(recording, ("", None))
-            if before != look or held is None:
-                with suppress(StoreError):
-                    held = self._read(recording, now)
-                if held is not None and is_stable(look):
-                    self._known[recording] = look, held
-            if held is None or (held.id, _WHOLE) in self._failed:
+        for manifest in self._directory.manifests.each(self._directory.ids()):
+            if manifest.status == "unproven":
+                self._unproven.add(manifest.name)
                 continue
-            left = [s for s in held.segments if (held.id, s.number) not in self._failed]
-            held = replace(held, segments=left)
-            if self._own is not None and recording == self._own.recording:
-                unread = self._own.first_unread()
-                yield replace(held, segments=[s for s in held.segments if s.number < unread])
-            else:
-                yield held if held.is_ended else replace(held, segments=[])
+            held, failed = held_of(manifest, now), self._failed[manifest.id]
+            left = [s for s in held.segments if s.number not in failed]
+            if self._own is not None and held.id == self._own.id:
+                unread = self._own.first_unread
+                left = [s for s in left if s.number < unread]
+            elif _WHOLE in failed or (not held.is_ended and self._directory.is_recorded(held.id)):
+                left, held = [], replace(held, is_ended=False)
+            yield replace(held, segments=left)
 
-    def _read(self, recording: str, now: int) -> Held | None:
-        manifest = self._directory.manifests.find(recording)
-        if manifest is None:
-            return None
-        if manifest.status == "unproven":
-            self._unproven.add(manifest.name)
-            return None
-        return held_of(manifest, now)
+    def _do(self, step: Step, rules: Rules, found: KeepReport, how: Mapping[str, Any]) -> None:
+        """Do a step, with the room of the spare file if there is no other.
 
-    def _do(self, step: Step, rules: Rules, found: KeepReport, progress: Progress | None) -> None:
+        Args:
+            step: The step.
+            rules: The rules.
+            found: Gets what became free, or the problem.
+            how: Further arguments of `expire`.
+        """
+        check = partial(_check, step, rules)
         try:
-            if not step.segments:
-                self._remove(step.id, partial(_check, step, rules))
-                found.freed_bytes += step.bytes
-                return
-            with self._locked(step):
-                found.freed_bytes += self._expire(step, rules, progress)
+            try:
+                done = self._done(step, check, how)
+            except DiskFullError:
+                if not _use_spare(self._directory):
+                    raise
+                done = self._done(step, check, how)
         except DiskFullError:
             raise
+        except ChangedError as error:  # the next plan judges again
+            found.problems.append(str(error))
         except (StoreError, TopicError) as error:
-            is_held = isinstance(error, HeldError | RecordingGoneError | TopicError)
-            if len(step.segments) > 1 and not is_held:  # one of them may be damaged
-                for number in step.segments:
-                    self._do(replace(step, segments=(number,)), rules, found, progress)
-                return
-            numbers = (_WHOLE,) if is_held else step.segments or (_WHOLE,)
-            self._failed.update((step.id, number) for number in numbers)
-            cure = ""
-            if isinstance(error, SegmentError):
-                cure = ". Its payloads stay until the file is restored from a copy"
-            found.problems.append(f"{error}{cure}")
+            found.problems.append(str(error))
+            self._failed[step.id].add(_WHOLE)
+        else:
+            found.freed_bytes += done.freed
+            for number, reason in done.damaged.items():
+                cure = "Its payloads stay until the file is restored from a copy"
+                found.problems.append(f"{reason}. {cure}")
+                self._failed[step.id].add(number)
 
-    @contextmanager
-    def _locked(self, step: Step) -> Iterator[None]:
-        """Let nobody else write a recording."""
-        if self._own is not None and step.id == self._own.recording:
-            yield
-            return
-        with self._directory.writing(step.id, step.recording, wait_s=LOCK_WAIT_S):
-            yield
+    def _done(
+        self, step: Step, check: Callable[[Manifest], None], how: Mapping[str, Any]
+    ) -> Expired:
+        if not step.segments and not step.groups:
+            self._remove(step.id, check)
+            return Expired(freed=step.bytes)
+        with ExitStack() as held:
+            if self._own is None or step.id != self._own.id:
+                lock = self._directory.writing(step.id, step.recording, wait_s=LOCK_WAIT_S)
+                held.enter_context(lock)
+            if step.groups:
+                let_go(self._directory, step.id, partial(_of_groups, step.groups), check)
+                done = Expired(freed=step.bytes)
+            else:
+                at_hand = self._directory.at_hand(step.id, step.segments, check)
+                with at_hand as (here, version):
+                    done = expire(here, step.id, step.segments, check=check, version=version, **how)
+            self._changed(step.id)
+        return done
 
-    def _expire(self, step: Step, rules: Rules, progress: Progress | None) -> int:
-        check = partial(_check, step, rules)
-        with self._directory.at_hand(step.id, step.segments, check) as (here, version):
-            done = expire(
-                here,
-                step.id,
-                step.segments,
-                digests=step.digests,
-                copy=step.copy,
-                check=check,
-                version=version,
-                progress=progress,
-            )
-        self._changed(step.id)
-        return done.freed
+
+def _of_groups(groups: Sequence[int], manifest: Manifest) -> list[File]:
+    return [file for file in manifest.files if file.group in groups]
 
 
 def _check(step: Step, rules: Rules, manifest: Manifest) -> None:
     """Raise if what goes in a step must stay by now.
 
     Raises:
-        StoreError: It must.
+        ChangedError: It must.
     """
     if rules.is_never(manifest.tags):
-        raise StoreError(f"{step.recording}: a tag that keeps it was set meanwhile.")
-    if not step.segments and manifest.pins:
-        raise StoreError(f"{step.recording}: a pin was set meanwhile.")
-    for number in step.segments:
-        log = manifest.logs.get(number)
-        if log is None:
-            raise StoreError(f"{step.recording}: segment {number} was replaced meanwhile.")
-        if is_pinned(log, manifest):
-            raise StoreError(f"{step.recording}: a pin was set meanwhile.")
+        raise ChangedError(f"{step.recording}: a tag that keeps it was set meanwhile.")
+    if manifest.pins and not step.segments and not step.groups:
+        raise ChangedError(f"{step.recording}: a pin was set meanwhile.")
+    if not manifest.logs.keys() >= {*step.segments}:
+        raise ChangedError(f"{step.recording}: a segment was replaced meanwhile.")
+    for number, log in manifest.logs.items():
+        goes = number in step.segments or log.group in step.groups
+        if goes and is_pinned(log, manifest):
+            raise ChangedError(f"{step.recording}: a pin was set meanwhile.")
+
+
+def _lay_spare(directory: StoreDirectory, rules: Rules) -> None:
+    """Keep some room for a pass on a full disk, where there is enough."""
+    path, size = directory.path / SPARE, _SPARE_BYTES
+    if rules.quota is not None:
+        size = min(size, rules.quota // _SPARE_SHARE)
+    with suppress(OSError):
+        is_apt = size >= _LEAST_SPARE and shutil.disk_usage(directory.path).free > 4 * size
+        if is_apt and not path.exists():
+            fd = files.open_file(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL)
+            try:
+                os.posix_fallocate(fd, 0, size)
+            finally:
+                os.close(fd)
+
+
+def _use_spare(directory: StoreDirectory) -> bool:
+    """Free the room that was kept; False if there is none."""
+    try:
+        files.unlink(directory.path / SPARE)
+    except OSError:
+        return False
+    return True
 
 
 def may_hold(entry: RecordingEntry, begin: int | None, end: int | None) -> bool:
@@ -318,35 +343,45 @@ LOOK_S: Final = 5.0
 """Seconds between two looks at the rules and at free space."""
 _TICK_S: Final = 0.1
 _AGES_S: Final = 60.0  # between two passes for the ages alone
+_PATIENCE_S: Final = 60.0  # of a full disk's writer for a pass
 
 
 class RetentionThread:
-    """Makes passes of retention, on a thread of its own.
+    """Makes room ahead of need, on a thread of its own.
 
-    A pass is made when a segment was sealed, when less is free than the rules say, and once a
-    minute. What it cannot do is told, and never stops the recorder.
+    A pass is made when a segment was sealed, when less is free than the rules or the recorder
+    want, and once a minute. Where the store has rules, the rows of sealed segments are written
+    then. What it cannot do is told, and never stops the recorder.
 
     Args:
         directory: The store.
         remove: Removes a whole recording, by its id, unless a check of its manifest raises.
-        own: The recording in progress; None if there is none.
+        own: The recording in progress.
+        reserve: Bytes that the recorder wants free at least, where rules may make room.
         say: Shows a line to the user, each text once.
     """
 
     def __init__(
         self,
         directory: StoreDirectory,
-        remove: Callable[[str, Callable[[Manifest], None]], None],
-        own: Own | None,
+        remove: Remove,
+        own: Own,
+        reserve: int,
         say: Callable[[str], None],
     ) -> None:
         self._directory = directory
         self._keeper = Keeper(directory, remove, own, is_wanted=lambda: not self._over.is_set())
         self._own = own
+        self._reserve = self._wanted = reserve
         self._say = say
         self._over = threading.Event()
+        self._passed = threading.Condition()
+        self._passes = 0  # that have ended
+        self._asked = 0  # number of the pass that must be made
+        self._freed = 0  # bytes, by the last pass
+        self._is_exhausted = False  # nothing was left to go when it was asked for
         self._thread = threading.Thread(target=self._run, name="hybridlog-keep", daemon=True)
-        self._rules = Rules.of(directory.settings.retention)
+        self._rules = self._read_rules()
         self._has_warned = False
 
     def start(self) -> None:
@@ -356,34 +391,67 @@ class RetentionThread:
     def stop(self) -> None:
         """End after the deletion in progress."""
         self._over.set()
+        with self._passed:
+            self._passed.notify_all()
         if self._thread.is_alive():
             self._thread.join()
 
+    def wants(self, free_bytes: int) -> bool:
+        """Ask for so many free bytes; False if none can be made."""
+        self._wanted = max(free_bytes, self._reserve)
+        with self._passed:
+            if self._asked <= self._passes:
+                if self._is_exhausted:
+                    return False
+                self._asked = self._passes + 1
+        return self._rules.makes_room
+
+    def make_room(self) -> bool:
+        """Wait for a pass, on a full disk; returns whether it freed anything."""
+        with self._passed:
+            self._asked = seen = self._passes + 1
+            done = self._passed.wait_for(
+                lambda: self._passes >= seen or self._over.is_set(), _PATIENCE_S
+            )
+            return done and not self._over.is_set() and self._freed > 0
+
+    def _read_rules(self) -> Rules:
+        rules = Rules.of(read_settings(self._directory.path).retention)
+        return rules.with_free(self._wanted) if rules.makes_room else rules
+
     def _run(self) -> None:
         looked = last_pass = -_AGES_S
-        segments = 0
+        sealed = 0
         while not self._over.wait(_TICK_S):
-            now, sealed = time.monotonic(), self._own.sealed() if self._own is not None else 0
-            is_low = False
+            now, count, is_low = time.monotonic(), self._own.sealed, False
+            is_asked = self._asked > self._passes
+            freed = 0
             try:
-                if now - looked >= LOOK_S:
-                    looked = now
-                    self._rules = Rules.of(read_settings(self._directory.path).retention)
+                if now - looked >= LOOK_S or is_asked:
+                    looked, self._rules = now, self._read_rules()
                     free = shutil.disk_usage(self._directory.path).free
                     is_low = free < (self._rules.min_free or 0)
-                is_due = sealed != segments or is_low or now - last_pass >= _AGES_S
-                if is_due and not self._rules.is_empty:
-                    segments, last_pass = sealed, now
-                    self._make_pass()
+                is_due = is_asked or is_low or count != sealed or now - last_pass >= _AGES_S
+                if not is_due:
+                    continue
+                last_pass, sealed = now, count
+                if not self._rules.is_empty:
+                    freed = self._make_pass()
+                    make_rows(self._directory, self._own.id, lambda: not self._over.is_set())
             except HeldError:
-                segments = -1  # another process makes room: see later what is left
+                sealed, freed = -1, 1  # another process makes room: see later what is left
             except (HybridlogError, OSError) as error:
                 self._say(f"making room failed: {error}")
+            with self._passed:
+                self._freed, self._passes = freed, self._passes + 1
+                self._is_exhausted = is_asked and not freed
+                self._passed.notify_all()
 
-    def _make_pass(self) -> None:
+    def _make_pass(self) -> int:
         done = self._keeper.keep(self._rules)
         warnings = [] if self._has_warned else done.plan.warnings
         self._has_warned = bool(done.plan.warnings)
         reasons = (f"making room: {step.reason}" for step in done.plan.steps)
         for text in (*reasons, *done.problems, *warnings):
             self._say(text)
+        return done.freed_bytes

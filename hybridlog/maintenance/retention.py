@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Final
 
 from hybridlog.maintenance.expiry import may_go
@@ -28,7 +28,6 @@ _SEGMENTS_OF_QUOTA: Final = 50
 _TOPICS_FROM: Final = 0.8  # share of the quota above which payloads of topics go
 _SEGMENTS_FROM: Final = 0.9  # share above which whole segments go
 _TOPICS_BELOW: Final = 1.25  # times the free space below which segments go
-_STEP_BYTES: Final = 256 << 20  # that go together, so that a recorder can stop soon
 _WARN_FROM: Final = 0.8  # share of the quota that pins may take without a warning
 _CLOCK_WAS_SET: Final = 1_577_836_800 * 10**9  # 2020: earlier times are of a clock not set yet
 _LEAST_BARE: Final = 1 << 16  # bytes that a size without a unit has; less is meant as gigabytes
@@ -113,6 +112,15 @@ class Rules:
         return self == Rules(never_tag=self.never_tag)
 
     @property
+    def makes_room(self) -> bool:
+        """True if something goes when room is short, whatever its age."""
+        return self.quota is not None or self.min_free is not None
+
+    def with_free(self, least: int) -> Rules:
+        """The rules with so much free space at least, bytes."""
+        return replace(self, min_free=max(self.min_free or 0, least))
+
+    @property
     def segment_size(self) -> float:
         """The greatest size of a new segment: what goes are whole ones."""
         if self.quota is None:
@@ -163,21 +171,27 @@ def _topic_rule(topic: str, topics: Mapping[str, Any]) -> TopicRule:
 
 @dataclass(frozen=True, slots=True)
 class HeldSegment:
-    """A log that may go before its recording.
+    """A log, or what is left of it.
 
     Attributes:
         number: Its number.
+        group: Number of its group.
         written: When it was written, or the time of its last message if that is later, ns.
-        size: Bytes of its file.
+        size: Bytes of its file; 0 if it is gone.
+        row_bytes: Bytes of its files of rows.
         topics: Its topics.
+        may_go: Whether its payloads may go before its group: not those of small topics.
         is_pinned: Whether a pin keeps messages of it.
     """
 
     number: int
+    group: int
     written: int
     size: int
+    row_bytes: int
     topics: frozenset[str]
-    is_pinned: bool = False
+    may_go: bool
+    is_pinned: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,7 +205,7 @@ class Held:
         written: When its last segment was written, or its last message if that is later, ns.
         tags: Its tags.
         size: Bytes of all its files.
-        segments: Logs that may go, in their order: not those of small topics, which stay.
+        segments: Its logs, in their order.
         is_ended: Whether it has ended.
         pins: Number of its pins.
     """
@@ -215,28 +229,33 @@ def held_of(manifest: Manifest, now: int) -> Held:
         now: The time, ns.
     """
     found: list[HeldSegment] = []
-    later, last = now, 0
-    for _, log in sorted(manifest.logs.items(), reverse=True):
+    later, last, rows = now, 0, manifest.rows
+    for number, log in sorted(manifest.logs.items(), reverse=True):
         parts = _parts_of(log, manifest)
         times = [part.last for _, part in parts if part.last is not None]
         written = min(max([log.written, *times]), now)
         # A segment is not newer than those that follow it, whatever the clock was.
-        later = min(later, written)
-        last = max(last, written)
-        if may_go(log):
-            topics = frozenset(topic for topic, _ in parts)
-            found.append(
-                HeldSegment(log.number, later, log.bytes, topics, is_pinned(log, manifest))
+        later, last = min(later, written), max(last, written)
+        found.append(
+            HeldSegment(
+                number,
+                log.group,
+                later,
+                log.bytes if log.is_here else 0,
+                sum(file.bytes for file in rows.get(number, ())),
+                frozenset(topic for topic, _ in parts),
+                may_go(log),
+                is_pinned(log, manifest),
             )
-    found.reverse()
+        )
     return Held(
         manifest.id,
         manifest.name,
         manifest.created,
         last,
         manifest.tags,
-        sum(file.bytes for file in manifest.files if file.is_here),
-        found,
+        sum(one.size + one.row_bytes for one in found),
+        found[::-1],
         manifest.is_ended,
         len(manifest.pins),
     )
@@ -268,18 +287,16 @@ def _touches(pin: Pin, topic: str, part: Part) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """A deletion.
+    """A deletion; without segments and groups, that of the whole recording, with its fields.
 
     Attributes:
         recording: Name of the recording.
         id: Its id.
-        segments: Numbers of the segments; empty for the whole recording, with its fields.
+        segments: Numbers of the segments whose payloads go.
         topics: Their topics, if a rule for them lets the segments go; else empty.
         bytes: About the bytes that become free.
         reason: Why it goes.
-        before: The time before which it was written, ns.
-        digests: Digests that the files of segments must have, by number.
-        copy: Address of a store with proven copies of them; empty if there is none.
+        groups: Numbers of the groups of segments that go with their fields.
     """
 
     recording: str
@@ -288,9 +305,7 @@ class Step:
     topics: tuple[str, ...]
     bytes: int
     reason: str
-    before: int
-    digests: Mapping[int, str] = field(default_factory=dict)
-    copy: str = ""
+    groups: tuple[int, ...] = ()
 
 
 @dataclass(slots=True)
@@ -351,6 +366,7 @@ class _Planning:
         self._now = now
         self._plan = Plan(used, free)
         self._freed = 0
+        self._others: list[Held] = []  # without those that a tag keeps
         self._gone: set[str] = set()  # recordings
         self._pieces: list[_Piece] = []
         self._shared: set[str] = set()  # topics of rules, in segments with others
@@ -359,13 +375,20 @@ class _Planning:
     def made(self) -> Plan:
         kept = [one for one in self._held if self._rules.is_never(one.tags)]
         others = [one for one in self._held if not self._rules.is_never(one.tags)]
-        pinned = [s for one in others for s in one.segments if s.is_pinned]
+        pinned = [s for one in others for s in one.segments if s.may_go and s.is_pinned]
         self._plan.pins = sum(one.pins for one in self._held)
-        self._plan.pinned_bytes = sum(s.size for one in kept for s in one.segments)
+        self._plan.pinned_bytes = sum(s.size for one in kept for s in one.segments if s.may_go)
         self._plan.pinned_bytes += sum(s.size for s in pinned)
+        self._others = others
         self._whole_recordings(others)
         self._pieces = sorted(
-            (_Piece(o, s) for o in others if o.id not in self._gone for s in o.segments),
+            (
+                _Piece(o, s)
+                for o in others
+                if o.id not in self._gone
+                for s in o.segments
+                if s.may_go
+            ),
             key=lambda piece: piece.order,
         )
         self._by_age()
@@ -386,7 +409,7 @@ class _Planning:
             if one.is_ended and not one.pins and self._is_older(one.written, age_ns):
                 self._gone.add(one.id)
                 reason = f"fields older than {age}"
-                self._step(Step(one.name, one.id, (), (), one.size, reason, one.written))
+                self._step(Step(one.name, one.id, (), (), one.size, reason))
 
     def _by_age(self) -> None:
         age = self._rules.max_age
@@ -407,6 +430,31 @@ class _Planning:
             if need > 0:
                 reason = f"{rule.pattern}: {self._reason(_TOPICS_FROM, _TOPICS_BELOW)}"
                 self._topics(self._pieces, rule, reason, need)
+        if self._short(_SEGMENTS_FROM, 1.0) > 0:
+            self._groups()
+
+    def _groups(self) -> None:
+        """Let whole groups of ended recordings go, the oldest first, until enough is free."""
+        reason = f"{self._reason(_SEGMENTS_FROM, 1.0)}, and no payloads are left to go"
+        need = self._short(_TOPICS_FROM, _TOPICS_BELOW)
+        found: dict[tuple[int, int, str, int], list[_Piece]] = {}
+        held = [one for one in self._others if one.is_ended and one.id not in self._gone]
+        for one in held:
+            for number in {segment.group for segment in one.segments}:
+                own = [_Piece(one, s) for s in one.segments if s.group == number]
+                found[min(piece.order for piece in own)] = own
+        chosen: dict[str, dict[int, int]] = {}  # what becomes free besides, by group
+        for _, own in sorted(found.items()):
+            if need > 0 and not any(piece.segment.is_pinned for piece in own):
+                left = (p for p in own if (p.held.id, p.segment.number) not in self._going)
+                size = sum(p.segment.size for p in left) + sum(p.segment.row_bytes for p in own)
+                chosen.setdefault(own[0].held.id, {})[own[0].segment.group] = size
+                need -= size
+        for one in held:
+            if groups := chosen.get(one.id):
+                is_whole = groups.keys() == {s.group for s in one.segments} and not one.pins
+                numbers = () if is_whole else tuple(groups)
+                self._step(Step(one.name, one.id, (), (), sum(groups.values()), reason, numbers))
 
     def _short(self, share: float, times: float) -> float:
         """Bytes that are to become free for a share of the quota, and for the free space."""
@@ -454,23 +502,16 @@ class _Planning:
         self._group(chosen, tuple(topics), reason)
 
     def _group(self, chosen: Iterable[_Piece], topics: tuple[str, ...], reason: str) -> None:
-        """Make steps of the pieces of one recording; each is done as a whole."""
-        groups: list[list[_Piece]] = []
-        latest: dict[str, list[_Piece]] = {}  # of each recording
+        """Make a step of the pieces of each recording."""
+        groups: dict[str, list[_Piece]] = {}  # by recording
         for piece in chosen:
-            group = latest.get(piece.held.id)
-            size = piece.segment.size
-            if group is None or size + sum(one.segment.size for one in group) > _STEP_BYTES:
-                group = latest[piece.held.id] = []
-                groups.append(group)
-            group.append(piece)
-        for group in groups:
+            groups.setdefault(piece.held.id, []).append(piece)
+        for group in groups.values():
             held = group[0].held
             numbers = tuple(sorted(piece.segment.number for piece in group))
-            written = max(piece.segment.written for piece in group)
             count = sum(piece.segment.size for piece in group)
             own = tuple(t for t in topics if any(t in piece.segment.topics for piece in group))
-            self._step(Step(held.name, held.id, numbers, own, count, reason, written))
+            self._step(Step(held.name, held.id, numbers, own, count, reason))
 
     def _step(self, step: Step) -> None:
         self._freed += step.bytes
@@ -494,6 +535,5 @@ class _Planning:
         if left > 0:
             plan_.warnings.append(
                 f"{size(left)} more should be deleted, but all that is left must stay: it is "
-                "pinned, being recorded, small topics, or fields, tables and the index. "
-                "--fields-age and `hybridlog rm` delete whole recordings."
+                "pinned, being recorded, or tables and the index."
             )

@@ -57,7 +57,6 @@ def make(
     topics: Collection[str] | None = None,
     *,
     until: float = math.inf,
-    is_new: bool = False,
     progress: Progress | None = None,
 ) -> bool:
     """Create tables of a recording again from its segments.
@@ -67,7 +66,6 @@ def make(
         entry: The recording's entry in the catalog.
         topics: Topics of the tables; None for those that are missing.
         until: When this is given up, by `time.monotonic`.
-        is_new: Whether there are no rows of the recording yet, so none are looked for.
         progress: Called after each chunk.
 
     Returns:
@@ -79,16 +77,14 @@ def make(
     """
     if entry.status == "open" or not directory.is_writable:
         return False
-    if topics is None:
-        topics = topics_of(entry) if is_new else missing(directory, entry)
-    wanted = set(topics)
+    wanted = missing(directory, entry) if topics is None else {*topics}
     if not wanted:
         return True
     try:
         with directory.writing(entry.id):
             from hybridlog.columns.table_writer import TableWriter
 
-            writer = TableWriter(directory.path, entry.id, entry.name, topics=wanted, is_new=is_new)
+            writer = TableWriter(directory.path, entry.id, entry.name, topics=wanted, is_new=False)
             try:
                 channels = channels_of(entry, wanted)
                 names, path = files_of(entry), directory.recording(entry.id)

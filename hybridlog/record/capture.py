@@ -27,12 +27,19 @@ from hybridlog.entries import (
     text,
 )
 from hybridlog.index.index_writer import INTERVAL_S, IndexTarget, IndexWriter
+from hybridlog.maintenance.expiry import make_rows
 from hybridlog.maintenance.retention import Rules
 from hybridlog.query.latching import depth_of
 from hybridlog.wording import parse_size
 from hybridlog_storage.catalog import RecordingEntry
 from hybridlog_storage.disk.directory import LOCK_WAIT_S
-from hybridlog_storage.errors import DatabaseError, DiskFullError, HybridlogError, UsageError
+from hybridlog_storage.errors import (
+    DatabaseError,
+    DiskFullError,
+    HybridlogError,
+    StoreError,
+    UsageError,
+)
 from hybridlog_storage.manifest import Manifest, Source, new_id
 from hybridlog_storage.manifest import replace as replaced
 from hybridlog_storage.mongo.index_state import IndexState
@@ -93,6 +100,7 @@ class Capture:
             latched messages have files of their own.
         check: Called with all recordings before anything is written, while no other process can
             start a recording; raises to refuse.
+        make_room: Called when the disk is full; returns whether to try again.
 
     Attributes:
         entry: The recording's catalog entry.
@@ -115,12 +123,14 @@ class Capture:
         no_index: Callable[[str], bool] | None = None,
         is_ring: bool = False,
         check: Callable[[Snapshot], None] | None = None,
+        make_room: Callable[[], bool] = lambda: False,
     ) -> None:
         self.catalog = catalog
         self._directory = directory
         self._is_ring = is_ring
+        self._make_room = make_room
         self._no_index = no_index or (lambda _: False)
-        rules = Rules.of(directory.settings.retention)
+        self._rules = rules = Rules.of(directory.settings.retention)
         largest = min(
             settings.segment_size,
             rules.segment_size,
@@ -173,6 +183,7 @@ class Capture:
             is_latched=lambda channel: depth_of(channel) > 0,
             latched_apart=is_ring,
             on_sealing=self._announce,
+            make_room=make_room,
             skip_compression=pressure.skip_compression if pressure else None,
             cpu_slots=pressure.cpu_slots if pressure else None,
             on_written=pressure.on_written if pressure else None,
@@ -247,12 +258,21 @@ class Capture:
             self.index.seal(sealed)
 
     def _change(self, how: Callable[[Manifest], Manifest]) -> None:
-        self._directory.manifests.change(self.entry.id, how)
+        while True:
+            try:
+                self._directory.manifests.change(self.entry.id, how)
+                return
+            except DiskFullError:
+                if not self._make_room():
+                    raise
 
     def _finish(self) -> DatabaseError | None:
         self.index.close()
         failure = self.index.failure
         recording = self.entry.id
+        if not self._rules.is_empty and not self._is_ring:
+            with suppress(StoreError):  # or else they are written when their logs go
+                make_rows(self._directory, recording)
         if self.index.damage:
             self.catalog.put_damage(recording, self.index.damage)
         self.entry = put_entry(self._directory, self.catalog, recording)

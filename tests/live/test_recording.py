@@ -363,24 +363,6 @@ def test_chunks_are_flushed_within_the_interval(store: hl.Store, calls: Calls) -
         assert {0 < age <= interval - 2 * tick for _, age in flushed} == {True}
 
 
-def test_the_thread_that_has_waited_longest_is_next() -> None:
-    semaphore = live.FairSemaphore(1)
-    order: list[int] = []
-
-    def work(number: int) -> None:
-        with semaphore:
-            order.append(number)
-
-    threads = [threading.Thread(target=work, args=(number,)) for number in range(20)]
-    with semaphore:
-        for number, thread in enumerate(threads):
-            thread.start()
-            wait_for(lambda number=number: len(semaphore._waiting) == number + 1)
-    for thread in threads:
-        thread.join()
-    assert order == list(range(20))
-
-
 def test_misuse(store: hl.Store) -> None:
     own = channel("/talk")
     recording = store.start("talk")

@@ -142,7 +142,6 @@ ROWS = {**FILE, "name": "000000.rows.parquet", "kind": "rows"}
         {"files": [FILE, FILE]},
         {"files": [FILE, {**FILE, "name": "000000.1.mcap"}]},
         {"files": [{**FILE, "digest": f"sha256:{DIGEST}"}]},
-        {"files": [FILE, ROWS]},
         {"files": [ROWS]},
         {"files": [{**FILE, "gone": "expired"}]},
         {"files": [{**FILE, "gone": "expired"}, ROWS, ROWS]},

@@ -124,14 +124,13 @@ class Listing:
                 if int(name[:6]) not in sealed:
                     wanted.setdefault(int(name[:6]), name)
             return replace(self, sealed=dict(sorted((sealed | wanted).items())))
-        rows, listed = manifest.rows, set[str]()
+        rows = manifest.rows
+        listed = {file.name for own in rows.values() for file in own}
         for number, log in manifest.logs.items():
             if not log.is_here:
-                names = [file.name for file in rows[number]]
-                listed.update(names)
                 sealed.pop(number, None)
-                if names[0] in self.rows:
-                    sealed[number] = names[0]
+                if (name := rows[number][0].name) in self.rows:
+                    sealed[number] = name
         others = {*self.others, *self.sealed.values(), *self.rows} - {*sealed.values()} - listed
         return replace(self, sealed=dict(sorted(sealed.items())), others=tuple(sorted(others)))
 

@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from threading import BoundedSemaphore, Lock
 from typing import TYPE_CHECKING, Literal, TypeVar
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     _Count = TypeVar("_Count", int, NDArray[np.int64])
+    _Done = TypeVar("_Done")
 from hybridlog_storage.threads import Threads
 
 PACKERS = 2
@@ -143,6 +145,7 @@ class RecordingWriter:
         on_sealing: Called when a group is complete and, unless `sync` is never, on the disk,
             before its segments get their final names. Called on a writer thread or by
             `close_truncated`. An exception stops the writer like a failed write.
+        make_room: Called on a writer thread when the disk is full; returns whether to try again.
     """
 
     def __init__(
@@ -160,6 +163,7 @@ class RecordingWriter:
         is_latched: Callable[[Channel], bool] | None = None,
         latched_apart: bool = False,
         on_sealing: Callable[[Sequence[Sealed]], None] | None = None,
+        make_room: Callable[[], bool] = lambda: False,
     ) -> None:
         self.settings = settings or SegmentSettings()
         self.totals = RecordingTotals()
@@ -185,6 +189,7 @@ class RecordingWriter:
         self._latched_apart = latched_apart
         self._is_latched = is_latched or (lambda _: False)
         self._on_sealing: Callable[[Sequence[Sealed]], None] = on_sealing or (lambda _: None)
+        self._make_room = make_room
         large, own = self.settings.large_payload, self.settings.own_payload
         self._division = Division(own, large, is_named or (lambda _: False))
         self._closed_bytes = 0
@@ -541,7 +546,7 @@ class RecordingWriter:
     def _add(self, record: Metadata | Attachment) -> None:
         group = self._open_group()
         if isinstance(record, Metadata):
-            group.first.add_metadata(self._stated(record))
+            self._with_room(partial(group.first.add_metadata, self._stated(record)))
         else:
             group.first.add_attachment(record)
         self._extras.remove(record)
@@ -569,14 +574,14 @@ class RecordingWriter:
         )
 
     def _write(self) -> None:
-        chunks = self._next_chunks()
+        chunks = self._with_room(self._next_chunks)
         by_segment: dict[SegmentFile, list[PackedChunk]] = {}
         for segment, chunk in chunks:
             by_segment.setdefault(segment, []).append(chunk)
         stored: dict[int, StoredChunk] = {}  # by the identity of the chunk
         try:
             for segment, own in by_segment.items():
-                places = segment.append_chunks(own)
+                places = self._with_room(partial(segment.append_chunks, own))
                 stored.update(zip(map(id, own), places, strict=True))
                 if self.settings.sync == "chunk":
                     segment.sync()
@@ -591,6 +596,15 @@ class RecordingWriter:
             self._sync_behind(group)
         if group.is_full(self.settings.segment_size, self.settings.segment_span_s):
             self._seal()
+
+    def _with_room(self, do: Callable[[], _Done]) -> _Done:
+        """Do what changes nothing when it fails, again when there is room for it."""
+        while True:
+            try:
+                return do()
+            except DiskFullError:
+                if not self._make_room():
+                    raise
 
     def _publish(self, chunk: PackedChunk, stored: StoredChunk) -> None:
         """Report that a chunk is in its segment."""
@@ -638,7 +652,8 @@ class RecordingWriter:
         group = self._open_group()
         self._finish_sync()
         self._synced = 0
-        self._on_sealing(group.prepare(sync=self.settings.sync != "never"))
+        is_synced = self.settings.sync != "never"
+        self._on_sealing(self._with_room(lambda: group.prepare(sync=is_synced)))
         segments = [*group.segments.values()]
         self._closed += [segment.publish(sync=segment is segments[-1]) for segment in segments]
         self.totals.segments += len(segments)
