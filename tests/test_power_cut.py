@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import random
 import struct
-from collections.abc import Iterator
 from contextlib import closing, suppress
 from pathlib import Path
 
@@ -15,24 +14,13 @@ from hybridlog_storage.disk import files
 from hybridlog_storage.errors import HybridlogError, SegmentError
 from hybridlog_storage.manifest import Manifest, replace
 from hybridlog_storage.messages import Channel, Schema
-from hybridlog_storage.mongo.database import Database
-from hybridlog_storage.mongo.mongod import EmbeddedMongod
 from hybridlog_storage.segments.segment_writer import RecordingWriter, SegmentSettings
 from tests import places
 from tests.power import PowerCut
 
-pytestmark = pytest.mark.mongo("embedded")
-
-NOWHERE = "mongodb://127.0.0.1:9/x?serverSelectionTimeoutMS=50&connectTimeoutMS=50"
 CHANNEL = Channel("/a", "ros1", Schema("std_msgs/String", "ros1msg", b"string data\n"), {})
 OTHER = Channel("/b", "ros1", Schema("std_msgs/String", "ros1msg", b"string data\n"), {})
 COUNT = 40
-
-
-@pytest.fixture(scope="module")
-def mongod(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    with EmbeddedMongod(tmp_path_factory.mktemp("power") / "mongod", linger_s=0) as running:
-        yield running.start()
 
 
 def message(number: int) -> bytes:
@@ -49,10 +37,9 @@ WANT = {
 class Run:
     """A recording that is made while the power may fail."""
 
-    def __init__(self, place: Path, mongod: str, sync: str, calls: int | None) -> None:
+    def __init__(self, place: Path, sync: str, calls: int | None) -> None:
         self.store = place / "store"
-        self._mongod, self._name = mongod, f"power-{place.name}-{sync}"
-        with hl.open(self.store, mongo=self._uri, create=True):
+        with hl.open(self.store, mongo="none", create=True):
             pass
         self.power = PowerCut(self.store, calls)
         self.written: list[int] = []
@@ -60,10 +47,6 @@ class Run:
         self.sealed = 0
         self.is_closed = False
         self.settings = SegmentSettings(chunk_size=2048, segment_size=9000, sync=sync)  # type: ignore[arg-type]
-
-    @property
-    def _uri(self) -> str:
-        return self._mongod.replace("/?", f"/{self._name}?")
 
     def go(self, monkeypatch: pytest.MonkeyPatch) -> None:
         tell = RecordingWriter._publish
@@ -76,7 +59,7 @@ class Run:
         with monkeypatch.context() as patch:
             patch.setattr(files, "system", self.power)
             patch.setattr(RecordingWriter, "_publish", told)
-            store = hl.open(self.store, mongo=self._uri)
+            store = hl.open(self.store, mongo="none")
             try:
                 with suppress(HybridlogError, OSError):
                     recording = store.start("run", settings=self.settings)
@@ -91,8 +74,6 @@ class Run:
             finally:
                 with suppress(HybridlogError, OSError):
                     store.close()
-        with Database.connect(self._mongod, self._name) as database:
-            database.drop_all()
 
 
 def check(found: Path, run: Run, sync: str) -> str:
@@ -105,7 +86,7 @@ def check(found: Path, run: Run, sync: str) -> str:
 
 
 def look(found: Path, run: Run, sync: str) -> str:
-    with closing(hl.open(found, mongo=NOWHERE)) as store:
+    with closing(hl.open(found, mongo="none")) as store:
         entries = store.recordings()
         if sync == "never" and store.repairs.unreadable:
             return "unreadable"
@@ -131,13 +112,13 @@ def look(found: Path, run: Run, sync: str) -> str:
             assert count >= sum(run.written)
         assert count + lost <= COUNT
         # Once more: what was found is found again, byte for byte.
-        with closing(hl.open(found, mongo=NOWHERE)) as again:
+        with closing(hl.open(found, mongo="none")) as again:
             assert again.recordings() == entries
         return entry.status
 
 
-def calls_of(tmp_path: Path, mongod: str, sync: str, monkeypatch: pytest.MonkeyPatch) -> int:
-    run = Run(tmp_path / "whole", mongod, sync, None)
+def calls_of(tmp_path: Path, sync: str, monkeypatch: pytest.MonkeyPatch) -> int:
+    run = Run(tmp_path / "whole", sync, None)
     run.go(monkeypatch)
     assert run.is_closed
     assert check(run.store, run, sync) == "complete"
@@ -146,16 +127,16 @@ def calls_of(tmp_path: Path, mongod: str, sync: str, monkeypatch: pytest.MonkeyP
 
 @pytest.mark.parametrize("sync", ["chunk", "seal", "never"])
 def test_a_power_cut_while_recording(
-    tmp_path: Path, mongod: str, sync: str, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, sync: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    try_cuts(tmp_path, mongod, sync, monkeypatch, cuts=12, fates=3)
+    try_cuts(tmp_path, sync, monkeypatch, cuts=12, fates=3)
 
 
 def test_the_end_says_how_many_segments_there_were(
-    tmp_path: Path, mongod: str, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of the last group a power cut may leave that which has the end, and no other."""
-    run = Run(tmp_path / "whole", mongod, "seal", None)
+    run = Run(tmp_path / "whole", "seal", None)
     run.go(monkeypatch)
     (folder,) = places.folders(run.store)
     last = places.manifest(run.store, "run").files[-1]
@@ -174,25 +155,24 @@ def test_the_end_says_how_many_segments_there_were(
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("sync", ["chunk", "seal", "never"])
 def test_power_cuts_at_every_call(
-    tmp_path: Path, mongod: str, sync: str, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, sync: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    try_cuts(tmp_path, mongod, sync, monkeypatch, cuts=1000, fates=4)
+    try_cuts(tmp_path, sync, monkeypatch, cuts=1000, fates=4)
 
 
 def try_cuts(
     tmp_path: Path,
-    mongod: str,
     sync: str,
     monkeypatch: pytest.MonkeyPatch,
     *,
     cuts: int,
     fates: int,
 ) -> None:
-    calls = calls_of(tmp_path, mongod, sync, monkeypatch)
+    calls = calls_of(tmp_path, sync, monkeypatch)
     assert calls > 20
     seen = set()
     for number in range(1, calls + 1, max(calls // cuts, 1)):
-        run = Run(tmp_path / f"cut{number}", mongod, sync, number)
+        run = Run(tmp_path / f"cut{number}", sync, number)
         run.go(monkeypatch)
         for fate in range(fates):
             found = tmp_path / f"found{number}-{fate}"

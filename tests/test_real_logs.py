@@ -192,7 +192,7 @@ def test_verify_finds_nothing_and_reindex_changes_nothing(store: hl.Store) -> No
 @pytest.mark.parametrize("name", [name for name in WHOLE if name.startswith("real/")])
 def test_segments_are_hardly_larger_than_a_plain_mcap_file(name: str, tmp_path: Path) -> None:
     """One that the `mcap` package writes with its defaults: chunks of 1 MiB, zstd."""
-    with hl.open(tmp_path / "store", create=True) as store:
+    with hl.open(tmp_path / "store", mongo="none", create=True) as store:
         label = store.record(DATA / name).entry.name
     plain = io.BytesIO()
     writer = Writer(plain)
