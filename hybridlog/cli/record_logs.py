@@ -75,8 +75,6 @@ def record_watched(choices: RecordChoices) -> None:
 
     recorder = LogRecorder(choices, (), is_search=True)
     watches = [Watch(path, choices.settle) for path in choices.paths]
-    for one in watches:
-        one.check()
     with recorder.opened() as store:
         look = partial(_look, recorder, store, watches, set[Path]())
         places = ", ".join(map(str, choices.paths))

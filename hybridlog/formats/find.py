@@ -95,14 +95,6 @@ class Watch:
         self._done: set[_File] = set()  # taken, or no log
         self._logs: dict[_File, LogFile | None] = {}
 
-    def check(self) -> None:
-        """Check that the directory can be read.
-
-        Raises:
-            SourceError: It cannot.
-        """
-        next(_folders(self._top, Found()), None)
-
     def look(self) -> Found:
         """The logs that have become complete since the last look.
 

@@ -31,12 +31,9 @@ from hybridlog_storage.errors import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from numpy.typing import NDArray
 
     from hybridlog.message import Message
-    from hybridlog_storage.messages import Buffer
 
 _TICKS: Final = 10**6
 """Units of time in a second. With more of them, two frames could not be far from each other."""
@@ -72,9 +69,9 @@ class _Video(Whole):
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self._av = pyav()
-        self._sink = _SeekableSink(path)
+        self._sink = Sink(path)
         self._file: Any = self._av.open(
-            self._sink,
+            str(self._sink.path),
             "w",
             format="mp4",
             options={"video_track_timescale": str(_TICKS), "movie_timescale": str(_TICKS)},
@@ -97,7 +94,7 @@ class _Video(Whole):
                 "An MP4 is of one topic in one recording: choose one, or name a file for each "
                 "with --split-by recording."
             )
-        with self._sink.checked():
+        with failures(self._sink.name):
             if is_video_type(message.type):
                 self._add_frame(message)
             else:
@@ -218,7 +215,7 @@ class _Video(Whole):
 
     def commit(self) -> None:
         """Complete the file."""
-        with self._sink.checked():
+        with failures(self._sink.name):
             self._end_of_frames()
             if self._track is None:
                 raise UsageError("There is no image in this answer.")
@@ -233,44 +230,3 @@ class _Video(Whole):
         self._sink.abort()
         with contextlib.suppress(Exception):  # it cannot be completed
             self._file.close()
-
-
-class _SeekableSink(Sink):
-    """A sink whose library goes back to complete its headers, and may lose what is raised in it.
-
-    Args:
-        target: Path.
-    """
-
-    def __init__(self, target: Target) -> None:
-        super().__init__(target)
-        self._failure: BaseException | None = None
-
-    def write(self, data: Buffer) -> int:
-        """Append bytes; nothing after a failure."""
-        if self._failure is None:
-            try:
-                return super().write(data)
-            except BaseException as error:
-                self._failure = error
-        return memoryview(data).nbytes
-
-    @contextlib.contextmanager
-    def checked(self) -> Iterator[None]:
-        """Raise what writing in the block has raised."""
-        with failures(self.name):
-            yield
-        if self._failure is not None:
-            raise self._failure
-
-    def seekable(self) -> bool:
-        """True."""
-        return True
-
-    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        """Go to a place in the file; after `abort`, nowhere."""
-        return 0 if self.closed else self._file.seek(offset, whence)
-
-    def tell(self) -> int:
-        """The place in the file."""
-        return 0 if self.closed else self._file.tell()

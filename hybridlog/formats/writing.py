@@ -78,6 +78,7 @@ class Sink(Whole):
     """A binary output that appears on `commit`.
 
     It has the methods that pyarrow, zipfile and the mcap writer need of a file without seek.
+    Others write to its `path`, where it is one.
 
     Args:
         target: Path or stream.
@@ -102,8 +103,8 @@ class Sink(Whole):
             if atomic:
                 self._unfinished = beside(self._final)
             # A path is never opened for reading here, and its links are resolved once.
-            path = self._unfinished.path if self._unfinished is not None else self._final
-            self._file = path.open("xb" if atomic else "wb", buffering=_BUFFER)
+            self.path = self._unfinished.path if self._unfinished is not None else self._final
+            self._file = self.path.open("xb" if atomic else "wb", buffering=_BUFFER)
 
     @property
     def closed(self) -> bool:

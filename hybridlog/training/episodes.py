@@ -148,7 +148,7 @@ def pictures(
     current: Message | None = None
     place, frames = 0, episode.times.tolist()
     reader = _Reader(session, episode.recording, frames[0], frames[-1] + 1)
-    for message in reader.messages(topic):
+    for message in reader.query(topic):
         shown = place
         while place < len(frames) and frames[place] < message.log_time_ns:
             place += 1
@@ -188,7 +188,7 @@ class _Reader:
     begin: int
     end: int
 
-    def _query(self, topic: str) -> Query:
+    def query(self, topic: str) -> Query:
         """The question for the messages in the range, and for the current one before it."""
         whole = Query(self.session, Question((topic,), (self.recording,)))
         try:
@@ -197,17 +197,13 @@ class _Reader:
             begin = self.begin
         return whole.between(begin, self.end)
 
-    def messages(self, topic: str) -> Iterator[Message]:
-        """The messages of a topic, by log time."""
-        yield from self._query(topic)
-
     def times(self, topic: str) -> NDArray[np.int64]:
         """Log times of the messages of a topic, ns.
 
         Raises:
             TopicError: There are none.
         """
-        query = self._query(topic)
+        query = self.query(topic)
         parts = match_times(query.session, query.question, Counters())
         found = [part.log_time for part in parts]
         return self._checked(topic, np.concatenate([np.empty(0, np.int64), *found]))
@@ -222,7 +218,7 @@ class _Reader:
         import pyarrow as pa
         import pyarrow.compute as pc
 
-        table = self._query(source.topic).fields(*source.paths).to_arrow()
+        table = self.query(source.topic).fields(*source.paths).to_arrow()
         present = [column for column in table.column_names if column in source.paths]
         if missing := set(source.paths).difference(present):
             raise UsageError(f"{source.topic} has no field {min(missing)}.")

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -159,34 +159,32 @@ def _plan(query: Query, features: FeatureMap, options: LerobotOptions) -> str:
 # The set.
 
 
+@dataclass(slots=True)
 class _Assembly:
     """Puts the episodes of a set together.
 
-    Args:
+    Attributes:
         root: Directory of the set.
         made: The episodes.
         features: The features.
         options: How.
         plan: What determines the bytes of the set.
+        rows: Of the table of episodes.
+        tasks: Numbers of the tasks.
     """
 
-    def __init__(
-        self,
-        root: Path,
-        made: Sequence[WrittenEpisode],
-        features: FeatureMap,
-        options: LerobotOptions,
-        plan: Mapping[str, Any],
-    ) -> None:
-        self._root = root
-        self._made = made
-        self._features = features
-        self._options = options
-        self._plan = plan
-        self._rows: list[dict[str, Any]] = [{} for _ in made]  # of the table of episodes
-        self._tasks = {
-            task: n for n, task in enumerate(dict.fromkeys(m.about["task"] for m in made))
-        }
+    root: Path
+    made: Sequence[WrittenEpisode]
+    features: FeatureMap
+    options: LerobotOptions
+    plan: Mapping[str, Any]
+    rows: list[dict[str, Any]] = field(init=False)
+    tasks: dict[str, int] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.rows = [{} for _ in self.made]
+        names = dict.fromkeys(one.about["task"] for one in self.made)
+        self.tasks = {task: number for number, task in enumerate(names)}
         self._check()
 
     def _check(self) -> None:
@@ -195,8 +193,8 @@ class _Assembly:
         Raises:
             UsageError: They differ.
         """
-        first = self._made[0]
-        for other in self._made[1:]:
+        first = self.made[0]
+        for other in self.made[1:]:
             for what, one, two in (
                 ("sizes of pictures", first.pixels, other.pixels),
                 ("columns", first.about["names"], other.about["names"]),
@@ -210,41 +208,39 @@ class _Assembly:
     def write(self, report: LerobotReport) -> None:
         """Write all files, `meta/info.json` last."""
         for name in ("data", "videos", "meta"):
-            if (self._root / name).exists():
-                shutil.rmtree(self._root / name)
-        (self._root / "meta").mkdir()
+            if (self.root / name).exists():
+                shutil.rmtree(self.root / name)
+        (self.root / "meta").mkdir()
         stats = self._write_data()
-        for name in self._features.images:
+        for name in self.features.images:
             self._write_videos(name)
-            counts = np.sum([one.counts[name] for one in self._made], axis=0)
+            counts = np.sum([one.counts[name] for one in self.made], axis=0)
             stats[f"{IMAGE_PREFIX}{name}"] = _colour_stats(counts)
         path = self._file(_EPISODES, 0)
-        pq.write_table(pa.Table.from_pylist(self._rows), path, compression="snappy")
+        pq.write_table(pa.Table.from_pylist(self.rows), path, compression="snappy")
         # The text of a task is the index, as LeRobot reads it.
-        tasks = pd.DataFrame(
-            {"task_index": self._tasks.values()}, pd.Index(self._tasks, name="task")
-        )
-        tasks.to_parquet(self._root / "meta/tasks.parquet")
-        own = {**self._plan, "episodes": [one.about for one in self._made]}
+        tasks = pd.DataFrame({"task_index": self.tasks.values()}, pd.Index(self.tasks, name="task"))
+        tasks.to_parquet(self.root / "meta/tasks.parquet")
+        own = {**self.plan, "episodes": [one.about for one in self.made]}
         for file, value in (("stats", stats), ("hybridlog", own), ("info", self._info())):
-            write_text(self._root / f"meta/{file}.json", json.dumps(value, indent=1))
-        report.episodes = len(self._made)
-        report.frames = sum(one.length for one in self._made)
-        report.held = sum(sum(one.about["held"].values()) for one in self._made)
-        report.missing = sum(sum(one.about["missing"].values()) for one in self._made)
-        report.lost = sum(one.about["lost"] for one in self._made)
+            write_text(self.root / f"meta/{file}.json", json.dumps(value, indent=1))
+        report.episodes = len(self.made)
+        report.frames = sum(one.length for one in self.made)
+        report.held = sum(sum(one.about["held"].values()) for one in self.made)
+        report.missing = sum(sum(one.about["missing"].values()) for one in self.made)
+        report.lost = sum(one.about["lost"] for one in self.made)
         report.bytes = sum(
             file.stat().st_size
-            for file in self._root.rglob("*")
+            for file in self.root.rglob("*")
             if file.is_file() and _UNFINISHED not in file.parts
         )
 
     def _write_data(self) -> dict[str, Any]:
         """Write the rows; returns statistics of all."""
-        begins = np.cumsum([0, *(one.length for one in self._made)]).tolist()
+        begins = np.cumsum([0, *(one.length for one in self.made)]).tolist()
         found = [
             one.vectors() | self._own_columns(place, one, begins[place])
-            for place, one in enumerate(self._made)
+            for place, one in enumerate(self.made)
         ]
         tables = [pa.table({key: _column(array) for key, array in own.items()}) for own in found]
         for number, places in _by_file((table.nbytes for table in tables), _DATA_MB):
@@ -252,10 +248,10 @@ class _Assembly:
             with pq.ParquetWriter(path, tables[0].schema, compression="snappy") as writer:
                 for place in places:
                     writer.write_table(tables[place])
-                    self._rows[place] = {
+                    self.rows[place] = {
                         "episode_index": place,
-                        "tasks": [self._made[place].about["task"]],
-                        "length": self._made[place].length,
+                        "tasks": [self.made[place].about["task"]],
+                        "length": self.made[place].length,
                         **_place_of("data", number),
                         **_place_of("meta/episodes", 0),
                         "dataset_from_index": begins[place],
@@ -267,24 +263,24 @@ class _Assembly:
     def _file(self, form: str, number: int, key: str = "") -> Path:
         """The path of a file by its number; its folder is made."""
         chunk, file = divmod(number, _CHUNK_FILES)
-        path = self._root / form.format(key=key, chunk=chunk, file=file)
+        path = self.root / form.format(key=key, chunk=chunk, file=file)
         path.parent.mkdir(parents=True, exist_ok=True)
         return path
 
     def _own_columns(self, place: int, one: WrittenEpisode, begin: int) -> dict[str, NDArray[Any]]:
         frames = np.arange(one.length, dtype=np.int64)
         return {
-            "timestamp": (frames / self._options.fps).astype(np.float32),
+            "timestamp": (frames / self.options.fps).astype(np.float32),
             "frame_index": frames,
             "episode_index": np.full(one.length, place, np.int64),
             "index": frames + begin,
-            "task_index": np.full(one.length, self._tasks[one.about["task"]], np.int64),
+            "task_index": np.full(one.length, self.tasks[one.about["task"]], np.int64),
         }
 
     def _write_videos(self, name: str) -> None:
         """Join the videos of the episodes; packets are copied."""
-        fps, key = self._options.fps, f"{IMAGE_PREFIX}{name}"
-        videos = [one.place / f"{name}.mp4" for one in self._made]
+        fps, key = self.options.fps, f"{IMAGE_PREFIX}{name}"
+        videos = [one.place / f"{name}.mp4" for one in self.made]
         for number, places in _by_file((path.stat().st_size for path in videos), _VIDEO_MB):
             with pyav().open(str(self._file(_VIDEO, number, key)), "w", format="mp4") as target:
                 frames, track = 0, None
@@ -300,12 +296,12 @@ class _Assembly:
                             packet.duration = 1
                             target.mux(packet)
                             frames += 1
-                    one = self._made[place]
+                    one = self.made[place]
                     if frames - begin != one.length:
                         raise PayloadError(
                             f"{name}.mp4 has {frames - begin} frames, not {one.length}"
                         )
-                    self._rows[place] |= {
+                    self.rows[place] |= {
                         **_place_of(f"videos/{key}", number),
                         f"videos/{key}/from_timestamp": begin / fps,
                         f"videos/{key}/to_timestamp": frames / fps,
@@ -314,7 +310,7 @@ class _Assembly:
 
     def _info(self) -> dict[str, Any]:
         """The description of the set for LeRobot."""
-        first, fps = self._made[0], self._options.fps
+        first, fps = self.made[0], self.options.fps
         features: dict[str, Any] = {}
         for name, array in first.vectors().items():
             names = first.about["names"][name]
@@ -330,7 +326,7 @@ class _Assembly:
                     "video.height": rows,
                     "video.width": columns,
                     "video.channels": 3,
-                    "video.codec": self._options.codec,
+                    "video.codec": self.options.codec,
                     "video.pix_fmt": "yuv420p",
                     "video.is_depth_map": False,
                     "has_audio": False,
@@ -340,15 +336,15 @@ class _Assembly:
         features |= dict.fromkeys(("frame_index", "episode_index", "index", "task_index"), _INDEX)
         return {
             "codebase_version": "v3.0",
-            "robot_type": self._features.robot_type or "unknown",
-            "total_episodes": len(self._made),
-            "total_frames": sum(one.length for one in self._made),
-            "total_tasks": len(self._tasks),
+            "robot_type": self.features.robot_type or "unknown",
+            "total_episodes": len(self.made),
+            "total_frames": sum(one.length for one in self.made),
+            "total_tasks": len(self.tasks),
             "chunks_size": _CHUNK_FILES,
             "data_files_size_in_mb": _DATA_MB,
             "video_files_size_in_mb": _VIDEO_MB,
             "fps": fps,
-            "splits": {"train": f"0:{len(self._made)}"},
+            "splits": {"train": f"0:{len(self.made)}"},
             "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
             "video_path": "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4",
             "features": features,

@@ -18,7 +18,7 @@ import hybridlog as hl
 from hybridlog.cli.answers import write_answer
 from hybridlog.formats import OUTPUTS
 from hybridlog.formats.answer import Answer
-from hybridlog.formats.writing import Sink
+from hybridlog.formats.mp4 import _Video
 from hybridlog.maintenance.expiry import expire
 from hybridlog.message import Message
 from hybridlog.query.query import Query
@@ -288,9 +288,10 @@ def test_files_that_are_not_completed(
     assert not list(tmp_path.iterdir())
 
     query = store.query(["/cam"], ["h264"])
-    for error in (KeyboardInterrupt, DiskFullError):
-        calls.fail(Sink, "write", error("no space left"))
-        with pytest.raises(error):
+    no_space = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    for error, wanted in ((KeyboardInterrupt(), KeyboardInterrupt), (no_space, DiskFullError)):
+        calls.fail(_Video, "_mux", error)
+        with pytest.raises(wanted):
             to_mp4(query, tmp_path / "out.mp4")
         assert not list(tmp_path.iterdir())
     monkeypatch.undo()

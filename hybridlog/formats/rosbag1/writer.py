@@ -16,7 +16,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from hybridlog.formats.answer import Answer, LogWriter
 from hybridlog.formats.mcap.writer import source_metadata
-from hybridlog.formats.writing import Target, destination, failures
+from hybridlog.formats.writing import Sink, Target, destination, failures
 from hybridlog.schema.completion import with_nested
 from hybridlog_storage.disk.unfinished import beside, scratch_directory
 from hybridlog_storage.errors import UsageError
@@ -48,19 +48,18 @@ class BagWriter(LogWriter):
     """
 
     def __init__(self, target: Target) -> None:
-        self._stream: BinaryIO | None = None
-        self._final: Path | None = None
+        self._target = target
         self._connections: dict[_ConnectionKey, Connection] = {}
         self._known: dict[Channel, Connection] = {}
+        self._final: Path | None = None
+        self._name = str(getattr(target, "name", "the output"))
         if isinstance(target, str | os.PathLike):
             self._name = os.fspath(target)
             with failures(self._name):
-                self._final, self._atomic = destination(target)
-        else:
-            self._name = str(getattr(target, "name", "the output"))
-            self._stream, self._atomic = target, False
+                final, is_atomic = destination(target)
+                self._final = final if is_atomic else None
         with failures(self._name):
-            if self._atomic and self._final is not None:
+            if self._final is not None:
                 self._unfinished = beside(self._final)
                 self._temporary = self._unfinished.path
             else:
@@ -137,18 +136,13 @@ class BagWriter(LogWriter):
         """Complete the bag."""
         with failures(self._name):
             self._writer.close()
-            if self._atomic and self._final is not None:
+            if self._final is not None:
                 with self._temporary.open("rb") as file:
                     os.fsync(file.fileno())
                 self._unfinished.publish(self._final)
                 return
-            with self._temporary.open("rb") as file:
-                if self._stream is not None:
-                    shutil.copyfileobj(file, self._stream, 1 << 20)
-                    self._stream.flush()
-                elif self._final is not None:
-                    with self._final.open("wb") as device:
-                        shutil.copyfileobj(file, device, 1 << 20)
+            with Sink(self._target) as sink, self._temporary.open("rb") as file:
+                shutil.copyfileobj(file, sink, 1 << 20)
         self.abort()
 
     def abort(self) -> None:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import yaml
 from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
+from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
 
 from hybridlog.formats.answer import Answer, LogWriter
 from hybridlog.formats.mcap.writer import McapWriter
@@ -30,23 +31,7 @@ MAX_FILE: Final = 2 << 30
 STORAGES: Final = {"mcap": ".mcap", "sqlite3": ".db3"}
 """Suffixes of files by the storage of a bag."""
 _VERSION: Final = 9
-_TABLES: Final = """
-CREATE TABLE schema(schema_version INTEGER PRIMARY KEY, ros_distro TEXT NOT NULL);
-CREATE TABLE metadata(
-    id INTEGER PRIMARY KEY, metadata_version INTEGER NOT NULL, metadata TEXT NOT NULL);
-CREATE TABLE topics(
-    id INTEGER PRIMARY KEY, name TEXT NOT NULL, type TEXT NOT NULL,
-    serialization_format TEXT NOT NULL, offered_qos_profiles TEXT NOT NULL,
-    type_description_hash TEXT NOT NULL);
-CREATE TABLE message_definitions(
-    id INTEGER PRIMARY KEY, topic_type TEXT NOT NULL, encoding TEXT NOT NULL,
-    encoded_message_definition TEXT NOT NULL, type_description_hash TEXT NOT NULL);
-CREATE TABLE messages(
-    id INTEGER PRIMARY KEY, topic_id INTEGER NOT NULL, timestamp INTEGER NOT NULL,
-    data BLOB NOT NULL);
-CREATE INDEX timestamp_idx ON messages (timestamp ASC);
-INSERT INTO schema VALUES (4, 'hybridlog');
-"""
+_TABLES: Final = f"{Sqlite3Writer.SQLITE_SCHEMA} UPDATE schema SET ros_distro = 'hybridlog';"  # noqa: S608
 
 
 @dataclass(slots=True)
