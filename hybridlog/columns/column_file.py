@@ -86,28 +86,6 @@ class ColumnFile(ParquetFileReader):
         return {leaf.names for leaf in self.leaves if leaf.array is not None}
 
     @lazy
-    def sizes(self) -> dict[tuple[Any, ...], int]:
-        """Stored bytes of columns that were asked about."""
-        return {}
-
-    def stored(
-        self,
-        group: int,
-        paths: Collection[str] | None,
-        own: Collection[str],
-        *,
-        arrays: bool = False,
-    ) -> int:
-        """Stored bytes of some fields in a row group; see `choose`."""
-        key = group, None if paths is None else frozenset(paths), frozenset(own), arrays
-        found = self.sizes.get(key)
-        if found is None:
-            if len(self.sizes) >= _MAX_FIELD_SETS:
-                self.sizes.clear()
-            found = self.sizes[key] = self.size(group, self.choose(paths, own, arrays=arrays))
-        return found
-
-    @lazy
     def chosen(self) -> dict[tuple[Any, ...], list[int]]:
         """Numbers of columns that were chosen, by what `choose` was asked for."""
         return {}

@@ -13,8 +13,7 @@ renamed from its field has the field's name in its metadata.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Sequence
-from itertools import zip_longest
+from collections.abc import Callable, Collection, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -175,20 +174,6 @@ def original_name(field: Any) -> str:
 def has_summaries(field: Any) -> bool:
     """True for a column of summaries."""
     return SUMMARY in (field.metadata or {})
-
-
-def has_long_arrays(columns: Iterable[Any]) -> bool:
-    """True if there may be arrays among columns that tables have in full on request alone."""
-    columns = [*columns]
-    for column, after in zip_longest(columns, columns[1:]):
-        kind = column.type
-        if after is not None and has_summaries(after) and not is_of_bytes(kind):
-            return True
-        while is_list(kind):
-            kind = kind.value_type
-        if pa.types.is_struct(kind) and has_long_arrays(kind):
-            return True
-    return False
 
 
 def records_of(

@@ -29,7 +29,6 @@ from hybridlog.columns.layout import (
     SUFFIX,
     TABLES,
     Section,
-    is_of_folder,
     parts_folder,
 )
 from hybridlog.columns.parquet_file import (
@@ -385,10 +384,7 @@ def recordings_of(root: Path) -> set[str]:
 def _reader(path: Path) -> ParquetFileReader | None:
     """A shared file; one that cannot be read is removed, since all of it can be made again."""
     try:
-        reader = ParquetFileReader(path)
-        if not is_of_folder(path.parent.name, reader.schema):
-            raise StoreError(f"The table {path} is of another folder.")
-        return reader
+        return ParquetFileReader(path)
     except FileNotFoundError:
         return None
     except StoreError as error:

@@ -88,17 +88,8 @@ def shape_folder(type_name: str, schema: Any) -> str:
         type_name: Name of the type, possibly empty.
         schema: The Arrow schema of its tables.
     """
-    return type_prefix(type_name) + _shape8(schema)
-
-
-def is_of_folder(folder: str, schema: Any) -> bool:
-    """True if a file with this Arrow schema belongs in a folder of this name."""
-    return folder.rpartition("~")[2] == _shape8(schema)
-
-
-def _shape8(schema: Any) -> str:
     text = json.dumps([_described(column) for column in schema])
-    return hashlib.sha256(text.encode()).hexdigest()[:8]
+    return type_prefix(type_name) + hashlib.sha256(text.encode()).hexdigest()[:8]
 
 
 def _described(column: Any) -> list[Any]:

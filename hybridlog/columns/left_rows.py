@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 _OWN: Final = frozenset(OWN_COLUMNS)
 _LONG: Final = (pa.int64(), pa.uint32(), pa.uint64())
 _MOST: Final = (1 << 64) - 1
-_UNFIT: Final = (pa.ArrowException, OverflowError, TypeError, ValueError)
+_UNFIT: Final = (pa.ArrowException, AttributeError, OverflowError, TypeError, ValueError)
 _NO_FIELDS: Final = "its payload did not fit its definition when it was dropped"
 _SUMMARIES: Final = ({*SUMMARY_FIELDS[:1]}, {*SUMMARY_FIELDS})
 
@@ -203,8 +203,10 @@ def _cells(array: Array, field: Any, *, typed: bool, summaries: bool) -> list[An
         return [d if v else None for d, v in zip(made, array.is_valid().to_pylist(), strict=True)]
     if is_list(kind):
         inner = field if is_empty else kind.value_field
-        values = iter(_cells(array.flatten(), inner, typed=typed, summaries=summaries))
-        counted = zip(lengths_of(array).tolist(), array.is_valid().to_pylist(), strict=True)
+        lengths = lengths_of(array)
+        items = array.flatten() if pa.types.is_fixed_size_list(kind) else _items(array, lengths)
+        values = iter(_cells(items, inner, typed=typed, summaries=summaries))
+        counted = zip(lengths.tolist(), array.is_valid().to_pylist(), strict=True)
         return [[next(values) for _ in range(n)] if there else None for n, there in counted]
     if is_bytes(kind):
         sizes = pc.binary_length(array).to_pylist()
@@ -214,6 +216,13 @@ def _cells(array: Array, field: Any, *, typed: bool, summaries: bool) -> list[An
     if is_empty:
         return [None if there is None else {} for there in values]
     return [*map(_whole, values)] if is_time(kind) or (typed and kind in _LONG) else values
+
+
+def _items(array: Array, lengths: NDArray[np.int64]) -> Array:
+    """The elements of lists; pyarrow cannot flatten those of JSON text where one is null."""
+    begin, total = array.offsets[0].as_py(), int(lengths.sum())
+    is_dense = array.offsets[-1].as_py() - begin == total
+    return array.values.slice(begin, total) if is_dense else array.flatten()
 
 
 def _whole(value: Any) -> Any:
@@ -290,17 +299,18 @@ def _filled(values: Sequence[Any], field: Any) -> Array:
             own = [None if value is None else value.get(name) for value in values]
             after = kind.field(number + 1) if number + 1 < kind.num_fields else None
             if has_summaries(inner):
-                own = [*map(_summary_in, own)]
+                own = [_summary_in(one, kind.field(number - 1).type) for one in own]
             elif after is not None and has_summaries(after):
-                own = [None if _summary_in(one) else one for one in own]
+                own = [None if _summary_in(one, inner.type) else one for one in own]
             columns[inner.name] = _filled(own, inner)
         return structs(columns, len(values), missing_rows(values), kind)
     if is_list(kind):
-        inner = kind.value_field.with_metadata(
-            field.metadata if kind.value_type == pa.bool_() else kind.value_field.metadata
-        )
+        inner = kind.value_field
+        if EMPTY in (field.metadata or {}):
+            inner = inner.with_metadata(field.metadata)
         items = _filled([item for value in values if value is not None for item in value], inner)
-        return lists(items, offsets_of(values), missing_rows(values)).cast(kind)
+        made = lists(items, offsets_of(values), missing_rows(values))
+        return made if made.type == kind else made.cast(kind)
     if kind == pa.json_():
         return json_array(values)
     if pa.types.is_integer(kind):
@@ -308,12 +318,11 @@ def _filled(values: Sequence[Any], field: Any) -> Array:
     return pa.array(values, kind)
 
 
-def _summary_in(value: Any) -> dict[str, Any] | None:
+def _summary_in(value: Any, kind: Any) -> dict[str, Any] | None:
     """The summary of an array, if it or an array among its elements was too long."""
     if isinstance(value, dict):
         return value
-    if isinstance(value, list) and any(
-        (isinstance(one, list) and _summary_in(one)) or _is_summary(one) for one in value
-    ):
+    is_nested = isinstance(value, list) and is_list(kind) and is_list(kind.value_type)
+    if is_nested and any(_summary_in(one, kind.value_type) for one in value):
         return {"n": len(value)}
     return None

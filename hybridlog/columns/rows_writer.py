@@ -24,11 +24,12 @@ from hybridlog_storage.ordering import distinct
 from hybridlog_storage.segments.segment_file import rows_name
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
 
+    from hybridlog.schema.codec import Codec
     from hybridlog_storage.manifest import File
     from hybridlog_storage.messages import Channel
     from hybridlog_storage.segments.chunk import StoredChunk
@@ -64,51 +65,6 @@ class _OpenFile:
     parts: defaultdict[int, list[Part]] = field(default_factory=lambda: defaultdict(list))
 
 
-class RowColumns:
-    """Turns messages of one type into rows of what is left of them."""
-
-    def __init__(self, channel: Channel) -> None:
-        self._codec = codec_for(channel)
-        self._shape = FieldShape()
-
-    def table(
-        self, chunk: StoredChunk, rows: NDArray[np.intp], has_publish_time: Mapping[int, bool]
-    ) -> pa.Table:
-        """Rows of messages, in the order of the chunk.
-
-        Args:
-            chunk: The chunk that holds them.
-            rows: Their rows in it, ascending; one at least.
-            has_publish_time: Whether messages of a channel have a publish time, by channel id.
-        """
-        batch = chunk.batch.take(rows)
-        is_reduced = isinstance(self._codec, ReducedCodec)
-        piece = piece_of(
-            chunk.segment,
-            batch,
-            Places.of([chunk]).take(rows),
-            self._codec,
-            State.REDUCED if is_reduced else State.EXPIRED,
-            has_publish_time=has_publish_time,
-            columns=lambda decoded: columns_from(decoded, self._shape),
-        )
-        surplus = np.zeros(len(rows), np.bool_)
-        surplus[piece.surplus] = True
-        payloads = map(batch.payload, range(len(batch)))
-        about = [parsed(p)[:2] if is_reduced else (len(p), sha256(p).digest()) for p in payloads]
-        more = {
-            "sequence": pa.array(batch.sequence),
-            "size": pa.array([size for size, _ in about], pa.uint64()),
-            "sha256": pa.array([digest for _, digest in about], pa.binary()),
-            "surplus": pa.array(surplus),
-        }
-        own = {**piece.own, "pub": pa.array(batch.publish_time)}
-        ref = own["ref"]
-        names = [field.name for field in ref.type]
-        own["ref"] = structs({**dict(zip(names, ref.flatten(), strict=True)), **more}, len(rows))
-        return as_table(own, piece.fields)
-
-
 class RowsWriter:
     """Writes what is left of the messages of a log.
 
@@ -133,7 +89,7 @@ class RowsWriter:
         self._channels = channels
         self._front = front
         self._version = version
-        self._columns: dict[_Kind, RowColumns] = {}
+        self._of_kind: dict[_Kind, tuple[Codec, FieldShape]] = {}
         self._open: dict[tuple[_Kind, pa.Schema], _OpenFile] = {}
         self.names: list[str] = []
         """Names of the files, the first one first."""
@@ -152,11 +108,9 @@ class RowsWriter:
             kind = channel.topic, table_schema_of(channel), is_reduced
             by_kind.setdefault(kind, []).append(number)
         for kind, numbers in by_kind.items():
-            if kind not in self._columns:
-                self._columns[kind] = RowColumns(self._channels[numbers[0]])
-            has_publish_time = {n: self._channels[n].has_publish_time for n in numbers}
-            rows = np.flatnonzero(np.isin(chunk.batch.channel, numbers))
-            table = self._columns[kind].table(chunk, rows, has_publish_time)
+            if kind not in self._of_kind:
+                self._of_kind[kind] = codec_for(self._channels[numbers[0]]), FieldShape()
+            table = _table(chunk, numbers, *self._of_kind[kind])
             file = self._file(kind, table.schema)
             file.tables.append(table)
             file.waiting += table.nbytes
@@ -223,6 +177,37 @@ class RowsWriter:
         except OSError as error:
             raise durability.explain(error, file.writer.path, "writing") from error
         self._written.append(rows_line(self._log, file.name, size, digest, parts))
+
+
+def _table(
+    chunk: StoredChunk, channels: Sequence[int], codec: Codec, shape: FieldShape
+) -> pa.Table:
+    """Rows of the messages of one type in a chunk, in its order."""
+    rows = np.flatnonzero(np.isin(chunk.batch.channel, channels))
+    batch = chunk.batch.take(rows)
+    is_reduced = isinstance(codec, ReducedCodec)
+    piece = piece_of(
+        chunk.segment,
+        batch,
+        Places.of([chunk]).take(rows),
+        codec,
+        State.REDUCED if is_reduced else State.EXPIRED,
+        has_publish_time=dict.fromkeys(channels, True),  # those that have none repeat log times
+        columns=lambda decoded: columns_from(decoded, shape),
+    )
+    surplus = np.zeros(len(rows), np.bool_)
+    surplus[piece.surplus] = True
+    payloads = map(batch.payload, range(len(batch)))
+    about = [parsed(p)[:2] if is_reduced else (len(p), sha256(p).digest()) for p in payloads]
+    ref = piece.own["ref"]
+    more = {
+        **dict(zip([field.name for field in ref.type], ref.flatten(), strict=True)),
+        "sequence": pa.array(batch.sequence),
+        "size": pa.array([size for size, _ in about], pa.uint64()),
+        "sha256": pa.array([digest for _, digest in about], pa.binary()),
+        "surplus": pa.array(surplus),
+    }
+    return as_table({**piece.own, "ref": structs(more, len(rows))}, piece.fields)
 
 
 def _part(chunk: StoredChunk, own: NDArray[np.bool_]) -> Part:

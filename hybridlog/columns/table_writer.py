@@ -36,7 +36,7 @@ from hybridlog.columns.layout import (
 )
 from hybridlog.columns.rows import Piece, Places, as_table, columns_from, piece_of
 from hybridlog.index.indexing import rows_by_channel
-from hybridlog.schema.codec import Codec
+from hybridlog.schema.codec import Codec, no_rows
 from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.left import LeftFields
 from hybridlog.schema.states import State, encoding_of, state_of
@@ -90,25 +90,29 @@ class _Topic:
     def __init__(self, recording: str, channel: Channel, *, arrays: bool = False) -> None:
         from hybridlog.columns.clouds import PointColumns, is_cloud
         from hybridlog.columns.fields import FieldShape
+        from hybridlog.schema.arrow_columns import structs
 
         self.recording = recording
         self.name = channel.topic
         self.type = channel.schema.name if channel.schema is not None else ""
         self.has_arrays = arrays
-        whole = replace(channel, message_encoding=_encoding_of(channel))
+        encoding = encoding_of(channel.message_encoding, channel.metadata)
+        whole = replace(channel, message_encoding=encoding)
         self.points = PointColumns() if arrays and is_cloud(whole) else None
         reserved = RESERVED if self.points is None else RESERVED | {POINTS}
         self.shape: FieldShape = FieldShape(arrays=arrays, reserved=reserved)
-        self.kind = _defined_fields(channel, self.shape)
-        """Type of the columns of fields, as far as the definition fixes it."""
+        codec, none = codec_for(whole), no_rows()
+        decoded = codec.columns(b"", none, none) if codec.indexed else None
+        self.none = structs({}, 0) if decoded is None else self.shape.columns(decoded.arrow())
+        """No fields, with the columns that the definition fixes."""
         self.is_wanted = True
         self.rows = 0
         self.pieces: list[Piece] = []
         """Rows in memory."""
         self.size = 0
         """Bytes of the rows in memory."""
-        self.files: dict[int, list[_File]] = {}
-        """Unfinished files of segments that are not closed yet."""
+        self.files: list[_File] = []
+        """Unfinished files, with rows of segments that are not closed yet."""
         self.finished: list[tuple[str, Path]] = []
         """Folders and paths of finished files."""
         self.has_failed = False
@@ -132,9 +136,8 @@ class _Topic:
         self.pieces.clear()
         self.size = 0
         self.finished.clear()
-        for unfinished in self.files.values():
-            for file in unfinished:
-                file.discard()
+        for file in self.files:
+            file.discard()
         self.files.clear()
 
     def columns(self, decoded: Decoded) -> Any:
@@ -156,15 +159,12 @@ class _Topic:
 
         from hybridlog.columns.fields import joined as joined_columns
 
-        with_fields = [piece.fields for piece in pieces if piece.fields is not None]
-        kind = self.kind if self.kind is not None or not with_fields else with_fields[0].type
-        fields = None
-        if kind is not None:
-            found = [
-                pa.nulls(piece.rows, kind) if piece.fields is None else piece.fields
-                for piece in pieces
-            ]
-            fields = joined_columns([pa.nulls(0, kind), *found])
+        missing = (pa.nulls(piece.rows, self.none.type) for piece in pieces)
+        found = [
+            none if piece.fields is None else piece.fields
+            for piece, none in zip(pieces, missing, strict=True)
+        ]
+        fields = joined_columns([self.none, *found])
         own = {
             name: pa.concat_arrays([piece.own[name] for piece in pieces]) for name in pieces[0].own
         }
@@ -175,20 +175,6 @@ class _Topic:
         table = as_table(columns | own, fields)
         order = order_of(own["t"].to_numpy(), own["seq"].to_numpy())
         return table if order is None else table.take(pa.array(order))
-
-
-def _defined_fields(channel: Channel, shape: FieldShape) -> Any:
-    """Type of the columns of the fields that a definition fixes; None without any."""
-    codec = codec_for(replace(channel, message_encoding=_encoding_of(channel)))
-    if not codec.indexed:
-        return None
-    none = np.empty(0, np.int64)
-    kind = shape.columns(codec.columns(b"", none, none).arrow()).type
-    return kind if kind.num_fields else None
-
-
-def _encoding_of(channel: Channel) -> str:
-    return encoding_of(channel.message_encoding, channel.metadata)
 
 
 def _counts(pieces: Sequence[Piece]) -> TopicCounts:
@@ -206,7 +192,7 @@ class _File:
         self.path = path
         self.schema: Any = None
         self._topic = topic
-        self._segments: set[int] = set()
+        self.segments: set[int] = set()
         self._counts = TopicCounts(0)
         self._writer: ParquetFileWriter | None = None
 
@@ -228,7 +214,7 @@ class _File:
         step = _rows_of_group(table)
         for begin in range(0, table.num_rows, step):
             self._writer.write(table.slice(begin, step))
-        self._segments.update(piece.segment for piece in pieces)
+        self.segments.update(piece.segment for piece in pieces)
         self._counts = self._counts.plus(_counts(pieces))
 
     def _fitting(self, table: Any) -> Any:
@@ -247,7 +233,7 @@ class _File:
     def close(self, digests: Mapping[int, str]) -> None:
         """Finish the file."""
         assert self._writer is not None
-        segments = {str(number): digests[number] for number in sorted(self._segments)}
+        segments = {str(number): digests[number] for number in sorted(self.segments)}
         section = Section(self._topic.recording, self._topic.name, 0, segments, self._counts)
         self._writer.close([section])
 
@@ -313,7 +299,7 @@ class TableWriter:
             self._channels.update(channels)
             self._collect(chunk)
             self._seen.add(chunk.segment)
-            self._spill(chunk.segment)
+            self._spill()
 
     def cut(self, segment: int, digest: str) -> None:
         """Register that a segment gets no more messages."""
@@ -434,18 +420,14 @@ class TableWriter:
     def _pending(self) -> int:
         return sum(topic.size for topic in self._topics.values())
 
-    def _spill(self, current: int) -> None:
-        """Write rows of the largest topics if too many are waiting in memory.
-
-        Args:
-            current: A segment that is not closed.
-        """
+    def _spill(self) -> None:
+        """Write rows of the largest topics if too many are waiting in memory."""
         if not self._has_grown or self._pending < _PENDING:
             return
         self._has_grown = False
         self._decode()
         left = self._pending
-        opened = sum(len(f) for topic in self._topics.values() for f in topic.files.values())
+        opened = sum(len(topic.files) for topic in self._topics.values())
         for topic in sorted(self._topics.values(), key=lambda topic: -topic.size):
             if left <= _LEFT:
                 return
@@ -453,30 +435,22 @@ class TableWriter:
             if opened >= _OPEN_FILES and not topic.files:
                 topic.give_up()
                 continue
-            for segment in sorted({piece.segment for piece in topic.pieces}):
-                with self._only(topic):
-                    # Waiting rows of closed segments have no file to go to.
-                    place = segment if segment not in self._cut else current
-                    opened += self._write(topic, place, topic.take({segment}))
+            with self._only(topic):
+                opened += self._write(topic, topic.take(self._seen))
 
-    def _write(self, topic: _Topic, segment: int, pieces: list[Piece]) -> int:
-        """Write rows to the unfinished file of a segment; returns the number of new files."""
+    def _write(self, topic: _Topic, pieces: list[Piece]) -> int:
+        """Write rows to an unfinished file of a topic; returns the number of new files."""
         from hybridlog.columns.fields import UnfitError
 
         if not pieces:
             return 0
         self._check_room()
-        unfinished = topic.files.setdefault(segment, [])
-        if unfinished:
-            try:
-                unfinished[-1].write(pieces)
-            except UnfitError:
-                pass
-            else:
+        if topic.files:
+            with suppress(UnfitError):
+                topic.files[-1].write(pieces)
                 return 0
-        file = _File(self._new_part(), topic)
-        unfinished.append(file)
-        file.write(pieces)
+        topic.files.append(_File(self._new_part(), topic))
+        topic.files[-1].write(pieces)
         return 1
 
     def _new_part(self) -> Path:
@@ -498,20 +472,20 @@ class TableWriter:
         for topic in self._topics.values():
             with self._only(topic):
                 pieces = [piece for piece in topic.pieces if piece.segment in self._cut]
-                if _are_long(pieces) or segment in topic.files:
-                    self._write(topic, segment, topic.take(self._cut))
+                if _are_long(pieces) or any(segment in file.segments for file in topic.files):
+                    self._write(topic, topic.take(self._cut))
                 self._finish(topic)
 
     def _finish(self, topic: _Topic) -> None:
         """Finish a topic's files of closed segments."""
-        for segment in sorted(topic.files.keys() & self._cut.keys()):
-            for file in topic.files.pop(segment):
-                file.close(self._cut)
-                folder = shape_folder(topic.type, file.schema)
-                place = self._parts / folder / file.path.name
-                files.make_folders(place.parent)
-                files.rename(file.path, place)
-                topic.finished.append((folder, place))
+        for file in [one for one in topic.files if one.segments <= self._cut.keys()]:
+            topic.files.remove(file)
+            file.close(self._cut)
+            folder = shape_folder(topic.type, file.schema)
+            place = self._parts / folder / file.path.name
+            files.make_folders(place.parent)
+            files.rename(file.path, place)
+            topic.finished.append((folder, place))
 
     def _close(self, entry: RecordingEntry) -> None:
         from hybridlog.columns.folders import Addition, TableFolders
@@ -530,7 +504,7 @@ class TableWriter:
             with self._only(topic):
                 pieces = topic.take(self._cut)
                 if _are_long(pieces):
-                    self._write(topic, max(self._cut), pieces)
+                    self._write(topic, pieces)
                     self._finish(topic)
                 elif pieces:
                     table = topic.table(pieces)

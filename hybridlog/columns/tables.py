@@ -28,7 +28,6 @@ from hybridlog.columns.layout import (
     TABLES,
     Section,
     TopicCounts,
-    is_of_folder,
     parts_folder,
     table_schema,
     type_prefix,
@@ -137,8 +136,6 @@ class _Folder:
         with suppress(FileNotFoundError, StoreError):
             file = ColumnFile(self._path / name)
             self._opened.opened(file)
-        if file is not None and not is_of_folder(self._path.name, file.schema):
-            file = None
         self._files[name] = _identity(status), file
         self._add(file)
 
@@ -203,13 +200,11 @@ class Tables:
         self._looked_at: set[str] = set()  # types whose folders were looked at
         self._sealed: OrderedDict[str, _Folders] = OrderedDict()
         self._channels: tuple[RecordingEntry, dict[str, list[ChannelEntry]]] | None = None
-        self._generation = 0
         self._lock = threading.RLock()
 
     def invalidate(self) -> None:
         """Forget all files, columns and invalid tables."""
         with self._lock:
-            self._generation += 1
             self._found.clear()
             self._looked_at.clear()
             self._folders = _Folders(self._root / TABLES, self.opened)
@@ -221,32 +216,25 @@ class Tables:
         """The table of a topic in a recording; None without one that the catalog confirms."""
         key = recording.id, topic
         with self._lock:
-            generation = self._generation
-            if key in self._found:
-                return self._found[key]
-        found = None
-        with suppress(FileNotFoundError, StoreError):
-            found = self.check(recording, topic)
-        self._note_found(key, found, generation)
-        return found
+            if key not in self._found:
+                found = None
+                with suppress(FileNotFoundError, StoreError):
+                    found = self.check(recording, topic)
+                self._found[key] = found
+                if len(self._found) > _MAX_FOUND:
+                    self._found.popitem(last=False)
+            return self._found[key]
 
     def look_again(self) -> None:
         """Look for all tables again; files that are as before stay open."""
         with self._lock:
-            self._generation += 1
             self._found.clear()
             self._looked_at.clear()
 
     def reject(self, recording: RecordingEntry, topic: str) -> None:
         """Ignore the table from now on, because it was found to be damaged."""
-        self._note_found((recording.id, topic), None, self._generation)
-
-    def _note_found(self, key: tuple[str, str], found: TopicTable | None, generation: int) -> None:
         with self._lock:
-            if generation == self._generation:
-                self._found[key] = found
-                while len(self._found) > _MAX_FOUND:
-                    self._found.popitem(last=False)
+            self._found[recording.id, topic] = None
 
     def whole(self, file: ColumnFile, *, arrays: bool) -> TopicTable:
         """All rows of a file, as if they were of one topic.

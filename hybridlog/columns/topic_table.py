@@ -154,7 +154,8 @@ class TopicTable:
         """
         own = {"t", "seq", *own}
         return sum(
-            part.file.stored(part.group, paths, own, arrays=self.has_arrays) for part in self._parts
+            part.file.size(part.group, part.file.choose(paths, own, arrays=self.has_arrays))
+            for part in self._parts
         )
 
     def scan(

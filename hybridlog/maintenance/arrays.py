@@ -80,12 +80,10 @@ def _differs(known: Tables, entry: RecordingEntry, found: ArraysOfTopic, *, off:
 
     Arrays of a recording from which some have expired are in no answer, and so in no table.
     """
-    from hybridlog.columns.fields import has_long_arrays
-
     topic, differs = found.topic, None
     for file, _, section in known.sections_of(entry):
         if section.topic == topic:
-            can_have = has_long_arrays(file.schema)
+            can_have = bool(file.arrays)
             found.has_arrays = found.has_arrays or can_have
             is_other = can_have and bool(section.counts.arrays) is off
             differs = differs or is_other

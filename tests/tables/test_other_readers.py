@@ -241,23 +241,6 @@ def test_each_folder_has_one_schema(many: hl.Store) -> None:
     assert any(len(list(folder.iterdir())) > 2 for folder in folders)
 
 
-def test_reduced_messages_have_their_fields(store: hl.Store) -> None:
-    from hybridlog.schema.codecs import codec_for
-    from hybridlog.schema.reduced_codec import reduce, reduced_channel
-
-    own = Channel("/a", "ros1", STATE)
-    with store.start("live") as recording:
-        recording.write(own, varied(1), log_time=BASE)
-        small = reduce(codec_for(own), varied(2))
-        recording.write(reduced_channel(own), small, log_time=BASE + 1)
-    query = "select state, i8 is null from read_parquet(?) order by t"
-    rows = duckdb.execute(query, [glob_of(store)]).fetchall()
-    assert rows == [("whole", False), ("reduced", False)]
-    answer = store.sql("select i8 from a")
-    assert [value is None for (value,) in answer.rows()] == [False, False]
-    assert not answer.remarks.absent
-
-
 def test_no_reader_needs_hybridlog(recorded: hl.Store) -> None:
     script = (
         "import sys, pyarrow.parquet as pq\n"

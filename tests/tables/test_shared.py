@@ -215,25 +215,6 @@ def test_rows_of_a_topic_with_two_definitions_are_made_again(
     assert making.missing(store.directory, store.entry("two")) == {"/two"}
 
 
-def test_files_that_were_exchanged_are_made_again(store: hl.Store, tmp_path: Path) -> None:
-    other = Schema("test/State", "ros1msg", b"int32 one\n")
-    record(store, tmp_path, 0)
-    said = [(BASE + n, "/c", bytes(4)) for n in range(5)]
-    log = write_log(tmp_path / "other.mcap", said, {"/c": ("ros1", other)})
-    store.record(log, name="other")
-    one, two = files_of(store)
-    rows = [pq.read_metadata(path).num_rows for path in (one, two)]
-    one.rename(tmp_path / "kept")
-    two.rename(one)
-    (tmp_path / "kept").rename(two)
-    store.refresh()
-    assert store.topic("/a").where("i8 > 0").count() == 6
-    assert store.topic("/b").where("i8 > 0").count() == 6
-    assert store.topic("/c").where("one = 0").count() == 5
-    store.mend()
-    assert [pq.read_metadata(path).num_rows for path in (one, two)] == rows
-
-
 @pytest.mark.parametrize("name", ["shared-old", "{} (1)", "{}_1"])
 def test_a_file_with_an_odd_name_is_in_no_ones_way(
     store: hl.Store, tmp_path: Path, name: str, caplog: pytest.LogCaptureFixture
