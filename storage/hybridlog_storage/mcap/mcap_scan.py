@@ -68,15 +68,6 @@ _BETWEEN_CHUNKS: Final = {
 }
 _IN_DATA: Final = _BETWEEN_CHUNKS | {Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE}
 _MESSAGE_SIZE: Final = 22  # bytes of its fields before the payload
-_LEAST: Final[dict[int, int]] = {
-    Opcode.HEADER: 8,
-    Opcode.SCHEMA: 14,
-    Opcode.CHANNEL: 16,
-    Opcode.MESSAGE: _MESSAGE_SIZE,
-    Opcode.ATTACHMENT: 36,
-    Opcode.METADATA: 8,
-    Opcode.DATA_END: 4,
-}
 _FIRST_PRIVATE: Final = 0x80
 
 Item: TypeAlias = McapRecord | Attachment | ChunkContent | Damage
@@ -200,8 +191,6 @@ class Scan:
             yield self._lost(at, what if opcode else "no record starts here")
         elif opcode == Opcode.MESSAGE:
             yield from self._loose(at, end)
-        elif LAST_KNOWN < opcode < _FIRST_PRIVATE and not self._goes_on(end):
-            yield self._lost(at, f"a record of kind {opcode}")
         else:
             self._at, self._behind = end, at + HEAD
             yield from self._plain(at, opcode, end)
@@ -454,7 +443,7 @@ class Scan:
         if opcode == Opcode.MESSAGE_INDEX:
             entries = int.from_bytes(raw[HEAD + 2 :], "little")
             return end if entries + 6 == length and entries % 16 == 0 else None
-        return end if length >= _LEAST.get(opcode, 0) else None
+        return end
 
     def _goes_on(self, at: int) -> bool:
         """True if `at` is the start of a record or the end of the data."""
