@@ -153,9 +153,8 @@ class Scan:
                     continue
                 if self._at < self._bytes.size:
                     why = "bytes follow the end of the log"
-                    why = why if is_closed else "the summary is damaged"
-                    yield _damage(self._at, self._bytes.size - self._at, why, 0)
-                    return
+                    yield self._behind_end(why if is_closed else "the summary is damaged")
+                    is_closed = True  # the damage tells it
         if not (is_closed or self._is_torn):
             why = "the file was not closed: its end is missing; all before it was read"
             yield _damage(self._bytes.size, 0, why, 0)
@@ -343,8 +342,8 @@ class Scan:
 
     def _message_index(self, at: int, fields: bytes) -> Iterator[tuple[int, Item]]:
         """Tell that a chunk was missed: it has one index for each channel."""
-        size = 6 + int.from_bytes(fields[2:], "little")
-        self._behind = min(self._behind + size, self._at)
+        if self._behind + 6 + int.from_bytes(fields[2:], "little") == self._at:
+            self._behind = self._at
         if self.summary is not None or not any(fields[2:]):
             return  # totals tell it, too
         channel = int.from_bytes(fields[:2], "little")
@@ -398,6 +397,14 @@ class Scan:
             if not is_in_summary(opcode) or end > self._bytes.size:
                 return False
             self._at = end
+
+    def _behind_end(self, why: str) -> tuple[int, Item]:
+        """Go on with the next chunk behind the end of a log, if there is one."""
+        at, size = self._at, self._bytes.size
+        found = self._bytes.search(at, size, {Opcode.CHUNK}, self._is_start)
+        self._at = self._behind = size if found is None else found
+        self._has_ended, self._stop = found is None, None
+        return _damage(at, self._at - at, why, 0)
 
     # Behind damage
 
