@@ -23,7 +23,6 @@ from hybridlog.formats.reading import BATCH_BYTES, BATCH_MESSAGES, Damage
 from hybridlog_storage.mcap.mcap_scan import MAGIC
 from hybridlog_storage.segments.segment_format import METADATA_CHECK
 from tests import places
-from tests.data import DATA, needs_data
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -123,19 +122,6 @@ def test_a_count_that_no_file_can_hold_is_not_kept(tmp_path: Path) -> None:
     found = read(path)
     assert len(found.messages) == 1
     assert found.lost == [None]
-
-
-@needs_data
-def test_all_conformance_files_give_their_messages_and_no_damage() -> None:
-    files = sorted(DATA.glob("mcap-conformance/data/*/*.mcap"))
-    assert len(files) == 416
-    total = 0
-    for path in files:
-        found = read(path)
-        assert found.messages == official(path), path.name
-        assert found.damage == [], path.name
-        total += len(found.messages)
-    assert total == 1768
 
 
 # Files made here

@@ -495,26 +495,6 @@ def test_official_readers_see_every_message(
     assert counted == len(seen)
 
 
-@settings(max_examples=30, deadline=None)
-@given(batches=st.lists(rows_of, max_size=4))
-def test_reader_gives_the_chunks_that_were_written(
-    tmp_path_factory: pytest.TempPathFactory, batches: list[list[Row]]
-) -> None:
-    paths, chunks = write(
-        tmp_path_factory.mktemp("r"), batches, SegmentSettings(chunk_size=2048, large_payload=64)
-    )
-    (path,) = paths
-    with SegmentReader(path, 0) as reader:
-        summary = reader.summary()
-        assert summary.recording["id"] == RECORDING["id"]
-        assert summary.end == {"status": "complete", "segments": 1}
-        assert [p.offset for p in summary.chunks] == [c.offset for c in chunks]
-        for place, chunk in zip(summary.chunks, chunks, strict=True):
-            assert content_of(reader.read_chunk(place)) == content_of(chunk)
-    seqs = sorted(s for c in chunks for s in c.seq.tolist())
-    assert seqs == list(range(sum(map(len, batches))))
-
-
 def many(count: int, channel: int = 0, size: int = 100, step: int = 10**7) -> list[Row]:
     return [(channel, bytes([i % 251]) * size, i * step, i * step, i) for i in range(count)]
 

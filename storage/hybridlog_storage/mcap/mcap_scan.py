@@ -68,15 +68,6 @@ _BETWEEN_CHUNKS: Final = {
 }
 _IN_DATA: Final = _BETWEEN_CHUNKS | {Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE}
 _MESSAGE_SIZE: Final = 22  # bytes of its fields before the payload
-_LEAST: Final[dict[int, int]] = {
-    Opcode.HEADER: 8,
-    Opcode.SCHEMA: 14,
-    Opcode.CHANNEL: 16,
-    Opcode.MESSAGE: _MESSAGE_SIZE,
-    Opcode.ATTACHMENT: 36,
-    Opcode.METADATA: 8,
-    Opcode.DATA_END: 4,
-}
 _FIRST_PRIVATE: Final = 0x80
 
 Item: TypeAlias = McapRecord | Attachment | ChunkContent | Damage
@@ -162,9 +153,8 @@ class Scan:
                     continue
                 if self._at < self._bytes.size:
                     why = "bytes follow the end of the log"
-                    why = why if is_closed else "the summary is damaged"
-                    yield _damage(self._at, self._bytes.size - self._at, why, 0)
-                    return
+                    yield self._behind_end(why if is_closed else "the summary is damaged")
+                    is_closed = True  # the damage tells it
         if not (is_closed or self._is_torn):
             why = "the file was not closed: its end is missing; all before it was read"
             yield _damage(self._bytes.size, 0, why, 0)
@@ -200,8 +190,6 @@ class Scan:
             yield self._lost(at, what if opcode else "no record starts here")
         elif opcode == Opcode.MESSAGE:
             yield from self._loose(at, end)
-        elif LAST_KNOWN < opcode < _FIRST_PRIVATE and not self._goes_on(end):
-            yield self._lost(at, f"a record of kind {opcode}")
         else:
             self._at, self._behind = end, at + HEAD
             yield from self._plain(at, opcode, end)
@@ -354,8 +342,8 @@ class Scan:
 
     def _message_index(self, at: int, fields: bytes) -> Iterator[tuple[int, Item]]:
         """Tell that a chunk was missed: it has one index for each channel."""
-        size = 6 + int.from_bytes(fields[2:], "little")
-        self._behind = min(self._behind + size, self._at)
+        if self._behind + 6 + int.from_bytes(fields[2:], "little") == self._at:
+            self._behind = self._at
         if self.summary is not None or not any(fields[2:]):
             return  # totals tell it, too
         channel = int.from_bytes(fields[:2], "little")
@@ -410,6 +398,14 @@ class Scan:
                 return False
             self._at = end
 
+    def _behind_end(self, why: str) -> tuple[int, Item]:
+        """Go on with the next chunk behind the end of a log, if there is one."""
+        at, size = self._at, self._bytes.size
+        found = self._bytes.search(at, size, {Opcode.CHUNK}, self._is_start)
+        self._at = self._behind = size if found is None else found
+        self._has_ended, self._stop = found is None, None
+        return _damage(at, self._at - at, why, 0)
+
     # Behind damage
 
     def _torn(self, at: int, reason: str) -> tuple[int, Item]:
@@ -454,7 +450,7 @@ class Scan:
         if opcode == Opcode.MESSAGE_INDEX:
             entries = int.from_bytes(raw[HEAD + 2 :], "little")
             return end if entries + 6 == length and entries % 16 == 0 else None
-        return end if length >= _LEAST.get(opcode, 0) else None
+        return end
 
     def _goes_on(self, at: int) -> bool:
         """True if `at` is the start of a record or the end of the data."""
