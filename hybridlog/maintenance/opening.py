@@ -51,7 +51,6 @@ if TYPE_CHECKING:
     from hybridlog_storage.summary import RecordingSummary, TopicType
 
 
-
 def open_catalog(directory: StoreDirectory) -> Catalog:
     """Open the catalog of a store; in memory if the store cannot be written."""
     return Catalog(
@@ -240,10 +239,9 @@ class StoreFiles:
         With `mends`, what a crash has left is mended.
         """
         directory, catalog = self.directory, self.catalog
-        can_write = not catalog.is_in_memory and os.access(directory.recording(recording), os.W_OK)
-        may_mend = can_write and self.report.disk_full is None
+        mends = self.mends and self.report.disk_full is None and not catalog.is_in_memory
         try:
-            if self.mends and may_mend:
+            if mends and os.access(directory.recording(recording), os.W_OK):
                 with suppress(HeldError, TopicError), directory.writing(recording):
                     if not recover(directory, recording, self.report):
                         return None
