@@ -111,10 +111,14 @@ class OpenStore(Shared):
         if self._latest is not None and self._latest.snapshot() is before:
             self._latest = now.again()
 
-    def catch_up(self, *recordings: str) -> None:
+    def catch_up(self, *recordings: str, mends: bool = False) -> None:
         """See which recordings came or went, and how some others are now.
 
         All else that was read stays, so this costs little in a store of thousands.
+
+        Args:
+            recordings: Their ids.
+            mends: Recover those of them that a crash has cut short.
         """
         with self.following:
             if self._latest is None:
@@ -130,7 +134,7 @@ class OpenStore(Shared):
                 if len(before) + len(come) > len(names):
                     ids |= before.by_id.keys() - {*names}
                 ids.update(come)
-            now = self._files.catch_up(before, ids)
+            now = replace(self._files, mends=mends).catch_up(before, ids)
             if now is None or (has_changed and self.directory.changed()[0] != changed[0]):
                 self.invalidate()
                 return
@@ -166,7 +170,7 @@ class OpenStore(Shared):
         """Repair what questions met: recordings after a crash, missing and damaged tables.
 
         Args:
-            seconds: What takes longer stays in `repairs.noted` and `repairs.noted_tables`.
+            seconds: For recordings that take longer, tables stay in `repairs.noted_tables`.
 
         Raises:
             DiskFullError: There is no room.
@@ -180,13 +184,13 @@ class OpenStore(Shared):
         from hybridlog.maintenance.tables import make_noted
 
         repairs = self.repairs
-        self.now()  # notes what this process has changed
-        mended = replace(self._files, mends=True).mend(until)
-        if mended:
+        known = self.now().snapshot().summaries
+        died = [one.id for one in known if one.status == "unfinished"]
+        if died and time.monotonic() < until:
             with self.following:
-                for recording in mended:
+                for recording in died:
                     self._running.pop(recording, None)
-                self.catch_up(*mended)
+                self.catch_up(*died, mends=True)
         by_recording: dict[str, set[str]] = {}
         for recording, topic in [*repairs.noted_tables]:
             by_recording.setdefault(recording, set()).add(topic)

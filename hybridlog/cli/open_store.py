@@ -152,10 +152,9 @@ def _print_rebuilt(store: Store, doing: str) -> None:
 
 def _print_left(store: Store) -> None:
     """Name what was met and takes longer to repair."""
-    found = {"recording": len(store.repairs.noted), "table": len(store.repairs.noted_tables)}
-    left = " and ".join(counted(number, what) for what, number in found.items() if number)
+    left = len(store.repairs.noted_tables)
     if left and store.directory.is_writable:
-        note(f"Left to repair: {left}. `hybridlog verify --repair` does it.")
+        note(f"Left to repair: {counted(left, 'table')}. `hybridlog verify --repair` does it.")
 
 
 @contextmanager

@@ -7,7 +7,6 @@ are not opened.
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Collection, Mapping
 from collections.abc import Set as AbstractSet
 from contextlib import suppress
@@ -51,9 +50,6 @@ if TYPE_CHECKING:
     from hybridlog_storage.segments.segment_file import Sealed
     from hybridlog_storage.summary import RecordingSummary, TopicType
 
-_RECOVERED_BYTES_PER_S = 200e6
-"""Size of the open segments that are recovered in a second, about."""
-
 
 def open_catalog(directory: StoreDirectory) -> Catalog:
     """Open the catalog of a store; in memory if the store cannot be written."""
@@ -73,7 +69,7 @@ class StoreFiles:
         directory: The store.
         catalog: Its catalog.
         report: Collects problems and repairs.
-        mends: Whether what a crash has left is repaired, or else noted.
+        mends: Whether what a crash has left is repaired.
     """
 
     directory: StoreDirectory
@@ -240,13 +236,12 @@ class StoreFiles:
     def _refresh(self, recording: str) -> Described | None:
         """Read what is whole of a recording, and put it into the catalog; None if it is gone.
 
-        What a crash has left is mended, or else noted.
+        With `mends`, what a crash has left is mended.
         """
         directory, catalog = self.directory, self.catalog
-        can_write = not catalog.is_in_memory and os.access(directory.recording(recording), os.W_OK)
-        may_mend = can_write and self.report.disk_full is None
+        mends = self.mends and self.report.disk_full is None and not catalog.is_in_memory
         try:
-            if self.mends and may_mend:
+            if mends and os.access(directory.recording(recording), os.W_OK):
                 with suppress(HeldError, TopicError), directory.writing(recording):
                     if not recover(directory, recording, self.report):
                         return None
@@ -254,8 +249,6 @@ class StoreFiles:
                     catalog.put(described)
                     return described
             is_open = directory.is_recorded(recording)
-            if may_mend and not (self.mends or is_open) and is_unfinished(directory, recording):
-                self.report.noted.add(recording)
             described = describe_now(directory, catalog, recording, is_open=is_open)
         except RecordingGoneError:
             return None
@@ -265,36 +258,6 @@ class StoreFiles:
             return None  # another process has just removed it
         catalog.put(described, waits=False)
         return described
-
-    def mend(self, until: float) -> set[str]:
-        """With `mends`, recover the recordings that were noted, and update their catalog rows.
-
-        Args:
-            until: When this should end, by `time.monotonic`; what would take longer stays noted.
-
-        Returns:
-            Ids of the recordings.
-        """
-        mended, report = set(), self.report
-        for recording in sorted([*report.noted]):  # other threads note more
-            if (
-                _open_bytes(self.directory, recording)
-                > (until - time.monotonic()) * _RECOVERED_BYTES_PER_S
-            ):
-                continue
-            report.noted.discard(recording)
-            report.unreadable.pop(recording, None)
-            try:
-                described = self._refresh(recording)
-            except DiskFullError:
-                raise
-            except StoreError as error:
-                if self.directory.has(recording):
-                    report.unreadable[recording] = str(error)
-                continue
-            if described is not None:
-                mended.add(described.entry.id)
-        return mended
 
 
 def _lost(directory: StoreDirectory, name: str) -> str:
@@ -307,15 +270,6 @@ def _lost(directory: StoreDirectory, name: str) -> str:
     if listing.sealed or listing.rows or listing.open:
         return NO_MANIFEST.format(name)
     return "it has neither a manifest nor a segment, but other files"
-
-
-def _open_bytes(directory: StoreDirectory, recording: str) -> int:
-    """Size of the segments of a recording that are not sealed."""
-    path, found = directory.recording(recording), 0
-    for name in directory.listing(recording).open.values():
-        with suppress(OSError):
-            found += files.status(path / name).st_size
-    return found
 
 
 def recover(directory: StoreDirectory, recording: str, report: RepairReport) -> bool:
@@ -359,17 +313,6 @@ def recover(directory: StoreDirectory, recording: str, report: RepairReport) -> 
 
     directory.manifests.change(recording, change)
     return True
-
-
-def is_unfinished(directory: StoreDirectory, recording: str) -> bool:
-    """True if `recover` has something to do: new files alone may be as the manifest says."""
-    try:
-        manifest = directory.manifests.read(recording)
-        listing = directory.listing(recording)
-    except StoreError:
-        return True
-    is_listed = listing.sealed.keys() <= manifest.logs.keys()
-    return not is_listed or _is_interrupted(manifest, listing)  # others may be whole
 
 
 def _is_interrupted(manifest: Manifest, listing: Listing) -> bool:

@@ -32,7 +32,6 @@ class RepairReport:
         damage: Reasons why data files of the embedded MongoDB were replaced by empty ones.
         tables: Recording and topic of tables that were missing or damaged, and made again.
         disk_full: The error if the disk had no room for repairs, else None.
-        noted: Ids of recordings that a question met after a crash; they are yet to be repaired.
         noted_tables: Recording's id and topic of tables that a question met missing or damaged.
     """
 
@@ -43,7 +42,6 @@ class RepairReport:
     damage: list[str] = field(default_factory=list)
     tables: list[tuple[str, str]] = field(default_factory=list)
     disk_full: DiskFullError | None = None
-    noted: set[str] = field(default_factory=set)
     noted_tables: set[tuple[str, str]] = field(default_factory=set)
 
 
