@@ -133,9 +133,15 @@ class _Folder:
         if name in self._files or status is None:
             return
         file: ColumnFile | None = None
-        with suppress(FileNotFoundError, StoreError):
-            file = ColumnFile(self._path / name)
+        for _ in range(2):  # of an object in a bucket, the first look tells that it has gone
+            try:
+                file = ColumnFile(self._path / name)
+            except FileNotFoundError:
+                return
+            except StoreError:
+                continue
             self._opened.opened(file)
+            break
         self._files[name] = _identity(status), file
         self._add(file)
 
