@@ -124,7 +124,11 @@ ALLOWED = {
     "starlette": ("hybridlog.view",),
     "uvicorn": ("hybridlog.view.server",),
     "websockets": ("hybridlog.view.playback.server",),
-    "yaml": ("hybridlog.formats.rosbag2.writer", "hybridlog.formats.yaml_values"),
+    "yaml": (
+        "hybridlog.formats.rosbag2.writer",
+        "hybridlog.formats.yaml_values",
+        "hybridlog.training.feature_map",
+    ),
     "zstandard": (
         "hybridlog.formats.log_set",
         "hybridlog.formats.spool",

@@ -17,7 +17,6 @@ from hybridlog.cli.answers import check_room, not_written, write_answer
 from hybridlog.cli.binder import argument, command, option
 from hybridlog.cli.options import Filtered, Forced, Served
 from hybridlog.cli.signals import ended_by_signal, if_stopped
-from hybridlog.formats.slices import cached_slice
 from hybridlog.wording import listed
 from hybridlog_storage.errors import HybridlogError, MissingDependencyError
 
@@ -106,6 +105,7 @@ def open_command(given: _Given) -> None:
 def _written(store: Store, query: Query, given: _Given) -> Path:
     """The slice as an MCAP file."""
     from hybridlog.attachments import extras_of
+    from hybridlog.formats.slices import cached_slice
 
     def write(query: Query, path: Path) -> None:
         write_answer(
