@@ -158,7 +158,8 @@ def print_table(
     """
     source = iter(rows)
     block = [*islice(source, ROWS_AT_ONCE)]
-    alike = [one for one in columns if one.varies and len({*map(one.cell, block)}) < 2]
+    is_all = len(block) < ROWS_AT_ONCE
+    alike = [one for one in columns if is_all and one.varies and len({*map(one.cell, block)}) < 2]
     titles = max(titles - sum(one in alike for one in columns[:titles]), 1)
     columns = [one for one in columns if one not in alike]
     shape = _shape(columns, block)
