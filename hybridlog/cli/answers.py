@@ -23,7 +23,6 @@ from hybridlog.cli.progress import Bar
 from hybridlog.cli.render import ROWS_AT_ONCE, Column, print_table
 from hybridlog.cli.signals import if_stopped
 from hybridlog.formats import OUTPUTS, formats_of, is_directory, suffixes_of
-from hybridlog.formats.slices import IN_FORCE, Front, log_of, payload_bytes
 from hybridlog_storage.disk.unfinished import is_published
 from hybridlog_storage.errors import PayloadError, UsageError
 from hybridlog_storage.stopping import anywhere
@@ -33,6 +32,7 @@ if TYPE_CHECKING:
 
     from hybridlog.attachments import Extras
     from hybridlog.formats.answer import Answer, Line
+    from hybridlog.formats.slices import Front
     from hybridlog.formats.writing import Target
     from hybridlog.message import Message
     from hybridlog.query.answers.completeness import Completeness
@@ -273,7 +273,7 @@ def write_answer(
     form: str,
     target: Target,
     *,
-    front: Front = IN_FORCE,
+    front: Front | None = None,
     extras: Extras | None = None,
     quiet: bool = False,
     strict: bool = False,
@@ -284,9 +284,11 @@ def write_answer(
     Returns:
         Messages that are missing, because they do not fit their definition.
     """
+    from hybridlog.formats.slices import IN_FORCE, payload_bytes
+
     counters, written = query.counters, 0
     counts = OUTPUTS[form].content in {"lines", "table"} and query.question.frame is None
-    answer = _answer_of(query, form, target, front, extras)
+    answer = _answer_of(query, form, target, front or IN_FORCE, extras)
     completeness = query.completeness if strict and query.question.frame is not None else None
 
     def told(pieces: Iterable[_T]) -> Iterator[_T]:
@@ -318,6 +320,7 @@ def _answer_of(
 ) -> Answer:
     """The answer in the form that a format takes."""
     from hybridlog.formats.answer import Answer
+    from hybridlog.formats.slices import Front, log_of
 
     content, question = OUTPUTS[form].content, query.question
     if content in {"pictures", "video"}:

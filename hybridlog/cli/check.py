@@ -70,11 +70,10 @@ def check_command(given: _Given) -> None:
                 raise UsageError("A contract is made from one good recording: name it with -r.")
             write_bytes(make, contract_of(found).encode())
             return
-        is_one = len({one.recording for one in found}) == 1
         # Losses are left out only where there are none; a late start may be why a topic is bad.
         has_losses = any(one.lost != 0 for one in found)
         columns = [
-            *([] if is_one else [Column("recording")]),
+            Column("recording", varies=True),
             Column("topic"),
             Column("messages", side="right"),
             Column("Hz", lambda row: row["rate_hz"] and f"{row['rate_hz']:.2f}", "right", order=3),

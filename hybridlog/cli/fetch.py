@@ -26,11 +26,11 @@ from hybridlog.cli.completion import complete_path
 from hybridlog.cli.options import Asking, Slices, in_frame, parse_fields, query_of
 from hybridlog.cli.signals import Stopped
 from hybridlog.formats import OUTPUTS, formats_of, is_directory
-from hybridlog.formats.slices import Front
 from hybridlog_storage.errors import TopicError, UsageError
 from hybridlog_storage.stopping import at_safe_points
 
 if TYPE_CHECKING:
+    from hybridlog.formats.slices import Front
     from hybridlog.query.query import Query
     from hybridlog.store import Store
 

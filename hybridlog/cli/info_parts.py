@@ -227,10 +227,11 @@ def _write(found: list[StoredAttachment], target: Path, *, is_one: bool, force: 
         paths = [target / name for name in file_names(found)]
     for path in paths:
         check_room(path, force=force)
-    try:
-        (target if paths != [target] else target.parent).mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UsageError(f"{target} cannot be made: {error.strerror}.") from error
+    if paths != [target]:
+        try:
+            target.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise UsageError(f"{target} cannot be made: {error.strerror}.") from error
     for attachment, path in zip(found, paths, strict=True):
         with if_stopped(partial(not_written, path)):
             attachment.save(path)

@@ -43,7 +43,10 @@ class _Given(Choosing, InStore, AsJson, Quiet):
     fields_age: str | None = option(
         "Recordings older than this go, with fields and counts, such as 2y.", "DURATION"
     )
-    save: bool = option("Write these rules into the store, for recorders too.")
+    save: bool = option(
+        "Write these rules into the store, for recorders too.",
+        needs=("quota", "min_free", "max_age", "topic", "never_tag", "fields_age"),
+    )
     dry_run: bool = option("Only say what would go.")
     pin: bool = option(
         "Pin recordings, or a time of them: it never goes.", excludes=("unpin", "pins", *_RULES)
@@ -78,7 +81,7 @@ def keep_command(given: _Given) -> None:
     90 % whole segments, the oldest first. Exits with 1 when not enough may go.
     """
     rules = {} if given.pin else _rules(given)
-    _check(given, rules)
+    _check(given)
     with given.opened() as store:
         if given.pin:
             found = _pin(store, given)
@@ -106,15 +109,13 @@ def _rules(given: _Given) -> dict[str, Any]:
     return {key: value for key, value in named.items() if value}
 
 
-def _check(given: _Given, rules: dict[str, Any]) -> None:
+def _check(given: _Given) -> None:
     """Refuse options that do not go together."""
     is_all = given.choice.is_everything
     if given.pin and is_all:
         raise UsageError("Choose the recordings to pin: -r 'monday*', --tag robot=7, -r '*'.")
     if not (given.pin or given.pins or given.unpin or is_all):
         raise UsageError("Rules are for the whole store; --never-tag leaves recordings out.")
-    if given.save and not rules:
-        raise UsageError("--save needs rules: --quota 200GB.")
 
 
 def _pin(store: Store, given: _Given) -> list[str]:

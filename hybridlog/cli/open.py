@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 import click
 
@@ -17,7 +17,6 @@ from hybridlog.cli.answers import check_room, not_written, write_answer
 from hybridlog.cli.binder import argument, command, option
 from hybridlog.cli.options import Filtered, Forced, Served
 from hybridlog.cli.signals import ended_by_signal, if_stopped
-from hybridlog.formats.slices import cached_slice
 from hybridlog.wording import listed
 from hybridlog_storage.errors import HybridlogError, MissingDependencyError
 
@@ -34,26 +33,21 @@ _PORT: Final = 8765
 _PLAY: Final = "`hybridlog open websocket` plays to the one in the browser"
 
 
-class _Viewer(NamedTuple):
-    """A viewer: its programs, one of which is enough, their options, and where to get one."""
-
-    programs: Sequence[str]
-    options: Sequence[str]
-    cure: str
-
-
-_VIEWERS: Final = {
-    "foxglove": _Viewer(
-        ("foxglove-studio", "lichtblick"), (), f"get it from https://foxglove.dev/download; {_PLAY}"
+_VIEWERS: Final[dict[str, tuple[Sequence[str], Sequence[str], str]]] = {
+    "foxglove": (
+        ["foxglove-studio", "lichtblick"],
+        [],
+        f"get it from https://foxglove.dev/download; {_PLAY}",
     ),
-    "lichtblick": _Viewer(
-        ("lichtblick",),
-        (),
+    "lichtblick": (
+        ["lichtblick"],
+        [],
         "get it from https://github.com/lichtblick-suite/lichtblick/releases",
     ),
     # It would listen on all interfaces for other programs.
-    "rerun": _Viewer(("rerun",), ("--bind", "127.0.0.1"), "pip install rerun-sdk"),
+    "rerun": (["rerun"], ["--bind", "127.0.0.1"], "pip install rerun-sdk"),
 }
+"""The programs of each viewer, one of which is enough, their options, and where to get one."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,7 +96,7 @@ def open_command(given: _Given) -> None:
             output.notes(query.remarks(is_empty=False))
             output.note(f"{path}: {output.size(path.stat().st_size)}, opened with {program}")
     ended = subprocess.run(  # noqa: S603
-        [program, *_VIEWERS[given.viewer].options, path.absolute()], check=False
+        [program, *_VIEWERS[given.viewer][1], path.absolute()], check=False
     )
     if ended.returncode:
         raise HybridlogError(f"{program} ended with exit code {ended.returncode}.")
@@ -111,6 +105,7 @@ def open_command(given: _Given) -> None:
 def _written(store: Store, query: Query, given: _Given) -> Path:
     """The slice as an MCAP file."""
     from hybridlog.attachments import extras_of
+    from hybridlog.formats.slices import cached_slice
 
     def write(query: Query, path: Path) -> None:
         write_answer(
@@ -131,12 +126,11 @@ def _find(viewer: str) -> str:
     import shutil
 
     programs, _, cure = _VIEWERS[viewer]
-    for name in programs:
-        found = shutil.which(name)
-        if found is not None:
-            return found
-    names = " or ".join(programs)
-    raise MissingDependencyError(f"There is no program {names} on the PATH: {cure}.")
+    found = next(filter(None, map(shutil.which, programs)), None)
+    if found is None:
+        names = " or ".join(programs)
+        raise MissingDependencyError(f"There is no program {names} on the PATH: {cure}.")
+    return found
 
 
 _MAX_SHOWN = 5  # topics

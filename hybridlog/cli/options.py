@@ -25,12 +25,12 @@ from hybridlog.cli.completion import (
 )
 from hybridlog.cli.render import Column, print_table
 from hybridlog.formats import formats_of
-from hybridlog.formats.slices import Front
 from hybridlog.query.choice import Choice
 from hybridlog.wording import parse_size
 from hybridlog_storage.errors import TopicError, UsageError
 
 if TYPE_CHECKING:
+    from hybridlog.formats.slices import Front
     from hybridlog.query.query import Query
     from hybridlog.query.times import TimeLike
     from hybridlog.recordings import Recordings
@@ -342,6 +342,8 @@ class Latched:
     @property
     def front(self) -> Front:
         """The choice of these messages."""
+        from hybridlog.formats.slices import Front
+
         return Front(latched=not self.no_latched, original_times=self.original_times)
 
 

@@ -113,12 +113,9 @@ def _print(found: Sequence[Line]) -> None:
     if not any(len(line.series.times) for line in found):
         output.note("No message.")
         return
-    shared = [
-        Column("topic", lambda line: line.topic),
-        Column("recording", lambda line: line.recording),
-    ]
     columns = [
-        *(one for one in shared if len(set(map(one.cell, found))) > 1),
+        Column("topic", lambda line: line.topic, varies=True),
+        Column("recording", lambda line: line.recording, varies=True),
         Column("field", lambda line: line.series.field),
         Column("least", lambda line: _ends(line.series)[0], "right"),
         Column("greatest", lambda line: _ends(line.series)[1], "right"),

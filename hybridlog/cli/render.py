@@ -30,6 +30,7 @@ class Column:
         short: Gives a shorter value, for a table that does not fit.
         cut: Cells may be cut off to so many characters; 0 for no.
         order: Columns are left out in this order where there is no room; 0 for never.
+        varies: It is left out where it is the same in all rows.
     """
 
     name: str
@@ -38,6 +39,7 @@ class Column:
     short: Get | None = None
     cut: int = 0
     order: int = 0
+    varies: bool = False
 
     def cell(self, row: Any, *, short: bool = False) -> str:
         """The text for a row."""
@@ -156,6 +158,10 @@ def print_table(
     """
     source = iter(rows)
     block = [*islice(source, ROWS_AT_ONCE)]
+    is_all = len(block) < ROWS_AT_ONCE
+    alike = [one for one in columns if is_all and one.varies and len({*map(one.cell, block)}) < 2]
+    titles = max(titles - sum(one in alike for one in columns[:titles]), 1)
+    columns = [one for one in columns if one not in alike]
     shape = _shape(columns, block)
     if shape is None:
         for number, row in enumerate(chain(block, source)):

@@ -50,7 +50,7 @@ def stats_command(given: _Given) -> None:
                 {"begin_ns": begin, "end_ns": end, **row}
                 for begin, end, row in zip(*spans, rows, strict=True)
             ]
-            columns = _of_rates(found, given.window)
+            columns = _of_rates(has_windows=given.window is not None)
         else:
             stats = asked.query.stats(*([] if given.fields is None else parse_fields(given.fields)))
             found = [asdict(row) for row in stats]
@@ -59,26 +59,24 @@ def stats_command(given: _Given) -> None:
             columns = _of_fields(found)
         if given.strict:
             asked.query.completeness().check()
-        given.answer(found, columns, titles=2 - (columns[0].name == "field"))
+        given.answer(found, columns, titles=2)
 
 
-def _of_rates(rows: Sequence[Mapping[str, Any]], window: str | None) -> list[Column]:
+def _of_rates(*, has_windows: bool) -> list[Column]:
     begin, end = times()
-    is_one = len({row["recording"] for row in rows}) == 1
     return [
         Column("topic"),
-        replace(begin, order=0 if window else 3),
+        replace(begin, order=0 if has_windows else 3),
         replace(end, order=2),
-        Column("recording", order=int(is_one)),
+        Column("recording", varies=True),
         Column("messages", side="right"),
         Column("Hz", lambda row: row["rate"] and f"{row['rate']:.2f}", "right"),
     ]
 
 
 def _of_fields(rows: Sequence[Mapping[str, Any]]) -> list[Column]:
-    several = len({row["topic"] for row in rows}) > 1
     # How many are no numbers is left out only where there are none.
     order = {name: 1 for name in ("nan", "infinite") if not any(row[name] for row in rows)}
     order["std"] = 2
     shown = [Column(name, side="right", order=order.get(name, 0)) for name in _NAMES]
-    return [*([Column("topic")] if several else []), Column("field"), *shown]
+    return [Column("topic", varies=True), Column("field"), *shown]

@@ -76,7 +76,7 @@ def tf_command(given: _Given) -> None:
             _show_tree(tree, to, quiet=given.quiet)
             return
         if not topic:
-            stamps = _times(tree, target, source, at=given.at, step=given.step, between=between)
+            stamps = _times(tree, given, between)
         else:
             query = given.bounded(chosen.topic(*topic))
             if len(query.topics) > 1:
@@ -100,13 +100,7 @@ def tf_command(given: _Given) -> None:
 
 
 def _times(
-    tree: FrameTree,
-    target: str,
-    source: str | None,
-    *,
-    at: tuple[str, ...],
-    step: str | None,
-    between: tuple[TimeLike, TimeLike | None] | None,
+    tree: FrameTree, given: _Given, between: tuple[TimeLike, TimeLike | None] | None
 ) -> NDArray[np.int64]:
     """The times that are wanted, ns."""
     import numpy as np
@@ -114,6 +108,7 @@ def _times(
     from hybridlog.query.times import parse_duration, parse_range, parse_time
 
     start, end = tree.span
+    target, step = given.target or "", given.step
     if step is not None:
         low, high = parse_range(*(between or (None, None)), start=start, end=end)
         length = parse_duration(step)
@@ -122,9 +117,9 @@ def _times(
         return np.arange(low, high, length, dtype=np.int64)
     if between is not None:
         raise UsageError("--between needs --step or --topic.")
-    if at:
-        return np.array([parse_time(one, start=start, end=end) for one in at], np.int64)
-    return np.array([tree.latest(target, source or target)], np.int64)
+    if given.at:
+        return np.array([parse_time(one, start=start, end=end) for one in given.at], np.int64)
+    return np.array([tree.latest(target, given.source or target)], np.int64)
 
 
 def _show_tree(tree: FrameTree, to: Destination, *, quiet: bool) -> None:

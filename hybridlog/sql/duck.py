@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, Final, TypeVar
 
 from hybridlog_storage.errors import (
+    HybridlogError,
     MissingDependencyError,
     ResourceError,
     UsageError,
@@ -150,7 +151,8 @@ class Worker:
         """The result of a call.
 
         Raises:
-            ResourceError: the time is over, or it was stopped.
+            HybridlogError: the time is over.
+            ResourceError: it was stopped.
         """
         with at_safe_points():
             future: Future[_T] = self._pool.submit(call)
@@ -168,7 +170,7 @@ class Worker:
                 raise ResourceError("The query was stopped.")
             left = _POLL_S if self._until is None else self._until - time.monotonic()
             if left <= 0:
-                raise ResourceError(
+                raise HybridlogError(
                     f"The query was stopped after {self._timeout:g} s: narrow it down, or allow "
                     "more."
                 )

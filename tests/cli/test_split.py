@@ -105,24 +105,6 @@ def test_nothing_leaves_no_file(store: Path, tmp_path: Path) -> None:
     )
 
 
-@pytest.mark.parametrize(
-    ("time", "options", "ends"),
-    [
-        *((time, ("--at", time), "begins at 2025-06-03T08:00:0") for time in ("3", "-10s")),
-        *((time, ("--at", time), "ends at 2025-06-03T08:00:0") for time in ("+900d", "2026-06-03")),
-        ("+100s", ("--at", "+1s", "--until", "+100s"), "ends at 2025-06-03T08:00:0"),
-    ],
-)
-def test_no_mark_outside_the_recording(
-    store: Path, time: str, options: tuple[str, ...], ends: str
-) -> None:
-    before = run("ls", "--json", store=store).out
-    done = run("mark", "x", "-r", "one", *options, store=store, code=2)
-    assert f"{time} is " in done.err
-    assert f"one {ends}" in done.err
-    assert run("ls", "--json", store=store).out == before
-
-
 def test_a_first_question_about_a_mark_tells_no_damage(store: Path) -> None:
     run("mark", "x", "-r", "one", "--at", "+1s", store=store)
     for _ in range(2):

@@ -120,7 +120,8 @@ def test_no_bar_elsewhere_or_when_quiet(logs: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("width", [60, 80, 160])
 def test_tables_keep_within_the_screen(width: int, store: Path) -> None:
-    for command in (("ls",), ("info", "odd"), ("info", "-t", "scan"), ("check", "-r", "odd")):
+    commands = (("ls",), ("info", "odd"), ("info", "-t", "scan"), ("check", "-r", "odd"))
+    for command in (*commands, ("stats", "imu/data", "-r", "robot")):
         code, shown = on_terminal(*command, "--store", store, width=width)
         assert code == 0
         table = plain(shown)
@@ -129,14 +130,6 @@ def test_tables_keep_within_the_screen(width: int, store: Path) -> None:
         assert max(map(len, rows.splitlines())) <= width
         assert "\x1b[31m" not in shown
         assert "\x07" not in shown
-
-
-def test_no_word_is_broken_at_eighty_columns(store: Path) -> None:
-    rows = run("diff", "robot", "torn", "--json", store=store, code=12).json
-    code, shown = on_terminal("diff", "robot", "torn", "--store", store, width=80)
-    assert code == 12
-    words = {word for row in rows for word in (row["topic"], *row["what"].split())}
-    assert words - {""} <= {*plain(shown).split()}
 
 
 def test_eighty_columns_hold_a_robot_without_a_fold(store: Path) -> None:
@@ -154,16 +147,6 @@ def test_eighty_columns_hold_a_robot_without_a_fold(store: Path) -> None:
     code, shown = on_terminal("ls", "--store", store, width=80)
     labels = [line.split()[0] for line in plain(shown).splitlines()[1:]]
     assert {*labels} == {"robot", "odd", "torn"}
-
-
-def test_statistics_at_eighty_columns_break_no_name(store: Path) -> None:
-    for words in (("stats", "imu/data"), ("stats", "--rate")):
-        rows = run(*words, "-r", "robot", "--json", store=store).json
-        code, shown = on_terminal(*words, "-r", "robot", "--store", store, width=80)
-        assert code == 0
-        name = "topic" if "--rate" in words else "field"
-        lines = [line.split()[0] for line in plain(shown).splitlines()]
-        assert lines == [name, *(row[name] for row in rows)]
 
 
 def test_versions_and_definitions_break_no_word(store: Path) -> None:

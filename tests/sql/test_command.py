@@ -134,7 +134,7 @@ def test_standard_input(root: Path) -> None:
 
 
 def test_limits(root: Path) -> None:
-    with pytest.raises(ResourceError, match=r"stopped after 0\.2 s"):
+    with pytest.raises(HybridlogError, match=r"stopped after 0\.2 s"):
         run(root, ENDLESS, "--timeout", "200ms")
     large = "select a.range, list(b.range) from range(9000) a, range(20000) b group by all"
     with pytest.raises(ResourceError, match="more than 64 MiB"):

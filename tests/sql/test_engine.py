@@ -21,6 +21,7 @@ from hybridlog.query.choice import Choice
 from hybridlog.sql import duck, engine
 from hybridlog.sql.engine import SqlConnection
 from hybridlog_storage.errors import (
+    HybridlogError,
     MissingDependencyError,
     ResourceError,
     SegmentError,
@@ -154,9 +155,9 @@ def test_memory_is_bounded(store: hl.Store) -> None:
 
 
 def test_a_timeout_ends_a_query(store: hl.Store) -> None:
-    with pytest.raises(ResourceError, match=r"stopped after 0\.2 s"):
+    with pytest.raises(HybridlogError, match=r"stopped after 0\.2 s"):
         store.sql(ENDLESS, timeout=0.2).rows()
-    with pytest.raises(ResourceError, match=r"stopped after 0\.2 s"):
+    with pytest.raises(HybridlogError, match=r"stopped after 0\.2 s"):
         list(store.sql(ENDLESS, timeout=0.2).to_batches())
     assert store.sql("select 1", timeout=60).rows() == [(1,)]
 
