@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import TypeAlias, cast
 
@@ -53,45 +52,27 @@ def to_bool(node: Predicate | Node, types: FieldTypes | Mapping[str, str] | None
     Raises:
         WhereError: it has a MongoDB filter.
     """
-    return _node(root_of(node), _Reader(FieldTypes.of(types)))
+    return _node(root_of(node), FieldTypes.of(types))
 
 
-@dataclass(frozen=True, slots=True)
-class _Reader:
-    """Follows paths into messages.
-
-    Attributes:
-        types: Types of the fields.
-    """
-
-    types: FieldTypes
-
-    def leaves(self, message: Message, target: Field) -> list[object]:
-        """Everything at a path: values, whole arrays, statistics of arrays."""
-        parts = target.parts
-        stat = self.types.statistic(parts)
-        if stat is None:
-            return list(_reach(message, parts))
-        arrays = list(_values(message, parts[:-1]))
-        found: list[object] = []
-        if self.types.known:
-            for array in arrays:
-                found.extend(self._typed_statistic(stat, array, parts[:-1]))
-            return found
-        found.extend(_reach(message, parts))
-        found.extend(
-            statistic(stat, array)
-            for array in arrays
-            if isinstance(array, list) and _has_statistic(array, stat)
-        )
-        return found
-
-    def _typed_statistic(self, stat: Stat, array: object, parts: Parts) -> Iterator[object]:
-        if isinstance(array, list | bytes):
-            kind = self.types.kind(".".join(part for part in parts if isinstance(part, str)))
-            if stat == "n" or kind != "other":
-                yield statistic(stat, array)
-        elif isinstance(array, Mapping) and stat in array:
+def _leaves(types: FieldTypes, message: Message, target: Field) -> Iterator[object]:
+    """Everything at a path: values, whole arrays, statistics of arrays."""
+    parts = target.parts
+    stat = types.statistic(parts)
+    if stat is None or not types.known:
+        yield from _reach(message, parts)
+    if stat is None:
+        return
+    name = ".".join(part for part in parts[:-1] if isinstance(part, str))
+    is_countable = stat == "n" or types.kind(name) != "other"
+    for array in _values(message, parts[:-1]):
+        if not types.known:
+            has = isinstance(array, list) and _has_statistic(array, stat)
+        else:
+            has = is_countable and isinstance(array, list | bytes)
+        if has:
+            yield statistic(stat, array)  # type: ignore[arg-type]
+        elif types.known and isinstance(array, Mapping) and stat in array:
             yield array[stat]
 
 
@@ -186,24 +167,24 @@ def with_statistics(message: Message, paths: Iterable[str]) -> Message:
     return found
 
 
-def _node(node: Node, reader: _Reader) -> Test:
+def _node(node: Node, types: FieldTypes) -> Test:
     match node:
         case Not(item):
-            return partial(_negated, _node(item, reader))
+            return partial(_negated, _node(item, types))
         case And(items):
-            return partial(_joined, [_node(item, reader) for item in items], False)
+            return partial(_joined, [_node(item, types) for item in items], False)
         case Or(items):
-            return partial(_joined, [_node(item, reader) for item in items], True)
+            return partial(_joined, [_node(item, types) for item in items], True)
         case MongoFilter() | Near():
             raise WhereError(f"{spelled(node)} is no predicate on the message itself.")
         case Exists(target, present):
-            exists = partial(_exists, reader, target)
+            exists = partial(_exists, types, target)
             return exists if present else partial(_negated, exists)
         case Compare(order="!=") | Member(negated=True) | Match(negated=True):
-            positive = partial(_negated, partial(_holds, reader, node.field, _test_of(node)))
-            return partial(_joined, [partial(_exists, reader, node.field), positive], False)
+            positive = partial(_negated, partial(_holds, types, node.field, _test_of(node)))
+            return partial(_joined, [partial(_exists, types, node.field), positive], False)
         case Compare() | Member() | Match():
-            return partial(_holds, reader, node.field, _test_of(node))
+            return partial(_holds, types, node.field, _test_of(node))
 
 
 def _negated(test: Test, message: Message) -> bool:
@@ -215,19 +196,19 @@ def _joined(tests: Sequence[Test], wanted: bool, message: Message) -> bool:  # n
     return any(test(message) is wanted for test in tests) is wanted
 
 
-def _exists(reader: _Reader, target: Field, message: Message) -> bool:
-    return bool(reader.leaves(message, target))
+def _exists(types: FieldTypes, target: Field, message: Message) -> bool:
+    return any(True for _ in _leaves(types, message, target))
 
 
 _Leaf: TypeAlias = Callable[[object, bool], bool]
 """Tests a value; the second argument is True for an element of an array."""
 
 
-def _holds(reader: _Reader, target: Field, test: _Leaf, message: Message) -> bool:
+def _holds(types: FieldTypes, target: Field, test: _Leaf, message: Message) -> bool:
     """True if a test holds for any value at a path."""
     return any(
         test(value, isinstance(leaf, list))
-        for leaf in reader.leaves(message, target)
+        for leaf in _leaves(types, message, target)
         for value in (_flat(leaf) if isinstance(leaf, list) else (leaf,))
     )
 
