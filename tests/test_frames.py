@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from hybridlog.frames import columns as columns_module
 from hybridlog.frames.builder import Block, TableBuilder
+from hybridlog.frames.frame import frame_of
 from hybridlog.schema.arrow_columns import records_array
 from hybridlog.schema.arrow_objects import values_array
 from hybridlog.schema.arrow_types import common_type, converted, extremes, plain_values
@@ -147,7 +148,7 @@ def test_arrow_types_and_values() -> None:
 
 
 def test_pandas_types_and_values() -> None:
-    frame = builder_of(5).to_pandas()
+    frame = frame_of(builder_of(5).to_arrow())
     assert frame.index.name == "log_time"
     assert str(frame.index.dtype) == "datetime64[ns, UTC]"
     assert frame.index.astype("int64").tolist() == [*range(5), *range(100, 105)]
@@ -207,7 +208,7 @@ def test_sorted_by_log_time_then_arrival(chunks: list[list[tuple[int, int]]], li
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(columns_module, "OFFSET_LIMIT", limit)
         table = fill().to_arrow()
-        frame = fill().to_pandas()
+        frame = frame_of(fill().to_arrow())
     table.validate(full=True)
     assert nanoseconds(table).to_pylist() == wanted
     assert len(frame) == len(wanted)
@@ -218,12 +219,13 @@ def test_sorted_by_log_time_then_arrival(chunks: list[list[tuple[int, int]]], li
 
 
 def test_rows_that_stop_being_equal() -> None:
-    frame = built(
+    builder = built(
         ([1, 2], {"c": arrays("f8", [1.0, 2.0], [1.0, 2.0])}),
         ([3], {"c": arrays("f8", [1.0, 2.5])}),
         ([4], {"c": arrays("f8", [7.0])}),
         ([5], {"c": arrays("f8", [])}),
-    ).to_pandas()
+    )
+    frame = frame_of(builder.to_arrow())
     assert [cell.tolist() for cell in frame["c"]] == [[1, 2], [1, 2], [1, 2.5], [7], []]
 
 
@@ -257,7 +259,7 @@ def test_columns_missing_in_some_chunks() -> None:
         "l": [None, None, None, ["p"], ["q"], None],
         "d": [None, None, None, 9, 10, None],
     }
-    frame = built(*chunks).to_pandas()
+    frame = frame_of(built(*chunks).to_arrow())
     assert {name: int(n) for name, n in frame.isna().sum().items()} == {
         name: 6 - n
         for name, n in {

@@ -238,9 +238,7 @@ class Aligned:
         """The rows as a frame, indexed by log time (UTC, ns)."""
         from hybridlog.frames.frame import frame_of
 
-        table = self.to_arrow()
-        names = table.column_names[1:]
-        return frame_of(table[TIME], ((name, table[name]) for name in names))
+        return frame_of(self.to_arrow())
 
     def to_polars(self) -> Any:
         """The rows as a polars frame.

@@ -22,7 +22,6 @@ from hybridlog_storage.messages import Batch
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    import pandas as pd
     from numpy.typing import NDArray
 
     from hybridlog.query.chunk_scan import MessageRun
@@ -46,26 +45,12 @@ def to_arrow(planner: Planner) -> pa.Table:
     Raises:
         DefinitionError: a topic has no definition to derive columns from.
     """
-    return _finished(_collected(planner), planner.question)
-
-
-def to_pandas(planner: Planner) -> pd.DataFrame:
-    """The whole answer as a frame, in order.
-
-    Raises:
-        DefinitionError: a topic has no definition to derive columns from.
-    """
-    frame = _collected(planner).to_pandas()
-    return frame.iloc[::-1] if planner.question.reverse else frame
-
-
-def _collected(planner: Planner) -> TableBuilder:
     question = planner.question
     builder = _builder(question)
     for group in _groups(planner, planner.parts(), in_order=not question.returns_all):
         for block in group:
             builder.append(block)
-    return builder
+    return _finished(builder, question)
 
 
 def _groups(

@@ -15,9 +15,8 @@ from hybridlog.schema.arrow_types import common_type, converted
 from hybridlog_storage.ordering import order_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
 
-    import pandas as pd
     from numpy.typing import NDArray
 
 
@@ -41,20 +40,6 @@ class Block(NamedTuple):
     records: pa.StructArray
     size: int
     summaries: Mapping[str, pa.Array[Any]] = MappingProxyType({})
-
-
-class Named(NamedTuple):
-    """A column and its name.
-
-    Attributes:
-        name: Name of the column.
-        field: Path of its field if it differs from the name, else None.
-        values: The column.
-    """
-
-    name: str
-    field: str | None
-    values: pa.ChunkedArray[Any]
 
 
 class TableBuilder:
@@ -96,43 +81,21 @@ class TableBuilder:
             arrays fixed_size_list if the definition fixes their length and list
             otherwise.
         """
-        names: list[pa.Field] = []
-        columns = []
-        for name, field, values in self._columns():
-            metadata: dict[bytes, str] | None = None if field is None else {FIELD: field}
-            if name in self._tags:
-                metadata = {TAG: self._tags[name]}
-            names.append(pa.field(name, values.type, metadata=metadata))
-            columns.append(values)
-        table = pa.Table.from_arrays(columns, schema=pa.schema(names))
-        return table.select(arranged(table.column_names, self._fields, self._tags))
-
-    def to_pandas(self) -> pd.DataFrame:
-        """The frame, sorted by log time and order; see `frame.py` for its types."""
-        from hybridlog.frames.frame import frame_of
-
-        columns = self._columns()
-        log_time = next(columns).values
-        frame = frame_of(log_time, ((name, values) for name, _, values in columns))
-        names = list(frame.columns)
-        wanted = arranged(names, self._fields, self._tags)
-        return frame if wanted == names else frame[wanted]
-
-    def _columns(self) -> Iterator[Named]:
-        """All columns, log time first; each is released after it is yielded."""
         blocks, self._blocks, self._rows = self._blocks, [], 0
         blocks.sort(key=_beginning)
         order = _order(blocks)
         times = [numbers(block.log_time, "time") for block in blocks]
-        yield Named("log_time", None, _ordered(times, TIME, order))
-        own = list(dict.fromkeys(name for block in blocks for name in block.own))
-        for name in own:
+        names = [pa.field("log_time", TIME)]
+        columns = [_ordered(times, TIME, order)]
+        for name in dict.fromkeys(name for block in blocks for name in block.own):
             arrays = [block.own[name] for block in blocks]
-            yield Named(name, None, _ordered(arrays, common_type(arrays), order))
+            columns.append(_ordered(arrays, common_type(arrays), order))
+            tag = {TAG: self._tags[name]} if name in self._tags else None
+            names.append(pa.field(name, columns[-1].type, metadata=tag))
         parts = self._flat(blocks)
         lengths = [len(block.log_time) for block in blocks]
         del blocks
-        taken = {"log_time", *own}
+        taken = {field.name for field in names}
         for path in dict.fromkeys(path for part in parts for path in part):
             name = free_name(path, taken)
             taken.add(name)
@@ -142,7 +105,11 @@ class TableBuilder:
                 pa.nulls(rows, kind) if array is None else converted(array, kind)
                 for array, rows in zip(found, lengths, strict=True)
             ]
-            yield Named(name, path if name != path else None, _ordered(arrays, kind, order))
+            columns.append(_ordered(arrays, kind, order))
+            of = {FIELD: path} if name != path else None
+            names.append(pa.field(name, kind, metadata=of))
+        table = pa.Table.from_arrays(columns, schema=pa.schema(names))
+        return table.select(arranged(table.column_names, self._fields, self._tags))
 
     def _flat(self, blocks: Sequence[Block]) -> list[dict[str, pa.Array[Any]]]:
         """The leaves of each block, with one type for each topic."""

@@ -24,8 +24,6 @@ from hybridlog.schema.arrow_types import is_list, is_numeric, is_text, lengths_o
 from hybridlog_storage.errors import MissingDependencyError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
     import pyarrow as pa
     from numpy.typing import NDArray
 
@@ -35,17 +33,11 @@ _NAT = np.iinfo(np.int64).min
 _NOTHING: NDArray[Any] = np.empty(0)
 
 
-def frame_of(
-    log_time: pa.ChunkedArray[Any], columns: Iterable[tuple[str, pa.ChunkedArray[Any]]]
-) -> pd.DataFrame:
-    """A frame of Arrow columns.
-
-    Args:
-        log_time: Column for the index.
-        columns: Names and columns, all with the same number of rows.
-    """
-    data = {name: _array(column) for name, column in columns}
-    index = pd.DatetimeIndex(_times(log_time), name="log_time", copy=False)
+def frame_of(table: pa.Table) -> pd.DataFrame:
+    """A frame of an Arrow table, with its column `log_time` as the index."""
+    names = [name for name in table.column_names if name != "log_time"]
+    data = {name: _array(table[name]) for name in names}
+    index = pd.DatetimeIndex(_times(table["log_time"]), name="log_time", copy=False)
     return pd.DataFrame(data, index=index, copy=False)
 
 

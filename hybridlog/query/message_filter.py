@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from hybridlog.frames.names import is_summary
-from hybridlog.query.predicate.to_bool import UndecidedError, to_bool
+from hybridlog.query.predicate.to_bool import to_bool
 from hybridlog.query.predicate.tree import Predicate
 from hybridlog.schema.codec import columns_of, plain_message
 from hybridlog_storage.errors import DefinitionError, PayloadError
@@ -49,7 +49,6 @@ class MessageFilter:
         self._predicate = predicate
         self._types = types
         self._test = to_bool(predicate.root, types)
-        self._summary_test = to_bool(predicate.root, types, summarised=True)
         self._elements = _elements_of(predicate, types or {})
         self._fields = {path.split(".")[0].split("[")[0] for path in predicate.fields()}
 
@@ -96,7 +95,7 @@ class MessageFilter:
         decidable = np.setdiff1d(np.arange(len(batch)), lacking, assume_unique=True)
         known = dict(zip(decoded.rows.tolist(), decoded.plain(), strict=True))
         found = self._one_by_one(channel, batch, seq, decidable, known)
-        return Matches(found.holds, found.unreadable + len(lacking), found.expired + len(lacking))
+        return Matches(found.holds, found.unreadable + len(lacking), len(lacking))
 
     def _one_by_one(
         self,
@@ -108,8 +107,7 @@ class MessageFilter:
     ) -> Matches:
         """Decide on some rows, whose fields may be known by row."""
         holds = np.zeros(len(batch), np.bool_)
-        unreadable = lacking = 0
-        test = self._summary_test if channel.is_reduced else self._test
+        unreadable = 0
         for row in rows.tolist():
             try:
                 if known is None:
@@ -123,19 +121,18 @@ class MessageFilter:
                 fields = {}
             if "_meta" in self._fields:
                 fields["_meta"] = _meta_of(channel, batch, seq, row)
-            try:
-                holds[row] = test(fields)
-            except UndecidedError:
-                lacking += 1
-        return Matches(holds, unreadable + lacking, lacking)
+            holds[row] = self._test(fields)
+        return Matches(holds, unreadable)
 
 
 def _elements_of(predicate: Predicate, types: Mapping[str, str]) -> set[str]:
-    """Fields in a predicate, but for summaries of whole arrays: documents have those."""
+    """Fields in a predicate, but for summaries of arrays that are in no other array."""
     found = set()
     for condition in predicate.conditions():
         parts = condition.field.parts
-        if not (all(isinstance(p, str) for p in parts) and is_summary(condition.field.path, types)):
+        path = condition.field.path
+        is_plain = all(isinstance(part, str) for part in parts) and is_summary(path, types)
+        if not is_plain or path.rpartition(".")[0] not in types:
             names = takewhile(lambda part: isinstance(part, str), parts)
             found.add(".".join(map(str, names)))
     return found - {"_meta"}

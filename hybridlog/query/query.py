@@ -534,15 +534,9 @@ class Query:
 
     def to_pandas(self) -> pd.DataFrame:
         """A frame of the same columns, indexed by log time (UTC, ns)."""
-        from hybridlog.frames.answer import to_pandas
         from hybridlog.frames.frame import frame_of
 
-        if self.question.frame is not None:
-            table = self.to_arrow()
-            names = [name for name in table.column_names if name != "log_time"]
-            frame = frame_of(table["log_time"], ((name, table[name]) for name in names))
-        else:
-            frame = to_pandas(self._planner())
+        frame = frame_of(self.to_arrow())
         frame.attrs["hybridlog"] = asdict(self.counters)
         return frame
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any, Final
 
 import numpy as np
@@ -52,7 +51,6 @@ OWN: Final = pa.schema(
 )
 """Columns of every view in addition to the fields."""
 _RESERVED: Final = frozenset({*OWN_COLUMNS, *OWN.names})
-_SHARED_ROWS: Final = 131_072  # as many as a row group has
 _types = pa.types
 Fields = Callable[["ViewColumn"], Any]
 """Finds the values of a field that is no struct; None where the messages lack it."""
@@ -102,21 +100,11 @@ class ViewColumn:
         """
         if not self.inner:
             found = fields(self)
-            return _nulls(self.type, rows) if found is None else found
+            return pa.nulls(rows, self.type) if found is None else found
         children = [column.values(fields, rows, missing) for column in self.inner]
         return pa.StructArray.from_arrays(
             children, fields=list(self.type), mask=missing(self.source)
         )
-
-
-@lru_cache(maxsize=256)
-def _shared_nulls(kind: Any) -> Any:
-    return pa.nulls(_SHARED_ROWS, kind)
-
-
-def _nulls(kind: Any, rows: int) -> Any:
-    """Nulls, which share their memory."""
-    return _shared_nulls(kind).slice(0, rows) if rows <= _SHARED_ROWS else pa.nulls(rows, kind)
 
 
 def view_columns(kind: Any) -> list[ViewColumn]:

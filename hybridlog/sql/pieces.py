@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
 import pyarrow as pa
@@ -103,36 +103,6 @@ class DamagedTableError(StoreError):
     def __init__(self, source: TopicOfRecording, problem: str) -> None:
         super().__init__(f"{problem} It is made again when you ask again.")
         self.source = source
-
-
-class RowSource(Protocol):
-    """Some rows of a topic of a recording that are read together."""
-
-    @property
-    def first(self) -> int | None:
-        """Least log time, ns; None if unknown."""
-
-    @property
-    def last(self) -> int | None:
-        """Greatest log time, ns; None if unknown."""
-
-    @property
-    def is_whole(self) -> bool:
-        """True if it has all arrays; else some may be summaries."""
-
-    @property
-    def has_summaries(self) -> bool:
-        """True if it has summaries of all arrays that it has in full."""
-
-    @property
-    def has_points(self) -> bool:
-        """True if it has the points of clouds."""
-
-    def kinds(self, paths: Paths) -> Sequence[Any]:
-        """Types of the fields that it holds, at least at some paths."""
-
-    def read(self, paths: Paths, own: Collection[str], counts: ScanCounts) -> Iterator[Rows]:
-        """Read columns."""
 
 
 class TopicOfRecording:
@@ -277,7 +247,15 @@ def _is_fixed(channel: RecordedChannel) -> bool:
 
 
 class _TableRows:
-    """A row group of a table."""
+    """A row group of a table.
+
+    Attributes:
+        first: Least log time, ns; None if unknown.
+        last: Greatest log time, ns; None if unknown.
+        is_whole: True if it has all arrays; else some may be summaries.
+        has_summaries: True if it has summaries of all arrays that it has in full.
+        has_points: True if it has the points of clouds.
+    """
 
     is_whole = False
 
@@ -292,6 +270,7 @@ class _TableRows:
         self.last = part.last if is_known else None
 
     def kinds(self, paths: Paths) -> Sequence[Any]:
+        """Types of the fields that it holds, at least at some paths."""
         try:
             return [self._table.fields(paths)]
         except StoreError as error:
@@ -324,7 +303,7 @@ class _FieldRows(_TableRows):
 
 
 class _ChunkRows:
-    """The messages of a topic in a chunk."""
+    """The messages of a topic in a chunk; the attributes are those of `_TableRows`."""
 
     has_summaries = False
 
@@ -404,3 +383,7 @@ class _ChunkRows:
         columns = piece.own if points is None else {**piece.own, POINTS: points}
         none = pa.nulls(len(batch), pa.struct([]))
         return Rows(columns, none if piece.fields is None else piece.fields, len(batch))
+
+
+RowSource: TypeAlias = _TableRows | _ChunkRows
+"""Some rows of a topic of a recording that are read together."""

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from functools import lru_cache
 from typing import Protocol
 
 MAX_LENGTH = 1_000
 """Maximum length of a pattern, characters."""
 _MAX_BYTES = 8 << 20  # of a compiled pattern; Arrow has the same limit
-_BYTE = "matches a byte, and strings are characters"
+_ESCAPE = re.compile(r"\\Q.*?(?:\\E|\Z)|\\(.)", re.DOTALL)
 
 
 class RegexError(ValueError):
@@ -58,8 +59,9 @@ def compile_regex(pattern: str, max_length: int = MAX_LENGTH) -> Regex:
         raise RegexError("is not valid Unicode", error.start) from None
     except re2.error as error:
         raise _refusal(pattern, error.args[0]) from None
-    if (place := _byte_escape(pattern)) is not None:
-        raise RegexError(f"\\C {_BYTE}", place)
+    for escape in _ESCAPE.finditer(pattern):
+        if escape[1] == "C":
+            raise RegexError("\\C matches a byte, and strings are characters", escape.start())
     return compiled
 
 
@@ -74,17 +76,3 @@ def _refusal(pattern: str, reported: bytes | str) -> RegexError:
     ):
         shown += "; patterns have RE2's syntax, without looking around and back references"
     return RegexError(f"not a regular expression of RE2: {shown}", place)
-
-
-def _byte_escape(pattern: str) -> int | None:
-    r"""Index of `\\C`, None if not found."""
-    at = pattern.find("\\")
-    while at >= 0:
-        if pattern[at + 1 : at + 2] == "C":
-            return at
-        if pattern[at + 1 : at + 2] == "Q":
-            at = pattern.find("\\E", at)
-            if at < 0:
-                return None
-        at = pattern.find("\\", at + 2)
-    return None

@@ -95,18 +95,6 @@ class FieldTypes:
             return types
         return _listed(None if types is None else tuple(types.items()))
 
-    def is_open(self, target: Field) -> bool:
-        """True if each message decides the type at a path."""
-        name = target.names
-        if str(target.parts[0]) == "_meta":
-            return False
-        return not self.known or not (
-            name in self.types
-            or name in self.inner
-            or name in self.arrays
-            or self.statistic(target.parts) is not None
-        )
-
     def statistic(self, parts: Parts) -> Stat | None:
         """The statistic of an array that a path names; None if it names a field.
 

@@ -1,15 +1,12 @@
-"""One question, one answer: of messages in memory, of documents and of Arrow columns.
-
-Messages are made as JSON and as ROS messages, with arrays that the index holds whole and
-arrays that it holds as summaries. `to_bool` on the whole message is the reference.
+"""One question, one answer: of messages in memory and of Arrow columns, which `to_bool` and
+`to_mask` give. Columns hold arrays whole, and as summaries.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterable
-from contextlib import suppress
+from collections.abc import Iterable
 
 import numpy as np
 import pyarrow as pa
@@ -19,24 +16,17 @@ from hypothesis import strategies as st
 
 from hybridlog.query.message_filter import MessageFilter
 from hybridlog.query.predicate.parser import parse
-from hybridlog.query.predicate.to_bool import UndecidedError, statistic, to_bool
+from hybridlog.query.predicate.to_bool import statistic, to_bool
 from hybridlog.query.predicate.to_mask import to_mask
 from hybridlog.query.predicate.tree import Predicate
 from hybridlog.query.question import RecordedChannel
-from hybridlog.schema.codec import Codec
 from hybridlog.schema.codecs import codec_for
-from hybridlog.schema.index_bodies import index_fields
 from hybridlog.schema.reduced_codec import reduce, reduced_channel
 from hybridlog_storage.catalog import ChannelStats, RecordingEntry
 from hybridlog_storage.messages import Batch, Channel, Schema
-from tests.schema.wire_oracle import oracle
 
 Message = dict[str, object]
 Types = dict[str, str] | None
-Ask = Callable[[list[Message], list[Message], Iterable[str], Types], None]
-
-LIMIT = 3
-"""Elements of an array that the index holds whole, here."""
 
 DEFINITION = """\
 float64 x
@@ -64,39 +54,12 @@ uint8 level
 SUMMARISED = ("a", "k", "w")
 
 
-@pytest.fixture(scope="module")
-def ask() -> Ask:
-    def ask(
-        messages: list[Message],
-        documents: list[Message],
-        questions: Iterable[str],
-        types: Types,
-    ) -> None:
-        for question in questions:
-            predicate = parse(question)
-            test = to_bool(predicate, types)
-            expected = {n for n, message in enumerate(messages) if test(message)}
-
-            def shown(wrong: set[int], question: object = question) -> object:
-                return repr((question, [(messages[n], documents[n]) for n in wrong]))
-
-            summarised = to_bool(predicate, types, summarised=True)
-            for n, document in enumerate(documents):
-                if not is_rounded(messages[n]):
-                    with suppress(UndecidedError):
-                        assert summarised(document) == (n in expected), shown({n})
-            in_columns(predicate, types, messages, expected)
-
-    return ask
-
-
-def is_rounded(value: object) -> bool:
-    """Whether a message has integers that its document has as doubles."""
-    if isinstance(value, dict):
-        return any(map(is_rounded, value.values()))
-    if isinstance(value, list):
-        return any(map(is_rounded, value))
-    return isinstance(value, int) and not -(2**63) <= value < 2**63
+def ask(messages: list[Message], questions: Iterable[str], types: Types) -> None:
+    for question in questions:
+        predicate = parse(question)
+        test = to_bool(predicate, types)
+        expected = {n for n, message in enumerate(messages) if test(message)}
+        in_columns(predicate, types, messages, expected)
 
 
 def in_columns(
@@ -306,12 +269,8 @@ SLOW = settings(
 @example([{"a": [[0, 1, 2, 3]]}, {"a": {"0": [1] * 5}}], ["a.max != 1", "a[0].n exists"])
 @example([{"m": {"n": {}}}, {"m": {"n": 4}}], ["m.`0` missing", "`m`.`0` missing", "m[1] exists"])
 @example([{"a": [{"n": 1}] * 40}], ["a.n >= 40", "a.n == 1", "a.min missing"])
-def test_of_json(ask: Ask, messages: list[Message], questions: list[str]) -> None:
-    codec = codec_for(Channel("/j", "json", None))
-    documents = [
-        index_fields(codec, json.dumps(message).encode(), array_limit=LIMIT) for message in messages
-    ]
-    ask(messages, documents, questions, None)
+def test_of_json(messages: list[Message], questions: list[str]) -> None:
+    ask(messages, questions, None)
 
 
 @SLOW
@@ -320,12 +279,8 @@ def test_of_json(ask: Ask, messages: list[Message], questions: list[str]) -> Non
     st.lists(questions_on(even_paths), min_size=8, max_size=16),
 )
 @example([{"g": [None, [0, 1, 2, 3]]}], ["g[0][1:3] !~ '^$'", "g[1][1:3] == 2"])
-def test_of_even_json(ask: Ask, messages: list[Message], questions: list[str]) -> None:
-    codec = codec_for(Channel("/j", "json", None))
-    documents = [
-        index_fields(codec, json.dumps(message).encode(), array_limit=LIMIT) for message in messages
-    ]
-    ask(messages, documents, questions, None)
+def test_of_even_json(messages: list[Message], questions: list[str]) -> None:
+    ask(messages, questions, None)
 
 
 JSON_ARRAYS: dict[str, dict[str, Message]] = {
@@ -401,21 +356,14 @@ JSON_ARRAYS: dict[str, dict[str, Message]] = {
         ("nested", "a.n == 2", "three mixed empty"),
     ],
 )
-def test_what_json_arrays_answer(ask: Ask, kind: str, where: str, expected: str) -> None:
+def test_what_json_arrays_answer(kind: str, where: str, expected: str) -> None:
     """Arrays in an array are looked into."""
     messages = JSON_ARRAYS[kind]
-    codec = codec_for(Channel("/j", "json", None))
-    documents = [index_fields(codec, json.dumps(message).encode()) for message in messages.values()]
-    ask(list(messages.values()), documents, [where], None)
-    for one, document in zip(messages.values(), documents, strict=True):
-        ask([one], [document], [where], None)  # columns of one kind
+    ask(list(messages.values()), [where], None)
+    for one in messages.values():
+        ask([one], [where], None)  # columns of one kind
     test = to_bool(parse(where))
     assert [name for name, message in messages.items() if test(message)] == expected.split()
-
-
-def ros_codec() -> Codec:
-    schema = Schema("demo/Whole", "ros1msg", DEFINITION.encode())
-    return codec_for(Channel("/r", "ros1", schema))
 
 
 doubles = st.sampled_from([-1.0, 0.0, -0.0, 0.25, 1.0, 1.5, 2.0, math.nan, math.inf, -math.inf])
@@ -468,16 +416,10 @@ ros_paths = [
     st.lists(ros_messages, min_size=4, max_size=12),
     st.lists(questions_on(ros_paths), min_size=8, max_size=16),
 )
-def test_of_ros_messages(ask: Ask, messages: list[Message], questions: list[str]) -> None:
-    codec = ros_codec()
+def test_of_ros_messages(messages: list[Message], questions: list[str]) -> None:
+    codec = codec_for(Channel("/r", "ros1", Schema("demo/Whole", "ros1msg", DEFINITION.encode())))
     types = {path.path: path.type for path in codec.paths()}
-    asked = [*questions, *ROS_QUESTIONS]
-    ask(
-        messages,
-        [index_fields(codec, serialised(message), array_limit=LIMIT) for message in messages],
-        asked,
-        types,
-    )
+    ask(messages, [*questions, *ROS_QUESTIONS], types)
 
 
 ROS_QUESTIONS = [
@@ -487,30 +429,6 @@ ROS_QUESTIONS = [
     *("a[9:] missing", "a[1:3].n >= 2", "flags[2:] == true", "flags[1:].max >= 1"),
     *("w.max >= 9223372036854775809", "u < 9223372036854775809", "w == 9223372036854775809"),
 ]
-
-
-STORE = oracle("demo/msg/Whole", DEFINITION)
-ARRAYS = (("a", np.float64), ("k", np.int64), ("w", np.uint64), ("flags", np.bool_))
-
-
-def serialised(message: Message) -> bytes:
-    made = STORE.types
-    whole = made["demo/msg/Whole"](
-        **{**message, "m": [part(element) for element in message["m"]]},  # type: ignore[attr-defined]
-    )
-    for name, kind in ARRAYS:
-        setattr(whole, name, np.array(message[name], kind))
-    return bytes(STORE.serialize_ros1(whole, "demo/msg/Whole"))
-
-
-def part(values: Message) -> object:
-    leaf = STORE.types["demo/msg/Leaf"]
-    return STORE.types["demo/msg/Part"](
-        v=values["v"],
-        n=values["n"],
-        q=np.array(values["q"], np.float32),
-        leaves=[leaf(**inner) for inner in values["leaves"]],  # type: ignore[attr-defined]
-    )
 
 
 @pytest.mark.parametrize(
