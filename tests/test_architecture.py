@@ -57,7 +57,6 @@ ALLOWED = {
         "hybridlog_storage.mcap.mcap_content",
         "hybridlog_storage.mcap.mcap_scan",
         "hybridlog_storage.segments.walk",
-        "hybridlog_storage.segments.recovery",
         "hybridlog_storage.segments.segment_file",
         "hybridlog_storage.segments.segment_format",
         "hybridlog_storage.segments.segment_reader",

@@ -30,10 +30,7 @@ class PackedChunk:
     Attributes:
         batch: Its messages over the uncompressed content; `channel` holds channel ids.
         seq: int64[n], arrival numbers.
-        first: Smallest log time, ns.
-        last: Largest log time, ns.
         uncompressed_size: Bytes of content.
-        compression: MCAP name of the codec.
         head: The chunk record up to the compressed content.
         data: The compressed content.
         head_crc: CRC-32 of the head.
@@ -45,10 +42,7 @@ class PackedChunk:
 
     batch: Batch
     seq: NDArray[np.int64]
-    first: int
-    last: int
     uncompressed_size: int
-    compression: str
     head: bytes
     data: Buffer
     head_crc: int
@@ -86,10 +80,7 @@ def pack(
     return PackedChunk(
         batch=batch,
         seq=seq,
-        first=first,
-        last=last,
         uncompressed_size=size,
-        compression=compression,
         head=head,
         data=data,
         head_crc=crc32(head),

@@ -38,6 +38,7 @@ _RATIO_SLACK = 1 << 17
 _PIECE = 1 << 18
 _SAMPLE = 8192  # bytes of one sample of a chunk
 _SAMPLES = 6
+_MAX_SHARE = 0.97  # of its size that a compressed chunk may have
 # In a hurry: compressing to this share or less is faster than writing uncompressed,
 _WORTH_IT = 0.2
 _FAST = 1  # at this level of either codec.
@@ -238,13 +239,12 @@ class Compressor:
     """Compresses chunks, except those that would not shrink.
 
     Compressed images and the like cost much time and gain nothing. So a few samples of a
-    large chunk are tried first, and a chunk that gains less than `min_gain` is stored
+    large chunk are tried first, and a chunk that gains less than 3 % is stored
     uncompressed. Thread safe; compression releases the interpreter lock.
 
     Args:
         name: The codec; `none` stores everything as it is.
         level: Level of the codec: 1 to 22 for zstd (negative: faster), 0 to 16 for lz4.
-        min_gain: Share of the size that compressing must save, 0 to 1.
 
     Raises:
         ValueError: The codec is unknown or the level not allowed.
@@ -254,8 +254,6 @@ class Compressor:
         self,
         name: Literal["zstd", "lz4", "none"] = "zstd",
         level: int = 1,
-        *,
-        min_gain: float = 0.03,
     ) -> None:
         if name not in {"zstd", "lz4", "none"}:
             raise ValueError(f"compression {name!r} is not known; use zstd, lz4 or none")
@@ -265,7 +263,6 @@ class Compressor:
             raise ValueError(f"lz4 has levels up to {lz4.frame.COMPRESSIONLEVEL_MAX}")
         self.name = name
         self.level = level
-        self._max_ratio = 1.0 - min_gain
         self._own = threading.local()  # threads must not share a ZstdCompressor
 
     def compress(self, data: Buffer, *, hurried: bool = False) -> tuple[str, Buffer]:
@@ -280,12 +277,12 @@ class Compressor:
             MCAP name of the codec and the compressed bytes, or the empty name and `data`
             itself.
         """
-        bound = _WORTH_IT if hurried else self._max_ratio
+        bound = _WORTH_IT if hurried else _MAX_SHARE
         level = min(self.level, _FAST) if hurried else self.level
         if self.name == "none" or len(data) == 0 or not self._promising(data, level, bound):
             return "", data
         packed = self._pack(data, level)
-        if len(packed) > len(data) * self._max_ratio or is_implausible(len(data), len(packed)):
+        if len(packed) > len(data) * _MAX_SHARE or is_implausible(len(data), len(packed)):
             return "", data
         return self.name, packed
 

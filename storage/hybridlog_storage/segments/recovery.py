@@ -11,8 +11,6 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from mcap.records import ChunkIndex
-
 from hybridlog_storage.disk import durability, files
 from hybridlog_storage.disk.append_file import BLOCK, AppendFile
 from hybridlog_storage.errors import SegmentError, StoreError
@@ -33,7 +31,6 @@ from hybridlog_storage.segments.segment_format import (
     START,
     damaged_head,
     group_of,
-    index_offsets,
     index_order,
     json_metadata,
     trailer_of,
@@ -197,21 +194,7 @@ class _Rest:
         if not indexes:
             size = trailer - ARRIVAL_HEAD - len(behind.packed)
             self._damage.append(Damage(offset + length, size, "message indexes are damaged"))
-        self._segment.note_chunk(
-            ChunkIndex(
-                message_start_time=head.first,
-                message_end_time=head.last,
-                chunk_start_offset=offset,
-                chunk_length=length,
-                message_index_offsets=index_offsets(indexes, offset + length),
-                message_index_length=sum(indexes.values()),
-                compression=head.codec,
-                compressed_size=head.end - head.start,
-                uncompressed_size=len(content),
-            ),
-            parts,
-            trailer,
-        )
+        self._segment.note_chunk(offset, trailer, head, indexes, parts)
         return len(batch)
 
     def seal(self, recording: Mapping[str, object] | None, on_sealing: OnSealing) -> Path:

@@ -26,7 +26,7 @@ from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk import durability, files
 from hybridlog_storage.disk.append_file import AppendFile
 from hybridlog_storage.errors import HybridlogError, StoreError
-from hybridlog_storage.mcap.mcap_content import RECORD_HEAD
+from hybridlog_storage.mcap.mcap_content import RECORD_HEAD, ChunkHead, chunk_head_of
 from hybridlog_storage.messages import EXPIRED_IDS, schema_hash
 from hybridlog_storage.segments.attachments import Attachment
 from hybridlog_storage.segments.chunk import PackedChunk, StoredChunk
@@ -334,35 +334,42 @@ class SegmentFile:
         self._append(parts)
         for chunk, place in zip(chunks, stored, strict=True):
             sizes = {channel: len(data) for channel, data in chunk.indexes.items()}
-            self.note_chunk(
-                ChunkIndex(
-                    message_start_time=chunk.first,
-                    message_end_time=chunk.last,
-                    chunk_start_offset=place.offset,
-                    chunk_length=place.length,
-                    message_index_offsets=index_offsets(sizes, place.offset + place.length),
-                    message_index_length=sum(sizes.values()),
-                    compression=chunk.compression,
-                    compressed_size=place.compressed_size,
-                    uncompressed_size=chunk.uncompressed_size,
-                ),
-                chunk.parts,
-                place.trailer,
-            )
+            head = chunk_head_of(chunk.head)
+            assert head is not None
+            self.note_chunk(place.offset, place.trailer, head, sizes, chunk.parts)
         return stored
 
-    def note_chunk(self, chunk: ChunkIndex, parts: NDArray[np.void], trailer: int) -> None:
+    def note_chunk(
+        self,
+        offset: int,
+        trailer: int,
+        head: ChunkHead,
+        indexes: Mapping[int, int],
+        parts: NDArray[np.void],
+    ) -> None:
         """Note a chunk that is in the file already.
 
         Args:
-            chunk: Its entry in the summary.
-            parts: `PART`[c], statistics of each channel in it.
+            offset: Byte of the chunk record.
             trailer: Bytes of message indexes and arrival record behind it.
+            head: What stands before its content.
+            indexes: Bytes of the message index of each channel, by channel id.
+            parts: `PART`[c], statistics of each channel in it.
         """
-        span = chunk.message_start_time, chunk.message_end_time
-        place = chunk.chunk_start_offset, chunk.chunk_length, trailer
-        self.table.chunk(place, span, parts)
-        self._chunk_indexes += record_bytes(chunk)
+        self.table.chunk((offset, head.length, trailer), (head.first, head.last), parts)
+        self._chunk_indexes += record_bytes(
+            ChunkIndex(
+                message_start_time=head.first,
+                message_end_time=head.last,
+                chunk_start_offset=offset,
+                chunk_length=head.length,
+                message_index_offsets=index_offsets(indexes, offset + head.length),
+                message_index_length=sum(indexes.values()),
+                compression=head.codec,
+                compressed_size=head.end - head.start,
+                uncompressed_size=head.size,
+            )
+        )
 
     def rewrite(self, position: int, data: Buffer) -> None:
         """Overwrite bytes damaged by a crash or the disk."""
