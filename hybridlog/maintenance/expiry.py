@@ -231,7 +231,7 @@ def let_go(
         before = now.let_go or LetGo(0, 0)
         count = 0 if lost else sum(part.messages for _, part in parts)
         rows = [
-            Loss(Cause.DISK, now.channels[n].topic, part.messages, part.first, part.last, lost)
+            Loss(Cause.SEGMENT, now.channels[n].topic, part.messages, part.first, part.last, lost)
             for n, part in (parts if lost else ())
         ]
         return with_totals(
