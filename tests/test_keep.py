@@ -18,6 +18,7 @@ import pytest
 import hybridlog as hl
 from hybridlog.cli.keep import keep_command
 from hybridlog.cli.open import print_unplayed
+from hybridlog.entries import summary_of
 from hybridlog.maintenance import expiry
 from hybridlog.maintenance import keep as keeping
 from hybridlog.maintenance.expiry import may_go
@@ -410,6 +411,34 @@ def test_one_process_at_a_time(store: Path) -> None:
         with hl.open(store, mongo="none") as opened, pytest.raises(StoreError, match="already"):
             opened.keep({"max-age": "0s"})
     assert payloads(store)[0] == image(0)
+
+
+def test_whole_groups_go_when_no_payloads_are_left(store: Path) -> None:
+    """Every answer is of what is left, and nothing else is found to be wrong."""
+    keep("--pin", "-r", "run", "--at", "+60s", "--before", "9s", "--after", "9s", store=store)
+    found = keep("--quota", "200kB", "--json", store=store, code=None).json
+    (step,) = [step for step in found["plan"]["steps"] if step["groups"]]
+    assert "no payloads are left to go" in step["reason"]
+    assert not {log.group for log in logs_of(store).values()} & {*step["groups"]}
+    with hl.open(store, mongo="none") as opened:
+        arms, cameras = ([m.fields["n"] for m in opened.topic(t)] for t in ("/arm", "/camera"))
+        assert {*range(51, 70)} <= {*arms} & {*cameras}
+        assert max(len(arms), len(cameras)) < COUNT
+        (entry,) = opened.recordings()
+        assert entry.messages == len(arms) + len(cameras) + len(entry.marks)
+        for topic, numbers in (("/arm", arms), ("/camera", cameras)):
+            query = opened.topic(topic)
+            assert query.count() == query.where("n >= 0").count() == len(numbers)
+            assert query.to_arrow().num_rows == len(numbers)
+            assert opened.sql(f"select n from {topic[1:]} order by n").rows() == [
+                (number,) for number in numbers
+            ]
+        assert opened.verify().findings == []
+    answer("verify", "--repair", "--mongo", "none", store=store)
+    with hl.open(store, mongo="none") as opened:
+        assert opened.topic("/arm").count() == len(arms)
+        (known,) = opened.summaries()
+        assert known == summary_of(opened.entry(known.id), known.look)
 
 
 # A full disk.
