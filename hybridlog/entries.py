@@ -343,6 +343,8 @@ def describe(catalog: Catalog, inventory: Inventory, *, is_open: bool = False) -
     ours = [row for sealed in inventory.lost for row in _losses_of_segment(inventory, sealed)]
     ours += _losses_of_rows(inventory)
     ours += _losses_of_chunks(inventory, catalog.damage(inventory.id))
+    if not inventory.manifest.is_ended:  # what went to make room
+        ours += map(loss_values, inventory.manifest.losses)
     has_losses = bool(ours) or any(row["cause"] == Cause.SEGMENT for row in _ledger(end))
     entry.status = _status(inventory, end, is_open=is_open, has_losses=has_losses)
     if lost or ours:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import random
 import re
 import shutil
 import struct
+from collections.abc import Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -16,6 +18,7 @@ import pytest
 import hybridlog as hl
 from hybridlog.cli.keep import keep_command
 from hybridlog.cli.open import print_unplayed
+from hybridlog.entries import summary_of
 from hybridlog.maintenance import expiry
 from hybridlog.maintenance import keep as keeping
 from hybridlog.maintenance.expiry import may_go
@@ -24,7 +27,13 @@ from hybridlog.maintenance.retention import Rules
 from hybridlog.maintenance.sizes import disk_bytes
 from hybridlog_storage.disk import files
 from hybridlog_storage.disk.directory import StoreDirectory
-from hybridlog_storage.errors import HybridlogError, PayloadError, StoreError, TimeError
+from hybridlog_storage.errors import (
+    DiskFullError,
+    HybridlogError,
+    PayloadError,
+    StoreError,
+    TimeError,
+)
 from hybridlog_storage.manifest import File, Manifest, new_id, replace
 from hybridlog_storage.manifests import DiskManifests
 from hybridlog_storage.messages import Channel, Schema
@@ -402,6 +411,87 @@ def test_one_process_at_a_time(store: Path) -> None:
         with hl.open(store, mongo="none") as opened, pytest.raises(StoreError, match="already"):
             opened.keep({"max-age": "0s"})
     assert payloads(store)[0] == image(0)
+
+
+def test_whole_groups_go_when_no_payloads_are_left(store: Path) -> None:
+    """Every answer is of what is left, and nothing else is found to be wrong."""
+    keep("--pin", "-r", "run", "--at", "+60s", "--before", "9s", "--after", "9s", store=store)
+    found = keep("--quota", "200kB", "--json", store=store, code=None).json
+    (step,) = [step for step in found["plan"]["steps"] if step["groups"]]
+    assert "no payloads are left to go" in step["reason"]
+    assert not {log.group for log in logs_of(store).values()} & {*step["groups"]}
+    with hl.open(store, mongo="none") as opened:
+        arms, cameras = ([m.fields["n"] for m in opened.topic(t)] for t in ("/arm", "/camera"))
+        assert {*range(51, 70)} <= {*arms} & {*cameras}
+        assert max(len(arms), len(cameras)) < COUNT
+        (entry,) = opened.recordings()
+        assert entry.messages == len(arms) + len(cameras) + len(entry.marks)
+        for topic, numbers in (("/arm", arms), ("/camera", cameras)):
+            query = opened.topic(topic)
+            assert query.count() == query.where("n >= 0").count() == len(numbers)
+            assert query.to_arrow().num_rows == len(numbers)
+            assert opened.sql(f"select n from {topic[1:]} order by n").rows() == [
+                (number,) for number in numbers
+            ]
+        assert opened.verify().findings == []
+    answer("verify", "--repair", "--mongo", "none", store=store)
+    with hl.open(store, mongo="none") as opened:
+        assert opened.topic("/arm").count() == len(arms)
+        (known,) = opened.summaries()
+        assert known == summary_of(opened.entry(known.id), known.look)
+
+
+# A full disk.
+
+
+class Full(files.System):
+    """Nothing can be written as long as the spare file is there."""
+
+    def __init__(self, store: Path) -> None:
+        self.spare = store / keeping.SPARE
+
+    def writev(self, fd: int, parts: Sequence[memoryview]) -> int:
+        if self.spare.exists():
+            raise OSError(errno.ENOSPC, "full")
+        return super().writev(fd, parts)
+
+
+def test_a_full_disk_is_relieved_by_what_was_written_before(tmp_path: Path, calls: Calls) -> None:
+    path = tmp_path / "store"
+    with hl.open(path, mongo="none", create=True) as store:
+        store.directory.change_settings(retention={"quota": "1GB"})
+        settings = SegmentSettings(chunk_size=1024, segment_size=50_000)
+        with store.start("run", settings=settings) as recording:
+            for number in range(COUNT):
+                at = BEGIN + number * SECOND
+                recording.write(CAMERA, image(number), log_time=at)
+                recording.write(ARM, struct.pack("<Id", number, number / 2), log_time=at + 1)
+        store.keep()
+        calls.fail(expiry, "write_rows", AssertionError)
+        calls.system(Full(path))
+        (step,) = store.keep({"max-age": "0s"}).plan.steps
+    assert not (path / keeping.SPARE).exists()
+    assert {*payloads(path).values()} == {None}
+    assert step.segments == tuple(n for n, log in logs_of(path).items() if not log.is_here)
+    check_answers(path)
+
+
+def test_a_log_that_goes_without_its_fields_is_counted(store: Path, calls: Calls) -> None:
+    calls.fail(expiry, "write_rows", DiskFullError)
+    keep("--topic", "/camera=0s", store=store)
+    with hl.open(store, mongo="none") as opened:
+        (entry,) = opened.recordings()
+        camera = opened.topic("/camera")
+        lost = COUNT - camera.count()
+        assert lost > 50
+        assert {(one["cause"], one["reason"]) for one in entry.end["losses"]} == {
+            ("segment", "deleted without its fields: the disk was full")
+        }
+        assert sum(one["count"] for one in entry.end["losses"]) == lost
+        assert len([m.raw for m in camera]) == camera.where("n >= 0").count() == COUNT - lost
+        assert f"{lost} messages" in str(camera.completeness())
+        assert [m.fields["n"] for m in opened.topic("/arm")] == [*range(COUNT)]
+        assert opened.verify().findings == []
 
 
 # What a crash leaves.

@@ -272,7 +272,7 @@ def show_tables(store: Store, query: Query, *, as_json: bool) -> None:
     going = [one.name for one in recordings if one.status in UNFINISHED]
     found = _tables_of(store, [one for one in channels if one.recording.status not in UNFINISHED])
     tables = store.session.tables
-    lacking = [one.name for one in ended if missing(store.directory, one, tables, [topic])]
+    lacking = [one.name for one in ended if topic in missing(store.directory, one, tables)]
     if as_json:
         output.print_json({"tables": found, "missing": lacking})
         return

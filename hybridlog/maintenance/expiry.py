@@ -43,14 +43,10 @@ class Expired:
     """The result of an expiry.
 
     Attributes:
-        segments: Numbers of the logs that went.
-        messages: Number of messages whose payloads went, by topic.
         freed: Bytes of the disk that became free, what was written subtracted.
         damaged: Why logs could not go, by number.
     """
 
-    segments: list[int] = field(default_factory=list)
-    messages: dict[str, int] = field(default_factory=dict)
     freed: int = 0
     damaged: dict[int, str] = field(default_factory=dict)
 
@@ -111,13 +107,7 @@ def expire(
         except SegmentError as error:
             done.damaged[log.number] = str(error)
         before += log.bytes
-    going = [log for log in going if log.number not in done.damaged]
-    done.freed += sum(log.bytes for log in going)
-    done.segments = [log.number for log in going]
-    for log in going:
-        for number, part in log.parts.items():
-            topic = manifest.channels[number].topic
-            done.messages[topic] = done.messages.get(topic, 0) + part.messages
+    done.freed += sum(log.bytes for log in going if log.number not in done.damaged)
     return done
 
 
@@ -231,7 +221,7 @@ def let_go(
         before = now.let_go or LetGo(0, 0)
         count = 0 if lost else sum(part.messages for _, part in parts)
         rows = [
-            Loss(Cause.DISK, now.channels[n].topic, part.messages, part.first, part.last, lost)
+            Loss(Cause.SEGMENT, now.channels[n].topic, part.messages, part.first, part.last, lost)
             for n, part in (parts if lost else ())
         ]
         return with_totals(

@@ -7,9 +7,9 @@ topics and times of their channels. Nothing is deleted here; see `keep.py`.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from hybridlog.maintenance.expiry import may_go
 from hybridlog.query.choice import Choice
@@ -344,8 +344,7 @@ def plan(held: Iterable[Held], rules: Rules, *, used: int, free: int | None, now
     return _Planning([*held], rules, used, free, now).made()
 
 
-@dataclass(frozen=True, slots=True)
-class _Piece:
+class _Piece(NamedTuple):
     """A segment of a recording of which something may go."""
 
     held: Held
@@ -414,22 +413,19 @@ class _Planning:
     def _by_age(self) -> None:
         age = self._rules.max_age
         if age is not None:
-            age_ns = parse_duration(age)
-            old = (p for p in self._pieces if self._is_older(p.segment.written, age_ns))
-            self._segments(old, f"older than {age}", math.inf)
+            self._take(f"older than {age}", age_ns=parse_duration(age))
         for rule in self._rules.topics:
-            old = (p for p in self._pieces if self._is_older(p.segment.written, rule.age_ns))
-            self._topics(old, rule, f"{rule.pattern} older than {rule.age}", math.inf)
+            self._take(f"{rule.pattern} older than {rule.age}", rule, age_ns=rule.age_ns)
 
     def _by_room(self) -> None:
         if self._short(_SEGMENTS_FROM, 1.0) > 0:
             need = self._short(_TOPICS_FROM, _TOPICS_BELOW)
-            self._segments(self._pieces, self._reason(_SEGMENTS_FROM, 1.0), need)
+            self._take(self._reason(_SEGMENTS_FROM, 1.0), need=need)
         for rule in self._rules.topics:
             need = self._short(_TOPICS_FROM, _TOPICS_BELOW)
             if need > 0:
                 reason = f"{rule.pattern}: {self._reason(_TOPICS_FROM, _TOPICS_BELOW)}"
-                self._topics(self._pieces, rule, reason, need)
+                self._take(reason, rule, need=need)
         if self._short(_SEGMENTS_FROM, 1.0) > 0:
             self._groups()
 
@@ -473,45 +469,44 @@ class _Planning:
             return f"more than {share:.0%} of {size(quota)} is used"
         return f"less than {size(times * (rules.min_free or 0))} is free"
 
-    def _segments(self, pieces: Iterable[_Piece], reason: str, need: float) -> None:
-        """Let segments go until enough is free."""
-        self._group(self._chosen(pieces, need), (), reason)
+    def _take(
+        self,
+        reason: str,
+        rule: TopicRule | None = None,
+        *,
+        age_ns: int | None = None,
+        need: float = math.inf,
+    ) -> None:
+        """Let segments go, the oldest first, until enough is free; a step a recording.
 
-    def _chosen(self, pieces: Iterable[_Piece], need: float) -> Iterator[_Piece]:
-        """Those of some pieces that may go, until enough is free."""
-        for piece in pieces:
+        Args:
+            reason: Why.
+            rule: Those with no other topics than its own; None for all.
+            age_ns: Those that are as old, ns; None for all.
+            need: Bytes that are to become free.
+        """
+        chosen: dict[str, list[_Piece]] = {}  # by recording
+        for held, segment in self._pieces:
+            key = held.id, segment.number
             if need <= 0:
-                return
-            key = piece.held.id, piece.segment.number
-            if key not in self._going and not piece.segment.is_pinned:
+                break
+            if age_ns is not None and not self._is_older(segment.written, age_ns):
+                continue
+            if rule is not None:
+                fits = {t for t in segment.topics if self._rules.topic_rule(t) is rule}
+                if fits != segment.topics:
+                    self._shared |= fits
+                    continue
+            if key not in self._going and not segment.is_pinned:
                 self._going.add(key)
-                need -= piece.segment.size
-                yield piece
-
-    def _topics(self, pieces: Iterable[_Piece], rule: TopicRule, reason: str, need: float) -> None:
-        """Let segments with no other topics than those of a rule go until enough is free."""
-        own: list[_Piece] = []
-        for piece in pieces:
-            fits = {t for t in piece.segment.topics if self._rules.topic_rule(t) is rule}
-            if fits == piece.segment.topics:
-                own.append(piece)
-            else:
-                self._shared |= fits
-        chosen = [*self._chosen(own, need)]
-        topics = sorted({topic for piece in chosen for topic in piece.segment.topics})
-        self._group(chosen, tuple(topics), reason)
-
-    def _group(self, chosen: Iterable[_Piece], topics: tuple[str, ...], reason: str) -> None:
-        """Make a step of the pieces of each recording."""
-        groups: dict[str, list[_Piece]] = {}  # by recording
-        for piece in chosen:
-            groups.setdefault(piece.held.id, []).append(piece)
-        for group in groups.values():
-            held = group[0].held
-            numbers = tuple(sorted(piece.segment.number for piece in group))
-            count = sum(piece.segment.size for piece in group)
-            own = tuple(t for t in topics if any(t in piece.segment.topics for piece in group))
-            self._step(Step(held.name, held.id, numbers, own, count, reason))
+                need -= segment.size
+                chosen.setdefault(held.id, []).append(_Piece(held, segment))
+        for pieces in chosen.values():
+            held, going = pieces[0].held, [piece.segment for piece in pieces]
+            topics = set[str]().union(*(one.topics for one in going if rule is not None))
+            numbers = tuple(sorted(one.number for one in going))
+            size = sum(one.size for one in going)
+            self._step(Step(held.name, held.id, numbers, tuple(sorted(topics)), size, reason))
 
     def _step(self, step: Step) -> None:
         self._freed += step.bytes

@@ -29,7 +29,6 @@ def missing(
     directory: StoreDirectory,
     entry: RecordingEntry,
     tables: Tables | None = None,
-    among: Collection[str] | None = None,
 ) -> set[str]:
     """Topics whose tables are missing, or differ from the catalog.
 
@@ -37,12 +36,11 @@ def missing(
         directory: The store.
         entry: The recording's entry in the catalog.
         tables: Finds the tables.
-        among: The topics to look at; None for all.
     """
     from hybridlog.columns.tables import Tables
 
     tables = tables or Tables(directory.path)
-    topics = topics_of(entry) if among is None else topics_of(entry).intersection(among)
+    topics = topics_of(entry)
     lacking = tables.lacking(entry, topics)
     return lacking | {
         topic
@@ -120,17 +118,12 @@ def make_noted(
 ) -> bool:
     """Create tables of a recording that a question met missing or damaged.
 
-    Missing tables of topics that share chunks with them are created with them, so that no
-    chunk is read for each of them.
+    All that are missing are created with them, so that no chunk is read for each of them.
 
     Returns:
         False if time was short.
     """
-    try:
-        shared = _sharing(directory, entry, topics)
-    except StoreError:
-        return True
-    wanted = {*topics, *missing(directory, entry, tables, shared)}
+    wanted = {*topics, *missing(directory, entry, tables)}
     try:
         is_made = make(directory, entry, wanted, until=until)
     except TimeoutError:
@@ -140,23 +133,6 @@ def make_noted(
         made = (one for one in sorted(wanted) if tables.of(entry, one) is not None)
         report.tables += [(entry.name, one) for one in made]
     return True
-
-
-def _sharing(
-    directory: StoreDirectory, entry: RecordingEntry, wanted_topics: Collection[str]
-) -> set[str]:
-    """Topics that share chunks with some topics, or with another one of them."""
-    topics = {channel.id: channel.topic for channel in entry.channels}
-    together = {
-        frozenset(topics[channel] for channel in place.channels if channel in topics)
-        for segment in walk(directory.recording(entry.id), files_of(entry))
-        for place in segment.summary.chunks
-    }
-    found, before = {*wanted_topics}, 0
-    while len(found) > before:
-        before = len(found)
-        found.update(*(some for some in together if not found.isdisjoint(some)))
-    return found
 
 
 def channels_of(entry: RecordingEntry, topics: Collection[str]) -> set[int]:

@@ -7,9 +7,20 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from tests.faults.logs import Content
-from tests.faults.points import FAULTS
 from tests.faults.steps import ALLOCATES, DATABASE, TORN, Fault, Point, Run, Stepper
 from tests.faults.stores import Case, Prepared, Seen, Server, State, WrongError, look
+
+FAULTS: Mapping[str, tuple[Fault, bool]] = {
+    "killed": ("die", False),
+    "killed in the middle": ("torn", False),
+    "full disk": ("ENOSPC", False),
+    "failing disk": ("EIO", True),
+    "no database": ("database", False),
+    "database fails late": ("database", True),
+    "interrupted": ("INT", False),
+    "ended": ("TERM", True),
+}
+"""Faults, and whether the step is done first."""
 
 Allowed = Callable[[State, State, str], bool]
 """Gets what is there, what was before, and how the command went; whether that may be."""
