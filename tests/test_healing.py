@@ -188,6 +188,7 @@ def other_mongod(tmp_path: Path, *options: str, port: int | None = None) -> Iter
         with MongoClient(uri, serverSelectionTimeoutMS=30000) as client:
             client.admin.command("ping")
         yield uri
+        server.stop()
 
 
 def edited(store: hl.Store, _log: Path) -> None:
@@ -466,5 +467,5 @@ def test_damaged_tables_are_made_again(store: Path, way: str) -> None:
         }[way]()
     done = run(*question, store=store)
     assert done.out == want.out
-    assert done.err == "4 tables made again: missing or damaged.\n"
+    assert done.err == "6 tables made again: missing or damaged.\n"
     assert run(*question, store=store) == want
