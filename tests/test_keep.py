@@ -456,24 +456,31 @@ class Full(files.System):
         return super().writev(fd, parts)
 
 
-def test_a_full_disk_is_relieved_by_what_was_written_before(tmp_path: Path, calls: Calls) -> None:
+@pytest.mark.parametrize("has_rules", [True, False])
+def test_a_full_disk_is_relieved_and_fields_stay(
+    tmp_path: Path, calls: Calls, *, has_rules: bool
+) -> None:
+    """With rules the rows are there already; without, the spare file makes room for them."""
     path = tmp_path / "store"
     with hl.open(path, mongo="none", create=True) as store:
-        store.directory.change_settings(retention={"quota": "1GB"})
+        if has_rules:
+            store.directory.change_settings(retention={"quota": "1GB"})
         settings = SegmentSettings(chunk_size=1024, segment_size=50_000)
         with store.start("run", settings=settings) as recording:
             for number in range(COUNT):
                 at = BEGIN + number * SECOND
                 recording.write(CAMERA, image(number), log_time=at)
                 recording.write(ARM, struct.pack("<Id", number, number / 2), log_time=at + 1)
-        store.keep()
-        calls.fail(expiry, "write_rows", AssertionError)
+        store.keep({"quota": "1GB"})
+        if has_rules:
+            calls.fail(expiry, "write_rows", AssertionError)
         calls.system(Full(path))
         (step,) = store.keep({"max-age": "0s"}).plan.steps
     assert not (path / keeping.SPARE).exists()
     assert {*payloads(path).values()} == {None}
     assert step.segments == tuple(n for n, log in logs_of(path).items() if not log.is_here)
     check_answers(path)
+    assert not hl.open(path, mongo="none").recordings()[0].end.get("losses")
 
 
 def test_a_log_that_goes_without_its_fields_is_counted(store: Path, calls: Calls) -> None:

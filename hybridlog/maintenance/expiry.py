@@ -61,6 +61,7 @@ def expire(
     check: Check = lambda _: None,
     version: int = 0,
     progress: Progress | None = None,
+    make_room: Callable[[], bool] = lambda: False,
 ) -> Expired:
     """Delete sealed logs of a recording that this process has locked.
 
@@ -77,6 +78,7 @@ def expire(
         check: Part of each change of the manifest; raises if they must stay by now.
         version: As of `RowsWriter`.
         progress: Called after each chunk of which rows are written.
+        make_room: Makes room for rows on a full disk; returns False if there is none to make.
 
     Raises:
         StoreError: Files cannot be read or written; a log that is listed is as before.
@@ -98,10 +100,18 @@ def expire(
         def tell(at: int, before: int = before) -> None:
             report(before + at)
 
-        try:
+        def go(log: File = log) -> None:
             made = _rows_of(directory, recording, log, version, tell)
             _go(directory, recording, {log.number: made}, check, copy)
             done.freed -= sum(one.bytes for one in made)
+
+        try:
+            try:
+                go()
+            except DiskFullError:
+                if not make_room():
+                    raise
+                go()
         except DiskFullError:
             let_go(directory, recording, partial(_lines_of, log.number), check, NO_ROOM)
         except SegmentError as error:

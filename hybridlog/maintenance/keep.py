@@ -265,6 +265,7 @@ class Keeper:
             else:
                 at_hand = self._directory.at_hand(step.id, step.segments, check)
                 with at_hand as (here, version):
+                    how = {**how, "make_room": partial(_use_spare, self._directory)}
                     done = expire(here, step.id, step.segments, check=check, version=version, **how)
             self._changed(step.id)
         return done
