@@ -234,16 +234,13 @@ class Documents:
         Raises:
             PayloadError: Always.
         """
+        from hybridlog.columns.left_rows import with_rows
         from hybridlog.schema.left import missing_payload
-        from hybridlog.schema.reduced_codec import size_and_digest
 
-        left = self._batch.left
-        channel = self._channels[int(self._batch.channel[row])]
-        if left is None or left.part[row] < 0:
-            about = size_and_digest(self._batch.payload(row))
-        else:
-            about = left.parts[left.part[row]].about(int(left.row[row]))
-        raise missing_payload(channel.state, *about)
+        state = self._channels[int(self._batch.channel[row])].state
+        left = with_rows(self._batch.take(slice(row, row + 1))).left
+        assert left is not None
+        raise missing_payload(state, *left.parts[left.part[0]].about(int(left.row[0])))
 
     def _make(self, index: int) -> None:
         from hybridlog.schema.index_bodies import bodies_of

@@ -40,7 +40,6 @@ ALLOWED = {
         "hybridlog.schema.index_bodies",
         "hybridlog.schema.objects",
         "hybridlog.schema.protobuf_codec",
-        "hybridlog.schema.reduced_codec",
         "hybridlog_storage.mongo.database",
         "hybridlog_storage.mongo.mongod",
     ),

@@ -1,7 +1,7 @@
-"""What is left of messages without payload, by columns: rows of a file, or a reduced message.
+"""What is left of messages without payload: rows of a file, or of a reduced message.
 
-A reduced message has its fields as in an index document. They become the columns that rows
-files have, so whoever asks need not know where they come from.
+A recorder under pressure stores the row of a message in place of its payload, as an Arrow
+stream. It has the columns of fields, `error`, and of `ref` size, SHA-256 and surplus.
 """
 
 # Where stubs for pyarrow are installed, they are incomplete for its buffers.
@@ -9,6 +9,8 @@ files have, so whoever asks need not know where they come from.
 
 from __future__ import annotations
 
+from dataclasses import replace
+from hashlib import sha256
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -25,18 +27,16 @@ from hybridlog.columns.fields import (
     records_of,
 )
 from hybridlog.columns.layout import EMPTY, OWN_COLUMNS
-from hybridlog.schema.arrow_columns import lists, structs
-from hybridlog.schema.arrow_objects import json_array, missing_rows, objects_array, offsets_of
+from hybridlog.schema.arrow_columns import structs
 from hybridlog.schema.arrow_types import (
     Array,
-    has_empty,
     is_bytes,
     is_list,
     is_time,
     lengths_of,
     plain_values,
 )
-from hybridlog.schema.column import Records
+from hybridlog.schema.index_bodies import MAX_BYTES
 from hybridlog_storage.messages import Batch, Left
 
 if TYPE_CHECKING:
@@ -44,14 +44,11 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from hybridlog.schema.codec import Decoded
+    from hybridlog.schema.codec import Codec
+    from hybridlog_storage.messages import Buffer
 
 _OWN: Final = frozenset(OWN_COLUMNS)
 _LONG: Final = (pa.int64(), pa.uint32(), pa.uint64())
-_MOST: Final = (1 << 64) - 1
-_UNFIT: Final = (pa.ArrowException, AttributeError, OverflowError, TypeError, ValueError)
-_NO_FIELDS: Final = "its payload did not fit its definition when it was dropped"
-_SUMMARIES: Final = ({*SUMMARY_FIELDS[:1]}, {*SUMMARY_FIELDS})
 
 
 class LeftRows:
@@ -230,99 +227,69 @@ def _whole(value: Any) -> Any:
     return Int64(value) if isinstance(value, int) else value
 
 
-def rows_of_documents(
-    empty: Decoded | None, left: Sequence[tuple[int, bytes, dict[str, Any] | str]]
-) -> LeftRows:
-    """Rows of reduced messages.
+def reduced(codec: Codec, payload: bytes) -> bytes:
+    """What stays of a message under pressure: its row, as an Arrow stream."""
+    fields, error, surplus = structs({}, 1), None, False
+    if codec.indexed:
+        start = np.zeros(1, np.int64)
+        decoded = codec.columns(payload, start, start + len(payload))
+        surplus = len(decoded.surplus) > 0
+        if decoded.unreadable:
+            error = decoded.unreadable[0].reason
+        else:
+            fields = FieldShape().columns(decoded.arrow())
+    if fields.nbytes > MAX_BYTES:
+        fields, error = structs({}, 1), f"its fields take more than {MAX_BYTES >> 20} MiB"
+    row = _row(fields, error, len(payload), sha256(payload).digest(), surplus=surplus)
+    sink = pa.BufferOutputStream()
+    with pa.ipc.new_stream(sink, pa.schema([*row.type])) as stream:
+        stream.write_batch(pa.RecordBatch.from_struct_array(row))
+    return sink.getvalue().to_pybytes()
 
-    Args:
-        empty: No messages, as the codec of their payloads decodes them; None if it cannot.
-        left: Bytes and SHA-256 of each payload; its document, or why there is none.
-    """
-    none = structs({}, 0) if empty is None else empty.arrow()
-    kind = FieldShape().columns(none).type
-    is_typed = empty is None or isinstance(empty.records, Records) or not has_empty(none.type)
-    errors = [one if isinstance(one, str) else None for _, _, one in left]
-    documents = [{} if isinstance(one, str) else one for _, _, one in left]
-    if kind.num_fields:
-        errors = [e or (None if d else _NO_FIELDS) for e, d in zip(errors, documents, strict=True)]
-    if not is_typed:
-        kind = FieldShape().columns(objects_array([*map(_example, documents)], None)).type
-    made: Array
+
+def _row_in(payload: Buffer) -> pa.StructArray:
+    """The row in the payload of a reduced message; a struct has all columns."""
+    problem: object = "its columns are others"
     try:
-        made = _filled(documents, pa.field("", kind))
-    except _UNFIT:
-        for row, document in enumerate(documents):
-            try:
-                _filled([document], pa.field("", kind))
-            except _UNFIT as error:
-                errors[row], documents[row] = f"the payload is no reduced message: {error}", {}
-        made = _filled(documents, pa.field("", kind))
-    sizes, digests = pa.array([one[0] for one in left], pa.uint64()), [one[1] for one in left]
+        row = pa.ipc.open_stream(bytes(payload)).read_next_batch().to_struct_array()
+        row.validate(full=True)
+        kinds = {field.name: field.type for field in row.type}
+        if len(row) == 1 and all(kinds.get(field.name) == field.type for field in _EMPTY.type):
+            return row
+    except (pa.ArrowException, OSError, StopIteration) as error:
+        problem = error
+    return _row(structs({}, 1), f"the payload is not a reduced message: {problem}", 0, b"")
+
+
+def with_rows(batch: Batch) -> Batch:
+    """Reduced messages of a topic with their rows."""
+    if not len(batch) or (batch.left is not None and batch.left.part[0] >= 0):
+        return batch
+    found: dict[bytes, tuple[int, list[pa.StructArray]]] = {}  # by their columns
+    places = np.empty((2, len(batch)), np.int64)
+    for at in range(len(batch)):
+        row = _row_in(batch.payload(at))
+        columns = pa.schema([*row.type]).serialize().to_pybytes()
+        number, same = found.setdefault(columns, (len(found), []))
+        places[:, at] = number, len(same)
+        same.append(row)
+    parts = [LeftRows(pa.concat_arrays(same)) for _, same in found.values()]
+    left = Left(parts, places[0].astype(np.int32), places[1], *batch.places)
+    return replace(batch, left=left)
+
+
+def _row(
+    fields: pa.StructArray, error: str | None, size: int, digest: bytes, *, surplus: bool = False
+) -> pa.StructArray:
     about = {
-        "size": sizes,
-        "sha256": pa.array(digests, pa.binary()),
-        "surplus": pa.array(np.zeros(len(left), np.bool_)),
+        "size": pa.array([size], pa.uint64()),
+        "sha256": pa.array([digest], pa.binary()),
+        "surplus": pa.array([surplus]),
     }
-    own = {"error": pa.array(errors, pa.string()), "ref": structs(about, len(left))}
-    fields = [pa.field(name, array.type) for name, array in own.items()]
-    columns = dict(zip([field.name for field in kind], made.flatten(), strict=True))
-    return LeftRows(structs(own | columns, len(left), None, [*fields, *kind]))
+    own = {"error": pa.array([error], pa.string()), "ref": structs(about, 1)}
+    columns = dict(zip([field.name for field in fields.type], fields.flatten(), strict=True))
+    kinds = [pa.field(name, array.type) for name, array in own.items()]
+    return structs(own | columns, 1, None, [*kinds, *fields.type])
 
 
-def _is_summary(value: Any) -> bool:
-    """True for the summary of an array: integers of messages are as short as they can be."""
-    if not isinstance(value, dict) or value.keys() not in _SUMMARIES:
-        return False
-    return isinstance(value["n"], Int64) and value["n"] < 1 << 31
-
-
-def _example(value: Any) -> Any:
-    """A value of the same type with a short array in place of each summary."""
-    if _is_summary(value):
-        ends = [value.get(name, "") for name in ("min", "max")]
-        return [0.0 if end is None else end for end in ends]
-    if isinstance(value, dict):
-        return {name: _example(inner) for name, inner in value.items()}
-    return [*map(_example, value)] if isinstance(value, list) else value
-
-
-def _filled(values: Sequence[Any], field: Any) -> Array:
-    """A column of values of documents."""
-    kind = field.type
-    if EMPTY in (field.metadata or {}) and not is_list(kind):
-        return pa.array([None if value is None else True for value in values], kind)
-    if pa.types.is_struct(kind):
-        columns = {}
-        for number, inner in enumerate(kind):
-            name = original_name(inner)
-            own = [None if value is None else value.get(name) for value in values]
-            after = kind.field(number + 1) if number + 1 < kind.num_fields else None
-            if has_summaries(inner):
-                own = [_summary_in(one, kind.field(number - 1).type) for one in own]
-            elif after is not None and has_summaries(after):
-                own = [None if _summary_in(one, inner.type) else one for one in own]
-            columns[inner.name] = _filled(own, inner)
-        return structs(columns, len(values), missing_rows(values), kind)
-    if is_list(kind):
-        inner = kind.value_field
-        if EMPTY in (field.metadata or {}):
-            inner = inner.with_metadata(field.metadata)
-        items = _filled([item for value in values if value is not None for item in value], inner)
-        made = lists(items, offsets_of(values), missing_rows(values))
-        return made if made.type == kind else made.cast(kind)
-    if kind == pa.json_():
-        return json_array(values)
-    if pa.types.is_integer(kind):
-        values = [min(int(one), _MOST) if isinstance(one, float) else one for one in values]
-    return pa.array(values, kind)
-
-
-def _summary_in(value: Any, kind: Any) -> dict[str, Any] | None:
-    """The summary of an array, if it or an array among its elements was too long."""
-    if isinstance(value, dict):
-        return value
-    is_nested = isinstance(value, list) and is_list(kind) and is_list(kind.value_type)
-    if is_nested and any(_summary_in(one, kind.value_type) for one in value):
-        return {"n": len(value)}
-    return None
+_EMPTY: Final = _row(structs({}, 1), None, 0, b"")

@@ -12,11 +12,12 @@ import pyarrow as pa
 
 from hybridlog.columns.fields import FieldShape
 from hybridlog.columns.layout import Section, TopicCounts, table_schema_of
+from hybridlog.columns.left_rows import with_rows
 from hybridlog.columns.parquet_file import ParquetFileWriter
 from hybridlog.columns.rows import Places, as_table, columns_from, piece_of
 from hybridlog.schema.arrow_columns import structs
 from hybridlog.schema.codecs import codec_for
-from hybridlog.schema.reduced_codec import ReducedCodec, parsed
+from hybridlog.schema.left import LeftCodec
 from hybridlog.schema.states import State, state_of
 from hybridlog_storage.disk import durability
 from hybridlog_storage.manifest import Part, rows_line
@@ -185,7 +186,8 @@ def _table(
     """Rows of the messages of one type in a chunk, in its order."""
     rows = np.flatnonzero(np.isin(chunk.batch.channel, channels))
     batch = chunk.batch.take(rows)
-    is_reduced = isinstance(codec, ReducedCodec)
+    is_reduced = isinstance(codec, LeftCodec)
+    batch = with_rows(batch) if is_reduced else batch
     piece = piece_of(
         chunk.segment,
         batch,
@@ -197,8 +199,11 @@ def _table(
     )
     surplus = np.zeros(len(rows), np.bool_)
     surplus[piece.surplus] = True
-    payloads = map(batch.payload, range(len(batch)))
-    about = [parsed(p)[:2] if is_reduced else (len(p), sha256(p).digest()) for p in payloads]
+    if (left := batch.left) is None:
+        about = [(len(p), sha256(p).digest()) for p in map(batch.payload, range(len(batch)))]
+    else:
+        places = zip(left.part.tolist(), left.row.tolist(), strict=True)
+        about = [left.parts[part].about(row) for part, row in places]
     ref = piece.own["ref"]
     more = {
         **dict(zip([field.name for field in ref.type], ref.flatten(), strict=True)),

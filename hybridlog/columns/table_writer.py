@@ -77,7 +77,7 @@ def load() -> None:
     import pyarrow as pa
 
     import hybridlog.columns.clouds
-    import hybridlog.columns.fields
+    import hybridlog.columns.left_rows
     import hybridlog.columns.parquet_file
     import hybridlog.schema.arrow_objects  # noqa: F401
 

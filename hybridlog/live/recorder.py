@@ -48,7 +48,6 @@ from hybridlog.record.losses import Cause, Loss
 from hybridlog.record.marks import CLOCK_SET, CONTRACT
 from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.completion import completed
-from hybridlog.schema.reduced_codec import reduce, reduced_channel
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import (
     DiskFullError,
@@ -60,7 +59,7 @@ from hybridlog_storage.errors import (
 from hybridlog_storage.manifest import Mark, new_random, with_mark
 from hybridlog_storage.manifest import replace as replaced
 from hybridlog_storage.manifests import MANIFESTS
-from hybridlog_storage.messages import Channel
+from hybridlog_storage.messages import REDUCED, Channel, left_channel
 
 if TYPE_CHECKING:
     from hybridlog.contract import Contract
@@ -690,11 +689,13 @@ class Recorder:
         number: int,
     ) -> None:
         """Store the fields of a message without its payload."""
+        from hybridlog.columns.left_rows import reduced  # a recording has loaded it
+
         if recorded.reduced is None:
-            recorded.reduced = reduced_channel(recorded.channel)
+            recorded.reduced = left_channel(recorded.channel, REDUCED)
         if self._target.write(
             recorded.reduced,
-            reduce(codec_for(recorded.channel), payload),
+            reduced(codec_for(recorded.channel), payload),
             log_time=received,
             publish_time=sent,
             sequence=number,

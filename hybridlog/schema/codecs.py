@@ -32,11 +32,9 @@ def codec_for(channel: Channel) -> Codec:
     state = state_of(channel.message_encoding)
     if state is not State.WHOLE:
         from hybridlog.schema.left import LeftCodec
-        from hybridlog.schema.reduced_codec import ReducedCodec
 
         encoding = encoding_of(channel.message_encoding, channel.metadata)
-        original = codec_for(replace(channel, message_encoding=encoding))
-        return ReducedCodec(original) if state is State.REDUCED else LeftCodec(original, state)
+        return LeftCodec(codec_for(replace(channel, message_encoding=encoding)), state)
     if schema is not None and has_hidden_fields(channel):
         return OpaqueCodec(
             f"{schema.name}: the definition in the source is empty, but its md5sum says that it "

@@ -175,6 +175,10 @@ class LeftCodec:
 
     def columns_of(self, batch: Batch, fields: Collection[str] | None = None) -> Decoded:
         """The fields that are left; see `Codec.columns`."""
+        if self.state is State.REDUCED and self.indexed:
+            from hybridlog.columns.left_rows import with_rows
+
+            batch = with_rows(batch)
         places = batch.left
         if places is None:
             return self.columns(b"", no_rows(), no_rows(), fields)

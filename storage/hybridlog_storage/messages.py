@@ -102,8 +102,8 @@ class Channel:
     is_indexed: bool = True
 
 
-def expired_channel(channel: Channel, encoding: str) -> Channel:
-    """The channel of a channel's expired messages; a reduced one has no payload to expire."""
+def left_channel(channel: Channel, encoding: str) -> Channel:
+    """The channel of a channel's messages without payload; a reduced one has none to expire."""
     if channel.message_encoding == REDUCED:
         return channel
     metadata = {**channel.metadata, ORIGINAL_ENCODING: channel.message_encoding}
@@ -116,7 +116,7 @@ def with_expired(channels: Mapping[int, Channel], ids: Iterable[int]) -> dict[in
     for number in ids:
         kind, own = divmod(number, EXPIRED_IDS)
         if kind and own in found:
-            found.setdefault(number, expired_channel(found[own], _ENCODINGS[kind]))
+            found.setdefault(number, left_channel(found[own], _ENCODINGS[kind]))
     return found
 
 

@@ -14,17 +14,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import hybridlog as hl
+from hybridlog.columns.left_rows import reduced
 from hybridlog.columns.recording_logs import RecordingRows
 from hybridlog.columns.rows_file import RowsFile
 from hybridlog.entries import put_entry
 from hybridlog.maintenance.expiry import expire, write_rows
 from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.index_bodies import index_fields
-from hybridlog.schema.reduced_codec import reduce, reduced_channel
 from hybridlog_storage import manifest as truth
 from hybridlog_storage.errors import PayloadError, SegmentError, StoreError
 from hybridlog_storage.manifest import File
-from hybridlog_storage.messages import EXPIRED_IDS, Channel, Schema
+from hybridlog_storage.messages import EXPIRED_IDS, REDUCED, Channel, Schema, left_channel
 from hybridlog_storage.segments.gone_log import GoneLog, open_log
 from hybridlog_storage.segments.segment_reader import SegmentReader
 from hybridlog_storage.segments.segment_writer import SegmentSettings
@@ -179,9 +179,9 @@ def test_what_pressure_cut_answers_as_what_expired(tmp_path: Path) -> None:
     with hl.open(tmp_path / "store", create=True, mongo="none") as store:
         with store.start("log") as recording:
             for own, message in ((Channel("/cut", "ros1", CUT), payload), (CHANNELS[2], json_text)):
-                codec, small = codec_for(own), reduced_channel(own)
-                recording.write(small, reduce(codec, message), log_time=1)
-                recording.write(small, reduce(codec, message[:-1]), log_time=2)
+                codec, small = codec_for(own), left_channel(own, REDUCED)
+                recording.write(small, reduced(codec, message), log_time=1)
+                recording.write(small, reduced(codec, message[:-1]), log_time=2)
         before = answers_of(store)
         assert before["/cut"][0] == index_fields(codec_for(Channel("", "ros1", CUT)), payload)
         assert before["/said"][0] == index_fields(codec_for(CHANNELS[2]), json_text)

@@ -15,12 +15,12 @@ from mcap.writer import Writer
 
 import hybridlog as hl
 from hybridlog.cli.answers import write_answer
+from hybridlog.columns.left_rows import reduced
 from hybridlog.formats.slices import Front
 from hybridlog.query.latching import KEEP_ALL, LatchedFront, depth_of
 from hybridlog.query.query import Query
 from hybridlog.schema.codecs import codec_for
-from hybridlog.schema.reduced_codec import reduce, reduced_channel
-from hybridlog_storage.messages import Batch, Channel, Schema
+from hybridlog_storage.messages import REDUCED, Batch, Channel, Schema, left_channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.limits import Limit
 
@@ -269,10 +269,10 @@ def test_a_recorded_slice_begins_with_the_same(
 
 def test_a_latched_message_without_payload_is_counted(store: hl.Store) -> None:
     channel = Channel("/reduced", "ros1", Schema("p/T", "ros1msg", b"uint8 x"), latch("/n4"))
-    small = reduced_channel(channel)
+    small = left_channel(channel, REDUCED)
     with store.start("reduced") as recording:
         recording.write(channel, b"a", log_time=BEGIN)
-        recording.write(small, reduce(codec_for(channel), b"b"), log_time=BEGIN + 1)
+        recording.write(small, reduced(codec_for(channel), b"b"), log_time=BEGIN + 1)
         recording.write(channel, b"c", log_time=BEGIN + 2)
     query = store.topic("/reduced").between(BEGIN + 2, None)
     assert list(query.latched()) == []

@@ -13,11 +13,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hybridlog.columns.left_rows import reduced
 from hybridlog.schema.codec import Codec, Decoded, OpaqueCodec, columns_of
 from hybridlog.schema.codecs import codec_for
-from hybridlog.schema.reduced_codec import reduce, reduced_channel
 from hybridlog_storage.errors import DefinitionError
-from hybridlog_storage.messages import Batch, Channel, Schema
+from hybridlog_storage.messages import REDUCED, Batch, Channel, Schema, left_channel
 
 JSON = codec_for(Channel("/t", "json", None))
 
@@ -203,8 +203,8 @@ def test_reduced_messages_have_what_the_index_has() -> None:
         "/t", "ros1", Schema("p/T", "ros1msg", b"float32[] r\nint32 n\nstring s\ntime t")
     )
     payload = struct.pack("<I100fiI1sII", 100, *range(100), 7, 1, b"x", 5, 6)
-    codec = codec_for(reduced_channel(channel))
-    decoded = decoded_of(codec, [reduce(codec_for(channel), payload), b"short"])
+    codec = codec_for(left_channel(channel, REDUCED))
+    decoded = decoded_of(codec, [reduced(codec_for(channel), payload), b"short"])
     assert decoded.rows.tolist() == [0]
     assert [u.rows.tolist() for u in decoded.unreadable] == [[1]]
     (row,) = decoded.arrow().to_pylist()

@@ -14,6 +14,7 @@ import pytest
 from hypothesis import HealthCheck, Phase, example, given, settings
 from hypothesis import strategies as st
 
+from hybridlog.columns.left_rows import reduced
 from hybridlog.query.message_filter import MessageFilter
 from hybridlog.query.predicate.parser import parse
 from hybridlog.query.predicate.to_bool import statistic, to_bool
@@ -21,9 +22,8 @@ from hybridlog.query.predicate.to_mask import to_mask
 from hybridlog.query.predicate.tree import Predicate
 from hybridlog.query.question import RecordedChannel
 from hybridlog.schema.codecs import codec_for
-from hybridlog.schema.reduced_codec import reduce, reduced_channel
 from hybridlog_storage.catalog import ChannelStats, RecordingEntry
-from hybridlog_storage.messages import Batch, Channel, Schema
+from hybridlog_storage.messages import REDUCED, Batch, Channel, Schema, left_channel
 
 Message = dict[str, object]
 Types = dict[str, str] | None
@@ -439,11 +439,11 @@ ROS_QUESTIONS = [
 )
 def test_reduced_json_has_summaries(where: str, holds: bool) -> None:
     channel = Channel("/r", "json", None, {}, has_publish_time=False)
-    payload = reduce(codec_for(channel), json.dumps({"r": [*range(1000)]}).encode())
+    payload = reduced(codec_for(channel), json.dumps({"r": [*range(1000)]}).encode())
     zero = np.zeros(1, np.int64)
     batch = Batch(payload, zero, zero + len(payload), zero, zero, zero, zero)
     entry = RecordingEntry("0", "a", {}, {}, 0, "complete")
-    recorded = RecordedChannel(entry, 0, reduced_channel(channel), ChannelStats(), None)
+    recorded = RecordedChannel(entry, 0, left_channel(channel, REDUCED), ChannelStats(), None)
     found = MessageFilter(parse(where), None).matches(recorded, batch, zero)
     assert found.holds.tolist() == [holds]
     assert found.unreadable == found.expired == ("r." not in where)
