@@ -99,16 +99,17 @@ class RowsFile(ColumnFile):
             StoreError: They are damaged.
         """
         place = self.places[chunk]
-        return self._group(place).slice(place.begin, place.rows)
-
-    def _group(self, place: Place) -> pa.StructArray:
-        return self._cache.made(
+        group = self._cache.made(
             "column",
             self.number,
             place.group,
-            make=lambda: self.read(place.group, range(len(self.leaves))).to_struct_array(),
+            make=lambda: self._struct(place.group),
             size_of=lambda one: int(one.nbytes),
-        ).combine_chunks()
+        )
+        return group.slice(place.begin, place.rows)
+
+    def _struct(self, group: int) -> pa.StructArray:
+        return self.read(group, range(len(self.leaves))).to_struct_array().combine_chunks()
 
 
 def lines_of(folder: Path, log: File, names: Iterable[str]) -> list[File]:
