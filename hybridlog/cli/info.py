@@ -266,7 +266,7 @@ def _print_recording(
                 ("metadata", f"{one['name']} ({', '.join(one['values'])})")
                 for one in about["metadata_records"]
             ),
-            ("index", store.shared.index.connection.place),
+            ("index", store.shared.index.place),
         ]
     )
     if about["channels"]:
