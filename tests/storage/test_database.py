@@ -158,7 +158,7 @@ def test_the_drivers_own_log_and_monitors_cope(
     with MongoClient(mongod.start(), event_listeners=[Listener()]) as client:
         watched = Database(client, "test", "here")
         assert put(watched, name, encoded(100)) == 100
-    assert any("bytes of documents" in text for text in seen)
+    assert "insert" in seen
 
 
 # --- reading ---
