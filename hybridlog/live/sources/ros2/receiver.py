@@ -229,6 +229,7 @@ def _read(file: io.BufferedIOBase, size: int) -> bytes:
 def _parsed(body: bytes) -> _Event:
     """The event in the body of a frame; a definition may have surrogates, so `json` reads it."""
     try:
-        return msgspec.convert(parse_object(body), _Event)
+        event: _Event = msgspec.convert(parse_object(body), _Event)
     except msgspec.ValidationError as error:
         raise WireError(f"a malformed event: {error}") from error
+    return event
