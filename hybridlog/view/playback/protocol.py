@@ -181,9 +181,10 @@ def parse(message: str | bytes) -> Request:
     if isinstance(message, bytes):
         return _parse_binary(message)
     try:
-        return msgspec.json.decode(message, type=_Text)
+        request: _Text = msgspec.json.decode(message, type=_Text)
     except (msgspec.MsgspecError, RecursionError, UnicodeError) as problem:
         raise RequestError(f"a message is no request to a playback: {problem}") from problem
+    return request
 
 
 def _parse_binary(message: bytes) -> Control:

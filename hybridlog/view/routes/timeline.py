@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from starlette.responses import Response
 
-from hybridlog.drawing.density import bins, gaps, periods
+from hybridlog.drawing.density import aligned, density, gaps, periods
 from hybridlog.drawing.fields import fields_of
 from hybridlog.drawing.series import series as read_series
 from hybridlog.query.answers.infer_fields import SAMPLE
@@ -67,7 +67,7 @@ def timeline(context: Context, params: RequestParams) -> Response:
     start = start_of(recording)
     span = params.span(start)
     session = context.store.session
-    found = bins(session, recording, span, pixels, topics)
+    found = density(session, recording, aligned(span, pixels), topics)
     usual = periods(session, recording, topics)
     lanes, body = [], []
     for counts, exact, period in zip(found.counts, found.exact.tolist(), usual, strict=True):
