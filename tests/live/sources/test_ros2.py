@@ -409,5 +409,5 @@ def test_overrides_that_are_not_there(tmp_path: Path) -> None:
         read_overrides(tmp_path / "none.yaml")
     large = tmp_path / "large.yaml"
     large.write_bytes(b"#" * ((1 << 20) + 1))
-    with pytest.raises(UsageError, match="more than 256 KiB"):
+    with pytest.raises(UsageError, match="larger than 1 MiB"):
         read_overrides(large)
