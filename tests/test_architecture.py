@@ -66,9 +66,12 @@ ALLOWED = {
     "msgspec": (
         "hybridlog.columns.layout",
         "hybridlog.entries",
+        "hybridlog.live.sources.ros1",
+        "hybridlog.live.sources.ros2.receiver",
         "hybridlog.live.state",
         "hybridlog.maintenance",
         "hybridlog.record.capture",
+        "hybridlog.view.playback.protocol",
         "hybridlog_storage.catalog",
         "hybridlog_storage.disk.directory",
         "hybridlog_storage.manifest",
