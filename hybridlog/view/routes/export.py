@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import io
 from collections.abc import AsyncIterator, Generator
-from typing import TYPE_CHECKING, Any, BinaryIO, Final, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import StreamingResponse
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
 
     from hybridlog.query.query import Query
     from hybridlog.view.params import RequestParams
-    from hybridlog_storage.messages import Buffer
 
 MAX_TOPICS: Final = 200
 """Greatest number of topics that are named; without any, all are meant."""
@@ -105,42 +105,20 @@ def _question(context: Context, params: RequestParams) -> PageQuestion:
     return question.around(params.text("around", longest=64)) if params.has("around") else question
 
 
-class _Pieces:
-    """Bytes that were written and not taken yet."""
-
-    def __init__(self) -> None:
-        self._held: list[bytes] = []
-        self.size = 0
-
-    def write(self, data: Buffer) -> int:
-        """Hold a copy of bytes."""
-        self._held.append(bytes(data))
-        self.size += len(self._held[-1])
-        return len(self._held[-1])
-
-    def flush(self) -> None:
-        """Do nothing."""
-
-    def take(self) -> bytes:
-        """The bytes, which are no longer held."""
-        taken = b"".join(self._held)
-        self._held.clear()
-        self.size = 0
-        return taken
-
-
 def pieces_of(query: Query) -> Pieces:
     """An MCAP file in pieces; a piece is made when it is asked for."""
     from hybridlog.formats.mcap.writer import McapWriter
     from hybridlog.formats.slices import log_of
 
-    written, log = _Pieces(), log_of(query)
-    with McapWriter(cast("BinaryIO", written), profile=log.profile) as writer:
+    written, log = io.BytesIO(), log_of(query)
+    with McapWriter(written, profile=log.profile) as writer:
         for batch, channels in log.batches:
             writer.write(batch, channels)
-            if written.size >= PIECE:
-                yield written.take()
-    yield written.take()
+            if written.tell() >= PIECE:
+                yield written.getvalue()
+                written.seek(0)
+                written.truncate()
+    yield written.getvalue()
 
 
 routes = [route("/export-command", command), route("/export", file)]
