@@ -47,17 +47,7 @@ _MAX_CANDIDATES: Final = 50
 
 def ask(context: Context, params: RequestParams) -> dict[str, Any]:
     """The number of messages that satisfy a predicate, with losses and remarks."""
-    question = question_of(context, params)
-    query = question.query()
-    count = query.count()
-    found = query.completeness()
-    return {
-        "count": count,
-        "lost": found.describe(count) if found.has_losses else None,
-        "remarks": query.remarks(),
-        "python": question.python(),
-        "command": question.command(),
-    }
+    return question_of(context, params).told()
 
 
 def matches(context: Context, params: RequestParams) -> dict[str, Any]:

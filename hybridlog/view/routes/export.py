@@ -34,16 +34,7 @@ _streams = asyncio.Semaphore(MAX_STREAMS)
 def command(context: Context, params: RequestParams) -> dict[str, Any]:
     """The command line that writes a part of a recording, and how many messages it has."""
     question = _question(context, params)
-    query = question.query()
-    count = query.count()
-    found = query.completeness()
-    return {
-        "command": question.command(),
-        "python": question.python(),
-        "count": count,
-        "name": question.file_name(),
-        "lost": found.describe(count) if found.has_losses else None,
-    }
+    return {**question.told(), "name": question.file_name()}
 
 
 def file(context: Context, params: RequestParams) -> Response:
@@ -60,36 +51,21 @@ def mcap_response(query: Query, name: str) -> Response:
         name: Name of the file, of plain characters.
     """
     pieces = pieces_of(query)
-    # Most errors come before the first piece, and can still be told.
-    return _file_response(_with(next(pieces), pieces), name)
-
-
-def _with(first: bytes, rest: Pieces) -> Pieces:
-    try:
-        yield first
-        yield from rest
-    finally:
-        rest.close()
-
-
-def _file_response(pieces: Pieces, name: str) -> Response:
-    """A file that is made while it is sent; nothing more is made when the client has gone.
-
-    Args:
-        pieces: Its bytes, none of them empty.
-        name: Its name, of plain characters.
-    """
+    first = next(pieces)  # most errors come before it, and can still be told
     headers = {"Content-Disposition": f'attachment; filename="{name}"'}
-    return StreamingResponse(_sent(pieces), headers=headers, media_type="application/octet-stream")
+    sent = _sent(first, pieces)
+    return StreamingResponse(sent, headers=headers, media_type="application/octet-stream")
 
 
-async def _sent(pieces: Pieces) -> AsyncIterator[bytes]:
+async def _sent(piece: bytes, rest: Pieces) -> AsyncIterator[bytes]:
+    """All pieces, none of them empty; nothing more is made when the client has gone."""
     try:
         async with _streams:
-            while piece := await run_in_threadpool(next, pieces, b""):
+            while piece:
                 yield piece
+                piece = await run_in_threadpool(next, rest, b"")
     finally:
-        pieces.close()
+        rest.close()
 
 
 def _question(context: Context, params: RequestParams) -> PageQuestion:
