@@ -10,7 +10,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from hybridlog.index.access import IndexAccess
-from hybridlog.index.connection import Connection
 from hybridlog.session import Session
 from hybridlog.shared import Shared
 from hybridlog.snapshot import UNFINISHED
@@ -52,8 +51,7 @@ class OpenStore(Shared):
         recover: bool = True,
     ) -> None:
         super().__init__(directory)
-        connection = Connection(directory, mongo, cache_mb)
-        self.index = IndexAccess(self, connection, progress, recovers=recover)
+        self.index = IndexAccess(self, mongo, cache_mb, progress, recovers=recover)
         self._recovers = recover
         self._is_opened = False  # what a crash left was repaired, unless it is left to another
         self._latest: Session | None = None

@@ -24,7 +24,7 @@ from typing import (
 
 from hybridlog.entries import free_name_in, put_entry, text
 from hybridlog.index import consent
-from hybridlog.index.connection import again_if_lost
+from hybridlog.index.access import again_if_lost
 from hybridlog.index.of_store import Index
 from hybridlog.maintenance.report import Progress, RepairReport
 from hybridlog.opened import OpenStore
@@ -771,7 +771,7 @@ class Store:
         questions = [narrowed(query, topic).question for query in queries for topic in query.topics]
         if clock not in {"log", "publish", "header"}:
             raise UsageError(f"Unknown clock {clock!r}; choose log, publish or header.")
-        again = partial(_session_of, self.directory.address, self.shared.index.connection.wanted)
+        again = partial(_session_of, self.directory.address, self.shared.index.wanted)
         return Synced(now.session, again, questions, tolerance, cast("Clock", clock))
 
     @property
@@ -898,7 +898,7 @@ class Store:
         index.disconnect()
         shared.catch_up(entry.id)
         try:
-            if index.connection.has_none:
+            if index.has_none:
                 with suppress(StoreError), self.directory.writing(entry.id, entry.name):
                     derive(self.directory, self.catalog, entry)
             else:
@@ -916,7 +916,7 @@ class Store:
         if report.failure is None and (connected is None or connected.ping()):
             if connected is not None:
                 # The next connection need not look at it.
-                self.catalog.put_indexed([report.entry.id], self.shared.index.connection.index)
+                self.catalog.put_indexed([report.entry.id], self.shared.index.id)
             return
         # MongoDB has ended meanwhile. If it is available again, the rest is indexed.
         self.shared.index.disconnect()

@@ -47,7 +47,6 @@ PLACES = {
     "replay_late_s": "hybridlog.live.sources.replay._LATE_S",
     "replay_window_bytes": "hybridlog.live.sources.replay._WINDOW",
     "replay_window_rows": "hybridlog.live.sources.replay._WINDOW_ROWS",
-    "ros1_quiet_s": "hybridlog.live.sources.ros1.subscription._QUIET_S",
     "outbox_payload_bytes": "hybridlog.live.sources.ros2.child.outbox.MAX_PAYLOAD",
     "ros2_hello_s": "hybridlog.live.sources.ros2.process.HELLO_S",
     "ros2_hand_over_s": "hybridlog.live.sources.ros2.source._HAND_OVER_S",

@@ -65,9 +65,12 @@ ALLOWED = {
     "msgspec": (
         "hybridlog.columns.layout",
         "hybridlog.entries",
+        "hybridlog.live.sources.ros1",
+        "hybridlog.live.sources.ros2.receiver",
         "hybridlog.live.state",
         "hybridlog.maintenance",
         "hybridlog.record.capture",
+        "hybridlog.view.playback.protocol",
         "hybridlog_storage.catalog",
         "hybridlog_storage.disk.directory",
         "hybridlog_storage.manifest",
@@ -147,7 +150,7 @@ DISTRIBUTIONS = {
 
 # Modules of ours that only some may import when the program runs.
 WIRED_BY = {
-    "hybridlog_storage.mongo.mongod": ("hybridlog.cli.installed", "hybridlog.index.connection"),
+    "hybridlog_storage.mongo.mongod": ("hybridlog.cli.installed", "hybridlog.index.access"),
     "hybridlog.store": ("hybridlog", "hybridlog.cli", "hybridlog.store"),
 }
 

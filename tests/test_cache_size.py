@@ -56,7 +56,7 @@ def test_a_store_from_elsewhere_gets_half_of_the_memory_at_most(
 ) -> None:
     StoreDirectory.create(tmp_path / "store", cache_mb=10_000_000)
     sizes = {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": (1 << 30) // 4096}
-    monkeypatch.setattr("hybridlog.index.connection.os.sysconf", sizes.__getitem__)
+    monkeypatch.setattr("hybridlog.index.access.os.sysconf", sizes.__getitem__)
     with hl.open(tmp_path / "store", require_database=True) as store:
         assert cache_gb(store) == 0.5
 

@@ -45,11 +45,11 @@ def test_a_server_has_to_be_agreed_to(state: Path) -> None:
 def test_what_is_agreed_to_is_kept_private_and_without_a_password(state: Path) -> None:
     consent.trust("a", URI.replace("me@", "me:hunter2@"))
     assert consent.is_trusted("a", URI)
-    file = state / "trusted.json"
+    file = state / "trusted.jsonl"
     assert "hunter2" not in file.read_text()
     assert stat.S_IMODE(file.stat().st_mode) == 0o600
     assert stat.S_IMODE(state.stat().st_mode) == 0o700
-    assert [p.name for p in state.iterdir()] == ["trusted.json"]
+    assert [p.name for p in state.iterdir()] == ["trusted.jsonl"]
 
 
 def test_nothing_is_lost_when_many_agree_at_once() -> None:
@@ -64,7 +64,7 @@ def test_nothing_is_lost_when_many_agree_at_once() -> None:
 )
 def test_a_damaged_file_trusts_nothing(state: Path, content: bytes) -> None:
     state.mkdir(parents=True)
-    (state / "trusted.json").write_bytes(content)
+    (state / "trusted.jsonl").write_bytes(content)
     assert not consent.is_trusted("a", URI)
     consent.trust("a", URI)
     assert consent.is_trusted("a", URI)
@@ -72,7 +72,7 @@ def test_a_damaged_file_trusts_nothing(state: Path, content: bytes) -> None:
 
 def test_a_file_that_others_may_write_trusts_nothing(state: Path) -> None:
     consent.trust("a", URI)
-    file = state / "trusted.json"
+    file = state / "trusted.jsonl"
     for mode in (0o620, 0o602):
         file.chmod(mode)
         assert not consent.is_trusted("a", URI)

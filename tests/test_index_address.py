@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from urllib.parse import unquote
 
 import psutil
@@ -73,7 +74,7 @@ def test_as_a_command(path: Path) -> None:
 def test_an_address_has_no_password(tmp_path: Path) -> None:
     uri = "mongodb://me:secret@127.0.0.1:1/robots?serverSelectionTimeoutMS=1&authSource=admin"
     with hl.open(tmp_path / "store", create=True, mongo=uri) as store:
-        connection = store.shared.index.connection
-        connection._uri = uri
-        connection.open = lambda: None  # type: ignore[method-assign, assignment, return-value]
-        assert connection.address(1) == uri.replace(":secret", "")
+        index = store.shared.index
+        index._uri = uri
+        index.connect = lambda: SimpleNamespace(name="robots")  # type: ignore[method-assign, assignment, return-value]
+        assert index.address(1).uri == uri.replace(":secret", "")

@@ -72,7 +72,7 @@ def test_what_only_mongodb_can_is_refused(stores: dict[str, hl.Store]) -> None:
             ask()
     assert isinstance(store.shared.index.unavailable, WithoutMongoError)
     assert (store.verify().index, store.verify().findings) == (False, [])
-    assert store.shared.index.connection.place == "none"
+    assert store.shared.index.place == "none"
 
 
 def test_header_statistics_and_marks(
@@ -146,7 +146,7 @@ def test_a_live_recording_while_the_server_comes(tmp_path: Path, calls: Calls) -
             if away:
                 raise ConnectionLostError("MongoDB does not answer")
 
-        calls(store.shared.index.connection, "another", another)
+        calls(store.shared.index, "another", another)
         with store.start("live", LiveOptions(flush_interval_s=0.1)) as recording:
             for one in messages(0, 50, 0):
                 recording.write(CHANNELS[one.topic], one.raw, log_time=one.log_time)

@@ -266,7 +266,7 @@ def _print_recording(
                 ("metadata", f"{one['name']} ({', '.join(one['values'])})")
                 for one in about["metadata_records"]
             ),
-            ("index", store.shared.index.connection.place),
+            ("index", store.shared.index.place),
         ]
     )
     if about["channels"]:
@@ -290,14 +290,15 @@ def _coverage(entry: RecordingEntry, words: str) -> list[tuple[str, str]]:
 def _sparklines(store: Store, entry: RecordingEntry) -> dict[str, str]:
     """Messages of each topic over time; none without any, or if they cannot be read."""
     from hybridlog.cli.sparkline import densities
-    from hybridlog.drawing.density import density
+    from hybridlog.drawing.density import density, evenly
     from hybridlog.record.losses import extent_of
 
     begin, end = extent_of(entry)
     if begin == end:
         return {}
+    edges = evenly((begin, end), _DRAWN)
     try:
-        found = density(store.session, entry, (begin, end), _DRAWN, max_times=_DRAWN_TIMES)
+        found = density(store.session, entry, edges, max_times=_DRAWN_TIMES)
     except SegmentError as error:
         output.note(f"{entry.name}: {error}")
         return {}

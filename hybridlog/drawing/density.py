@@ -48,11 +48,28 @@ class Density:
     exact: NDArray[np.bool_]
 
 
+def evenly(span: tuple[int, int], pixels: int) -> NDArray[np.int64]:
+    """Edges of parts of a span, ns; the lengths of parts differ by one nanosecond at most."""
+    whole, rest = divmod(span[1] - span[0], pixels)
+    numbers = np.arange(pixels + 1, dtype=np.int64)
+    return np.int64(span[0]) + numbers * whole + numbers * rest // pixels
+
+
+def aligned(span: tuple[int, int], pixels: int) -> NDArray[np.int64]:
+    """Edges of bins of a power of two of nanoseconds from the epoch: a moved picture has the same.
+
+    They cover the span: more than half as many as pixels, unless a bin is one nanosecond, and one
+    more than pixels at most.
+    """
+    level = max(-(-(span[1] - span[0]) // pixels) - 1, 0).bit_length()
+    numbers = range(span[0] >> level, -(-span[1] >> level) + 1)
+    return np.array([min(number << level, _LATEST) for number in numbers], np.int64)
+
+
 def density(
     session: Session,
     recording: RecordingEntry,
-    span: tuple[int, int],
-    pixels: int,
+    edges: NDArray[np.int64],
     topics: Sequence[str] | None = None,
     *,
     max_times: int = MAX_TIMES,
@@ -62,67 +79,24 @@ def density(
     Args:
         session: The open store.
         recording: The recording.
-        span: Log time `[begin, end)`, ns.
-        pixels: Number of parts of the span; their lengths differ by one nanosecond at most.
+        edges: int64[p + 1], ns, as of `Density`.
         topics: Full names; None for all topics of the recording.
         max_times: Messages of a topic whose times are read; of more, those of a chunk are
             spread evenly.
-    """
-    whole, rest = divmod(span[1] - span[0], pixels)
-    numbers = np.arange(pixels + 1, dtype=np.int64)
-    edges = np.int64(span[0]) + numbers * whole + numbers * rest // pixels
-    chosen = sorted({one.topic for one in recording.channels}) if topics is None else topics
-    return _counted(session, recording, edges, chosen, max_times)
-
-
-def bins(
-    session: Session,
-    recording: RecordingEntry,
-    span: tuple[int, int],
-    pixels: int,
-    topics: Sequence[str],
-) -> Density:
-    """Counts of messages by bins of a power of two of nanoseconds, counted from the epoch.
-
-    So bins stay the same when a picture moves.
-
-    Args:
-        session: The open store.
-        recording: The recording.
-        span: Log time `[begin, end)`, ns.
-        pixels: Most bins that fit into the span.
-        topics: Full names.
-
-    Returns:
-        Bins of equal length that cover the span: more than half as many as pixels, unless
-        a bin is one nanosecond, and one more than pixels at most.
 
     Raises:
         TopicError: The recording has no such topic.
     """
-    unknown = {*topics}.difference(channel.topic for channel in recording.channels)
-    if unknown:
+    known = {channel.topic for channel in recording.channels}
+    chosen = sorted(known) if topics is None else topics
+    if unknown := {*chosen} - known:
         raise TopicError(f"{recording.name} has no topic {min(unknown)!r}.")
-    level = max(-(-(span[1] - span[0]) // pixels) - 1, 0).bit_length()
-    numbers = range(span[0] >> level, -(-span[1] >> level) + 1)
-    edges = np.array([min(number << level, _LATEST) for number in numbers], np.int64)
-    return _counted(session, recording, edges, topics)
-
-
-def _counted(
-    session: Session,
-    recording: RecordingEntry,
-    edges: NDArray[np.int64],
-    topics: Sequence[str],
-    max_times: int = MAX_TIMES,
-) -> Density:
-    counts = np.zeros((len(topics), len(edges) - 1), np.int64)
-    exact = np.ones(len(topics), np.bool_)
-    for row, topic in enumerate(topics):
-        times, is_exact = _times(session, recording, topic, max_times)
+    counts = np.zeros((len(chosen), len(edges) - 1), np.int64)
+    exact = np.ones(len(chosen), np.bool_)
+    for row, topic in enumerate(chosen):
+        times, exact[row] = _times(session, recording, topic, max_times)
         counts[row] = np.diff(np.searchsorted(times, edges))
-        exact[row] = is_exact
-    return Density(tuple(topics), edges, counts, exact)
+    return Density(tuple(chosen), edges, counts, exact)
 
 
 def periods(session: Session, recording: RecordingEntry, topics: Sequence[str]) -> list[float]:

@@ -24,20 +24,16 @@ _BAYER: Final = "bayer_"
 def thumbnail(image: NDArray[Any], encoding: str = "rgb8") -> bytes:
     """A picture of at most `SIDE` pixels a side, as PNG; empty for an empty image.
 
-    Only the pixels of the picture are looked at.
-
     Args:
         image: As for `pixels`.
         encoding: Encoding of the message.
     """
-    rows, columns = image.shape[:2]
-    shown = pixels(image, encoding, step=max(1, -(-max(rows, columns) // SIDE)))
-    return png(shown) if shown.size else b""
+    shown = pixels(image, encoding)
+    step = max(1, -(-max(shown.shape[:2]) // SIDE))
+    return png(np.ascontiguousarray(shown[::step, ::step])) if shown.size else b""
 
 
-def pixels(
-    image: NDArray[Any], encoding: str = "rgb8", *, step: int = 1, deep: bool = False
-) -> NDArray[Any]:
+def pixels(image: NDArray[Any], encoding: str = "rgb8", *, deep: bool = False) -> NDArray[Any]:
     """The pixels of an image as grey or red, green and blue.
 
     YUV is converted by ITU-R BT.601, Bayer patterns are interpolated. Values of other types
@@ -47,7 +43,6 @@ def pixels(
     Args:
         image: Shape (height, width) or (height, width, channels), as of `Message.to_numpy`.
         encoding: Encoding of the message.
-        step: Take each n-th pixel in each direction.
         deep: Keep values of `uint16` as they are, and transparency.
 
     Returns:
@@ -56,41 +51,39 @@ def pixels(
     """
     encoding = encoding.strip().lower()
     if encoding in _PLANES:
-        return _from_planes(image, *_PLANES[encoding], step)
+        return _from_planes(image, *_PLANES[encoding])
     if encoding in _LUMA:
-        return _from_pairs(image, _LUMA[encoding], step)
+        return _from_pairs(image, _LUMA[encoding])
     if encoding.startswith(_BAYER):
-        return _in_range(_from_bayer(image, encoding.removeprefix(_BAYER)[:4], step), deep=deep)
-    small = image[::step, ::step]
-    if small.ndim == 3:
-        has_alpha = deep and small.shape[2] == 4 and encoding[:4] in {"rgba", "bgra"}
-        colours = small[..., :3] if small.shape[2] >= 3 else small[..., 0]
+        return _in_range(_from_bayer(image, encoding.removeprefix(_BAYER)[:4]), deep=deep)
+    if image.ndim == 3:
+        has_alpha = deep and image.shape[2] == 4 and encoding[:4] in {"rgba", "bgra"}
+        colours = image[..., :3] if image.shape[2] >= 3 else image[..., 0]
         if encoding.startswith("bgr"):
             colours = colours[..., ::-1]
-        small = np.dstack([colours, small[..., 3]]) if has_alpha else colours
-    return _in_range(small, deep=deep)
+        image = np.dstack([colours, image[..., 3]]) if has_alpha else colours
+    return _in_range(image, deep=deep)
 
 
-def _from_pairs(image: NDArray[Any], bright: int, step: int) -> NDArray[np.uint8]:
+def _from_pairs(image: NDArray[Any], bright: int) -> NDArray[np.uint8]:
     """YUV 4:2:2: two pixels in a row share their colour."""
-    rows = image[::step]
-    luma, colour = rows[:, ::step, bright], rows[..., 1 - bright]
-    at = np.arange(0, image.shape[1], step) // 2 * 2
+    luma, colour = image[..., bright], image[..., 1 - bright]
+    at = np.arange(image.shape[1]) // 2 * 2
     # The last pixel of an odd row has no second colour.
     second = np.minimum(at + 1, max(image.shape[1] - 1, 0))
     return _from_yuv(luma, colour[:, at], colour[:, second])
 
 
-def _from_planes(image: NDArray[Any], order: str, shared: int, step: int) -> NDArray[np.uint8]:
+def _from_planes(image: NDArray[Any], order: str, shared: int) -> NDArray[np.uint8]:
     """Brightness in a plane, then pairs of colours."""
     height = image.shape[0] * 2 // 3 if shared == 2 else image.shape[0] // 3
     width = image.shape[1]
-    luma = image[:height:step, ::step]
+    luma = image[:height]
     if not luma.size:
         return np.empty(luma.shape, np.uint8)
     colours = image[height:].reshape(-(-height // shared), -1)
-    rows = np.arange(0, height, step) // shared
-    at = np.minimum(np.arange(0, width, step) // shared * 2, colours.shape[1] - 2)
+    rows = np.arange(height) // shared
+    at = np.minimum(np.arange(width) // shared * 2, colours.shape[1] - 2)
     planes = dict(
         zip(order, (colours[np.ix_(rows, at)], colours[np.ix_(rows, at + 1)]), strict=True)
     )
@@ -108,10 +101,8 @@ def _from_yuv(y: NDArray[Any], u: NDArray[Any], v: NDArray[Any]) -> NDArray[np.u
     return found
 
 
-def _from_bayer(mosaic: NDArray[Any], order: str, step: int) -> NDArray[Any]:
+def _from_bayer(mosaic: NDArray[Any], order: str) -> NDArray[Any]:
     """Colours of a mosaic: known samples stay, others are means of their neighbours."""
-    if step > 1:
-        return _sampled(mosaic, order, step)
     values = mosaic.astype(np.float32)
     found = np.empty((*mosaic.shape, 3), mosaic.dtype)
     for place, colour in enumerate("rgb"):
@@ -122,22 +113,6 @@ def _from_bayer(mosaic: NDArray[Any], order: str, step: int) -> NDArray[Any]:
         weights = _spread(is_known.astype(np.float32))
         means = np.rint(_spread(np.where(is_known, values, 0)) / np.maximum(weights, 1))
         found[..., place] = np.where(is_known, mosaic, means)
-    return found
-
-
-def _sampled(mosaic: NDArray[Any], order: str, step: int) -> NDArray[Any]:
-    """Colours of some cells of 2 x 2 pixels of a mosaic."""
-    rows, columns = (np.arange(0, size, step) // 2 * 2 for size in mosaic.shape)
-    found = np.empty((len(rows), len(columns), 3), mosaic.dtype)
-    for place, colour in enumerate("rgb"):
-        cell = order.index(colour)
-        at = [
-            np.minimum(places + offset, size - 1)
-            for places, offset, size in zip(
-                (rows, columns), divmod(cell, 2), mosaic.shape, strict=True
-            )
-        ]
-        found[..., place] = mosaic[np.ix_(*at)]
     return found
 
 

@@ -93,47 +93,6 @@ class Track:
 
 
 @dataclass(frozen=True, slots=True)
-class Fix:
-    """One position.
-
-    Attributes:
-        time: Log time, ns since the epoch.
-        has_fix: False if the receiver says that it has none, or the position is none.
-        latitude: Degrees.
-        longitude: Degrees.
-        altitude: Metres; None if it is unknown.
-        status: Number that the receiver gives; None if the message has none.
-        ellipse: Half axes of the ellipse that holds the position with 95 %, metres, and the
-            angle of the first one, radians from east to north. None if it is unknown.
-    """
-
-    time: int
-    has_fix: bool
-    latitude: float
-    longitude: float
-    altitude: float | None
-    status: int | None
-    ellipse: tuple[float, float, float] | None
-
-
-@dataclass(frozen=True, slots=True)
-class Pose:
-    """One pose.
-
-    Attributes:
-        time: Log time, ns since the epoch.
-        x: Metres, in the frame of the message.
-        y: Metres.
-        heading: Radians from x to y; None if the message has no orientation.
-    """
-
-    time: int
-    x: float
-    y: float
-    heading: float | None
-
-
-@dataclass(frozen=True, slots=True)
 class Position:
     """Place of the position in the messages of a topic.
 
@@ -323,8 +282,14 @@ def _numbers(table: pa.Table, path: str) -> NDArray[np.float64]:
     return np.full(table.num_rows, np.nan)
 
 
-def fix_of(message: Message, prefix: str = "") -> Fix:
-    """The position of a message.
+def fix_of(message: Message, prefix: str = "") -> dict[str, Any]:
+    """The position of a message: `time`, log time in ns, and more by name.
+
+    * `latitude`, `longitude`: degrees; None for what is no number. `altitude`: m, None if unknown.
+    * `has_fix`: False if the receiver says that it has none, or the position is none.
+    * `status`: number that the receiver gives; None if the message has none.
+    * `ellipse`: half axes of the ellipse that holds the position with 95 %, m, and the angle of
+      the first one, rad from east to north; None if it is unknown.
 
     Args:
         message: A message with a latitude and a longitude.
@@ -344,19 +309,21 @@ def fix_of(message: Message, prefix: str = "") -> Fix:
     number = given.get("status") if isinstance(given, Mapping) else None
     status = number if isinstance(number, int) and not isinstance(number, bool) else None
     is_there = bool(_is_position(np.array(latitude), np.array(longitude)))
-    return Fix(
-        time=message.log_time_ns,
-        has_fix=is_there and (status is None or status >= 0),
-        latitude=latitude,
-        longitude=longitude,
-        altitude=altitude if math.isfinite(altitude) else None,
-        status=status,
-        ellipse=_ellipse(fields),
-    )
+    return {
+        "time": message.log_time_ns,
+        "has_fix": is_there and (status is None or status >= 0),
+        "latitude": _finite(latitude),
+        "longitude": _finite(longitude),
+        "altitude": _finite(altitude),
+        "status": status,
+        "ellipse": _ellipse(fields),
+    }
 
 
-def pose_of(message: Message, prefix: str) -> Pose:
-    """The pose of a message.
+def pose_of(message: Message, prefix: str) -> dict[str, Any]:
+    """The pose of a message: `time`, log time in ns; `x`, `y`, m; `heading`, rad from x to y.
+
+    What is no number or not there is None.
 
     Args:
         message: A message with a pose.
@@ -371,16 +338,17 @@ def pose_of(message: Message, prefix: str) -> Pose:
     around = _inner(message.fields, prefix.removesuffix("position."))
     x, y, z, w = (_number(_inner(around, "orientation.").get(name)) for name in "xyzw")
     length = x * x + y * y + z * z + w * w
-    return Pose(
-        time=message.log_time_ns,
-        x=_number(inner["x"]),
-        y=_number(inner["y"]),
-        heading=(
-            math.atan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z)
-            if math.isfinite(length) and length > 0
-            else None
-        ),
-    )
+    heading = math.atan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z)
+    return {
+        "time": message.log_time_ns,
+        "x": _finite(_number(inner["x"])),
+        "y": _finite(_number(inner["y"])),
+        "heading": heading if math.isfinite(length) and length > 0 else None,
+    }
+
+
+def _finite(number: float) -> float | None:
+    return number if math.isfinite(number) else None
 
 
 def _inner(fields: Any, prefix: str) -> Mapping[str, Any]:

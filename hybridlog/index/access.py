@@ -1,32 +1,72 @@
-"""Reaches the index of an open store in MongoDB, when a question or a recording needs it."""
+"""The index of an open store in MongoDB, reached when a question or a recording needs it."""
 
 from __future__ import annotations
 
+import os
+import re
 import threading
 import time
+from collections.abc import Callable
 from contextlib import suppress
-from typing import TYPE_CHECKING
+from functools import wraps
+from typing import TYPE_CHECKING, NamedTuple, ParamSpec, TypeVar
 
-from hybridlog.index.connection import Connection
 from hybridlog.maintenance.report import RepairReport
 from hybridlog_storage.errors import (
     ConnectionBrokenError,
     ConnectionLostError,
     DatabaseError,
+    DiskFullError,
     HybridlogError,
     MissingDependencyError,
     ResourceError,
     StoreError,
+    WithoutMongoError,
 )
+from hybridlog_storage.settings import EMBEDDED, MIN_CACHE_MB, NAME, NONE, with_password
 
 if TYPE_CHECKING:
     from hybridlog.index.index_writer import IndexTarget
     from hybridlog.maintenance.report import Progress
     from hybridlog.shared import Shared
     from hybridlog_storage.mongo.database import Database
+    from hybridlog_storage.mongo.mongod import EmbeddedMongod
 
+_P = ParamSpec("_P")
+_T = TypeVar("_T")
+_TIMEOUT_S = 5.0
+_EMBEDDED_TIMEOUT_S = 2.0
+"""Seconds to wait for a server that was reached before; the embedded one has no network."""
 _REST_S = 10.0
 """Seconds after a failure in which questions do not try to connect again."""
+
+
+def again_if_lost(work: Callable[_P, _T]) -> Callable[_P, _T]:
+    """Do something once more if the connection to MongoDB was lost.
+
+    The new connection has started a MongoDB that had ended, and replaced damaged data files.
+    """
+
+    @wraps(work)
+    def tried(*args: _P.args, **options: _P.kwargs) -> _T:
+        try:
+            return work(*args, **options)
+        except ConnectionLostError:
+            return work(*args, **options)
+
+    return tried
+
+
+class IndexAddress(NamedTuple):
+    """The address of the index for other programs.
+
+    Attributes:
+        uri: As `pymongo.MongoClient` takes it, without a password.
+        database: Name of the database.
+    """
+
+    uri: str
+    database: str
 
 
 class IndexAccess:
@@ -34,28 +74,44 @@ class IndexAccess:
 
     Args:
         shared: The open store.
-        connection: Its connection to MongoDB.
+        mongo: URI of the MongoDB, `embedded`, or `none`; None for the one in the store's
+            settings.
+        cache_mb: Size of the embedded MongoDB's cache in MiB, if this process starts it; None
+            for the one in the store's settings.
         progress: Called while an index is brought up to date.
         recovers: False to leave what the index lacks of cut recordings to another opening.
 
     Attributes:
-        connection: As above.
+        wanted: The URI that was asked for; None for the one in the store's settings.
+        may_write: False if the user of MongoDB may only read.
+        has_none: True if the store does without MongoDB: none is wanted, or ours does not start.
+        id: Id of the index; an index that replaces it has another one. Empty without a
+            connection, and for an index without an id that this user may only read.
         unavailable: The reason why MongoDB is unavailable; None while that is unknown.
     """
 
     def __init__(
         self,
         shared: Shared,
-        connection: Connection,
+        mongo: str | None,
+        cache_mb: int | None,
         progress: Progress | None,
         *,
         recovers: bool,
     ) -> None:
-        self._shared = shared
-        self.connection = connection
+        self.wanted = mongo
+        self.may_write = True
+        self.has_none = False
+        self.id = ""
         self.unavailable: HybridlogError | None = None
+        self._shared = shared
+        self._directory = shared.directory
+        self._cache_mb = cache_mb
         self._progress = progress
         self._recovers = recovers
+        self._uri: str | None = None
+        self._mongod: EmbeddedMongod | None = None
+        self._database: Database | None = None
         self._rests_until = 0.0
         self._connecting = threading.RLock()
         self._is_complete = False  # the index has all recordings
@@ -69,7 +125,7 @@ class IndexAccess:
     @property
     def connected(self) -> Database | None:
         """The index, if it is connected already."""
-        return self.connection.database
+        return None if self._database is None or self._database.is_lost else self._database
 
     @property
     def database(self) -> Database | None:
@@ -79,24 +135,58 @@ class IndexAccess:
         """
         return self._reached(brings=True)
 
-    def _reached(self, *, brings: bool) -> Database | None:
-        """The index, connected when it is needed; `brings` it up to date first."""
-        is_ready = self._is_complete or not brings
-        if (self.connected is None or not is_ready) and time.monotonic() >= self._rests_until:
-            with suppress(HybridlogError):
-                self.connect(brings=brings)
-        return self.connected
+    @property
+    def writable_database(self) -> Database | None:
+        """The index; None if it is unavailable, or if its user may only read."""
+        database = self.database
+        return database if self.may_write else None
 
-    def index_as_it_is(self) -> Database:
-        """The index, for a MongoDB filter; it may lack recordings.
+    def database_for(self, purpose: str, *, writes: bool = False, brings: bool = True) -> Database:
+        """The index.
+
+        Args:
+            purpose: The activity, for messages.
+            writes: True if it changes the index.
+            brings: False to leave it as it is: it may lack recordings.
 
         Raises:
-            DatabaseError: it is unavailable; has the reason.
+            DatabaseError: it is unavailable, or may not be changed; has the purpose and the
+                reason.
         """
-        database = self._reached(brings=False)
+        database = self._reached(brings=brings)
         if database is None:
-            raise self._missing_database("A MongoDB filter (a predicate needs none)")
+            raise DatabaseError(f"{purpose} needs MongoDB. {self.unavailable or ''}".strip())
+        if writes and not self.may_write:
+            raise DatabaseError(
+                f"{purpose} needs a MongoDB user who may write. This one may only read: grant "
+                f"the role readWrite on the database {database.name!r}."
+            )
         return database
+
+    def index_to_record(self, purpose: str) -> IndexTarget:
+        """The index, for a new recording; it may lack other recordings, or be unavailable.
+
+        Raises:
+            DatabaseError: as for `database_for`, if it was reached.
+            StoreError: it holds the index of another store, or this store is a copy.
+        """
+        from hybridlog.index.index_writer import IndexTarget
+
+        if self.connected is not None and self.may_write:
+            if self.connected.ping():
+                return IndexTarget(self.connected, renew=self._another_again)
+            self.disconnect()
+        # Those that a crash has cut are brought into the index by another opening.
+        brings = self._recovers
+        why = self.unavailable if self._reached(brings=brings) is None else None
+        if isinstance(why, ConnectionLostError):
+            return IndexTarget(failure=why, renew=self._another_again)
+        if why is not None and self.has_none:
+            return IndexTarget()
+        if isinstance(why, StoreError):
+            raise why
+        database = self.database_for(purpose, writes=True, brings=brings)
+        return IndexTarget(database, renew=self._another_again)
 
     def connect(self, *, brings: bool = True) -> Database:
         """Connect to the index and bring it up to date; once more if the connection breaks.
@@ -105,7 +195,7 @@ class IndexAccess:
             brings: False to leave it as it is.
 
         Raises:
-            DatabaseError: MongoDB does not answer.
+            DatabaseError: MongoDB does not answer, or the store does without.
             StoreError: it holds the index of another store, or this store is a copy.
         """
         with self._connecting:
@@ -126,6 +216,133 @@ class IndexAccess:
                     self._rests_until = time.monotonic() + _REST_S
                 raise
 
+    def disconnect(self) -> None:
+        """Disconnect; questions are then answered from the files.
+
+        The embedded MongoDB ends when no process uses it.
+        """
+        if self._database is not None:
+            self._database.close()
+        self._database = None
+        self.id = ""
+        if self._mongod is not None:
+            self._mongod.stop()
+        self._mongod = None
+
+    def take_over(self) -> None:
+        """Record in the index that the store is at this location.
+
+        Raises:
+            DatabaseError: MongoDB does not answer.
+            StoreError: the database holds the index of another store.
+        """
+        from hybridlog.maintenance import lease
+        from hybridlog_storage.mongo.index_state import IndexState
+
+        self.disconnect()
+        with self.another() as database:
+            state = IndexState(database)
+            place = lease.place_of(self._directory)
+            lease.check(state.mark(), place, database, embedded=True)
+            state.claim(place)
+        self._is_available()
+
+    def address(self, wait_s: float) -> IndexAddress:
+        """The address of the index for other programs; it stays the same.
+
+        Args:
+            wait_s: Seconds for which an embedded MongoDB waits for clients.
+
+        Raises:
+            DatabaseError: MongoDB does not answer.
+        """
+        name = self.connect().name
+        if self._mongod is not None:
+            return IndexAddress(self._mongod.publish(wait_s), name)
+        return IndexAddress(re.sub(r"//([^:/@]*):[^/]*@", r"//\1@", self._uri or ""), name)
+
+    @property
+    def place(self) -> str:
+        """Description of the index's location; does not contact MongoDB."""
+        if self.connected is not None:
+            return f"database {self.connected.name} at {self.connected.address}"
+        uri = self.wanted or self._directory.settings.mongo or EMBEDDED
+        if uri == EMBEDDED:
+            return "the MongoDB that comes with hybridlog"
+        if uri == NONE:
+            return "none"
+        from hybridlog_storage.mongo.database import without_secrets
+
+        return without_secrets(uri)
+
+    def another(self) -> Database:
+        """An additional connection; starts the embedded MongoDB if it is not running.
+
+        Raises:
+            DatabaseError: MongoDB does not answer, or the store does without.
+        """
+        from hybridlog.index import consent
+
+        if self._uri is None:
+            self._uri = consent.trusted_uri(
+                self._directory.settings, self._directory.path, self.wanted
+            )
+        if self._uri == NONE:
+            self.has_none = True
+            setting = "--mongo none" if self.wanted else f'mongo = "none" in {NAME}'
+            raise WithoutMongoError(
+                f"The store is used without MongoDB ({setting}). With --mongo embedded, or --mongo "
+                "URI, a command uses one; `hybridlog index rebuild` makes its index."
+            )
+        from hybridlog_storage.mongo.database import Database
+
+        if self._uri == EMBEDDED:
+            return Database.connect(self._started(), timeout_s=_EMBEDDED_TIMEOUT_S)
+        return Database.connect(with_password(self._uri), timeout_s=_TIMEOUT_S)
+
+    def _started(self) -> str:
+        """The URI of the embedded MongoDB, which runs."""
+        from hybridlog_storage.mongo.mongod import EmbeddedMongod
+
+        if self._mongod is None:
+            cache_mb = self._cache_mb or _bounded_cache_mb(self._directory.settings.cache_mb)
+            self._mongod = EmbeddedMongod(self._directory.mongod, cache_mb=cache_mb)
+        try:
+            uri = self._mongod.start()
+        except StoreError as error:
+            # A read-only store has no embedded MongoDB, but its segments can be read.
+            self.has_none = True
+            raise DatabaseError(str(error)) from error
+        except (DatabaseError, MissingDependencyError, ResourceError) as error:
+            self.has_none = not isinstance(error, DiskFullError)
+            raise
+        self.has_none = False
+        if self._mongod.damage is not None:
+            self._shared.repairs.damage.append(self._mongod.damage)
+        return uri
+
+    def _another_again(self) -> Database:
+        """An additional connection to the index, after one has failed.
+
+        Raises:
+            DatabaseError: It does not answer, or belongs to another store.
+        """
+        try:
+            if not self.id:
+                with self._connecting:
+                    self._open()
+            return self.another()
+        except (StoreError, ResourceError, MissingDependencyError) as error:
+            raise DatabaseError(str(error)) from error
+
+    def _reached(self, *, brings: bool) -> Database | None:
+        """The index, connected when it is needed; `brings` it up to date first."""
+        is_ready = self._is_complete or not brings
+        if (self.connected is None or not is_ready) and time.monotonic() >= self._rests_until:
+            with suppress(HybridlogError):
+                self.connect(brings=brings)
+        return self.connected
+
     def _connect(self, *, brings: bool) -> Database:
         from hybridlog.maintenance import index
 
@@ -135,25 +352,22 @@ class IndexAccess:
         repairs = RepairReport()
         changed: set[str] = set()
         try:
-            database = self.connection.open()
-            if brings and self.connection.may_write:
+            database = self._open()
+            if brings and self.may_write:
                 store = index.StoreIndex(shared.directory, shared.catalog, database, self._progress)
                 session = self._shared.now()
                 changed = store.bring_up_to_date(
                     session.snapshot(),
                     session.entry_of,
-                    index=self.connection.index,
+                    index=self.id,
                     stale=self._stale,
                     report=repairs,
                 )
         finally:
-            shared.repairs.damage += self.connection.damage
-            self.connection.damage.clear()
             shared.repairs.indexed.update(repairs.indexed)
             shared.repairs.unreadable.update(repairs.unreadable)
             shared.repairs.removed += repairs.removed
-        self.unavailable = None
-        self._rests_until = 0.0
+        self._is_available()
         if brings:
             self._stale = set()
             self._is_complete = True
@@ -161,84 +375,40 @@ class IndexAccess:
                 shared.catch_up(*changed)  # what came meanwhile is seen, and indexed next
         return database
 
-    def disconnect(self) -> None:
-        """Disconnect from MongoDB; questions are then answered from the files."""
-        self.connection.close()
+    def _open(self) -> Database:
+        """Connect, and check that the database belongs to this store."""
+        from hybridlog.maintenance import lease
+        from hybridlog_storage.mongo.index_state import IndexState
 
-    def take_over(self) -> None:
-        """Record in the index that the store is at this location."""
-        self.connection.take_over()
+        database = self.connected
+        if database is None:
+            if self._database is not None:
+                self._database.close()
+            database = self._database = self.another()
+            state = IndexState(database)
+            place = lease.place_of(self._directory)
+            self.may_write = database.may_write()
+            mark = state.mark()
+            if self._uri == EMBEDDED and mark is not None and mark.get("id") != place["id"]:
+                database.drop_all()  # the store is a copy that has an id of its own now
+                mark = None
+            is_new = lease.check(mark, place, database, embedded=self._uri == EMBEDDED)
+            if (is_new or mark is None or "index" not in mark) and self.may_write:
+                mark = state.claim(place)
+            self.id = "" if mark is None else str(mark.get("index", ""))
+        return database
+
+    def _is_available(self) -> None:
         self.unavailable = None
         self._rests_until = 0.0
 
-    def database_for(self, purpose: str, *, writes: bool = False) -> Database:
-        """The index.
 
-        Args:
-            purpose: The activity, for messages.
-            writes: True if it changes the index.
+def _bounded_cache_mb(stored: int | None) -> int:
+    """The size of the cache in a store's settings, at most half of the memory.
 
-        Raises:
-            DatabaseError: it is unavailable, or may not be changed; has the purpose and the
-                reason.
-        """
-        return self._checked(self.database, purpose, writes=writes)
-
-    def _checked(self, database: Database | None, purpose: str, *, writes: bool) -> Database:
-        """The index, if there is one that may be used; raises as `database_for` does."""
-        if database is None:
-            raise self._missing_database(purpose)
-        if writes and not self.connection.may_write:
-            raise DatabaseError(
-                f"{purpose} needs a MongoDB user who may write. This one may only read: grant "
-                f"the role readWrite on the database {database.name!r}."
-            )
-        return database
-
-    def _missing_database(self, purpose: str) -> DatabaseError:
-        return DatabaseError(f"{purpose} needs MongoDB. {self.unavailable or ''}".strip())
-
-    @property
-    def writable_database(self) -> Database | None:
-        """The index; None if it is unavailable, or if its user may only read."""
-        database = self.database
-        return database if self.connection.may_write else None
-
-    def index_to_record(self, purpose: str) -> IndexTarget:
-        """The index, for a new recording; it may lack other recordings, or be unavailable.
-
-        Raises:
-            DatabaseError: as for `database_for`, if it was reached.
-            StoreError: it holds the index of another store, or this store is a copy.
-        """
-        from hybridlog.index.index_writer import IndexTarget
-
-        if self.connected is not None and self.connection.may_write:
-            if self.connected.ping():
-                return IndexTarget(self.connected, renew=self._another_database)
-            self.disconnect()
-        # Those that a crash has cut are brought into the index by another opening.
-        database = self._reached(brings=self._recovers)
-        if database is None and self.unavailable is not None:
-            if isinstance(self.unavailable, ConnectionLostError):
-                return IndexTarget(failure=self.unavailable, renew=self._another_database)
-            if self.connection.has_none:
-                return IndexTarget()
-            if isinstance(self.unavailable, StoreError):
-                raise self.unavailable
-        database = self._checked(database, purpose, writes=True)
-        return IndexTarget(database, renew=self._another_database)
-
-    def _another_database(self) -> Database:
-        """An additional connection to the index.
-
-        Raises:
-            DatabaseError: It does not answer, or belongs to another store.
-        """
-        try:
-            if not self.connection.index:
-                with self._connecting:
-                    self.connection.open()
-            return self.connection.another()
-        except (StoreError, ResourceError, MissingDependencyError) as error:
-            raise DatabaseError(str(error)) from error
+    The store may come from a larger machine, or from somebody else.
+    """
+    if stored is None:
+        return MIN_CACHE_MB
+    memory_mb = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") >> 20
+    return max(MIN_CACHE_MB, min(stored, memory_mb // 2))

@@ -2,7 +2,7 @@
 
 A store may come from somebody else, and its `hybridlog.toml` may name any server. So the URI
 in it is used only if this user created the store with it, or has named it by `--mongo`. That is
-remembered outside all stores, in `$XDG_STATE_HOME/hybridlog/trusted.json`.
+remembered outside all stores, in `$XDG_STATE_HOME/hybridlog/trusted.jsonl`.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ import json
 import os
 import stat
 from contextlib import suppress
-from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from hybridlog_storage.disk import durability, files
@@ -20,11 +19,12 @@ from hybridlog_storage.errors import DatabaseError, StoreError
 from hybridlog_storage.settings import EMBEDDED, is_uri, without_password
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from hybridlog_storage.settings import StoreSettings
 
-_NAME: Final = "trusted.json"
+_NAME: Final = "trusted.jsonl"
 _LIMIT: Final = 16 << 20  # bytes
-_STORES: Final = "stores"
 
 
 def trusted_uri(settings: StoreSettings, store: Path, named: str | None = None) -> str:
@@ -55,8 +55,15 @@ def trusted_uri(settings: StoreSettings, store: Path, named: str | None = None) 
 
 
 def is_trusted(store_id: str, uri: str) -> bool:
-    """True if this user has named a server for a store."""
-    return without_password(uri) in _trusted().get(store_id, ())
+    """True if this user has named a server for a store.
+
+    A file that is missing, or that other users may write, trusts none.
+    """
+    with suppress(OSError, StoreError):
+        path = state_directory() / _NAME
+        lines = files.read_file(path, _LIMIT).splitlines() if _is_own(path) else ()
+        return _line(store_id, uri) in lines
+    return False
 
 
 def trust(store_id: str, uri: str) -> None:
@@ -71,17 +78,28 @@ def trust(store_id: str, uri: str) -> None:
     """
     if is_trusted(store_id, uri):
         return
-    directory = state_directory()
-    path = directory / _NAME
+    path = state_directory() / _NAME
     try:
-        directory.mkdir(mode=0o700, parents=True, exist_ok=True)
-        with files.locked_folder(directory):
-            trusted = _trusted()
-            trusted.setdefault(store_id, []).append(without_password(uri))
-            content = json.dumps({_STORES: trusted}, indent=2) + "\n"
-            files.write_file(path, content.encode(), 0o600)
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        with suppress(FileNotFoundError):
+            if not _is_own(path):
+                files.unlink(path)
+        file = files.open_file(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
+        with os.fdopen(file, "wb") as appended:
+            # What stands before may be cut.
+            appended.write(b"\n" + _line(store_id, uri) + b"\n")
     except OSError as error:
         raise durability.explain(error, path, "remembering trusted servers in") from error
+
+
+def _is_own(path: Path) -> bool:
+    """True if only this user may write a file."""
+    about = files.status(path)
+    return about.st_uid == os.geteuid() and not stat.S_IMODE(about.st_mode) & 0o022
+
+
+def _line(store_id: str, uri: str) -> bytes:
+    return json.dumps([store_id, without_password(uri)]).encode()
 
 
 def state_directory() -> Path:
@@ -91,24 +109,3 @@ def state_directory() -> Path:
         StoreError: this user has no home directory.
     """
     return user_directory("XDG_STATE_HOME", ".local/state", "trusted servers")
-
-
-def _trusted() -> dict[str, list[str]]:
-    """URIs by store; empty if the file is missing, damaged, or writable by other users."""
-    try:
-        path = state_directory() / _NAME
-        about = files.status(path)
-        if about.st_uid != os.geteuid() or stat.S_IMODE(about.st_mode) & 0o022:
-            return {}
-        stores = json.loads(files.read_file(path, _LIMIT))[_STORES]
-        return {str(store): [str(uri) for uri in uris] for store, uris in stores.items()}
-    except (
-        OSError,
-        StoreError,
-        ValueError,
-        LookupError,
-        TypeError,
-        AttributeError,
-        RecursionError,
-    ):
-        return {}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
-from hybridlog.index.connection import IndexAddress, again_if_lost
+from hybridlog.index.access import IndexAddress, again_if_lost
 from hybridlog.query.query import Query
 from hybridlog.query.question import Question
 from hybridlog_storage.errors import TopicError, UsageError
@@ -184,8 +184,7 @@ class Index:
         Raises:
             DatabaseError: MongoDB is unavailable.
         """
-        database = self._shared.index.connect()
-        return IndexAddress(self._shared.index.connection.address(_CLIENTS_WAIT_S), database.name)
+        return self._shared.index.address(_CLIENTS_WAIT_S)
 
     def _about(self, *topics: str) -> Query:
         return Query(self._shared, Question(*self._shared.now().resolve(topics)))

@@ -74,7 +74,7 @@ def change(
             raise gone(entry.name) from error
     shared.catch_up(entry.id)
     row = catalog.recording(entry.id)
-    if row is not None and index.connected is not None and index.connection.may_write:
+    if row is not None and index.connected is not None and index.may_write:
         with suppress(ConnectionLostError):  # the next connection mirrors it
             IndexState(index.connected).show(with_said(row[1], made))
     return shared.now().entry(entry.id)

@@ -145,7 +145,9 @@ class IndexReader:
                 )
         failure: Exception | None = None
         for _ in range(_TRIES):
-            database = self._session.shared.index.index_as_it_is()
+            database = self._session.shared.index.database_for(
+                "A MongoDB filter (a predicate needs none)", brings=False
+            )
             keys = {part.recording.key for part in parts}
             try:
                 indexed = IndexState(database).of(keys, ())

@@ -372,14 +372,7 @@ def narrowed(array: Array, kind: pa.DataType) -> Array:
     if _types.is_struct(kind) and not kind.num_fields:
         return structs({}, len(array), missing_of(array))
     if _types.is_struct(kind) and _types.is_struct(array.type):
-        have = dict(zip([field.name for field in array.type], array.flatten(), strict=True))
-        children = {
-            field.name: narrowed(have[field.name], field.type)
-            if field.name in have
-            else pa.nulls(len(array), field.type)
-            for field in kind
-        }
-        return structs(children, len(array), missing_of(array), kind)
+        return _with_fields(array, kind, narrowed)
     if is_list(kind) and is_list(array.type) and kind != array.type:
         values = narrowed(array.flatten(), kind.value_type)
         return converted(with_values(array, values), kind)
@@ -404,11 +397,18 @@ def _converted_struct(array: Array, kind: pa.DataType) -> Array:
         array = summary(array)
     if not _types.is_struct(array.type):
         raise pa.ArrowInvalid(f"{array.type} is not {kind}")
-    have = dict(zip([field.name for field in array.type], array.flatten(), strict=True))
-    if not {field.name for field in kind} >= set(have):
+    if not {field.name for field in kind} >= {field.name for field in array.type}:
         raise pa.ArrowInvalid(f"{array.type} has fields that {kind} lacks")
+    return _with_fields(array, kind, converted)
+
+
+def _with_fields(
+    array: Array, kind: pa.DataType, convert: Callable[[Array, pa.DataType], Array]
+) -> Array:
+    """Structs with converted fields, and nulls in those that they lack."""
+    have = dict(zip([field.name for field in array.type], array.flatten(), strict=True))
     children = {
-        field.name: converted(have[field.name], field.type)
+        field.name: convert(have[field.name], field.type)
         if field.name in have
         else pa.nulls(len(array), field.type)
         for field in kind

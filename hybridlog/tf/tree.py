@@ -31,10 +31,6 @@ if TYPE_CHECKING:
     Way = tuple[str, ...]  # names of frames, each the parent of the one before
 
 _S: Final = 1e9
-_TREE: Final = (
-    "frame", "parent", "depth", "is_static", "transforms", "rate_hz",
-    "first", "last", "longest_gap_ns", "longest_gap_begin",
-)  # fmt: skip
 _BLOCK: Final = 1 << 13  # times looked up together, so that they stay in the processor's cache
 
 
@@ -294,30 +290,23 @@ class FrameTree:
         import pyarrow as pa
 
         stamp = pa.timestamp("ns", "UTC")
-        rows: dict[str, list[object]] = {name: [] for name in _TREE}
+        kinds = {
+            "frame": pa.string(), "parent": pa.string(), "depth": pa.int64(),
+            "is_static": pa.bool_(), "transforms": pa.int64(), "rate_hz": pa.float64(),
+            "first": stamp, "last": stamp, "longest_gap_ns": pa.int64(), "longest_gap_begin": stamp,
+        }  # fmt: skip
+        rows: list[dict[str, object]] = []
         for name, depth in self.walk():
-            one = self.frames.get(name)
-            gap = None if one is None else one.longest_gap()
-            is_moving = one is not None and not one.is_static
-            values = (
-                name,
-                one and one.parents[-1],
-                depth,
-                one and one.is_static,
-                one and len(one.stamps),
-                one and one.rate_hz,
-                int(one.stamps[0]) if one and is_moving else None,
-                int(one.stamps[-1]) if one and is_moving else None,
-                gap and gap[1] - gap[0],
-                gap and gap[0],
-            )
-            for column, value in zip(rows.values(), values, strict=True):
-                column.append(value)
-        types = (
-            pa.string(), pa.string(), pa.int64(), pa.bool_(), pa.int64(), pa.float64(),
-            stamp, stamp, pa.int64(), stamp,
-        )  # fmt: skip
-        return pa.table([pa.array(c, t) for c, t in zip(rows.values(), types, strict=True)], _TREE)
+            rows.append({"frame": name, "depth": depth})
+            if (one := self.frames.get(name)) is None:
+                continue
+            rows[-1] |= {"parent": one.parents[-1], "is_static": one.is_static}
+            rows[-1] |= {"transforms": len(one.stamps), "rate_hz": one.rate_hz}
+            if not one.is_static:
+                rows[-1] |= {"first": int(one.stamps[0]), "last": int(one.stamps[-1])}
+            if (gap := one.longest_gap()) is not None:
+                rows[-1] |= {"longest_gap_ns": gap[1] - gap[0], "longest_gap_begin": gap[0]}
+        return pa.Table.from_pylist(rows, pa.schema(kinds))
 
     def transform(
         self, target: str, source: str, time: TimeLike, *, extrapolate: DurationLike | None = None

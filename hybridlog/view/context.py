@@ -28,7 +28,6 @@ from hybridlog_storage.stopping import GivenUpError, held, until_given_up
 from hybridlog_storage.times import END, span_of
 
 if TYPE_CHECKING:
-    import numpy as np
     from numpy.typing import NDArray
     from starlette.requests import Request
 
@@ -278,14 +277,15 @@ def _message(query: Query, moment: int, seq: int) -> Message | None:
 _ALIGNED = 8
 
 
-def packed_response(
-    header: Mapping[str, Any], arrays: Mapping[str, NDArray[np.floating[Any]]]
-) -> Response:
-    """Plain values, and arrays of float32 or float64 by name; the wide ones come first."""
+def packed_response(header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> Response:
+    """Plain values, and arrays of numbers by name; those of wide numbers come first.
+
+    Behind the length of the header (uint32, little-endian, as all numbers) is the header, JSON
+    with spaces up to a multiple of 8 bytes, then array after array.
+    """
     ordered = sorted(arrays.items(), key=lambda one: -one[1].dtype.itemsize)
     described = [
-        {"name": name, "type": f"float{array.dtype.itemsize * 8}", "count": array.size}
-        for name, array in ordered
+        {"name": name, "type": array.dtype.name, "count": array.size} for name, array in ordered
     ]
     values = {**header, "arrays": described}
     text = json.dumps(values, separators=(",", ":"), allow_nan=False).encode()

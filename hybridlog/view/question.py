@@ -6,7 +6,7 @@ import re
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from hybridlog.query.predicate.parser import names_topics, parse
 from hybridlog.query.predicate.tokens import MAX_TEXT
@@ -61,6 +61,19 @@ class PageQuestion:
         if self.where:
             query = query.where(self.where, self.within or None)
         return query
+
+    def told(self) -> dict[str, Any]:
+        """The number of its messages, losses and remarks, its command line and its program."""
+        query = self.query()
+        count = query.count()
+        found = query.completeness()
+        return {
+            "count": count,
+            "lost": found.describe(count) if found.has_losses else None,
+            "remarks": query.remarks(),
+            "python": self.python(),
+            "command": self.command(),
+        }
 
     def around(self, distance: str) -> PageQuestion:
         """The messages of all topics near the matches in time.

@@ -90,7 +90,7 @@ class SqlProcess:
                     start_new_session=True,  # Ctrl-C ends the page, which ends this process
                 )
             threading.Thread(target=child.wait, daemon=True).start()
-            mongo = self._store.shared.index.connection.wanted
+            mongo = self._store.shared.index.wanted
             directory = self._store.directory
             self._control.send((directory.address, mongo, directory.read_only))
         send_handle(self._control, theirs.fileno(), None)

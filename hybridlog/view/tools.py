@@ -7,7 +7,7 @@ are data of the robot.
 from __future__ import annotations
 
 import json
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from itertools import chain, islice
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
@@ -166,8 +166,7 @@ def _each(found: Any) -> Iterator[int]:
 
 def sql(context: Context, text: str, seconds: float) -> Answer:
     """The first rows of a query in SQL."""
-    connection = context.store.sql_engine.connect(SQL_MEMORY, only_reads=True)
-    try:
+    with closing(context.store.sql_engine.connect(SQL_MEMORY, only_reads=True)) as connection:
         answer = connection.query(text, timeout=seconds)
         table, is_cut = answer.first(MAX_ROWS, MAX_BYTES)
         try:
@@ -179,8 +178,6 @@ def sql(context: Context, text: str, seconds: float) -> Answer:
         rows = [*map(list, zip(*values, strict=True))]
         found = {"columns": table.column_names, "lacks": answer.sentences(), "rows": rows}
         return _answer(found, "rows", is_cut=is_cut)
-    finally:
-        connection.close()
 
 
 def fetch(

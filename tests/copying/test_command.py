@@ -12,7 +12,7 @@ import pytest
 import hybridlog as hl
 from hybridlog.cli import watching
 from hybridlog.cli.signals import Stopped
-from hybridlog.drawing.density import density
+from hybridlog.drawing.density import density, evenly
 from hybridlog.schema.states import CAUSES, State, without_payload
 from hybridlog.view.context import Context
 from hybridlog.view.tools import recordings
@@ -129,7 +129,7 @@ def _told(path: Path) -> Counter[State]:
         (one,) = store.summaries()
         assert one.span is not None
         span = one.span[0], one.span[1] + 1
-        drawn = density(store.session, store.entry(one.id), span, 8, ["/cloud"])
+        drawn = density(store.session, store.entry(one.id), evenly(span, 8), ["/cloud"])
         assert drawn.counts.sum() == found.total()
         (listed,) = answer("ls", "--json", store=path).json
         assert (listed["expired"], listed["not_copied"]) == (one.expired, one.not_copied)

@@ -15,7 +15,7 @@ from mcap.writer import Writer
 from numpy.typing import NDArray
 
 import hybridlog as hl
-from hybridlog.drawing.density import bins, density, periods
+from hybridlog.drawing.density import aligned, density, evenly, periods
 from hybridlog.query.planner import Planner
 from hybridlog_storage.cache import Cache
 from hybridlog_storage.catalog import RecordingEntry
@@ -88,7 +88,7 @@ SPANS = st.tuples(
 def test_pixels_have_what_queries_count(
     store: hl.Store, span: tuple[int, int], pixels: int, number: int
 ) -> None:
-    found = density(store.session, store.entry("a"), span, pixels)
+    found = density(store.session, store.entry("a"), evenly(span, pixels))
     assert found.topics == tuple(sorted(TIMES))
     assert (found.edges[0], found.edges[-1], len(found.edges)) == (*span, pixels + 1)
     assert np.ptp(np.diff(found.edges)) <= 1
@@ -108,7 +108,9 @@ def test_zooming_and_panning_change_nothing(
     store: hl.Store, views: list[tuple[tuple[int, int], int]]
 ) -> None:
     for span, pixels in views:
-        found = bins(store.session, store.entry("a"), span, pixels, ["/late", "/steady"])
+        found = density(
+            store.session, store.entry("a"), aligned(span, pixels), ["/late", "/steady"]
+        )
         widths = np.diff(found.edges)
         assert found.edges[0] <= span[0] < found.edges[1]
         assert found.edges[-2] < span[1] <= found.edges[-1]
@@ -127,7 +129,7 @@ def test_a_small_cache_forgets_and_stays_right(store: hl.Store) -> None:
     try:
         for begin in range(0, LENGTH, LENGTH // 16):
             span = BASE + begin, BASE + begin + LENGTH // 16
-            found = bins(store.session, store.entry("a"), span, 500, sorted(TIMES))
+            found = density(store.session, store.entry("a"), aligned(span, 500), sorted(TIMES))
             for topic, counts in zip(found.topics, found.counts, strict=True):
                 assert (counts == _truth(topic, found.edges)).all()
     finally:
@@ -139,7 +141,7 @@ def test_a_picture_reads_its_topics_once_and_no_payload(store: hl.Store, calls: 
     calls.fail(SegmentReader, "read_chunk", AssertionError("a payload was read"))
     asked = calls(Planner, "parts")
     for span in ((BASE, BASE + LENGTH), (BASE + 100 * MS, BASE + 120 * MS)):
-        bins(store.session, store.entry("a"), span, 100, ["/steady", "/rare"])
+        density(store.session, store.entry("a"), aligned(span, 100), ["/steady", "/rare"])
         periods(store.session, store.entry("a"), ["/steady"])
     assert len(asked) == 2
 
@@ -155,8 +157,8 @@ def test_usual_periods(store: hl.Store) -> None:
 
 def test_too_many_messages_are_estimated(store: hl.Store) -> None:
     span = BASE - 10 * MS, BASE + LENGTH + 10 * MS
-    exact = density(store.session, store.entry("a"), span, 400)
-    found = density(store.session, store.entry("a"), span, 400, max_times=1999)
+    exact = density(store.session, store.entry("a"), evenly(span, 400))
+    found = density(store.session, store.entry("a"), evenly(span, 400), max_times=1999)
     right = dict(zip(found.topics, found.exact.tolist(), strict=True))
     assert [topic for topic, is_right in right.items() if not is_right] == ["/steady"]
     assert (found.counts[found.exact] == exact.counts[found.exact]).all()
@@ -179,7 +181,7 @@ def test_damaged_message_indexes(store: hl.Store, tmp_path: Path) -> None:
         for place in (int(chunk["offset"]) + 60, int(chunk["offset"] + chunk["length"]) + 20):
             content[place] ^= 0xFF
         path.write_bytes(content)
-        found = density(damaged.session, entry, (BASE, BASE + LENGTH), 500)
+        found = density(damaged.session, entry, evenly((BASE, BASE + LENGTH), 500))
         steady = found.topics.index("/steady")
         assert not found.exact[steady]
         assert found.counts[steady].sum() == len(TIMES["/steady"])
@@ -202,13 +204,13 @@ def test_a_recording_that_goes_on(tmp_path: Path) -> None:
         hl.open(tmp_path / "store") as store,
     ):
         with pytest.raises(TopicError, match="'/a'"):
-            bins(store.session, store.entry("live"), span, 10, ["/a"])
+            density(store.session, store.entry("live"), aligned(span, 10), ["/a"])
 
         def live() -> RecordingEntry:
             return store.entry("live")
 
         def ask() -> NDArray[np.int64]:
-            return bins(store.session, live(), span, 1000, ["/a", "/b"]).counts
+            return density(store.session, live(), aligned(span, 1000), ["/a", "/b"]).counts
 
         written = 0
         for channel, messages in ((A, 100), (B, 60), (A, 1500)):
@@ -225,7 +227,7 @@ def test_a_recording_that_goes_on(tmp_path: Path) -> None:
         assert found[1][50:80].tolist() == [2] * 30
         assert live().flushed
         assert live().digests
-        plain = density(store.session, live(), span, 1000, ["/a", "/b"])
+        plain = density(store.session, live(), evenly(span, 1000), ["/a", "/b"])
         assert (plain.counts == found).all()
         recording.close()
         assert store.entry("live").status == "complete"

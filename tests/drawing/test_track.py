@@ -167,8 +167,8 @@ def test_json_without_a_definition(store: hl.Store) -> None:
     assert got.fixes == 5
     assert np.allclose(np.diff(got.xy[:, 1]), 110.6, atol=0.1)
     found = fix_of(store.topic("json").at("+0s"))
-    assert (found.latitude, found.longitude, found.altitude) == (10.0, 20.0, None)
-    assert (found.status, found.ellipse, found.has_fix) == (None, None, True)
+    assert (found["latitude"], found["longitude"], found["altitude"]) == (10.0, 20.0, None)
+    assert (found["status"], found["ellipse"], found["has_fix"]) == (None, None, True)
 
 
 def test_the_grid_is_on_the_ellipsoid() -> None:
@@ -205,16 +205,16 @@ def test_one_fix(tmp_path: Path) -> None:
                 recorder.write(fix, payload(**values), log_time=BASE + at)
         fixes = [fix_of(message) for message in store.topic("fix")]
         assert position_of(field_types(store.topic("fix"))) == Position("", is_geographic=True)
-    assert fixes[0].ellipse == pytest.approx((2 * 2.4477, 2.4477, math.pi / 2), abs=1e-3)
-    assert fixes[0].altitude == 12.5
-    assert fixes[0].time == BASE
-    large, small, angle = fixes[1].ellipse or (0, 0, 0)
+    assert fixes[0]["ellipse"] == pytest.approx((2 * 2.4477, 2.4477, math.pi / 2), abs=1e-3)
+    assert fixes[0]["altitude"] == 12.5
+    assert fixes[0]["time"] == BASE
+    large, small, angle = fixes[1]["ellipse"] or (0, 0, 0)
     assert (large, small) == pytest.approx((math.sqrt(3) * 2.4477, 2.4477), abs=1e-3)
     assert angle % math.pi == pytest.approx(math.pi / 4)
-    assert fixes[1].altitude is None
-    assert [one.ellipse for one in fixes[2:6]] == [None] * 4
-    assert [one.has_fix for one in fixes] == [True] * 6 + [False] * 2
-    assert [one.status for one in fixes[-2:]] == [-1, 2]
+    assert fixes[1]["altitude"] is None
+    assert [one["ellipse"] for one in fixes[2:6]] == [None] * 4
+    assert [one["has_fix"] for one in fixes] == [True] * 6 + [False] * 2
+    assert [one["status"] for one in fixes[-2:]] == [-1, 2]
 
 
 def test_topics_without_positions(store: hl.Store) -> None:
@@ -252,11 +252,11 @@ def test_poses_of_a_robot(tmp_path: Path) -> None:
         assert {tuple(place) for place in thin.xy.tolist()} <= {tuple(p) for p in got.xy.tolist()}
         time, pose = read[200]
         found = pose_of(query.at(time), "pose.pose.position.")
-        assert (found.time, found.x, found.y) == (time, pose.position.x, pose.position.y)
+        assert (found["time"], found["x"], found["y"]) == (time, pose.position.x, pose.position.y)
         # The robot turns about z only.
         turned = 2 * math.atan2(pose.orientation.z, pose.orientation.w)
-        assert found.heading is not None
-        assert math.cos(found.heading - turned) == pytest.approx(1)
+        assert found["heading"] is not None
+        assert math.cos(found["heading"] - turned) == pytest.approx(1)
         assert position_of(field_types(store.topic("r_cart/command_pose"))) == Position(
             "pose.position.", is_geographic=False
         )

@@ -76,7 +76,7 @@ def test_what_comes_into_a_store_is_indexed_once_by_several_that_watch(
 
         def is_indexed(label: str) -> Any:
             with hl.open(robot, mongo="none") as source, hl.open(lab, mongo=uri) as store:
-                state = IndexState(store.shared.index.connection.open())
+                state = IndexState(store.shared.index.connect(brings=False))
                 indexed = state.one(source.entry(label).key)
                 return indexed is not None and indexed.is_whole(source.entry(label))
 

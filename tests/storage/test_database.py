@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import logging
 import tempfile
 import time
 from collections.abc import Iterator
@@ -12,7 +11,7 @@ import bson
 import numpy as np
 import pymongo
 import pytest
-from pymongo import MongoClient, monitoring
+from pymongo import MongoClient
 
 from hybridlog_storage.catalog import RecordingEntry, channel_entry
 from hybridlog_storage.errors import DatabaseError, DiskFullError, UsageError, WhereError
@@ -137,28 +136,6 @@ def test_a_document_the_server_refuses(database: Database, name: str) -> None:
     good = bson.encode({"_id": 1})
     with pytest.raises(DatabaseError, match="refuses"):
         put(database, name, [bad, good])
-
-
-def test_the_drivers_own_log_and_monitors_cope(
-    mongod: EmbeddedMongod, name: str, caplog: pytest.LogCaptureFixture
-) -> None:
-    caplog.set_level(logging.DEBUG, logger="pymongo")
-    seen: list[str] = []
-
-    class Listener(monitoring.CommandListener):
-        def started(self, event: monitoring.CommandStartedEvent) -> None:
-            seen.append(repr(event.command))
-
-        def succeeded(self, event: monitoring.CommandSucceededEvent) -> None:
-            seen.append(event.command_name)
-
-        def failed(self, event: monitoring.CommandFailedEvent) -> None:
-            seen.append(event.command_name)
-
-    with MongoClient(mongod.start(), event_listeners=[Listener()]) as client:
-        watched = Database(client, "test", "here")
-        assert put(watched, name, encoded(100)) == 100
-    assert any("bytes of documents" in text for text in seen)
 
 
 # --- reading ---

@@ -10,7 +10,6 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import numpy as np
 import pytest
 
 import hybridlog as hl
@@ -20,7 +19,7 @@ from hybridlog_storage.errors import TimeError
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import places
-from tests.view.conftest import Asking, served
+from tests.view.conftest import Asking, served, unpacked
 from tests.waiting import wait_for
 
 if TYPE_CHECKING:
@@ -52,20 +51,12 @@ def picture(client: TestClient, topics: list[str], begin: int, end: int, pixels:
 def picture_of(client: TestClient, asked: dict[str, Any]) -> Picture:
     answer = client.get("timeline", params=asked)
     assert answer.status_code == 200, answer.text
-    content = answer.content
-    length = int.from_bytes(content[:4], "little")
-    head = json.loads(content[4 : 4 + length])
-    at = 4 + length
-    assert at % 8 == 0
-    lanes = []
-    for lane in head["lanes"]:
-        columns = []
-        for kind, count in ((f"<u{lane['size']}", head["bins"]), ("<u4", 2 * lane["gaps"])):
-            columns.append(np.frombuffer(content, kind, count, at))
-            at += -(-columns[-1].nbytes // 8) * 8
-        lanes.append(Lane(columns[0], columns[1].reshape(-1, 2), lane["exact"], lane["period"]))
-    assert at == len(content)
-    return Picture(head, lanes, len(content))
+    head, arrays = unpacked(answer.content)
+    lanes = [
+        Lane(arrays[f"counts {n}"], arrays[f"gaps {n}"].reshape(-1, 2), one["exact"], one["period"])
+        for n, one in enumerate(head["lanes"])
+    ]
+    return Picture(head, lanes, len(answer.content))
 
 
 def counted(store: hl.Store, topic: str, begin: int, end: int) -> int:

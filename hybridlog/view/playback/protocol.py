@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import IntEnum
 from struct import Struct, error
-from typing import Final
+from typing import Annotated, Final
+
+import msgspec
 
 from hybridlog.live.sources.foxglove.protocol import MESSAGE_DATA, TIME
 from hybridlog.schema.completion import with_nested
@@ -23,7 +25,6 @@ _PLAYBACK_STATE: Final = 5
 _PLAYBACK_CONTROL: Final = 3
 _PLAY: Final = 0
 _PAUSE: Final = 1
-_MAX_ID: Final = 1 << 32
 
 
 class RequestError(Exception):
@@ -45,23 +46,34 @@ class Level(IntEnum):
     ERROR = 2
 
 
-@dataclass(frozen=True, slots=True)
-class Subscribe:
-    """A request for channels: their numbers by number of the subscription."""
-
-    channels: Mapping[int, int]
+_Number = Annotated[int, msgspec.Meta(ge=0, lt=1 << 32)]
 
 
-@dataclass(frozen=True, slots=True)
-class Unsubscribe:
+class Subscription(msgspec.Struct):
+    """A subscription, and the channel that it is for."""
+
+    id: _Number
+    channel: _Number = msgspec.field(name="channelId")
+
+
+class Subscribe(msgspec.Struct, tag_field="op", tag="subscribe"):
+    """A request for channels."""
+
+    subscriptions: list[Subscription]
+
+
+class Unsubscribe(msgspec.Struct, tag_field="op", tag="unsubscribe"):
     """A request to end subscriptions, by their numbers."""
 
-    subscriptions: tuple[int, ...]
+    subscriptions: list[_Number] = msgspec.field(name="subscriptionIds")
 
 
-@dataclass(frozen=True, slots=True)
-class SubscribeGraph:
+class SubscribeGraph(msgspec.Struct, tag_field="op", tag="subscribeConnectionGraph"):
     """A request for the publishers of the topics."""
+
+
+class UnsubscribeGraph(msgspec.Struct, tag_field="op", tag="unsubscribeConnectionGraph"):
+    """An end of that, which changes nothing: the graph never changes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +93,8 @@ class Control:
     id: bytes
 
 
-Request = Subscribe | Unsubscribe | SubscribeGraph | Control
+_Text = Subscribe | Unsubscribe | SubscribeGraph | UnsubscribeGraph
+Request = _Text | Control
 
 
 def server_info(name: str, session: str, begin: int, end: int) -> str:
@@ -165,7 +178,13 @@ def parse(message: str | bytes) -> Request:
     Raises:
         RequestError: It is malformed, or asks for what a playback does not have.
     """
-    return _parse_text(message) if isinstance(message, str) else _parse_binary(message)
+    if isinstance(message, bytes):
+        return _parse_binary(message)
+    try:
+        request: _Text = msgspec.json.decode(message, type=_Text)
+    except (msgspec.MsgspecError, RecursionError, UnicodeError) as problem:
+        raise RequestError(f"a message is no request to a playback: {problem}") from problem
+    return request
 
 
 def _parse_binary(message: bytes) -> Control:
@@ -179,42 +198,6 @@ def _parse_binary(message: bytes) -> Control:
     if command not in {_PLAY, _PAUSE} or len(name) != length:
         raise RequestError("a playback control request is malformed")
     return Control(command == _PLAY, speed, position if seeks else None, name)
-
-
-def _parse_text(text: str) -> Request:
-    try:
-        message = json.loads(text)
-    except (ValueError, RecursionError) as problem:
-        raise RequestError(f"a message is not JSON: {problem}") from problem
-    operation = message.get("op") if isinstance(message, dict) else None
-    if operation == "subscribe":
-        return Subscribe(dict(map(_subscription, _entries(message, "subscriptions"))))
-    if operation == "unsubscribe":
-        return Unsubscribe(tuple(map(_number, _entries(message, "subscriptionIds"))))
-    if operation == "subscribeConnectionGraph":
-        return SubscribeGraph()
-    if operation == "unsubscribeConnectionGraph":
-        return Unsubscribe(())  # the graph never changes, so nothing more would come
-    raise RequestError(f"a playback does not know the operation {str(operation)[:100]!r}")
-
-
-def _entries(message: Mapping[str, object], key: str) -> list[object]:
-    entries = message.get(key)
-    if not isinstance(entries, list):
-        raise RequestError(f"a request lacks its list of {key}")
-    return entries
-
-
-def _subscription(entry: object) -> tuple[int, int]:
-    if not isinstance(entry, dict):
-        raise RequestError("a subscription is not a JSON object")
-    return _number(entry.get("id")), _number(entry.get("channelId"))
-
-
-def _number(value: object) -> int:
-    if type(value) is not int or not 0 <= value < _MAX_ID:
-        raise RequestError("a subscription or a channel is not named by a number")
-    return value
 
 
 def _seconds(time: int) -> dict[str, int]:

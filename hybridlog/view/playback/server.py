@@ -327,14 +327,15 @@ class PlaybackServer:
             self._read_subscribed()
         elif isinstance(request, SubscribeGraph):
             await client.send(connection_graph(self._log.channels))
-        else:
+        elif isinstance(request, Control):
             await self._control(request)
 
     async def _subscribe(self, client: _Client, request: Subscribe) -> None:
         """Begin subscriptions with the messages that are current now."""
         new = []
         taken = set(client.subscriptions.values())
-        for number, channel in request.channels.items():
+        for each in request.subscriptions:
+            number, channel = each.id, each.channel
             if channel not in self._topics:
                 await client.send(status(Level.ERROR, f"there is no channel {channel}"))
             elif channel in client.subscriptions or number in taken:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections import defaultdict
 from collections.abc import Callable, Collection, Sequence
-from contextlib import suppress
+from contextlib import closing, suppress
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any, Final, cast
 
@@ -47,17 +47,7 @@ _MAX_CANDIDATES: Final = 50
 
 def ask(context: Context, params: RequestParams) -> dict[str, Any]:
     """The number of messages that satisfy a predicate, with losses and remarks."""
-    question = question_of(context, params)
-    query = question.query()
-    count = query.count()
-    found = query.completeness()
-    return {
-        "count": count,
-        "lost": found.describe(count) if found.has_losses else None,
-        "remarks": query.remarks(),
-        "python": question.python(),
-        "command": question.command(),
-    }
+    return question_of(context, params).told()
 
 
 def matches(context: Context, params: RequestParams) -> dict[str, Any]:
@@ -135,11 +125,8 @@ def sql_completion(context: Context, text: str, place: int) -> dict[str, Any]:
     from hybridlog.sql.completion import candidates, word_before
 
     word = word_before(text[:place])
-    connection = context.store.sql_engine.connect(SQL_MEMORY, only_reads=True)
-    try:
+    with closing(context.store.sql_engine.connect(SQL_MEMORY, only_reads=True)) as connection:
         found = candidates(connection, text, word)
-    finally:
-        connection.close()
     offered = [[name, "word", ""] for name in found[:_MAX_CANDIDATES]]
     return {"begin": place - len(word), "candidates": offered}
 
@@ -154,8 +141,7 @@ def sql_answer(context: Context, text: str, seconds: float) -> dict[str, Any]:
     """The first rows of a query, worked out in the process for SQL."""
     from hybridlog.frames.cells import shown
 
-    connection = context.store.sql_engine.connect(SQL_MEMORY, only_reads=True)
-    try:
+    with closing(context.store.sql_engine.connect(SQL_MEMORY, only_reads=True)) as connection:
         answer = connection.query(text, timeout=seconds)
         table, is_cut = answer.first(SQL_ROWS, _SQL_BYTES)
         body = f"    print(store.sql({text!r}).to_pandas())\n"
@@ -168,8 +154,6 @@ def sql_answer(context: Context, text: str, seconds: float) -> dict[str, Any]:
             "remarks": answer.sentences(),
             "python": program(context.store, body),
         }
-    finally:
-        connection.close()
 
 
 def _moments(

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import io
 from collections.abc import AsyncIterator, Generator
-from typing import TYPE_CHECKING, Any, BinaryIO, Final, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import StreamingResponse
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
 
     from hybridlog.query.query import Query
     from hybridlog.view.params import RequestParams
-    from hybridlog_storage.messages import Buffer
 
 MAX_TOPICS: Final = 200
 """Greatest number of topics that are named; without any, all are meant."""
@@ -34,16 +34,7 @@ _streams = asyncio.Semaphore(MAX_STREAMS)
 def command(context: Context, params: RequestParams) -> dict[str, Any]:
     """The command line that writes a part of a recording, and how many messages it has."""
     question = _question(context, params)
-    query = question.query()
-    count = query.count()
-    found = query.completeness()
-    return {
-        "command": question.command(),
-        "python": question.python(),
-        "count": count,
-        "name": question.file_name(),
-        "lost": found.describe(count) if found.has_losses else None,
-    }
+    return {**question.told(), "name": question.file_name()}
 
 
 def file(context: Context, params: RequestParams) -> Response:
@@ -60,36 +51,21 @@ def mcap_response(query: Query, name: str) -> Response:
         name: Name of the file, of plain characters.
     """
     pieces = pieces_of(query)
-    # Most errors come before the first piece, and can still be told.
-    return _file_response(_with(next(pieces), pieces), name)
-
-
-def _with(first: bytes, rest: Pieces) -> Pieces:
-    try:
-        yield first
-        yield from rest
-    finally:
-        rest.close()
-
-
-def _file_response(pieces: Pieces, name: str) -> Response:
-    """A file that is made while it is sent; nothing more is made when the client has gone.
-
-    Args:
-        pieces: Its bytes, none of them empty.
-        name: Its name, of plain characters.
-    """
+    first = next(pieces)  # most errors come before it, and can still be told
     headers = {"Content-Disposition": f'attachment; filename="{name}"'}
-    return StreamingResponse(_sent(pieces), headers=headers, media_type="application/octet-stream")
+    sent = _sent(first, pieces)
+    return StreamingResponse(sent, headers=headers, media_type="application/octet-stream")
 
 
-async def _sent(pieces: Pieces) -> AsyncIterator[bytes]:
+async def _sent(piece: bytes, rest: Pieces) -> AsyncIterator[bytes]:
+    """All pieces, none of them empty; nothing more is made when the client has gone."""
     try:
         async with _streams:
-            while piece := await run_in_threadpool(next, pieces, b""):
+            while piece:
                 yield piece
+                piece = await run_in_threadpool(next, rest, b"")
     finally:
-        pieces.close()
+        rest.close()
 
 
 def _question(context: Context, params: RequestParams) -> PageQuestion:
@@ -105,42 +81,20 @@ def _question(context: Context, params: RequestParams) -> PageQuestion:
     return question.around(params.text("around", longest=64)) if params.has("around") else question
 
 
-class _Pieces:
-    """Bytes that were written and not taken yet."""
-
-    def __init__(self) -> None:
-        self._held: list[bytes] = []
-        self.size = 0
-
-    def write(self, data: Buffer) -> int:
-        """Hold a copy of bytes."""
-        self._held.append(bytes(data))
-        self.size += len(self._held[-1])
-        return len(self._held[-1])
-
-    def flush(self) -> None:
-        """Do nothing."""
-
-    def take(self) -> bytes:
-        """The bytes, which are no longer held."""
-        taken = b"".join(self._held)
-        self._held.clear()
-        self.size = 0
-        return taken
-
-
 def pieces_of(query: Query) -> Pieces:
     """An MCAP file in pieces; a piece is made when it is asked for."""
     from hybridlog.formats.mcap.writer import McapWriter
     from hybridlog.formats.slices import log_of
 
-    written, log = _Pieces(), log_of(query)
-    with McapWriter(cast("BinaryIO", written), profile=log.profile) as writer:
+    written, log = io.BytesIO(), log_of(query)
+    with McapWriter(written, profile=log.profile) as writer:
         for batch, channels in log.batches:
             writer.write(batch, channels)
-            if written.size >= PIECE:
-                yield written.take()
-    yield written.take()
+            if written.tell() >= PIECE:
+                yield written.getvalue()
+                written.seek(0)
+                written.truncate()
+    yield written.getvalue()
 
 
 routes = [route("/export-command", command), route("/export", file)]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
@@ -115,13 +114,8 @@ def fix_at(context: Context, params: RequestParams) -> dict[str, Any]:
         return answer
     _, query = context.topic(params)
     position = position_of(field_types(query)) or Position("", is_geographic=True)
-    if position.is_geographic:
-        found = asdict(fix_of(shown.message, position.prefix))
-    else:
-        found = asdict(pose_of(shown.message, position.prefix))
-    for name in found.keys() & {"latitude", "longitude", "x", "y"}:
-        found[name] = found[name] if math.isfinite(found[name]) else None
-    return {**found, **answer}
+    find = fix_of if position.is_geographic else pose_of
+    return {**find(shown.message, position.prefix), **answer}
 
 
 routes = [

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from math import isfinite
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-from starlette.responses import Response
 
-from hybridlog.drawing.density import bins, gaps, periods
+from hybridlog.drawing.density import aligned, density, gaps, periods
 from hybridlog.drawing.fields import fields_of
 from hybridlog.drawing.series import series as read_series
 from hybridlog.query.answers.infer_fields import SAMPLE
@@ -17,12 +15,13 @@ from hybridlog.query.answers.marks import mark_topics
 from hybridlog.query.answers.marks import marks as marks_of
 from hybridlog.query.asked import field_types
 from hybridlog.query.counters import Counters
-from hybridlog.view.context import Context, extent, route, start_of
+from hybridlog.view.context import Context, extent, packed_response, route, start_of
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
+    from starlette.responses import Response
 
     from hybridlog.view.context import Context
     from hybridlog.view.params import RequestParams
@@ -35,8 +34,6 @@ MAX_BINS: Final = 1 << 17
 MAX_MARKS: Final = 500
 """Marks of one answer."""
 
-_ALIGNED: Final = 8  # bytes
-
 MAX_FIELDS: Final = 16
 """Most fields of one plot."""
 _GREATEST_EXACT: Final = 1 << 53
@@ -46,18 +43,12 @@ def timeline(context: Context, params: RequestParams) -> Response:
     """Messages of some topics by bin, as bytes.
 
     Parameters are `recording`, `begin` and `end` (ns since its start), `pixels` (most bins that
-    fit between them), and `topic`, repeated. The answer is
+    fit between them), and `topic`, repeated.
 
-    | bytes | |
-    |---|---|
-    | 4 | length of the head, little endian |
-    | head | JSON in UTF-8, with spaces behind it up to a multiple of 8 bytes |
-    | counts | of each lane, `bins` integers of `size` bytes, and zeros up to a multiple of 8 |
-    | gaps | of the lane, pairs of uint32: first bin, and the one behind the last; and zeros |
-
-    The head has `start` (ns since 1970, as text), `begin` of the first bin, `width` of a bin
-    and their number `bins`, and `lanes`: `size`, `gaps`, `exact` (false for estimates) and
-    `period`, the usual time from one message to the next, 0 if unknown. Times are ns.
+    The header has `start` (ns since 1970, as text), `begin` of the first bin, `width` of a bin,
+    and `lanes`: `exact` (false for estimates) and `period`, the usual time from one message to
+    the next, 0 if unknown. Times are ns. The arrays of lane n are `counts n`, an integer a bin, and
+    `gaps n`, pairs: first bin, and the one behind the last.
     """
     recording = context.recording(params)
     topics = params.texts("topic", most=MAX_LANES)
@@ -67,27 +58,22 @@ def timeline(context: Context, params: RequestParams) -> Response:
     start = start_of(recording)
     span = params.span(start)
     session = context.store.session
-    found = bins(session, recording, span, pixels, topics)
+    found = density(session, recording, aligned(span, pixels), topics)
     usual = periods(session, recording, topics)
-    lanes, body = [], []
-    for counts, exact, period in zip(found.counts, found.exact.tolist(), usual, strict=True):
+    lanes = []
+    arrays: dict[str, NDArray[Any]] = {}
+    lanes_of = zip(found.counts, found.exact.tolist(), usual, strict=True)
+    for number, (counts, exact, period) in enumerate(lanes_of):
         silent = gaps(*_within(counts, found.edges, extent(recording)), period)
-        small = _small(counts)
-        lanes.append(
-            {"size": small.itemsize, "gaps": len(silent), "exact": exact, "period": period}
-        )
-        body += [_filled(small.tobytes()), _filled(silent.astype("<u4").tobytes())]
+        lanes.append({"exact": exact, "period": period})
+        arrays |= {f"counts {number}": _small(counts), f"gaps {number}": silent.astype(np.uint32)}
     head = {
         "start": str(start),
         "begin": int(found.edges[0]) - start,
         "width": int(found.edges[1] - found.edges[0]),
-        "bins": found.counts.shape[1],
         "lanes": lanes,
     }
-    text = json.dumps(head, separators=(",", ":")).encode()
-    text += b" " * (-(len(text) + 4) % _ALIGNED)
-    content = b"".join([len(text).to_bytes(4, "little"), text, *body])
-    return Response(content, media_type="application/octet-stream")
+    return packed_response(head, arrays)
 
 
 def marks(context: Context, params: RequestParams) -> dict[str, Any]:
@@ -122,12 +108,7 @@ def _within(
 def _small(counts: NDArray[np.int64]) -> NDArray[Any]:
     """The counts in as few bytes as possible: 1, 2 or 4; none of them is greater."""
     most = int(counts.max(initial=0))
-    size = "<u1" if most < 1 << 8 else "<u2" if most < 1 << 16 else "<u4"
-    return np.minimum(counts, (1 << 32) - 1).astype(size)
-
-
-def _filled(content: bytes) -> bytes:
-    return content + bytes(-len(content) % _ALIGNED)
+    return np.minimum(counts, (1 << 32) - 1).astype(np.min_scalar_type(min(most, (1 << 32) - 1)))
 
 
 def fields(context: Context, params: RequestParams) -> dict[str, Any]:

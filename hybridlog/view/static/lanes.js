@@ -2,6 +2,7 @@
 
 import { ApiError, bytes } from "./api.js";
 import { notice } from "./dom.js";
+import { unpack } from "./packed.js";
 import { clamped } from "./range.js";
 import { instant } from "./state.js";
 
@@ -24,23 +25,12 @@ const LATEST = 2n ** 63n - 1n; // ns
 
 /** Lanes and the start of the recording, from the answer of `timeline`. */
 export function decoded(buffer, topics) {
-  const length = new DataView(buffer).getUint32(0, true);
-  const head = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length)));
-  const arrays = { 1: Uint8Array, 2: Uint16Array, 4: Uint32Array };
-  let at = 4 + length;
-  const take = (Kind, count) => {
-    const found = new Kind(buffer, at, count);
-    at += Math.ceil(found.byteLength / 8) * 8;
-    return found;
-  };
-  const lanes = new Map();
-  head.lanes.forEach(({ size, gaps, exact, period }, place) => {
-    const counts = take(arrays[size], head.bins);
-    const { begin, width } = head;
-    const lane = { begin, width, counts, exact, period, gaps: take(Uint32Array, 2 * gaps) };
-    lanes.set(topics[place], lane);
+  const { start, begin, width, lanes, arrays } = unpack(buffer);
+  const found = lanes.map(({ exact, period }, place) => {
+    const [counts, gaps] = [arrays[`counts ${place}`], arrays[`gaps ${place}`]];
+    return [topics[place], { begin, width, counts, exact, period, gaps }];
   });
-  return { start: BigInt(head.start), lanes };
+  return { start: BigInt(start), lanes: new Map(found) };
 }
 
 /** The number of messages of a lane between two times. Bins that are cut count as a whole. */

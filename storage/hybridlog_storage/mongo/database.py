@@ -1,7 +1,7 @@
 """Access to MongoDB: raw BSON in and out, and driver errors mapped to hybridlog errors.
 
 The only module that uses pymongo. Documents made by hybridlog are transferred as bytes in
-both directions, thousands at a time, and never become Python objects. pymongo is imported
+both directions, thousands at a time, and are never decoded. pymongo is imported
 on first use, since its import takes longer than most commands.
 
 Every command may be repeated: documents are inserted under their own `_id`, and other
@@ -13,10 +13,10 @@ a majority has, whatever the URI says: what was read outlives the loss of the pr
 from __future__ import annotations
 
 import contextlib
-import functools
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 import numpy as np
@@ -32,6 +32,7 @@ from hybridlog_storage.errors import (
 from hybridlog_storage.settings import LOGIN_CURE
 
 if TYPE_CHECKING:
+    from bson.raw_bson import RawBSONDocument
     from numpy.typing import NDArray
     from pymongo import MongoClient
     from pymongo.database import Database as PymongoDatabase
@@ -284,25 +285,25 @@ class Database:
             DiskFullError: The server has no space left.
             DatabaseError: It refuses a document, or does not answer.
         """
-        whole = memoryview(documents).cast("B")
+        from bson.raw_bson import RawBSONDocument
+
+        whole = bytes(documents)
         ends = np.concatenate([[0], np.cumsum(lengths)])
         if ends[-1] != len(whole):
             raise ValueError(f"the documents end at byte {ends[-1]} of {len(whole)}")
         inserted = 0
         for first, last in _batches(ends):
-            start, end = int(ends[first]), int(ends[last])
-            # All documents are passed without a copy; pymongo before 4.18 takes bytes only.
-            is_whole = isinstance(documents, bytes) and end - start == len(documents)
-            part = documents if is_whole else whole[start:end]
-            inserted += self._insert_batch(collection, bytes(part))
+            places = ends[first : last + 1].tolist()
+            parts = [RawBSONDocument(whole[begin:end]) for begin, end in pairwise(places)]
+            inserted += self._insert_batch(collection, parts)
         return inserted
 
-    def _insert_batch(self, collection: str, documents: bytes) -> int:
+    def _insert_batch(self, collection: str, documents: Sequence[RawBSONDocument]) -> int:
         if not collection or "$" in collection or "\0" in collection:
             raise DatabaseError(f"{collection!r} cannot be the name of a collection.")
         command: Document = {
             "insert": collection,
-            "documents": [_pass_through(documents)],
+            "documents": documents,
             "ordered": False,
             "writeConcern": self._database.write_concern.document,
         }
@@ -538,50 +539,6 @@ def _batches(ends: NDArray[np.int64]) -> Iterator[tuple[int, int]]:
         last = min(fit, first + BATCH_DOCUMENTS)
         yield first, last
         first = last
-
-
-def _pass_through(documents: bytes) -> Mapping[str, Any]:
-    return _pass_through_type()(documents)
-
-
-@functools.cache
-def _pass_through_type() -> Callable[[bytes], Mapping[str, Any]]:
-    """A type of "document" that pymongo copies into the message as it is.
-
-    An insert sends documents in an OP_MSG document sequence, without separators and
-    without a count. So any number of documents can be passed as one.
-    """
-    from bson.raw_bson import RawBSONDocument
-
-    class Documents(RawBSONDocument):
-        __slots__ = ("_documents",)
-
-        def __init__(self, documents: bytes) -> None:
-            # Not super().__init__, which requires exactly one document.
-            self._documents = documents
-
-        @property
-        def raw(self) -> bytes:
-            return self._documents
-
-        # The driver's logs and monitors read commands as mappings. They see an empty
-        # document here.
-        def __getitem__(self, key: str) -> Any:
-            raise KeyError(key)
-
-        def __iter__(self) -> Iterator[str]:
-            return iter(())
-
-        def __len__(self) -> int:
-            return 0
-
-        def items(self) -> Any:
-            return {}.items()
-
-        def __repr__(self) -> str:
-            return f"<{len(self._documents)} bytes of documents>"
-
-    return Documents
 
 
 @contextlib.contextmanager

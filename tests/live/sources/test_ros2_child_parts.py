@@ -18,10 +18,10 @@ import pytest
 from hybridlog.live.sources.ros2.child import qos, topics
 from hybridlog.live.sources.ros2.child.child import Child
 from hybridlog.live.sources.ros2.child.definitions import (
+    Definition,
     Definitions,
     UnknownTypeError,
 )
-from hybridlog.live.sources.ros2.child.event_sender import EventSender
 from hybridlog.live.sources.ros2.child.middleware import Offer
 from hybridlog.live.sources.ros2.child.outbox import Outbox
 from hybridlog.live.sources.ros2.child.profile import VARIABLES, default_profile, is_set_up, profile
@@ -177,31 +177,17 @@ def drained(peer: socket.socket, outbox: Outbox) -> Heard:
     return heard
 
 
-def channel_event(number: int, topic: str) -> dict[str, Any]:
-    return {
-        "event": "channel",
-        "number": number,
-        "topic": topic,
-        "type": "a/msg/B",
-        "encoding": "ros2msg",
-        "definition": "caf\udcff",
-        "offered": "",
-        "hash": "",
-    }
-
-
 def test_what_finds_no_room_is_counted() -> None:
     ours, theirs = socket.socketpair()
     with ours, theirs:
         outbox = Outbox(theirs, budget=1 << 20)
-        events = EventSender(outbox)
-        outbox.event(channel_event(0, "/x"))
-        events._channels.append("/x")
+        definition = Definition("ros2msg", b"caf\xff", has_bytes=False, has_arrays=False)
+        assert outbox.channel("/x", "a/msg/B", definition, "", "") == 0
         for at in range(100):
             outbox.message(0, bytes(50_000), 10 + at, 0, -1)
             outbox.send()
         assert outbox.waiting <= 1 << 20
-        events.refusals()
+        outbox.report_refused()
         heard = drained(ours, outbox)
     [loss] = heard.losses
     assert (loss.topic, loss.cause, loss.last) == ("/x", "queue", 109)
@@ -277,20 +263,15 @@ class Rig:
         self.messages: list[tuple[Any, ...]] = []
         rig = self
 
-        class Box:
-            refused: dict[int, Any] = {}  # noqa: RUF012
-
-            def event(self, event: dict[str, Any]) -> None:
-                rig.events.append(event)
+        class Box(Outbox):
+            def event(self, kind: str, **values: object) -> None:
+                rig.events.append({"event": kind, **values})
 
             def message(self, *message: Any) -> None:
                 rig.messages.append(message)
 
-            def close_batch(self) -> None:
-                pass
-
-        self.box: Any = Box()
-        self.sender = EventSender(self.box)
+        peer: Any = SimpleNamespace(setblocking=lambda _: None)
+        self.box: Any = Box(peer)
         found = packages(
             folder,
             {
@@ -300,8 +281,8 @@ class Rig:
                 "a/msg/Bad.msg": "",
             },
         )
-        self.topics = Topics(self.ros, self.box, self.sender, found, overrides or {})
-        self.child = Child(self.ros, self.topics, self.box, self.sender)
+        self.topics = Topics(self.ros, self.box, found, overrides or {})
+        self.child = Child(self.ros, self.topics, self.box)
 
     def told(self, kind: str) -> list[dict[str, Any]]:
         return [event for event in self.events if event["event"] == kind]

@@ -13,6 +13,8 @@ import contextlib
 from functools import partial
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
+import msgspec
+
 from hybridlog.live.sources.base import one_line
 from hybridlog.live.sources.ros1.handshake import ANY
 from hybridlog.live.sources.ros1.network import PeerError
@@ -24,6 +26,11 @@ if TYPE_CHECKING:
 
     from hybridlog.live.sources.ros1.network import Network
     from hybridlog.live.sources.ros1.subscription import Context
+
+_Item = TypeVar("_Item")
+_Kind = TypeVar("_Kind")
+_Lists = list[tuple[str, list[str]]]
+"""Topics and their nodes."""
 
 
 class State(NamedTuple):
@@ -49,31 +56,17 @@ class Master:
 
     async def state(self) -> State:
         """All topics with their publishers."""
-        answer = await self._call("getSystemState")
-        if not isinstance(answer, list) or len(answer) != 3:
-            raise PeerError("its answer is not that of a ROS master")
-        publishers = {topic: nodes for topic, nodes in _lists(answer[0]).items() if nodes}
-        subscribers = _lists(answer[1])
-        ours = frozenset(t for t, nodes in subscribers.items() if self._caller in nodes)
-        return State(publishers, ours)
+        answer = _read(await self._call("getSystemState"), tuple[_Lists, _Lists, object])
+        publishers = {topic: frozenset(nodes) for topic, nodes in answer[0] if nodes}
+        return State(publishers, frozenset(t for t, nodes in answer[1] if self._caller in nodes))
 
     async def types(self) -> dict[str, str]:
         """Types of all topics; unknown ones are missing or `*`."""
-        answer = await self._call("getTopicTypes")
-        pairs = answer if isinstance(answer, list) else [None]
-        types: dict[str, str] = {}
-        for pair in pairs:
-            if not isinstance(pair, list) or [type(part) for part in pair] != [str, str]:
-                raise PeerError("its answer is not that of a ROS master")
-            types[pair[0]] = pair[1]
-        return types
+        return dict(_read(await self._call("getTopicTypes"), list[tuple[str, str]]))
 
     async def subscribe(self, topic: str) -> list[str]:
         """Registers this node for a topic, and returns its publishers' addresses."""
-        answer = await self._call("registerSubscriber", topic, "*", self._api)
-        if not isinstance(answer, list):
-            raise PeerError("its answer is not that of a ROS master")
-        return [uri for uri in answer if isinstance(uri, str)]
+        return _read(await self._call("registerSubscriber", topic, "*", self._api), list[str])
 
     async def unsubscribe(self, topic: str) -> None:
         """Takes back the registration for a topic."""
@@ -83,19 +76,12 @@ class Master:
         return await call(self._network, self._uri, method, self._caller, *arguments)
 
 
-def _lists(value: object) -> dict[str, frozenset[str]]:
-    """Topics and their nodes in an answer to `getSystemState`."""
-    lists: dict[str, frozenset[str]] = {}
-    for pair in value if isinstance(value, list) else [None]:
-        if (
-            not isinstance(pair, list)
-            or len(pair) != 2
-            or not isinstance(pair[0], str)
-            or not isinstance(pair[1], list)
-        ):
-            raise PeerError("its answer is not that of a ROS master")
-        lists[pair[0]] = frozenset(node for node in pair[1] if isinstance(node, str))
-    return lists
+def _read(answer: object, kind: type[_Kind]) -> _Kind:
+    """An answer of the master."""
+    try:
+        return msgspec.convert(answer, kind)
+    except msgspec.ValidationError as error:
+        raise PeerError("its answer is not that of a ROS master") from error
 
 
 _FIRST_PAUSE_S: Final = 0.25
@@ -105,8 +91,6 @@ _CALLS_AT_ONCE: Final = 8
 _FAREWELL_S: Final = 2.0
 _MAX_REST_S: Final = 1.0
 _REST: Final = 4
-
-_Item = TypeVar("_Item")
 
 
 class Graph:

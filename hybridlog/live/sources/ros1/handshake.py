@@ -10,7 +10,9 @@ from __future__ import annotations
 import asyncio
 import socket
 import struct
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Annotated, Final, Literal
+
+import msgspec
 
 from hybridlog.live.sources.base import one_line
 from hybridlog.live.sources.ros1.network import (
@@ -38,6 +40,11 @@ u32: Final[Callable[..., tuple[int]]] = struct.Struct("<I").unpack_from
 """Reads the number at an offset of a buffer, as a tuple."""
 
 _MAX_FIELDS = 1000
+_Protocol = tuple[
+    Literal["TCPROS"],
+    Annotated[str, msgspec.Meta(min_length=1)],
+    Annotated[int, msgspec.Meta(ge=1, lt=65536)],
+]
 
 
 class WireError(Exception):
@@ -130,17 +137,11 @@ async def subscribe(
 
 def _place_of(protocol: object) -> Endpoint:
     """The endpoint in a publisher's answer to `requestTopic`."""
-    if isinstance(protocol, list) and len(protocol) >= 3:
-        name, host, port = protocol[:3]
-        if (
-            name == "TCPROS"
-            and isinstance(host, str)
-            and host
-            and isinstance(port, int)
-            and 0 < port < 65536
-        ):
-            return Endpoint(host, port)
-    raise PeerError("it does not offer the topic over TCPROS")
+    try:
+        _, host, port = msgspec.convert(protocol, _Protocol)
+    except msgspec.ValidationError as error:
+        raise PeerError("it does not offer the topic over TCPROS") from error
+    return Endpoint(host, port)
 
 
 async def _exchange_headers(connected: socket.socket, caller: str, topic: str) -> dict[str, str]:

@@ -18,7 +18,7 @@ from hybridlog.live.sources.ros1.network import Endpoint, Network, PeerError, en
 from hybridlog.live.sources.ros1.reader import Reader
 from hybridlog.live.sources.ros1.rpc import RpcServer
 from hybridlog.live.sources.ros1.slave import listen, methods, uri_of
-from hybridlog.live.sources.ros1.subscription import Context, ErrorAggregator
+from hybridlog.live.sources.ros1.subscription import Context
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
@@ -169,10 +169,9 @@ class Ros1Source(LiveSource):
         graph = Graph(master, uri, self._poll_s, self._reached)
         server = RpcServer(listening, methods(uri, graph.topics, graph.hint, sink.say))
         reader = Reader(end)
-        errors = ErrorAggregator(sink.say)
         context = Context(
             *(network, self.caller, sink, reader, self._max_message_bytes),
-            *(spawn, graph.hint, errors),
+            *(spawn, graph.hint),
         )
         reader.start()
         try:
@@ -186,5 +185,4 @@ class Ros1Source(LiveSource):
                 await asyncio.wait(tuple(tasks), timeout=1)
             listening.close()
             reader.stop()
-            errors.flush()
             await graph.farewell()

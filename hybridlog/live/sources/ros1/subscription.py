@@ -11,7 +11,6 @@ from hybridlog.live.sources.base import one_line
 from hybridlog.live.sources.ros1.handshake import ANY, channel_of, subscribe
 from hybridlog.live.sources.ros1.network import PeerError, UnreachedError, reason_of
 from hybridlog.live.sources.ros1.stream import Stream
-from hybridlog.wording import listed
 
 if TYPE_CHECKING:
     import socket
@@ -21,81 +20,6 @@ if TYPE_CHECKING:
     from hybridlog.live.sources.ros1.network import Network
     from hybridlog.live.sources.ros1.reader import Reader
     from hybridlog_storage.messages import Channel
-
-
-_QUIET_S = 1.5  # without further errors they are reported; a busy master delays some topics
-_MAX_DELAY_S: Final = 5.0
-_MAX_NAMED: Final = 3
-_MAX_ERRORS: Final = 10_000
-
-_Key = tuple[str, bool]  # a node's address, and True if it is unreachable
-
-
-class ErrorAggregator:
-    """Collects errors of a node's topics for a moment, and reports them in one line.
-
-    A repeated error is not reported again, even with another reason.
-    """
-
-    def __init__(self, say: Callable[[str], None]) -> None:
-        self._say = say
-        self._known: dict[_Key, set[str]] = {}
-        self._size = 0
-        self._new: dict[_Key, tuple[str, list[str]]] = {}
-        self._since = 0.0
-        self._timer: asyncio.TimerHandle | None = None
-
-    def add(self, uri: str, topic: str, error: Exception) -> None:
-        """Adds an error of a topic; call it within the event loop."""
-        key = uri, isinstance(error, UnreachedError)
-        topics = self._known.setdefault(key, set())
-        if topic in topics or self._size >= _MAX_ERRORS:
-            return
-        is_reported = bool(topics) and key[1] and key not in self._new
-        topics.add(topic)
-        self._size += 1
-        if is_reported:
-            return  # an unreachable node is so for all of its topics
-        self._flush_soon()
-        self._new.setdefault(key, (reason_of(error), []))[1].append(topic)
-
-    def resolve(self, uri: str, topic: str) -> None:
-        """Forgets the errors of a topic that works; later ones are reported again."""
-        unreachable = self._known.pop((uri, True), set())
-        self._size -= len(unreachable)
-        rest = self._known.get((uri, False), set())
-        if topic in rest:
-            rest.remove(topic)
-            self._size -= 1
-
-    def _flush_soon(self) -> None:
-        loop = asyncio.get_running_loop()
-        if self._timer is not None:
-            self._timer.cancel()
-        if not self._new:
-            self._since = loop.time()
-        self._timer = loop.call_at(
-            min(loop.time() + _QUIET_S, self._since + _MAX_DELAY_S), self.flush
-        )
-
-    def flush(self) -> None:
-        """Reports the collected errors."""
-        new, self._new = self._new, {}
-        for (uri, is_unreachable), (reason, topics) in new.items():
-            self._say(_line(one_line(uri), reason, sorted(topics), is_unreachable=is_unreachable))
-
-
-def _line(uri: str, reason: str, topics: list[str], *, is_unreachable: bool) -> str:
-    named = listed(map(one_line, topics), _MAX_NAMED)
-    its = "its"
-    if len(topics) > 1:
-        named, its = f"{len(topics)} topics ({named})", "their"
-    if not is_unreachable:
-        return f"{named}: cannot subscribe at {its} publisher {uri}: {reason}; trying again"
-    return (
-        f"{named}: {its} publisher {uri} cannot be reached: {reason}; trying again. Is it dead "
-        "(`rosnode cleanup`), or on a computer with an unknown name (set ROS_IP there)?"
-    )
 
 
 _FIRST_PAUSE_S: Final = 0.25
@@ -116,7 +40,6 @@ class Context:
         max_message_bytes: Longest message.
         spawn: Runs a coroutine until the source stops.
         look_again: Asks the master for the publishers of a topic soon.
-        errors: Reports publishers that cannot be subscribed to.
     """
 
     network: Network
@@ -126,7 +49,6 @@ class Context:
     max_message_bytes: int
     spawn: Callable[[Coroutine[None, None, None]], None]
     look_again: Callable[[str], None]
-    errors: ErrorAggregator
 
 
 class Subscription:
@@ -244,6 +166,7 @@ class _Link:
         self._uri = uri
         self._failures = 0
         self._has_reported = False
+        self._told: set[bool] = set()  # that it cannot be reached, that it does wrong
         self._hurry = asyncio.Event()
 
     def list(self, *, is_listed: bool) -> None:
@@ -266,7 +189,7 @@ class _Link:
                 self._failures += 1
                 # A single failure is normal: a node that ends is listed a little longer.
                 if self._failures >= 2:
-                    context.errors.add(self._uri, topic, error)
+                    self._say_problem(context, error)
             else:
                 try:
                     channel = self._subscription.channel(fields)
@@ -281,6 +204,24 @@ class _Link:
             # It may have returned under another address, which only the master knows.
             context.look_again(topic)
             await self._pause()
+
+    def _say_problem(self, context: Context, error: OSError | PeerError) -> None:
+        """Tells of a publisher, once; all topics of one that cannot be reached say the same."""
+        is_unreachable = isinstance(error, UnreachedError)
+        if is_unreachable in self._told:
+            return
+        self._told.add(is_unreachable)
+        uri, reason = one_line(self._uri), reason_of(error)
+        if is_unreachable:
+            context.sink.say(
+                f"the publisher {uri} cannot be reached: {reason}; trying again. Is it dead "
+                "(`rosnode cleanup`), or on a computer with an unknown name (set ROS_IP there)?"
+            )
+            return
+        context.sink.say(
+            f"{one_line(self._subscription.topic)}: cannot subscribe at its publisher {uri}: "
+            f"{reason}; trying again"
+        )
 
     async def _serve(self, context: Context, connected: socket.socket, channel: Channel) -> None:
         """Lets the reader read a connection until it ends."""
@@ -301,7 +242,6 @@ class _Link:
         failure = await ended
         if loop.time() - began > _STABLE_S:
             self._failures, self._has_reported = 0, False
-            context.errors.resolve(self._uri, self._subscription.topic)
         else:
             self._failures += 1
         # Repeated failures of a publisher are reported once; the ledger has all.

@@ -13,14 +13,13 @@ from __future__ import annotations
 import reprlib
 from typing import TYPE_CHECKING, Any
 
-from hybridlog.formats.yaml_values import YamlError, parse_yaml
+from hybridlog.formats.yaml_values import YamlError, parse_yaml, read_yaml
 from hybridlog.live.sources.ros2.child.qos import DURATIONS, FOREVER, Profile
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-MAX_BYTES = 256 << 10
 MAX_DEPTH = 1_000_000
 
 _POLICIES = {
@@ -37,13 +36,7 @@ def read_overrides(path: Path) -> dict[str, dict[str, Any]]:
     Raises:
         UsageError: The file is unreadable or not YAML, or a policy is unknown.
     """
-    try:
-        with path.open("rb") as file:
-            data = file.read(MAX_BYTES + 1)
-    except OSError as error:
-        raise UsageError(f"{path}: cannot be opened: {error.strerror}") from error
-    if len(data) > MAX_BYTES:
-        raise UsageError(f"{path}: more than {MAX_BYTES >> 10} KiB are too large for QoS overrides")
+    data = read_yaml(path, "QoS overrides")
     try:
         root = parse_yaml(data)
     except YamlError as error:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import io
 import time
 from json import dumps
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated
+
+import msgspec
 
 from hybridlog.live.sources.base import Cause, Loss, one_line
 from hybridlog.live.sources.ros2.child.wire import (
@@ -27,12 +29,52 @@ if TYPE_CHECKING:
 
 # Reads of whole multiples of this size bypass the buffer.
 _BUFFER = 32 << 10
-_CAUSES = {
-    "transport": Cause.TRANSPORT,
-    "queue": Cause.QUEUE,
-    "unreadable": Cause.UNREADABLE,
-}
-_MAX_INT = 2**63
+_Number = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
+
+
+class _Candidate(msgspec.Struct, tag_field="event", tag="candidate"):
+    topic: str
+    type: str
+
+
+class _Channel(msgspec.Struct, tag_field="event", tag="channel"):
+    number: _Number
+    topic: str
+    type: str
+    encoding: str
+    definition: str
+    offered: str
+    hash: str
+
+
+class _Topic(msgspec.Struct, tag_field="event", tag="topic"):
+    topic: str
+    type: str
+    publishers: _Number
+
+
+class _Gone(msgspec.Struct, tag_field="event", tag="gone"):
+    topic: str
+
+
+class _Lost(msgspec.Struct, tag_field="event", tag="lost"):
+    topic: str
+    cause: Cause
+    count: _Number | None
+    first: _Number
+    last: _Number
+    detail: str
+
+
+class _Say(msgspec.Struct, tag_field="event", tag="say"):
+    text: str
+
+
+class _Bye(msgspec.Struct, tag_field="event", tag="bye"):
+    pass
+
+
+_Event = _Candidate | _Channel | _Topic | _Gone | _Lost | _Say | _Bye
 
 
 class Receiver:
@@ -78,7 +120,7 @@ class Receiver:
                 kind, length = HEADER.unpack(header)
                 check_frame(kind, length)
                 if kind == EVENT:
-                    self._event(parse_object(_read(file, length)))
+                    self._event(_parsed(_read(file, length)))
                 elif kind == MESSAGES:
                     self._messages(_read(file, length))
                 else:
@@ -122,75 +164,47 @@ class Receiver:
             )
             at = end
 
-    # Events.
+    def _event(self, event: _Event) -> None:
+        match event:
+            case _Candidate(topic, kind):
+                if self._sink.wants(topic, kind):
+                    command = dumps({"subscribe": topic, "type": kind})
+                    self._peer.sendall(command.encode("ascii") + b"\n")
+            case _Channel():
+                self._channel(event)
+            case _Topic(topic, kind, publishers):
+                self.present.add(topic)
+                self._sink.topic_came(topic, kind, publishers)
+            case _Gone(topic):
+                self.present.discard(topic)
+                self._sink.topic_gone(topic)
+            case _Lost(topic, cause, count, first, last, detail):
+                self._sink.lost(Loss(topic, cause, count, first, last, one_line(detail)))
+            case _Say(text):
+                self._sink.say(one_line(f"ROS 2: {text}"))
+            case _Bye():
+                self.said_bye = True
 
-    def _event(self, event: dict[str, Any]) -> None:
-        kind = event.get("event")
-        if kind == "candidate":
-            self._candidate(_text(event, "topic"), _text(event, "type"))
-        elif kind == "channel":
-            self._channel(event)
-        elif kind == "topic":
-            topic = _text(event, "topic")
-            self.present.add(topic)
-            self._sink.topic_came(topic, _text(event, "type"), _number(event, "publishers"))
-        elif kind == "gone":
-            topic = _text(event, "topic")
-            self.present.discard(topic)
-            self._sink.topic_gone(topic)
-        elif kind == "lost":
-            self._lost(event)
-        elif kind == "say":
-            self._sink.say(one_line(f"ROS 2: {_text(event, 'text')}"))
-        elif kind == "bye":
-            self.said_bye = True
-        else:
-            raise WireError("an unknown event")
-
-    def _candidate(self, topic: str, kind: str) -> None:
-        if self._sink.wants(topic, kind):
-            command = dumps({"subscribe": topic, "type": kind})
-            self._peer.sendall(command.encode("ascii") + b"\n")
-
-    def _channel(self, event: dict[str, Any]) -> None:
-        topic = _text(event, "topic")
+    def _channel(self, event: _Channel) -> None:
         try:
-            definition = _text(event, "definition").encode("utf-8", "surrogateescape")
+            definition = event.definition.encode("utf-8", "surrogateescape")
         except UnicodeEncodeError as error:
             raise WireError("a definition that is not text") from error
-        metadata = {"offered_qos_profiles": _text(event, "offered")}
-        type_hash = _text(event, "hash")
-        if type_hash:
-            metadata["topic_type_hash"] = type_hash
-        number = _number(event, "number")
-        self._channels[number] = Channel(
-            topic=topic,
+        metadata = {"offered_qos_profiles": event.offered}
+        if event.hash:
+            metadata["topic_type_hash"] = event.hash
+        channel = self._channels[event.number] = Channel(
+            topic=event.topic,
             message_encoding="cdr",
-            schema=Schema(_text(event, "type"), _text(event, "encoding"), definition),
+            schema=Schema(event.type, event.encoding, definition),
             metadata=metadata,
             has_publish_time=True,
         )
-        self._sink.expect(self._channels[number])
-        self.subscribed.add(topic)
-        since = self._outages.pop(topic, None)
+        self._sink.expect(channel)
+        self.subscribed.add(event.topic)
+        since = self._outages.pop(event.topic, None)
         if since is not None:
-            report_outage(self._sink, topic, since)
-
-    def _lost(self, event: dict[str, Any]) -> None:
-        cause = _CAUSES.get(_text(event, "cause"))
-        if cause is None:
-            raise WireError("a loss without a cause")
-        count = None if event.get("count") is None else _number(event, "count")
-        self._sink.lost(
-            Loss(
-                _text(event, "topic"),
-                cause,
-                count,
-                first=_number(event, "first"),
-                last=_number(event, "last"),
-                detail=one_line(_text(event, "detail")),
-            )
-        )
+            report_outage(self._sink, event.topic, since)
 
 
 def report_outage(sink: Sink, topic: str, since: int) -> None:
@@ -212,15 +226,10 @@ def _read(file: io.BufferedIOBase, size: int) -> bytes:
     return data
 
 
-def _text(event: dict[str, Any], name: str) -> str:
-    value = event.get(name)
-    if not isinstance(value, str):
-        raise WireError(f"an event without {name}")
-    return value
-
-
-def _number(event: dict[str, Any], name: str) -> int:
-    value = event.get(name)
-    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < _MAX_INT:
-        raise WireError(f"an event without {name}")
-    return value
+def _parsed(body: bytes) -> _Event:
+    """The event in the body of a frame; a definition may have surrogates, so `json` reads it."""
+    try:
+        event: _Event = msgspec.convert(parse_object(body), _Event)
+    except msgspec.ValidationError as error:
+        raise WireError(f"a malformed event: {error}") from error
+    return event

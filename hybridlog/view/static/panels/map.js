@@ -2,7 +2,7 @@
 
 import { ApiError, Question, bytes, get, isAborted } from "../api.js";
 import { element } from "../dom.js";
-import { unpack } from "../spatial/packed.js";
+import { unpack } from "../packed.js";
 import { metres, plane } from "../spatial/plane.js";
 import { instant } from "../state.js";
 import { counted, offset } from "../words.js";

@@ -4,7 +4,7 @@ import { bytes } from "../api.js";
 import { element, fill } from "../dom.js";
 import { Colours } from "../paint.js";
 import { coloursOf, onTheme, packedColours, paintScale, sameColour } from "../spatial/colours.js";
-import { unpack } from "../spatial/packed.js";
+import { unpack } from "../packed.js";
 import { metres, plane } from "../spatial/plane.js";
 import { count, offset } from "../words.js";
 import { follow } from "./follow.js";

@@ -17,7 +17,6 @@ from collections import deque
 from typing import Any
 
 from hybridlog.live.sources.ros2.child.definitions import Definitions, share_folders
-from hybridlog.live.sources.ros2.child.event_sender import EventSender
 from hybridlog.live.sources.ros2.child.middleware import Middleware
 from hybridlog.live.sources.ros2.child.outbox import Outbox
 from hybridlog.live.sources.ros2.child.topics import Topics
@@ -39,13 +38,10 @@ _FLUSH_S = 2.0
 class Child:
     """Moves messages from ROS into the outbox, and the outbox into the socket."""
 
-    def __init__(
-        self, middleware: Middleware, topics: Topics, outbox: Outbox, events: EventSender
-    ) -> None:
+    def __init__(self, middleware: Middleware, topics: Topics, outbox: Outbox) -> None:
         self._middleware = middleware
         self._topics = topics
         self._outbox = outbox
-        self._events = events
         self._commands: deque[dict[str, Any]] = deque()
         self._is_stopping = False
 
@@ -110,8 +106,8 @@ class Child:
                 taken, taken_size = topic.stream.take(self._outbox)
             except Exception as error:
                 # rclpy raises errors of many kinds; each costs one message.
-                self._events.lost(topic.name, "unreadable", 1, detail=str(error))
-                self._events.say(f"{topic.name}: a message cannot be taken from ROS: {error}")
+                self._outbox.lost(topic.name, "unreadable", 1, detail=str(error))
+                self._outbox.say(f"{topic.name}: a message cannot be taken from ROS: {error}")
                 continue
             count += taken
             size += taken_size
@@ -128,7 +124,7 @@ class Child:
             if not self._outbox.send():
                 writable.poll(2)
         self._topics.account(final=True)
-        self._events.bye()
+        self._outbox.event("bye")
         deadline = time.monotonic() + _FLUSH_S
         while not self._outbox.send() and time.monotonic() < deadline:
             writable.poll(100)
@@ -149,18 +145,18 @@ def run(number: int) -> int:
     with peer.makefile("rb") as file:
         settings = parse_object(file.readline(MAX_BATCH))
     outbox = Outbox(peer)
-    events = EventSender(outbox)
     try:
         middleware = Middleware()
     except Exception as error:
         # The recorder reports any error of ROS.
-        events.failed(error)
+        why = f"{type(error).__name__}: {error}"
+        outbox.event("failed", missing=isinstance(error, ImportError), why=why)
         outbox.send()
         return 1
     overrides = settings.get("overrides", {})
-    topics = Topics(middleware, outbox, events, Definitions(share_folders()), overrides)
-    child = Child(middleware, topics, outbox, events)
-    events.hello(middleware.implementation)
+    topics = Topics(middleware, outbox, Definitions(share_folders()), overrides)
+    child = Child(middleware, topics, outbox)
+    outbox.event("hello", middleware=middleware.implementation)
     signal.signal(signal.SIGTERM, lambda _number, _frame: child.stop())
     threading.Thread(target=_listen, args=(peer, child), daemon=True).start()
     try:

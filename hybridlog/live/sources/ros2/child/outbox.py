@@ -7,9 +7,10 @@ Messages that do not fit are counted by channel.
 from __future__ import annotations
 
 import socket
+import time
 from collections import deque
 from itertools import islice
-from typing import Any
+from typing import TYPE_CHECKING
 
 from hybridlog.live.sources.ros2.child.wire import (
     COUNT,
@@ -22,11 +23,15 @@ from hybridlog.live.sources.ros2.child.wire import (
     event_frame,
 )
 
+if TYPE_CHECKING:
+    from hybridlog.live.sources.ros2.child.definitions import Definition
+
 BUDGET = 256 << 20
 """Maximum number of queued bytes."""
 
 _BATCH = 1 << 20
 _MAX_BUFFERS = 64
+_MAX_REPORTS = 10_000  # different ones
 
 
 class Refusal:
@@ -62,6 +67,8 @@ class Outbox:
         self._small = 0
         self.waiting = 0
         self.refused: dict[int, Refusal] = {}
+        self._channels: list[str] = []
+        self._said: set[str] = set()
 
     def message(self, channel: int, payload: bytes, received: int, sent: int, number: int) -> None:
         """Adds a message; the arguments are those of `wire.ENTRY`."""
@@ -85,10 +92,64 @@ class Outbox:
         if self._small >= _BATCH:
             self.close_batch()
 
-    def event(self, event: dict[str, Any]) -> None:
+    def event(self, kind: str, **values: object) -> None:
         """Adds an event after all messages so far, even beyond the budget."""
         self.close_batch()
-        self._put(event_frame(event))
+        self._put(event_frame({"event": kind, **values}))
+
+    def channel(
+        self, topic: str, kind: str, definition: Definition, offered: str, type_hash: str
+    ) -> int:
+        """Announces a channel for the messages of a topic; returns its number."""
+        self._channels.append(topic)
+        number = len(self._channels) - 1
+        self.event(
+            "channel",
+            number=number,
+            topic=topic,
+            type=kind,
+            encoding=definition.encoding,
+            definition=definition.text.decode("utf-8", "surrogateescape"),
+            offered=offered,
+            hash=type_hash,
+        )
+        return number
+
+    def lost(
+        self,
+        topic: str,
+        cause: str,
+        count: int | None,
+        *,
+        times: tuple[int, int] | None = None,
+        detail: str = "",
+    ) -> None:
+        """Reports lost messages.
+
+        Args:
+            topic: Their topic.
+            cause: Value of `base.Cause`.
+            count: Number of messages, None if unknown.
+            times: Begin and end of the loss, ns since the epoch; None for now.
+            detail: Text for the user.
+        """
+        first, last = times or (time.time_ns(),) * 2
+        values = {"count": count, "first": first, "last": last, "detail": detail}
+        self.event("lost", topic=topic, cause=cause, **values)
+
+    def report_refused(self) -> None:
+        """Reports messages that were refused."""
+        detail = "the recorder did not take them from the ROS 2 child in time"
+        for number, one in self.refused.items():
+            topic, times = self._channels[number], (one.first, one.last)
+            self.lost(topic, "queue", one.count, times=times, detail=detail)
+        self.refused.clear()
+
+    def say(self, text: str) -> None:
+        """Reports a problem to the user, each text once."""
+        if text not in self._said and len(self._said) < _MAX_REPORTS:
+            self._said.add(text)
+            self.event("say", text=text)
 
     def close_batch(self) -> None:
         """Packs the small messages so far into a frame."""

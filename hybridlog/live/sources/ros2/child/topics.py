@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
 
     from hybridlog.live.sources.ros2.child.definitions import Definition, Definitions
-    from hybridlog.live.sources.ros2.child.event_sender import EventSender
     from hybridlog.live.sources.ros2.child.middleware import Middleware, Offer, Subscription
     from hybridlog.live.sources.ros2.child.outbox import Outbox
 
@@ -66,8 +65,7 @@ class Topics:
 
     Args:
         middleware: ROS.
-        outbox: Takes the messages of a subscription that is made anew.
-        events: Sends events to the recorder.
+        outbox: Takes events, and the messages of a subscription that is made anew.
         definitions: Definitions of types.
         overrides: Fields of `Profile` by topic that the user has set.
 
@@ -79,7 +77,6 @@ class Topics:
         self,
         middleware: Middleware,
         outbox: Outbox,
-        events: EventSender,
         definitions: Definitions,
         overrides: Mapping[str, Mapping[str, Any]],
     ) -> None:
@@ -87,7 +84,6 @@ class Topics:
         self._live: list[Topic] = []
         self._middleware = middleware
         self._outbox = outbox
-        self._events = events
         self._definitions = definitions
         self._overrides = overrides
         self._topics: dict[tuple[str, str], Topic] = {}
@@ -96,15 +92,15 @@ class Topics:
         """Looks at the graph, follows its changes, and reports losses."""
         found = self._middleware.publishers()
         for name, reason in self._middleware.invalid.items():
-            self._events.say(f"{name!r} is ignored, ROS cannot subscribe to it: {reason}")
+            self._outbox.say(f"{name!r} is ignored, ROS cannot subscribe to it: {reason}")
         for key, offers in found.items():
             topic = self._topics.get(key)
             if topic is None:
                 if len(self._topics) >= MAX_TOPICS:
-                    self._events.say(f"more than {MAX_TOPICS} topics; the rest is ignored")
+                    self._outbox.say(f"more than {MAX_TOPICS} topics; the rest is ignored")
                     continue
                 topic = self._topics[key] = Topic(*key)
-                self._events.candidate(*key)
+                self._outbox.event("candidate", topic=key[0], type=key[1])
             before, topic.offers = topic.offers, offers
             if topic.is_wanted:
                 self._update(topic, before)
@@ -121,12 +117,12 @@ class Topics:
         if had and topic.is_wanted:
             others = (other for other in self._topics.values() if other.name == topic.name)
             if not any(other.offers and other.is_wanted for other in others):
-                self._events.gone(topic.name)
+                self._outbox.event("gone", topic=topic.name)
 
     def _update(self, topic: Topic, before: list[Offer]) -> None:
         """Handles the publishers of a wanted topic."""
         if len(before) != len(topic.offers):
-            self._events.publishers(topic.name, topic.kind, len(topic.offers))
+            self._tell_publishers(topic)
         stream = topic.stream
         if stream is None:
             self._report_problem(topic)
@@ -138,6 +134,10 @@ class Topics:
                 return
         self._set_channels(topic, stream, topic.offers)
         self._check(topic, stream, known)
+
+    def _tell_publishers(self, topic: Topic) -> None:
+        count = len(topic.offers)
+        self._outbox.event("topic", topic=topic.name, type=topic.kind, publishers=count)
 
     def _adapt(self, topic: Topic, stream: Stream, *, is_first: bool) -> None:
         """Adapts a subscription to new publishers."""
@@ -175,7 +175,7 @@ class Topics:
         for offer in topic.offers:
             reasons = conflicts(offer.profile, stream.subscription.profile)
             if reasons and offer.publisher in known:
-                self._events.say(
+                self._outbox.say(
                     f"{topic.name}: {offer.node or 'a publisher'} is incompatible: its "
                     f"{' and '.join(reasons)} does not satisfy the QoS overrides; change that "
                     "in the file"
@@ -183,12 +183,12 @@ class Topics:
         assert topic.definition is not None
         hashes = {offer.type_hash for offer in topic.offers if offer.type_hash}
         if len(hashes) > 1 and not stream.named:
-            self._events.say(
+            self._outbox.say(
                 f"{topic.name}: its publishers have different versions of {topic.kind}, and this "
                 "rclpy does not tell their messages apart; the installed definition is recorded"
             )
         elif any(topic.definition.of(each) != topic.definition for each in hashes):
-            self._events.say(
+            self._outbox.say(
                 f"{topic.name}: a publisher has another version of {topic.kind} than the one that "
                 "is installed here; its messages are recorded without that definition. Source "
                 "the workspace of the publisher for their fields"
@@ -207,7 +207,7 @@ class Topics:
         if topic is None or topic.is_wanted:
             return
         topic.is_wanted = True
-        self._events.publishers(name, kind, len(topic.offers))
+        self._tell_publishers(topic)
         try:
             topic.definition = self._definitions.find(kind)
             found = self._middleware.subscribe(name, parse_type(kind), self._wanted(topic))
@@ -235,7 +235,7 @@ class Topics:
             found = self._middleware.offers(topic.name)
         except Exception as error:
             # rclpy raises errors of many kinds; the next look tells more.
-            self._events.say(f"{topic.name}: its publishers are unknown for now: {error}")
+            self._outbox.say(f"{topic.name}: its publishers are unknown for now: {error}")
             return
         assert topic.stream is not None
         offers = [offer for kind, offer in found if kind == topic.kind]
@@ -267,12 +267,12 @@ class Topics:
         assert topic.definition is not None
         topic.profiles.setdefault(type_hash, set()).update(profiles)
         definition, offered = topic.definition.of(type_hash), offered_text(profiles)
-        return self._events.channel(topic.name, topic.kind, definition, offered, type_hash)
+        return self._outbox.channel(topic.name, topic.kind, definition, offered, type_hash)
 
     def _refuse(self, topic: Topic, problem: str) -> None:
         topic.problem = problem
         topic.reported_at = -_REPORT_S
-        self._events.say(f"{topic.name}: {topic.kind} cannot be recorded: {problem}")
+        self._outbox.say(f"{topic.name}: {topic.kind} cannot be recorded: {problem}")
         self._report_problem(topic)
 
     def _report_problem(self, topic: Topic) -> None:
@@ -280,14 +280,14 @@ class Topics:
         now = time.monotonic()
         if topic.problem and now - topic.reported_at >= _REPORT_S:
             topic.reported_at = now
-            self._events.lost(topic.name, "unreadable", None, detail=topic.problem)
+            self._outbox.lost(topic.name, "unreadable", None, detail=topic.problem)
 
     def account(self, *, final: bool = False) -> None:
         """Reports losses in transport and in the outbox."""
         for topic in self._live:
             assert topic.stream is not None
             self._account(topic, topic.stream, final=final)
-        self._events.refusals()
+        self._outbox.report_refused()
 
     def _account(self, topic: Topic, stream: Stream, *, final: bool) -> None:
         if len(topic.nodes) > MAX_PUBLISHERS:
@@ -300,13 +300,13 @@ class Topics:
             # A message in fragments has the time of the first one, and others may come between.
             times = min(gap.first, gap.last), max(gap.first, gap.last)
             detail = f"from {node}" if node else ""
-            self._events.lost(topic.name, "transport", gap.missing, times=times, detail=detail)
+            self._outbox.lost(topic.name, "transport", gap.missing, times=times, detail=detail)
         if not stream.numbered:
-            self._events.say(
+            self._outbox.say(
                 "this ROS does not number messages, so losses in transport cannot be counted"
             )
         if not stream.named and stream.numbered and len(topic.offers) > 1:
-            self._events.say(
+            self._outbox.say(
                 f"{topic.name}: this rclpy does not name the publishers of messages, so losses "
                 "in transport cannot be counted; ROS 2 Kilted names them"
             )

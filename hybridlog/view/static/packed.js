@@ -1,6 +1,12 @@
-/** Reads answers that are arrays of numbers: see `hybridlog/view/packed.py`. */
+/** Reads answers that are arrays of numbers: see `packed_response` in `hybridlog/view/context.py`. */
 
-const KINDS = { float32: Float32Array, float64: Float64Array };
+const KINDS = {
+  float32: Float32Array,
+  float64: Float64Array,
+  uint8: Uint8Array,
+  uint16: Uint16Array,
+  uint32: Uint32Array,
+};
 
 /** The values of the header, and under `arrays` the arrays by name, as views of the buffer. */
 export function unpack(buffer) {
