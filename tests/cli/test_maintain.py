@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from pathlib import Path
 
@@ -51,21 +50,6 @@ def test_verify_lists_what_is_off(fresh: Path) -> None:
     assert run("verify", "--quiet", store=fresh, code=1).lines == findings
 
 
-def test_rm(logs: Path, fresh: Path) -> None:
-    run("record", logs / "odd.mcap", "--quiet", store=fresh)
-    refused = run("rm", "odd", store=fresh, code=2)
-    assert "--yes" in refused.err
-    run("rm", "nothing", "--yes", store=fresh, code=2)
-    assert places.names(fresh) == ["odd", "small"]
-    assert run("rm", "odd", "--yes", store=fresh).out == "deleted odd\n"
-    assert places.names(fresh) == ["small"]
-    assert "all is well" in run("verify", store=fresh).out
-    assert "/json" in run("fetch", "-t", "/json", store=fresh, code=2).err
-    assert run("rm", "small", "-yq", store=fresh).out == ""
-    assert "is empty" in run("ls", store=fresh).err
-    run("record", logs / "odd.mcap", "--quiet", store=fresh)
-
-
 def test_no_store(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     (tmp_path / "file").write_text("x")
@@ -99,18 +83,6 @@ def test_a_newer_store(logs: Path, tmp_path: Path) -> None:
         done = run(*command, store=store, code=5)
         assert "format 99" in done.err
         assert "Use the hybridlog that wrote it" in done.err
-
-
-@pytest.mark.skipif(os.geteuid() == 0, reason="the next test does the same as another user")
-def test_a_store_that_cannot_be_written(logs: Path, fresh: Path) -> None:
-    closed = [fresh, places.root(fresh), fresh / "mongod"]
-    for place in closed:
-        place.chmod(0o500)
-    try:
-        run("record", logs / "odd.mcap", store=fresh, code=5)
-    finally:
-        for place in closed:
-            place.chmod(0o700)
 
 
 @needs_root

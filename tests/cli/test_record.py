@@ -124,17 +124,6 @@ def test_several_paths(logs: Path, tmp_path: Path) -> None:
     assert not misfit(again.json, schema_of(["record"]))
 
 
-def test_the_same_content_is_noticed(logs: Path, fresh: Path, tmp_path: Path) -> None:
-    copy = tmp_path / "other-name.bag"
-    copy.write_bytes((logs / "small.bag").read_bytes())
-    done = run("record", copy, store=fresh, code=8)
-    assert "'small'" in done.err
-    assert "--again" in done.err
-    assert places.names(fresh) == ["small"]
-    run("record", copy, "--again", store=fresh)
-    assert places.names(fresh) == ["other-name", "small"]
-
-
 def test_large_fields_fit_their_definition(tmp_path: Path) -> None:
     path = tmp_path / "large.mcap"
     with path.open("wb") as file:

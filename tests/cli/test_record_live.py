@@ -130,18 +130,6 @@ def test_a_replay_is_recorded_whole(logs: Path, tmp_path: Path) -> None:
     assert "Nothing is missing" in run("info", "--losses", store=store).err
 
 
-def test_ctrl_c_ends_it_with_everything_stored(logs: Path, tmp_path: Path) -> None:
-    store = tmp_path / "store"
-    with recorder(store, "--replay", logs / "robot.bag") as process:
-        until_it_speaks(process)
-        report = end(process)
-    (recording,) = report["recordings"]
-    assert recording["status"] == "complete"
-    assert recording["messages"] == report["messages_received"] > 0
-    assert recording["messages_indexed"] == recording["messages"]
-    assert run("verify", store=store).code == 0
-
-
 @pytest.mark.parametrize("is_abstract", [False, True])
 def test_a_service_manager_hears_of_it(logs: Path, tmp_path: Path, is_abstract: bool) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:

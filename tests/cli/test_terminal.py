@@ -307,13 +307,6 @@ def test_eighty_columns_lose_no_end_and_no_late_start(store: Path) -> None:
     assert {"late", "early"} <= {*heading.split()}
 
 
-def test_a_long_note_is_cut_short(fresh: Path) -> None:
-    run("tag", "small", f"place={'x' * 90}", "robot=a", "-q", store=fresh)
-    _, row = plain(on_terminal("ls", "--store", fresh)[1]).splitlines()
-    assert re.search(r"  place=x+…$", row)
-    assert len(row) <= 80
-
-
 def test_a_message_breaks_between_words() -> None:
     for width in (60, 80):
         code, shown = on_terminal("ls", "--store", "nowhere/robot-logs", width=width)

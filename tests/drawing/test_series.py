@@ -7,7 +7,6 @@ import pytest
 from numpy.typing import NDArray
 
 from hybridlog.drawing.series import _Grid, numbers_of, series
-from hybridlog.query.asked import spans_of
 from hybridlog_storage.errors import TopicError, UsageError
 
 from .conftest import BASE, MS, Drive
@@ -234,17 +233,3 @@ def test_gaps_between_pixels(times: list[int], gaps: list[int]) -> None:
     assert x.times[np.isnan(x.least)].tolist() == gaps
     firsts = {time // 10: time for time in reversed(times)}
     assert x.times[~np.isnan(x.least)].tolist() == sorted(firsts.values())
-
-
-def test_spans_of_recordings(drive: Drive) -> None:
-    both = drive.store.topic("drive", "loose", "front")
-    spans = sorted(spans_of(both).values(), reverse=True)
-    end = int(drive.times[-1]) + 1
-    assert spans == [(BASE, end), (BASE, BASE + 3 * MS + 1)]
-    assert [*spans_of(both)] == [summary.id for summary in both.summaries()]
-    assert [*spans_of(drive.store.topic("loose", "drive").between("+1s", None)).values()] == [
-        (BASE + 1000 * MS, end)
-    ]
-    later = drive.store.topic("rear/compressed", "broken")
-    assert [*spans_of(later).values()] == [(BASE, BASE + 3)]
-    assert spans_of(drive.store.topic("loose")) != spans_of(drive.store.topic("drive"))

@@ -503,21 +503,6 @@ def test_the_reserve_holds_for_what_waits_in_memory(
     assert robot.recorder.stop() == []
 
 
-def test_what_a_recorder_says_goes_with_it(store: hl.Store) -> None:
-    folder = store.directory.path / "recorders"
-    robot = Running(store)
-    robot.recorder.look()
-    assert len([*folder.iterdir()]) == 1
-    robot.recorder.stop()
-    robot.recorder.look()
-    assert [*folder.iterdir()] == []
-    (folder / "20261128-killed-3f9a12bc04d7e615.json").write_text("{}")
-    other = Running(store)
-    other.recorder.look()
-    assert [*folder.iterdir()] == [folder / f"{other.recorder._target.id}.json"]
-    other.recorder.stop()
-
-
 def test_what_is_expected_is_ready_before_its_first_message(
     store: hl.Store, limit: Limit, calls: Calls
 ) -> None:

@@ -484,17 +484,6 @@ def test_abort_leaves_nothing(store: hl.Store) -> None:
     assert store.recordings() == []
 
 
-def test_an_error_in_the_block_keeps_what_came(store: hl.Store) -> None:
-    def speak() -> None:
-        with store.start("talk") as recording:
-            recording.write(channel("/talk"), text(b"kept"))
-            raise ZeroDivisionError
-
-    with pytest.raises(ZeroDivisionError):
-        speak()
-    assert store.topic("/talk").count() == 1
-
-
 def test_a_database_that_refuses_to_the_end_leaves_what_segments_know(
     store: hl.Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -9,7 +9,6 @@ import random
 import sqlite3
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
@@ -25,7 +24,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hybridlog.entries import summary_of, topic_types
-from hybridlog.query.chunk_columns import ChunkColumns
 from hybridlog_storage.catalog import (
     CATALOG,
     Catalog,
@@ -167,41 +165,13 @@ class Model:
                 ],
             )
 
-    def chunks(self, *, decoded: bool = True) -> list[ChunkEntry]:
+    def chunks(self) -> list[ChunkEntry]:
         """What the catalog should say of all chunks."""
-        found = []
-        for number in self.tables:
-            for row, told in enumerate(self.told[number]):
-                stats = told if decoded else {c: undecoded(s) for c, s in told.items()}
-                found.append(ChunkEntry(number, row, stats))
-        return found
-
-    def wanted(
-        self,
-        channels: Sequence[int] | None,
-        bounds: tuple[int, int] | None,
-        clock: str,
-        *,
-        decoded: bool = True,
-    ) -> list[ChunkEntry]:
-        """The same question, asked of the list."""
-        suffix = {"log": "", "publish": "_publish", "header": "_stamp"}[clock]
-        found = []
-        for chunk in self.chunks(decoded=decoded):
-            for c, stats in chunk.stats.items():
-                if channels is not None and c not in channels:
-                    continue
-                first, last = getattr(stats, f"first{suffix}"), getattr(stats, f"last{suffix}")
-                may = bounds is None or (clock == "header" and not decoded)
-                if may or (
-                    bounds is not None
-                    and first is not None
-                    and first < bounds[1]
-                    and last >= bounds[0]
-                ):
-                    found.append(chunk)
-                    break
-        return found
+        return [
+            ChunkEntry(number, row, stats)
+            for number, told in self.told.items()
+            for row, stats in enumerate(told)
+        ]
 
 
 def undecoded(stats: ChannelStats) -> ChannelStats:
@@ -230,38 +200,6 @@ def model() -> Model:
 # Questions.
 
 
-@pytest.mark.parametrize("decoded", [True, False])
-@pytest.mark.parametrize("clock", ["log", "publish", "header"])
-def test_chunks_by_channel_time_and_clock(
-    catalog: Catalog, model: Model, clock: str, decoded: bool
-) -> None:
-    model.put(catalog, decoded=decoded)
-    Model(9, "other").put(catalog)
-    rng = random.Random(2)
-    questions: list[tuple[list[int] | None, tuple[int, int] | None]] = [
-        (None, None), ([], None), ([3], None), ([77], None), (None, (-(1 << 70), 1 << 70)),
-        (None, (1 << 63, 1 << 64)), (None, (-(1 << 80), -(1 << 63))), (None, (50, 50)),
-    ]  # fmt: skip
-    for _ in range(300):
-        begin = rng.randrange(-5, 105)
-        channels = rng.sample(CHANNELS, rng.randrange(1, 4)) if rng.random() < 0.8 else None
-        questions.append((channels, (begin, begin + rng.choice([0, 1, 2, 5, 30]))))
-    kinds = set()
-    for channels, bounds in questions:
-        want = model.wanted(channels, bounds, clock, decoded=decoded)
-        got = []
-        timed = [c for c in CHANNELS if c != SILENT]
-        for number in model.tables:
-            table = model.tables[number]
-            stamps = catalog.stamps(model.entry, number, table)
-            columns = ChunkColumns(number, table, channels)
-            got += columns.chunks(columns.within(bounds, clock, stamps=stamps, timed=timed))
-        assert [(c.segment, c.number) for c in got] == [(c.segment, c.number) for c in want]
-        kinds.add((len(want) > 0, len(want) < 36))
-    if decoded or clock != "header":
-        assert kinds == {(True, True), (True, False), (False, True)}
-
-
 def decoded_of(catalog: Catalog, model: Model) -> list[bytes | None]:
     """What a catalog says of the decoding of each segment."""
     found = [catalog.stamps(model.entry, number, table) for number, table in model.tables.items()]
@@ -274,34 +212,6 @@ def decoded_in(model: Model) -> list[bytes | None]:
         stamps_of(table, dict(enumerate(model.told[number]))).tobytes()
         for number, table in model.tables.items()
     ]
-
-
-def test_a_chunk_says_where_it_lies_and_when(catalog: Catalog, model: Model) -> None:
-    model.put(catalog)
-    found = [
-        chunk
-        for number, table in model.tables.items()
-        for chunk in ChunkColumns(number, table, CHANNELS).chunks()
-    ]
-    for got, want in zip(found, model.chunks(), strict=True):
-        chunk = model.tables[want.segment].chunks[want.number]
-        assert (got.place.offset, got.place.length) == (chunk["offset"], chunk["length"])
-        assert (got.first, got.last) == (chunk["first"], chunk["last"])
-        assert got.messages == want.messages
-    assert not ChunkColumns(0, model.tables[0], [99]).chunks()
-
-
-def test_the_last_chunks_come_first(model: Model) -> None:
-    for number, table in model.tables.items():
-        columns = ChunkColumns(number, table, [3])
-        for latest in range(-1, 110):
-            found = [*columns.before(latest)]
-            assert {c.number for c, _ in found} == {
-                n for n, first in zip(columns.number.tolist(), columns.first, strict=True)
-                if first <= latest
-            }  # fmt: skip
-            for place, (_, last) in enumerate(found):
-                assert last == max(c.last for c, _ in found[place:])
 
 
 def test_recordings_come_back(catalog: Catalog, model: Model) -> None:
@@ -340,17 +250,6 @@ def test_totals_of_a_segment_are_those_of_its_chunks(model: Model) -> None:
             )
         assert got == want
         assert channel_totals(table, None, {SILENT}) == {c: undecoded(s) for c, s in want.items()}
-
-
-def test_results_belong_to_one_content_of_a_segment(catalog: Catalog, model: Model) -> None:
-    model.put(catalog)
-    assert decoded_of(catalog, model) == decoded_in(model)
-    again = Model(3, segments=2)
-    again.id = again.entry.id = model.id
-    assert decoded_of(catalog, again) == [None, None]
-    again.put(catalog)
-    assert decoded_of(catalog, again) == decoded_in(again)
-    assert decoded_of(catalog, model)[:2] == [None, None]
 
 
 def test_stamps_of_other_bytes_are_not_believed(catalog: Catalog, model: Model) -> None:
@@ -407,14 +306,6 @@ def test_a_recording_is_removed_without_a_trace(catalog: Catalog, model: Model) 
     assert decoded_of(catalog, other) == decoded_in(other)
     catalog.remove(other.id)
     assert catalog.summaries() == []
-
-
-def test_one_in_memory_leaves_no_file(tmp_path: Path, model: Model) -> None:
-    with closing(Catalog(tmp_path, STORE, in_memory=True)) as made:
-        assert made.is_in_memory
-        model.put(made)
-        assert decoded_of(made, model) == decoded_in(model)
-    assert list(tmp_path.iterdir()) == []
 
 
 @given(st.lists(st.integers(0, 2**32), min_size=1, max_size=12), st.randoms(use_true_random=False))
@@ -600,17 +491,6 @@ def test_whatever_happens_to_the_file_costs_time_only(
         truth.fill(opened)
         assert truth.check(opened) or way == "a trigger"
     made_again(truth, tmp_path)
-
-
-def test_a_file_that_may_not_be_written_is_read(truth: Truth, tmp_path: Path) -> None:
-    path = tmp_path / CATALOG
-    path.write_bytes(truth.content)
-    with closing(Catalog(tmp_path, STORE, in_memory=True)) as opened:
-        assert truth.check(opened)
-        opened.remove(truth.models[0].id)
-        assert len(opened.summaries()) == 2
-    assert path.read_bytes() == truth.content
-    assert [*tmp_path.iterdir()] == [path]
 
 
 def changed_anywhere(value: Any) -> Iterator[Any]:
@@ -815,25 +695,3 @@ def test_two_processes_write_at_the_same_time(tmp_path: Path) -> None:
         for model in want.values():
             assert decoded_of(opened, model) == decoded_in(model)
             assert len(opened.damage(model.id)) == 1
-
-
-def test_several_threads_use_one(catalog: Catalog) -> None:
-    failures: list[BaseException] = []
-
-    def use(first: int) -> None:
-        try:
-            for number in range(first, first + 10):
-                model = Model(number, f"run{number}", segments=2, chunks=3)
-                model.put(catalog)
-                assert decoded_of(catalog, model) == decoded_in(model)
-                catalog.remove(model.id)
-        except BaseException as error:
-            failures.append(error)
-
-    threads = [threading.Thread(target=use, args=(100 * n,)) for n in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert failures == []
-    assert rows_of(catalog) == {}

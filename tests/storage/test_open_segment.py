@@ -7,7 +7,6 @@ from io import BytesIO
 from pathlib import Path
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 from mcap.records import Metadata
 
@@ -99,26 +98,6 @@ def check(segment: OpenSegment, written: Written, size: int) -> None:
         }
 
 
-@pytest.mark.parametrize("step", [17, 400, 1500])
-def test_it_is_followed_while_it_grows(written: Written, tmp_path: Path, step: int) -> None:
-    path = tmp_path / "000000.mcap.open"
-    path.write_bytes(written.data[:8])
-    segment = OpenSegment(tmp_path, 0)
-    before = 0
-    for size in [*range(8, len(written.data), step), len(written.data)]:
-        with path.open("ab") as file:
-            file.write(written.data[file.tell() : size])
-        is_new = segment.follow()
-        count = len(segment.flushed.table.chunks)
-        assert is_new or count == before
-        assert not segment.follow()
-        assert not segment.damaged
-        check(segment, written, size)
-        before = count
-    assert len(segment.flushed.metadata) == len(segment.flushed.attachments) == 1
-    assert len(segment.losses) == 1
-
-
 @pytest.mark.parametrize("step", [61, pytest.param(1, marks=pytest.mark.exhaustive)])
 def test_a_part_of_a_write_is_no_damage(
     written: Written, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: int
@@ -141,32 +120,3 @@ def test_a_part_of_a_write_is_no_damage(
         assert not segment.damaged, seen
         check(segment, written, len(written.data))
     assert waits
-
-
-def test_what_cannot_be_read_is_told_and_the_rest_is_there(
-    written: Written, tmp_path: Path
-) -> None:
-    place = written.summary.chunks[3]
-    path = tmp_path / "000000.mcap.open"
-    data = bytearray(written.data[: written.ends[-1]])
-    data[place.offset + 100] ^= 0xFF
-    trailer = place.offset + place.length
-    data[trailer + 20] ^= 0xFF  # a time in the message index: only messages could tell
-    path.write_bytes(data)
-    segment = OpenSegment(tmp_path, 0)
-    segment.follow()
-    assert [(one.offset, one.length) for one in segment.damaged] == [
-        (place.offset, place.length + place.trailer)
-    ]
-    rest = np.delete(np.arange(6), 3)
-    offsets = written.summary.table.chunks["offset"][rest]
-    assert (segment.flushed.table.chunks["offset"] == offsets).all()
-    # A record of metadata whose content does not add up.
-    (index,) = written.summary.metadata
-    data = bytearray(written.data[: written.ends[-1]])
-    data[index.offset + 9 : index.offset + 13] = b"\xff\xff\xff\x7f"
-    path.write_bytes(data)
-    segment = OpenSegment(tmp_path, 0)
-    segment.follow()
-    assert [(one.offset, one.length) for one in segment.damaged] == [(index.offset, index.length)]
-    assert len(segment.flushed.table.chunks) == 6
