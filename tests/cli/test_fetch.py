@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import subprocess
 from pathlib import Path
 from types import SimpleNamespace
@@ -63,14 +62,6 @@ def test_a_wrong_predicate_is_pointed_at(store: Path) -> None:
     for predicate in ("nothing < 1", "__import__('os') == 1", "ranges.min <", "$where == 1"):
         refused = run(*SCAN, "--where", predicate, store=store, code=2)
         assert "^" in refused.err or "angle" in refused.err or "field" in refused.err
-
-
-def test_fields(store: Path) -> None:
-    done = run(*SCAN, "--fields", "angle_max, header.stamp", "-n", "1", store=store)
-    assert list(json.loads(done.out)) == ["log_time_ns", "topic", "angle_max", "header.stamp"]
-    refused = run(*SCAN, "--fields", "angle_mox", store=store, code=2)
-    assert "angle_max" in refused.err
-    run(*SCAN, "--fields", "a,,b", store=store, code=2)
 
 
 @pytest.mark.parametrize("form", ["csv", "parquet", "arrow", "npz", "mcap", "bag", "jsonl"])

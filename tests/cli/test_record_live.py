@@ -180,24 +180,6 @@ def test_each_key_of_its_json_is_in_the_documentation(logs: Path, tmp_path: Path
     assert json.loads(failed.lines[-1])["report"]["exit_code"] == failed.code
 
 
-def test_a_second_ctrl_c_leaves_at_once_and_what_was_flushed_is_there(
-    logs: Path, tmp_path: Path
-) -> None:
-    store = tmp_path / "store"
-    with recorder(store, "--replay", logs / "robot.bag", "--flush-interval", "100ms") as process:
-        until_it_speaks(process)
-        time.sleep(1)
-        # The second one may find it closing, or closed.
-        process.send_signal(signal.SIGTERM)
-        process.send_signal(signal.SIGINT)
-        code = process.wait(30)
-        assert code in {0, 128 + signal.SIGTERM, 128 + signal.SIGINT}
-    listed = run("ls", "--json", store=store)
-    (entry,) = listed.json
-    assert entry["messages"] > 0
-    run("verify", store=store)
-
-
 RECOVERS_WHEN_TOLD = """
 import sys, threading, time
 from importlib import import_module

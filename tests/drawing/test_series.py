@@ -176,13 +176,6 @@ def test_nothing_in_the_span(drive: Drive, span: tuple[int, int]) -> None:
     assert x.exact
 
 
-def test_absurd_spans(drive: Drive) -> None:
-    (z,) = series(drive.store.topic("drive"), ["linear.z"], pixels=9, span=(-(2**80), 2**80))
-    assert z.least.tolist() == [drive.z.min()]
-    assert z.greatest.tolist() == [drive.z.max()]
-    assert z.times.tolist() == [BASE]
-
-
 @pytest.mark.parametrize(
     ("fields", "problem"),
     [

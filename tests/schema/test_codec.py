@@ -64,20 +64,6 @@ def test_invalid_utf8_is_mended_in_the_index() -> None:
         codec.decode(payload)
 
 
-def test_payloads_that_do_not_fit_are_errors_and_the_others_are_read() -> None:
-    codec = ros1("float64 x")
-    good = np.array([1.5]).tobytes()
-    bodies = bodies_of(codec, [good, b"short", good, b"", good + b"too long"])
-    assert [isinstance(b, bytes) for b in bodies] == [True, False, True, False, True]
-    for row in (1, 3):
-        assert "pkg/T" in str(bodies[row])
-    assert index_fields(codec, b"short") == {}
-    with pytest.raises(PayloadError, match="pkg/T"):
-        codec.decode(b"short")
-    decoded = codec.columns(*joined([good, b"short"]))
-    assert decoded.rows.tolist() == [0]
-
-
 @pytest.mark.parametrize("surplus", [b"\0", b"\xff" * 20])
 def test_objects_of_payloads_with_bytes_left_over(surplus: bytes) -> None:
     plain = ros1("uint8[] data\nuint16 n")

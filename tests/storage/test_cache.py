@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import threading
-
-import numpy as np
 import pytest
 
 from hybridlog_storage.cache import Cache
@@ -73,24 +70,3 @@ def test_a_kind_is_dropped() -> None:
     assert (cache.get("chunk", 1), cache.get("density", 1)) == (None, "b")
     cache.put("matches", 1, value="c", size=70)  # there is room for it
     assert cache.get("density", 1) == "b"
-
-
-def test_several_threads_ask_for_the_same_values() -> None:
-    cache = Cache(5500)
-    wrong: list[int] = []
-
-    def ask(seed: int) -> None:
-        reading = Reading(cache)
-        numbers = np.random.default_rng(seed).integers(0, 10, 2000).tolist()
-        wrong.extend(number for number in numbers if reading.get(number)[0] != number)
-
-    threads = [threading.Thread(target=ask, args=(seed,)) for seed in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert not wrong
-    kept = Reading(cache)
-    for number in range(10):
-        kept.get(number)
-    assert len(kept.made) >= 5  # no more than five had room

@@ -10,7 +10,7 @@ import sqlite3
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import asdict, replace
 from itertools import combinations
@@ -28,7 +28,6 @@ from hybridlog_storage.catalog import (
     CATALOG,
     Catalog,
     ChannelStats,
-    ChunkEntry,
     Described,
     RecordingEntry,
     channel_entry,
@@ -38,7 +37,6 @@ from hybridlog_storage.catalog import (
 from hybridlog_storage.cells import put
 from hybridlog_storage.messages import Channel, Schema, schema_hash
 from hybridlog_storage.segments.chunk_table import CHUNK, PART, ChunkTable
-from tests.imports import ROOT
 from tests.limits import Limit
 
 STORE = "5" * 32
@@ -165,14 +163,6 @@ class Model:
                 ],
             )
 
-    def chunks(self) -> list[ChunkEntry]:
-        """What the catalog should say of all chunks."""
-        return [
-            ChunkEntry(number, row, stats)
-            for number, told in self.told.items()
-            for row, stats in enumerate(told)
-        ]
-
 
 def undecoded(stats: ChannelStats) -> ChannelStats:
     return ChannelStats(
@@ -214,28 +204,6 @@ def decoded_in(model: Model) -> list[bytes | None]:
     ]
 
 
-def test_recordings_come_back(catalog: Catalog, model: Model) -> None:
-    other = Model(2, "other", segments=0)
-    for one in (model, other):
-        one.put(catalog)
-    found = rows_of(catalog)
-    assert found == {
-        model.id: (f"looks of {model.id}", model.entry),
-        other.id: (f"looks of {other.id}", other.entry),
-    }
-    assert found[model.id][1].span == (
-        min(a for _, a, _ in model.entry.spans), max(b for _, _, b in model.entry.spans),
-    )  # fmt: skip
-    assert found[other.id][1].span is None
-    assert model.entry.messages == sum(c.messages for c in model.chunks())
-    assert model.entry.messages_by_topic()["/ä3"] == sum(
-        c.stats[3].messages for c in model.chunks() if 3 in c.stats
-    )
-    changed = replace(other.entry, status="recovered", tags={})
-    catalog.put(replace(other.described, entry=changed, files="otherwise"))
-    assert rows_of(catalog)[other.id] == ("otherwise", changed)
-
-
 def test_totals_of_a_segment_are_those_of_its_chunks(model: Model) -> None:
     for number, table in model.tables.items():
         want: dict[int, ChannelStats] = {}
@@ -273,16 +241,6 @@ def test_damage_is_replaced(catalog: Catalog) -> None:
     assert catalog.damage("r") == {(2, 3): "d"}
     catalog.put_damage("r", {})
     assert (catalog.damage("r"), catalog.damage("other")) == ({}, {(9, 9): "c"})
-
-
-def test_schemas(catalog: Catalog, model: Model) -> None:
-    model.put(catalog)
-    known = {schema_hash(s): s for s in SCHEMAS.values() if s is not None}
-    assert len(known) == 4
-    assert catalog.schemas(known) == known
-    one = next(iter(known))
-    assert catalog.schemas([one, "nothing"]) == {one: known[one]}
-    assert catalog.schemas([]) == {}
 
 
 def test_hashes_of_schemas_do_not_run_together() -> None:
@@ -566,23 +524,6 @@ def test_what_another_store_has_is_not_believed(tmp_path: Path, model: Model) ->
         assert rows_of(other).keys() == {another.id}
 
 
-@pytest.mark.parametrize("name", [CATALOG, *(f"{CATALOG}-{one}" for one in ("journal", "wal"))])
-@pytest.mark.parametrize("in_memory", [False, True])
-def test_a_symlink_in_its_place_is_not_followed(
-    tmp_path: Path, model: Model, name: str, in_memory: bool
-) -> None:
-    elsewhere, store = tmp_path / "elsewhere", tmp_path / "store"
-    elsewhere.write_bytes(b"precious")
-    store.mkdir()
-    (store / name).symlink_to(elsewhere)
-    with closing(Catalog(store, STORE, in_memory=in_memory)) as opened:
-        assert opened.summaries() == []
-        model.put(opened)
-        assert rows_of(opened).keys() == {model.id}
-    assert elsewhere.read_bytes() == b"precious"
-    assert (store / name).is_symlink() == in_memory
-
-
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
     """Another process writes, and does not end."""
@@ -647,51 +588,3 @@ def test_two_that_have_it_open_see_what_the_other_does(tmp_path: Path, model: Mo
         model.put(other)
         (tmp_path / CATALOG).unlink()
         assert rows_of(other).keys() == {model.id}
-
-
-WRITER = """
-import sys
-from pathlib import Path
-from tests.storage.test_catalog import STORE, Catalog, Model, decoded_in, decoded_of, rows_of
-
-first, count = int(sys.argv[2]), int(sys.argv[3])
-catalog = Catalog(Path(sys.argv[1]), STORE)
-for number in range(first, first + count):
-    model = Model(number, f"run{number}", segments=2, chunks=3)
-    model.put(catalog)
-    catalog.put_damage(model.id, {(0, number): "x"})
-    assert decoded_of(catalog, model) == decoded_in(model)
-    assert rows_of(catalog)[model.id][1] == model.entry
-    if number % 5 == 0:
-        catalog.remove(model.id)
-print("done")
-"""
-
-
-def test_two_processes_write_at_the_same_time(tmp_path: Path) -> None:
-    """From the first moment on: they also make the folder at the same time."""
-    count = 40
-    processes = [
-        subprocess.Popen(
-            [sys.executable, "-c", WRITER, str(tmp_path), str(first), str(count)],
-            cwd=ROOT,
-            env={**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "storage")])},
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        for first in (0, 1000)
-    ]
-    for process in processes:
-        assert process.communicate(timeout=120) == ("done\n", "")
-    want: Mapping[str, Model] = {
-        model.id: model
-        for first in (0, 1000)
-        for number in range(first, first + count)
-        if number % 5 and (model := Model(number, f"run{number}", segments=2, chunks=3))
-    }
-    with closing(Catalog(tmp_path, STORE)) as opened:
-        assert rows_of(opened).keys() == want.keys()
-        for model in want.values():
-            assert decoded_of(opened, model) == decoded_in(model)
-            assert len(opened.damage(model.id)) == 1

@@ -6,9 +6,8 @@ import fcntl
 import os
 import subprocess
 import sys
-import threading
 import tomllib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -47,36 +46,6 @@ def test_what_is_no_place_for_a_store(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match="holds files"):
         StoreDirectory.create(tmp_path / "full")
     assert sorted(p.name for p in tmp_path.rglob("*")) == ["file", "full", "precious.txt"]
-
-
-def test_many_make_the_same_store_at_once(tmp_path: Path) -> None:
-    for turn in range(20):
-        path = tmp_path / f"store{turn}"
-        made: list[object] = []
-        start = threading.Barrier(4)
-
-        def make(
-            path: Path = path,
-            made: list[object] = made,
-            wait: Callable[[], int] = start.wait,
-        ) -> None:
-            wait()
-            try:
-                made.append(StoreDirectory.create(path).settings.store_id)
-            except StoreError as error:
-                made.append(error)
-
-        threads = [threading.Thread(target=make) for _ in range(4)]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
-        assert set(made) == {StoreDirectory(path).settings.store_id}
-        assert sorted(p.name for p in path.iterdir()) == [
-            "hybridlog.toml",
-            "manifests",
-            "recordings",
-        ]
 
 
 def made(store: StoreDirectory, name: str = "r") -> Path:

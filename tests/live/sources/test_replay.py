@@ -199,15 +199,6 @@ def test_many_small_messages_do_not_cost_a_pause_each(tmp_path: Path, calls: Cal
     assert 1 <= len(pauses) <= 501
 
 
-def test_the_order_is_by_time_as_far_as_one_looks_ahead(tmp_path: Path) -> None:
-    times = list(range(3000))
-    random.Random(1).shuffle(times)
-    path = write(tmp_path / "a.mcap", [("/a", BEGIN + at, b"%d" % at) for at in times])
-    heard = Heard()
-    play(path, heard)
-    assert heard.payloads() == [b"%d" % at for at in range(3000)]
-
-
 def test_looking_ahead_is_bounded_and_loses_nothing(tmp_path: Path, limit: Limit) -> None:
     limit(replay_window_bytes=10_000, replay_window_rows=300)
     dice = random.Random(2)
