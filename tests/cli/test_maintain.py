@@ -9,27 +9,11 @@ import pytest
 
 import hybridlog as hl
 from tests import places
-from tests.independent import read_bag
 from tests.other_user import User, needs_root, open_place
 
 from .running import run
 
 pytestmark = pytest.mark.mongo
-
-
-def test_verify_and_reindex(logs: Path, fresh: Path) -> None:
-    count = len(read_bag(logs / "small.bag"))
-    done = run("verify", store=fresh)
-    assert "1 recording, " in done.out
-    assert f" {count} messages, " in done.out
-    assert done.out.endswith("all is well\n")
-    before = run("fetch", "-t", "scan", "--where", "ranges.min < 3", "-F", "raw", store=fresh).raw
-    again = run("index", "rebuild", "--json", store=fresh).json
-    assert (again["recordings"], again["messages"]) == (1, count)
-    after = run("fetch", "-t", "scan", "--where", "ranges.min < 3", "-F", "raw", store=fresh).raw
-    assert after == before != b""
-    assert run("verify", "small", "--json", store=fresh).json["findings"] == []
-    run("verify", "nothing", store=fresh, code=2)
 
 
 def test_verify_lists_what_is_off(fresh: Path) -> None:
