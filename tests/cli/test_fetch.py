@@ -123,13 +123,6 @@ def test_no_directory_is_deleted(store: Path, tmp_path: Path) -> None:
     assert len(list(mine.rglob("*.bin"))) == 2
 
 
-def test_places_that_cannot_be_written(store: Path, tmp_path: Path) -> None:
-    for path in (tmp_path / "no/such/x.csv", tmp_path, tmp_path / "x.unknown"):
-        run(*SCAN, "-o", path, store=store, code=2)
-    run(*SCAN, "-F", "table", "-o", tmp_path / "x", store=store, code=2)
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_a_full_disk_behind_standard_output(store: Path) -> None:
     asked = (
         ["fetch", "-t", "scan", "-F", "csv"],

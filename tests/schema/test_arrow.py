@@ -13,10 +13,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hybridlog.schema.codec import Codec, Decoded, OpaqueCodec, columns_of
+from hybridlog.schema.codec import Codec, Decoded, columns_of
 from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.reduced_codec import reduce, reduced_channel
-from hybridlog_storage.errors import DefinitionError
 from hybridlog_storage.messages import Batch, Channel, Schema
 
 JSON = codec_for(Channel("/t", "json", None))
@@ -159,15 +158,6 @@ def test_protobuf_presence_maps_and_extremes() -> None:
     assert arrow_of(codec, [], {"u", "m.s"}).type.field("u").type == pa.uint64()
 
 
-def test_ros_numbers_are_not_copied_and_outlive_their_column() -> None:
-    codec = codec_for(Channel("/t", "ros1", Schema("p/T", "ros1msg", b"float64 x\nbool[2] b")))
-    payloads = [np.array([x]).tobytes() + b"\1\0" for x in (1.5, math.nan)]
-    records = arrow_of(codec, payloads)
-    assert records.field("x")[0].as_py() == 1.5
-    assert math.isnan(records.field("x")[1].as_py())
-    assert records.field("b").to_pylist() == [[True, False]] * 2
-
-
 def test_reduced_messages_have_what_the_index_has() -> None:
     channel = Channel(
         "/t", "ros1", Schema("p/T", "ros1msg", b"float32[] r\nint32 n\nstring s\ntime t")
@@ -181,8 +171,3 @@ def test_reduced_messages_have_what_the_index_has() -> None:
     assert row["r"] is None
     assert decoded.records.statistic("r", "max").to_pylist() == [99.0]  # type: ignore[union-attr]
     assert (row["n"], row["s"], row["t"].value) == (7, "x", 5 * 10**9 + 6)
-
-
-def test_what_cannot_be_decoded_refuses() -> None:
-    with pytest.raises(DefinitionError, match=r"\.raw"):
-        arrow_of(OpaqueCodec("no definition"), [b"x"])

@@ -378,6 +378,29 @@ def test_chunks_that_wait_are_written_together(tmp_path: Path, calls: Calls) -> 
         )
 
 
+def test_no_chunk_follows_one_that_failed(tmp_path: Path, calls: Calls) -> None:
+    failing = threading.Event()
+
+    def full(*_: object) -> None:
+        failing.wait()
+        raise DiskFullError("There is no room.")
+
+    calls(SegmentFile, "append_chunks", full)
+    writer = recorder(tmp_path, setup=SegmentSettings(chunk_size=100_000), on_written=done)
+    for _ in range(50):
+        writer.place_one(CHANNELS[0], bytes(100_000), 0, 0, 0)
+    failing.set()
+    with pytest.raises(DiskFullError) as caught:
+        writer.flush()
+    # It is told of once, not once a chunk that waited, and again to who goes on.
+    assert len(caught.traceback) < 20
+    with pytest.raises(DiskFullError):
+        writer.place_one(CHANNELS[0], bytes(100_000), 0, 0, 0)
+    # Nobody waits for a payload that nobody copies any more.
+    writer.abort()
+    assert writer.written.total() == 0
+
+
 def many(count: int, channel: int = 0, size: int = 100, step: int = 10**7) -> list[Row]:
     return [(channel, bytes([i % 251]) * size, i * step, i * step, i) for i in range(count)]
 
