@@ -104,24 +104,6 @@ def test_a_slice_has_latched_messages_in_front(logs: Path, tmp_path: Path) -> No
         assert len(places.names(tmp_path / "s")) == 2
 
 
-def test_several_paths(logs: Path, tmp_path: Path) -> None:
-    done = run(
-        *("record", logs / "small.bag", logs / "nothing.bag", logs / "odd.mcap"),
-        store=tmp_path / "s",
-        code=3,
-    )
-    assert [line.split()[0] for line in done.lines] == ["recording", "small", "odd", "total"]
-    assert "nothing.bag: no such file" in done.err
-    assert places.names(tmp_path / "s") == ["odd", "small"]
-
-    again = run(
-        "record", logs / "odd.mcap", logs / "robot.bag", "--json", store=tmp_path / "s", code=8
-    )
-    assert [item["exit_code"] for item in again.json if "error" in item] == [8]
-    assert again.json[1]["recording"] == "robot"
-    assert not misfit(again.json, schema_of(["record"]))
-
-
 def test_what_cannot_be_indexed_is_said(logs: Path, tmp_path: Path) -> None:
     done = run("record", logs / "odd.mcap", store=tmp_path / "s")
     for topic in ("/code", "/recursive", "/no_definition", "/cbor"):

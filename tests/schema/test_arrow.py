@@ -65,6 +65,14 @@ def same(one: Any, other: Any) -> bool:
     return bool(one == other)
 
 
+def test_json_numbers_have_types_that_hold_them() -> None:
+    rows = [b'{"u": 18446744073709551615, "f": 1, "n": NaN}', b'{"u": 0, "f": 0.5, "n": null}']
+    records = arrow_of(JSON, rows)
+    assert [records.field(one).type for one in "ufn"] == [pa.uint64(), pa.float64(), pa.float64()]
+    assert records.field("u").to_pylist() == [(1 << 64) - 1, 0]
+    assert records.field("n").is_null().to_pylist() == [False, True]
+
+
 def test_json_text_is_json_also_of_nan_and_surrogates() -> None:
     rows = [b'{"v": [NaN, Infinity, "a"]}', b'{"v": "\\ud800"}', b'{"v": {"k": -Infinity}}']
     texts = arrow_of(JSON, rows).field("v").to_pylist()

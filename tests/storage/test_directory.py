@@ -18,6 +18,7 @@ import pytest
 from hybridlog_storage.disk import files
 from hybridlog_storage.disk.directory import LOCK, Holder, StoreDirectory
 from hybridlog_storage.errors import HeldError, StoreError, TopicError
+from tests.waiting import at_once
 
 
 @pytest.fixture
@@ -51,6 +52,16 @@ def test_what_is_no_place_for_a_store(tmp_path: Path) -> None:
 def made(store: StoreDirectory, name: str = "r") -> Path:
     store.make_folder(name)
     return store.recording(name)
+
+
+def test_many_make_the_same_store_at_once(tmp_path: Path) -> None:
+    for turn in range(20):
+        path = tmp_path / f"store{turn}"
+        made: list[StoreDirectory] = []
+        at_once(*[lambda path=path, made=made: made.append(StoreDirectory.create(path))] * 4)
+        assert {one.settings.store_id for one in made} == {StoreDirectory(path).settings.store_id}
+        names = sorted(p.name for p in path.iterdir())
+        assert (len(made), names) == (4, ["hybridlog.toml", "manifests", "recordings"])
 
 
 def test_segments_are_told_by_their_numbers(store: StoreDirectory) -> None:

@@ -284,6 +284,16 @@ def test_a_loose_message_whose_length_is_wrong_costs_few(claim: int) -> None:
     assert damages(items)
 
 
+def test_a_record_that_claims_too_much_costs_no_chunk_behind_it() -> None:
+    data = bytearray(written())
+    place = next(o for o, i in items_of(bytes(data)) if isinstance(i, Attachment))
+    (length,) = struct.unpack_from("<Q", data, place + 1)
+    struct.pack_into("<Q", data, place + 1, length + 7)
+    items = items_of(bytes(data[: parts_of(data)[1]]))
+    assert payloads(items) == ALL
+    assert damages(items)[0].offset == place + 9 + length
+
+
 def test_logs_that_follow_one_another_are_read_one_after_the_other() -> None:
     data = written()
     assert payloads(items_of(data * 3)) == ALL * 3
