@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import pytest
-
 from hybridlog_storage.cache import Cache
-from hybridlog_storage.errors import SegmentError
 
 
 class Reading:
@@ -37,18 +34,6 @@ def test_a_value_without_room_is_given_and_not_kept() -> None:
     assert reading.get(2, size=4000)[0] == 2
     assert reading.get(1)[0] == 1
     assert reading.made == [1, 2, 2]
-
-
-def test_nothing_is_kept_of_what_could_not_be_made() -> None:
-    cache = Cache()
-
-    def damaged() -> bytes:
-        raise SegmentError("damaged")
-
-    for _ in range(2):
-        with pytest.raises(SegmentError):
-            cache.made("chunk", "a", 1, make=damaged, size_of=len)
-    assert Reading(cache).get(1)[0] == 1
 
 
 def test_another_value_takes_the_place_of_the_one_before() -> None:

@@ -328,12 +328,7 @@ def test_a_segment_has_no_more_chunks_than_a_summary_should(tmp_path: Path, limi
         writer.append(batch_of([(0, payload, n, n, n)]), CHANNELS)
     paths = writer.close()
     assert [data for path in paths for _, _, data in messages_in(path)] == payloads
-    chunks = []
-    for path in paths:
-        with path.open("rb") as stream:
-            summary = make_reader(stream).get_summary()
-        assert summary is not None
-        chunks.append(len(summary.chunk_indexes))
+    chunks = [len(summary_of(path, number).chunks) for number, path in enumerate(paths)]
     # Those that wait together are written together, eight of them at most.
     assert sum(chunks) == 200
     assert all(10 <= count < 10 + AT_WORK for count in chunks[:-1])
@@ -989,10 +984,8 @@ def test_channels_of_all_chunks_are_bounded_in_a_segment(tmp_path: Path, limit: 
         rows = [(channel, b"x", n, n, n) for channel in range(10)]
         writer.append(batch_of(rows), topics)
         writer.flush()
-    parts = []
-    for number, path in enumerate(writer.close()):
-        with SegmentReader(path, number) as reader:
-            parts.append(len(reader.summary().table.parts))
+    paths = writer.close()
+    parts = [len(summary_of(path, number).table.parts) for number, path in enumerate(paths)]
     assert parts == [20, 20, 20, 0]
 
 
