@@ -81,6 +81,26 @@ def test_a_store_is_no_copy_of_itself(robots: Path, tmp_path: Path, to: To, expi
     assert sorted(found.known) == sorted(STATES)
 
 
+def test_damaged_recordings_are_refused_and_others_are_copied(
+    robots: Path, tmp_path: Path, to: To
+) -> None:
+    source = tmp_path / "damaged"
+    shutil.copytree(robots, source)
+    _flip_a_bit(places.segment(source, "recorded", 1))
+    _flip_a_bit(next(places.folder(source, "expired").glob("*.rows.parquet")))
+    places.segment(source, "noted").unlink()
+    for name in ("secret", "000000.mcap.old", "000077.rows.parquet"):
+        (places.folder(source, "calm") / name).write_bytes(b"not listed")
+    report = copied(source, to(tmp_path / "lab"))
+    assert sorted(report.copied) == ["calm", "damaged", "driven"]
+    for name in ("recorded", "expired"):
+        assert "is damaged: its bytes do not have the digest" in report.refused[name]
+    assert "cannot be copied: No such file" in report.refused["noted"]
+    assert names_in(tmp_path / "lab") == ["calm", "damaged", "driven"]
+    there = places.folder(tmp_path / "lab", "calm")
+    assert files_in(there) == files_in(places.folder(robots, "calm"))
+
+
 def test_payloads_expire_here_when_they_are_proved_there(robots: Path, tmp_path: Path) -> None:
     """A damaged copy is mended first."""
     robot, lab = tmp_path / "robot", tmp_path / "lab"
