@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 import hybridlog as hl
-from hybridlog.live.state import RecorderState, StateFile
 from hybridlog_storage.manifests import MANIFEST_OLD
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import places
-from tests.waiting import wait_for
 
 from .running import run
 
@@ -52,13 +49,6 @@ def test_a_recording_that_is_wholly_lost_is_missed(damaged: Path) -> None:
     done = run("fetch", "-t", "/late", "-r", "gone", "--count", store=damaged)
     assert done.out == "0\n"
     assert "gone is not complete, so this answer may not be: 1 message lost" in done.err
-
-
-def test_a_topic_that_is_wholly_lost_is_known(damaged: Path) -> None:
-    done = run("fetch", "-t", "/late", "--count", store=damaged)
-    assert done.out == "0\n"
-    assert "part is not complete" in done.err
-    assert "gone is not complete" in done.err
 
 
 def test_times_behind_what_is_left_are_known_to_be_lost(damaged: Path) -> None:
@@ -134,23 +124,3 @@ def test_info_shows_notes_and_marks(damaged: Path) -> None:
     assert [(mark["text"], mark["time"]) for mark in told["marks"]] == [
         ("bump", BEGIN_NS + SECOND_NS)
     ]
-
-
-def test_messages_that_are_not_written_yet_are_counted(tmp_path: Path) -> None:
-    def is_known() -> bool:
-        store.refresh()
-        return "/kept" in store.topics()
-
-    settings = SegmentSettings(chunk_size=1 << 10, segment_size=1)
-    with (
-        hl.open(tmp_path / "store", create=True) as store,
-        store.start("now", settings=settings) as recording,
-    ):
-        for second in range(3):
-            recording.write(KEPT, PAYLOAD, log_time=BEGIN_NS + second * SECOND_NS)
-        wait_for(is_known)
-        nothing = RecorderState("now", 0, [], 0, 0, {}, 0, 0, 0, "", 0, 0)
-        says = StateFile(store.directory, recording.id)
-        says.write(replace(nothing, taken={"/kept": 15, "/other": 100}))
-        done = run("fetch", "-t", "/kept", "--count", store=tmp_path / "store")
-    assert "now is being recorded: 12 messages not written yet" in done.err

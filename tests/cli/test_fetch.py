@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import subprocess
 from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
 
-import numpy as np
 import pytest
 
 from hybridlog.cli.answers import print_end
@@ -55,18 +53,6 @@ def test_the_closing_line(store: Path, scans: list[Seen], start: int) -> None:
     assert run(*SCAN, "--between", "+1s", "+2s", "-F", "raw", store=store).err == ""
 
 
-def test_times(store: Path, seen: list[Seen], scans: list[Seen], start: int) -> None:
-    wanted = [m.log_time for m in slice_of(scans, start)]
-    low, high = start + SECOND, start + 2 * SECOND
-    iso = str(np.datetime64(low, "ns")), f"{np.datetime64(high + 7200 * SECOND, 'ns')}+02:00"
-    for between in ((str(low), str(high)), iso):
-        done = run(*SCAN, "--between", *between, "--fields", "scan_time", store=store)
-        assert [json.loads(line)["log_time_ns"] for line in done.lines] == wanted, between
-    last = run(*SCAN, "--between", "-1s", "end", "--count", store=store)
-    end = max(r["last_ns"] for r in run("ls", "--json", store=store).json if r["name"] == "robot")
-    assert int(last.out) == sum(m.log_time >= end + 1 - SECOND for m in scans)
-
-
 def test_a_wrong_predicate_is_pointed_at(store: Path) -> None:
     done = run(*SCAN, "--where", "ranges.min << 0.5", store=store, code=2)
     message, text, caret = done.err.splitlines()
@@ -76,31 +62,6 @@ def test_a_wrong_predicate_is_pointed_at(store: Path) -> None:
     for predicate in ("nothing < 1", "__import__('os') == 1", "ranges.min <", "$where == 1"):
         refused = run(*SCAN, "--where", predicate, store=store, code=2)
         assert "^" in refused.err or "angle" in refused.err or "field" in refused.err
-
-
-def test_thinning(store: Path, scans: list[Seen]) -> None:
-    times = [m.log_time for m in scans]
-
-    def fetched(*options: str) -> list[int]:
-        done = run(*SCAN, "--fields", "scan_time", *options, "-v", store=store)
-        assert done.err.startswith(f"{len(done.lines)} message")
-        return [json.loads(line)["log_time_ns"] for line in done.lines]
-
-    assert fetched("--limit", "5") == times[:5]
-    assert fetched("-n", "0") == []
-    assert fetched("--every", "7") == times[::7]
-    assert fetched("--reverse", "--every", "3", "--limit", "4") == times[::-1][::3][:4]
-    limited = run(*SCAN, "--limit", "2", "-F", "raw", "-v", store=store)
-    assert limited.raw == scans[0].payload + scans[1].payload
-    assert f"2 messages, {len(limited.raw) / 1000:.1f} kB of payload" in limited.err
-
-
-def test_fields(store: Path) -> None:
-    done = run(*SCAN, "--fields", "angle_max, header.stamp", "-n", "1", store=store)
-    assert list(json.loads(done.out)) == ["log_time_ns", "topic", "angle_max", "header.stamp"]
-    refused = run(*SCAN, "--fields", "angle_mox", store=store, code=2)
-    assert "angle_max" in refused.err
-    run(*SCAN, "--fields", "a,,b", store=store, code=2)
 
 
 @pytest.mark.parametrize("form", ["csv", "parquet", "arrow", "npz", "mcap", "bag", "jsonl"])
@@ -162,13 +123,6 @@ def test_no_directory_is_deleted(store: Path, tmp_path: Path) -> None:
     assert len(list(mine.rglob("*.bin"))) == 2
 
 
-def test_places_that_cannot_be_written(store: Path, tmp_path: Path) -> None:
-    for path in (tmp_path / "no/such/x.csv", tmp_path, tmp_path / "x.unknown"):
-        run(*SCAN, "-o", path, store=store, code=2)
-    run(*SCAN, "-F", "table", "-o", tmp_path / "x", store=store, code=2)
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_a_full_disk_behind_standard_output(store: Path) -> None:
     asked = (
         ["fetch", "-t", "scan", "-F", "csv"],
@@ -214,14 +168,6 @@ def test_damage_that_has_cost_no_message(logs: Path, tmp_path: Path) -> None:
     assert "messages lost" not in info
 
 
-def test_a_type_that_changes_midway(store: Path, tmp_path: Path) -> None:
-    rows = [json.loads(r) for r in run("fetch", "-t", "change", store=store).lines]
-    assert [str(r["data"]) for r in rows] == ["x"] * 3 + ["7"] * 3
-    run("fetch", "-t", "change", "-o", tmp_path / "x.mcap", store=store)
-    payloads = [m.payload for m in read_mcap(tmp_path / "x.mcap")]
-    assert payloads == [odd_log.text("x")] * 3 + [odd_log.number(7)] * 3
-
-
 @pytest.mark.parametrize("topic", ["code", "recursive", "cbor", "no_definition"])
 def test_what_is_no_table_is_still_exact(topic: str, store: Path) -> None:
     refused = run("fetch", "-t", topic, store=store, code=10)
@@ -256,12 +202,3 @@ def test_remarks_follow_the_closing_line(store: Path) -> None:
     done = run("fetch", "-t", "odom", "-r", "odd", "--count", store=store, code=2)
     assert "there is no topic 'odom'" in done.err
     assert "in the store, robot has such a topic" in done.err
-
-
-def test_what_summaries_leave_out_is_said(store: Path) -> None:
-    left_out = "messages do not fit their definition and are not in this answer"
-    assert left_out in run("intervals", "/long", "--changes", "data", store=store).err
-    assert left_out in run("align", "-t", "/long", "--step", "1s", store=store).err
-    asked = run("align", "-t", "/long", "--step", "1s", "--where", "data > 9", store=store)
-    assert left_out not in asked.err
-    assert "messages could not be tested" in asked.err

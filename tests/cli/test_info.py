@@ -124,11 +124,6 @@ def test_stamps_that_were_not_set_are_no_delay(tmp_path: Path) -> None:
         assert rows == [("/all", 2e9, 0), ("/late", 2e9, 1), ("/never", None, 2)]
 
 
-def test_a_recording_that_is_not_there(store: Path) -> None:
-    done = run("info", "rob0t", store=store, code=2)
-    assert "robot" in done.err
-
-
 def test_schema(store: Path) -> None:
     done = run("info", "-t", "scan", store=store)
     assert done.lines[0].startswith("/base/scan  sensor_msgs/LaserScan  (ros1")
@@ -145,12 +140,6 @@ def test_schema(store: Path) -> None:
 def test_schema_of_a_topic_whose_type_changes(store: Path) -> None:
     found = run("info", "-t", "change", "--json", store=store).json
     assert [item["type"] for item in found] == ["std_msgs/msg/String", "std_msgs/msg/Int32"]
-
-
-def test_schema_of_a_hostile_definition(store: Path) -> None:
-    done = run("info", "-t", "code", store=store)
-    assert "not indexed" in done.out
-    assert "__import__" in done.out
 
 
 def test_schema_of_json_has_the_fields_that_messages_have(store: Path, tmp_path: Path) -> None:

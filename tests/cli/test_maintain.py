@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from pathlib import Path
 
@@ -10,27 +9,11 @@ import pytest
 
 import hybridlog as hl
 from tests import places
-from tests.independent import read_bag
 from tests.other_user import User, needs_root, open_place
 
 from .running import run
 
 pytestmark = pytest.mark.mongo
-
-
-def test_verify_and_reindex(logs: Path, fresh: Path) -> None:
-    count = len(read_bag(logs / "small.bag"))
-    done = run("verify", store=fresh)
-    assert "1 recording, " in done.out
-    assert f" {count} messages, " in done.out
-    assert done.out.endswith("all is well\n")
-    before = run("fetch", "-t", "scan", "--where", "ranges.min < 3", "-F", "raw", store=fresh).raw
-    again = run("index", "rebuild", "--json", store=fresh).json
-    assert (again["recordings"], again["messages"]) == (1, count)
-    after = run("fetch", "-t", "scan", "--where", "ranges.min < 3", "-F", "raw", store=fresh).raw
-    assert after == before != b""
-    assert run("verify", "small", "--json", store=fresh).json["findings"] == []
-    run("verify", "nothing", store=fresh, code=2)
 
 
 def test_verify_lists_what_is_off(fresh: Path) -> None:
@@ -49,21 +32,6 @@ def test_verify_lists_what_is_off(fresh: Path) -> None:
     found = run("verify", "--json", store=fresh, code=1).json["findings"]
     assert len(found) == len(findings)
     assert run("verify", "--quiet", store=fresh, code=1).lines == findings
-
-
-def test_rm(logs: Path, fresh: Path) -> None:
-    run("record", logs / "odd.mcap", "--quiet", store=fresh)
-    refused = run("rm", "odd", store=fresh, code=2)
-    assert "--yes" in refused.err
-    run("rm", "nothing", "--yes", store=fresh, code=2)
-    assert places.names(fresh) == ["odd", "small"]
-    assert run("rm", "odd", "--yes", store=fresh).out == "deleted odd\n"
-    assert places.names(fresh) == ["small"]
-    assert "all is well" in run("verify", store=fresh).out
-    assert "/json" in run("fetch", "-t", "/json", store=fresh, code=2).err
-    assert run("rm", "small", "-yq", store=fresh).out == ""
-    assert "is empty" in run("ls", store=fresh).err
-    run("record", logs / "odd.mcap", "--quiet", store=fresh)
 
 
 def test_no_store(tmp_path: Path) -> None:
@@ -99,18 +67,6 @@ def test_a_newer_store(logs: Path, tmp_path: Path) -> None:
         done = run(*command, store=store, code=5)
         assert "format 99" in done.err
         assert "Use the hybridlog that wrote it" in done.err
-
-
-@pytest.mark.skipif(os.geteuid() == 0, reason="the next test does the same as another user")
-def test_a_store_that_cannot_be_written(logs: Path, fresh: Path) -> None:
-    closed = [fresh, places.root(fresh), fresh / "mongod"]
-    for place in closed:
-        place.chmod(0o500)
-    try:
-        run("record", logs / "odd.mcap", store=fresh, code=5)
-    finally:
-        for place in closed:
-            place.chmod(0o700)
 
 
 @needs_root

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import time
 from pathlib import Path
 
@@ -72,10 +71,6 @@ def test_rows_have_all_forms(words: tuple[str, ...], store: Path, tmp_path: Path
     # Rows without a place are not offered the formats of places.
     assert "tum" not in answer(words[0], "--help", store=store).out
     assert "does not give the format" in _error(*words, "-o", tmp_path / "a.tum", store=store)
-
-
-def test_help_cuts_no_line(store: Path) -> None:
-    assert not re.search(r"[^\]]\.\.\.$", answer("index", "--help", store=store).out, re.MULTILINE)
 
 
 def _set(row: dict[str, object]) -> dict[str, object]:

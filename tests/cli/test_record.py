@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import os
 import shutil
-import struct
 from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
-from mcap.writer import Writer
 
 import hybridlog as hl
 from tests import places
@@ -104,61 +102,6 @@ def test_a_slice_has_latched_messages_in_front(logs: Path, tmp_path: Path) -> No
         empty = ("--between", f"{first + 1}ns", f"{first + 2}ns")
         assert "has no message from" in run(*asked, *empty, store=tmp_path / "s", code=2).err
         assert len(places.names(tmp_path / "s")) == 2
-
-
-def test_several_paths(logs: Path, tmp_path: Path) -> None:
-    done = run(
-        *("record", logs / "small.bag", logs / "nothing.bag", logs / "odd.mcap"),
-        store=tmp_path / "s",
-        code=3,
-    )
-    assert [line.split()[0] for line in done.lines] == ["recording", "small", "odd", "total"]
-    assert "nothing.bag: no such file" in done.err
-    assert places.names(tmp_path / "s") == ["odd", "small"]
-
-    again = run(
-        "record", logs / "odd.mcap", logs / "robot.bag", "--json", store=tmp_path / "s", code=8
-    )
-    assert [item["exit_code"] for item in again.json if "error" in item] == [8]
-    assert again.json[1]["recording"] == "robot"
-    assert not misfit(again.json, schema_of(["record"]))
-
-
-def test_the_same_content_is_noticed(logs: Path, fresh: Path, tmp_path: Path) -> None:
-    copy = tmp_path / "other-name.bag"
-    copy.write_bytes((logs / "small.bag").read_bytes())
-    done = run("record", copy, store=fresh, code=8)
-    assert "'small'" in done.err
-    assert "--again" in done.err
-    assert places.names(fresh) == ["small"]
-    run("record", copy, "--again", store=fresh)
-    assert places.names(fresh) == ["other-name", "small"]
-
-
-def test_large_fields_fit_their_definition(tmp_path: Path) -> None:
-    path = tmp_path / "large.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start("ros2")
-        schema = writer.register_schema("std_msgs/msg/String", "ros2msg", b"string data")
-        large, torn = (writer.register_channel(t, "cdr", schema) for t in ("/large", "/torn"))
-        text = b"x" * (9 << 20) + b"\0"
-        for n, (channel, size) in enumerate([(large, len(text)), (torn, 1 << 30), (large, 9)]):
-            payload = b"\0\1\0\0" + struct.pack("<I", size) + text[-min(size, len(text)) :]
-            writer.add_message(channel, n, payload, n)
-        writer.finish()
-    store = tmp_path / "s"
-    done = run("record", path, store=store)
-    assert "/large" not in done.err
-    assert "/torn: 1 message does not fit its definition" in done.err
-    notes = {line.split()[0]: line for line in run("info", store=store).lines if line[:1] == "/"}
-    assert "unreadable" not in notes["/large"]
-    assert notes["/torn"].endswith("1 unreadable")
-    rows = {
-        row["topic"]: row["unreadable"]
-        for row in run("info", "large", "--json", store=store).json[0]["channels"]
-    }
-    assert rows == {"/large": 0, "/torn": 1}
 
 
 def test_what_cannot_be_indexed_is_said(logs: Path, tmp_path: Path) -> None:

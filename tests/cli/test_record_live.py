@@ -130,18 +130,6 @@ def test_a_replay_is_recorded_whole(logs: Path, tmp_path: Path) -> None:
     assert "Nothing is missing" in run("info", "--losses", store=store).err
 
 
-def test_ctrl_c_ends_it_with_everything_stored(logs: Path, tmp_path: Path) -> None:
-    store = tmp_path / "store"
-    with recorder(store, "--replay", logs / "robot.bag") as process:
-        until_it_speaks(process)
-        report = end(process)
-    (recording,) = report["recordings"]
-    assert recording["status"] == "complete"
-    assert recording["messages"] == report["messages_received"] > 0
-    assert recording["messages_indexed"] == recording["messages"]
-    assert run("verify", store=store).code == 0
-
-
 @pytest.mark.parametrize("is_abstract", [False, True])
 def test_a_service_manager_hears_of_it(logs: Path, tmp_path: Path, is_abstract: bool) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
@@ -190,24 +178,6 @@ def test_each_key_of_its_json_is_in_the_documentation(logs: Path, tmp_path: Path
     failed = run("record", "--replay", tmp_path / "none.bag", "--json", store=tmp_path, code=None)
     assert failed.code != 0
     assert json.loads(failed.lines[-1])["report"]["exit_code"] == failed.code
-
-
-def test_a_second_ctrl_c_leaves_at_once_and_what_was_flushed_is_there(
-    logs: Path, tmp_path: Path
-) -> None:
-    store = tmp_path / "store"
-    with recorder(store, "--replay", logs / "robot.bag", "--flush-interval", "100ms") as process:
-        until_it_speaks(process)
-        time.sleep(1)
-        # The second one may find it closing, or closed.
-        process.send_signal(signal.SIGTERM)
-        process.send_signal(signal.SIGINT)
-        code = process.wait(30)
-        assert code in {0, 128 + signal.SIGTERM, 128 + signal.SIGINT}
-    listed = run("ls", "--json", store=store)
-    (entry,) = listed.json
-    assert entry["messages"] > 0
-    run("verify", store=store)
 
 
 RECOVERS_WHEN_TOLD = """

@@ -261,14 +261,6 @@ def test_help_breaks_no_word_at_eighty_columns(name: str) -> None:
         assert sections[1:] == ["Options:", "Choosing recordings:", "Common options:"]
 
 
-def test_only_the_module_of_the_command_is_imported(store: Path) -> None:
-    modules = {name: app.get_command(click.Context(app), name) for name in COMMANDS}
-    homes = {command.callback.__module__ for command in modules.values()}
-    assert len(homes) == len(COMMANDS)
-    found = homes & modules_of("ls", "--store", store)
-    assert found == {"hybridlog.cli.ls"}
-
-
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
 def test_a_shell_gets_its_completion_script(shell: str) -> None:
     script = run(_HYBRIDLOG_COMPLETE=f"{shell}_source").out

@@ -111,13 +111,6 @@ def test_edits_there_stay_that_are_made_meanwhile(pair: Pair) -> None:
     target.check(edited(recording()))
 
 
-def test_a_name_is_made_free_there(pair: Pair) -> None:
-    source, target = pair
-    for name in ("run-2", "run-3"):
-        copied = copy(source.source, target.place, RECORDING, How(named=lambda *_, name=name: name))
-        assert copied.manifest.name == "run-2"
-
-
 def test_progress_tells_all_bytes(pair: Pair) -> None:
     source, target = pair
     told: list[tuple[int, int]] = []

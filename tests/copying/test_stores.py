@@ -17,7 +17,6 @@ from tests import places
 from tests.cli.within import answer
 from tests.copying.conftest import STATES, all_answers, answers, expire, files_in
 from tests.copying.server import Sshd
-from tests.limits import Limit
 
 
 def _flip_a_bit(path: Path) -> None:
@@ -102,42 +101,6 @@ def test_damaged_recordings_are_refused_and_others_are_copied(
     assert files_in(there) == files_in(places.folder(robots, "calm"))
 
 
-def test_fields_come_first_and_payloads_later(robots: Path, tmp_path: Path, to: To) -> None:
-    lab = tmp_path / "lab"
-    before = sorted(path.name for path in robots.rglob("*"))
-    report = copied(robots, to(lab), "recorded", "driven", "noted", only_fields=True)
-    assert len(report.copied) == 3
-    rest = copied(robots, to(lab), only_fields=True)
-    assert (sorted(rest.copied), len(rest.known)) == (["calm", "damaged", "expired"], 3)
-    assert sorted(path.name for path in robots.rglob("*")) == before
-    right = answers(robots, "noted")
-    fields = answers(lab, "noted")
-    assert fields == {key: value for key, value in right.items() if key in fields}
-    assert len(fields) < len(right), "payloads are not there"
-    with hl.open(lab, mongo="none") as store:
-        assert not store.verify().findings
-        store.edit("noted", tag={"place": "lab"})
-        store.edit("noted", note="seen")
-        store.mark("noted", "end", "there")
-        store.edit("recorded", name="drive")
-    # What was added there stays, and the robot's own later tags do not come.
-    report = copied(robots, to(lab))
-    assert sorted(report.copied) == ["calm", "damaged", "drive", "driven", "noted"]
-    assert report.known == ["expired"]
-    for there, here in (("driven", "driven"), ("drive", "recorded"), ("noted", "noted")):
-        found, right = answers(lab, there), answers(robots, here)
-        own = {"entry", "notes", "marks"} if there == "noted" else set()
-        assert {k: v for k, v in found.items() if k not in own} == {
-            k: v for k, v in right.items() if k not in own
-        }
-    with hl.open(lab, mongo="none") as store:
-        entry = store.entry("noted")
-        assert entry.tags == {"place": "lab"}
-        assert [note["text"] for note in entry.notes] == ["it rained", "seen"]
-        assert [mark["text"] for mark in entry.marks] == ["here", "there"]
-        assert not store.verify().findings
-
-
 def test_payloads_expire_here_when_they_are_proved_there(robots: Path, tmp_path: Path) -> None:
     """A damaged copy is mended first."""
     robot, lab = tmp_path / "robot", tmp_path / "lab"
@@ -162,18 +125,6 @@ def test_payloads_expire_here_when_they_are_proved_there(robots: Path, tmp_path:
     said = answer("fetch", "-t", "/cloud", "-r", "recorded", "--count", "--where", "data[0] > 0",
                   store=robot).err  # fmt: skip
     assert f"{told}." in " ".join(said.split())
-
-
-def test_what_expired_before_keeps_no_other_payloads(robots: Path, tmp_path: Path) -> None:
-    robot, lab = tmp_path / "robot", tmp_path / "lab"
-    shutil.copytree(robots, robot)
-    with hl.open(robot, mongo="none") as store:
-        expire(store, "recorded", [1])
-        store.copy(lab, ["recorded"])
-        for frees in (True, False):
-            report = store.copy(lab, ["recorded"], CopyOptions(then_expire=True))
-            assert (report.known, report.problems) == (["recorded"], [])
-            assert bool(report.freed_bytes) == frees
 
 
 def test_what_the_copy_has_lost_stays(robots: Path, tmp_path: Path, to: To) -> None:
@@ -216,20 +167,6 @@ def test_recordings_that_are_held_or_gone_keep_no_others_waiting(
     assert "is not copied: another process copies it" in report.refused["noted"]
     assert "'driven' is no longer in the store" in report.refused["driven"]
     assert places.names(tmp_path / "lab") == ["recorded"]
-
-
-def test_a_recording_that_is_held_there_is_left_for_later(
-    robots: Path, tmp_path: Path, limit: Limit
-) -> None:
-    limit(copy_wait_s=0.1)
-    lab = tmp_path / "lab"
-    copied(robots, {"to": lab}, "recorded", only_fields=True)
-    with hl.open(lab, mongo="none") as store:
-        recording = store.entry("recorded").id
-        with store.directory.writing(recording):
-            report = copied(robots, {"to": lab}, "recorded", "noted")
-    assert (report.copied, report.held) == (["noted"], [recording])
-    assert "is being changed by" in report.refused["recorded"]
 
 
 def test_a_name_that_another_recording_has_there_gets_a_number(

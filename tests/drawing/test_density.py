@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 import hybridlog as hl
 from hybridlog.drawing.density import aligned, density, evenly, periods
 from hybridlog.query.planner import Planner
-from hybridlog_storage.cache import Cache
 from hybridlog_storage.catalog import RecordingEntry
 from hybridlog_storage.errors import TopicError
 from hybridlog_storage.messages import Channel
@@ -121,19 +120,6 @@ def test_zooming_and_panning_change_nothing(
         assert found.edges[0] % widths[0] == 0
         for row, topic in enumerate(("/late", "/steady")):
             assert (found.counts[row] == _truth(topic, found.edges)).all()
-
-
-def test_a_small_cache_forgets_and_stays_right(store: hl.Store) -> None:
-    shared = store.shared
-    before, shared.cache = shared.cache, Cache(20_000)
-    try:
-        for begin in range(0, LENGTH, LENGTH // 16):
-            span = BASE + begin, BASE + begin + LENGTH // 16
-            found = density(store.session, store.entry("a"), aligned(span, 500), sorted(TIMES))
-            for topic, counts in zip(found.topics, found.counts, strict=True):
-                assert (counts == _truth(topic, found.edges)).all()
-    finally:
-        shared.cache = before
 
 
 def test_a_picture_reads_its_topics_once_and_no_payload(store: hl.Store, calls: Calls) -> None:

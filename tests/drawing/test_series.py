@@ -7,7 +7,6 @@ import pytest
 from numpy.typing import NDArray
 
 from hybridlog.drawing.series import _Grid, numbers_of, series
-from hybridlog.query.asked import spans_of
 from hybridlog_storage.errors import TopicError, UsageError
 
 from .conftest import BASE, MS, Drive
@@ -177,13 +176,6 @@ def test_nothing_in_the_span(drive: Drive, span: tuple[int, int]) -> None:
     assert x.exact
 
 
-def test_absurd_spans(drive: Drive) -> None:
-    (z,) = series(drive.store.topic("drive"), ["linear.z"], pixels=9, span=(-(2**80), 2**80))
-    assert z.least.tolist() == [drive.z.min()]
-    assert z.greatest.tolist() == [drive.z.max()]
-    assert z.times.tolist() == [BASE]
-
-
 @pytest.mark.parametrize(
     ("fields", "problem"),
     [
@@ -234,17 +226,3 @@ def test_gaps_between_pixels(times: list[int], gaps: list[int]) -> None:
     assert x.times[np.isnan(x.least)].tolist() == gaps
     firsts = {time // 10: time for time in reversed(times)}
     assert x.times[~np.isnan(x.least)].tolist() == sorted(firsts.values())
-
-
-def test_spans_of_recordings(drive: Drive) -> None:
-    both = drive.store.topic("drive", "loose", "front")
-    spans = sorted(spans_of(both).values(), reverse=True)
-    end = int(drive.times[-1]) + 1
-    assert spans == [(BASE, end), (BASE, BASE + 3 * MS + 1)]
-    assert [*spans_of(both)] == [summary.id for summary in both.summaries()]
-    assert [*spans_of(drive.store.topic("loose", "drive").between("+1s", None)).values()] == [
-        (BASE + 1000 * MS, end)
-    ]
-    later = drive.store.topic("rear/compressed", "broken")
-    assert [*spans_of(later).values()] == [(BASE, BASE + 3)]
-    assert spans_of(drive.store.topic("loose")) != spans_of(drive.store.topic("drive"))

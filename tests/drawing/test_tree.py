@@ -223,15 +223,6 @@ def test_pages_of_lines_meet_without_missing_or_repeating_one(odd: hl.Store, top
     assert back == found
 
 
-def test_lines_around_a_line(odd: hl.Store) -> None:
-    log = log_of(odd, "/rosout2")
-    seq = log.after(log_time(100), -1, 3)[2].seq
-    assert told(log.before(log_time(102), seq, 4)) == written("/rosout2", range(98, 102))
-    assert told(log.after(log_time(102), seq, 4)) == written("/rosout2", range(103, 107))
-    assert log.before(START, -1, 5) == []
-    assert log.after(START * 2, -1, 5) == []
-
-
 @pytest.mark.parametrize("topic", [name for name in TOPICS if name != HOSTILE])
 @pytest.mark.parametrize("level", ["debug", "warning", "fatal"])
 def test_lines_of_a_level_and_above(odd: hl.Store, topic: str, level: str) -> None:

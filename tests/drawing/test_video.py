@@ -18,7 +18,6 @@ import numpy as np
 import pytest
 from mcap.writer import Writer
 from numpy.typing import NDArray
-from PIL import Image
 
 import hybridlog as hl
 from hybridlog.arrays.bitstream import FrameOrder, frame_of, is_key_frame
@@ -192,17 +191,6 @@ def test_pictures_at_any_time(videos: hl.Store, form: str, encoding: str) -> Non
         assert psnr(right[n], drawn()[n]) > 20
     every = videos.query([f"/{encoding}"], [form]).to_numpy()
     assert np.array_equal(every, right)
-
-
-@pytest.mark.parametrize("form", ENCODERS)
-def test_pictures_as_files(videos: hl.Store, form: str, tmp_path: Path) -> None:
-    out = tmp_path / "pictures"
-    asked = ("-t", "/cdr", "-r", form, "-F", "png")
-    answer("fetch", *asked, "-o", out, store=videos.directory.path)
-    right = decoded(form)
-    for n in range(COUNT):
-        with Image.open(out / "cdr" / f"{BASE + n * STEP}.png") as picture:
-            assert np.array_equal(np.asarray(picture), right[n])
 
 
 @pytest.mark.parametrize("form", ENCODERS)

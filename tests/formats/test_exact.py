@@ -175,21 +175,3 @@ def test_raw(tmp_path: Path) -> None:
     assert len(list(target.iterdir())) == 10
     assert (target / "a__b" / "5.bin").exists()
     assert (target / "a__b" / "5-1.bin").exists()
-
-
-def test_raw_target(tmp_path: Path) -> None:
-    (tmp_path / "empty").mkdir()
-    answer = Answer(batches=[(many(3), ros1_channels())])
-    write_raw(answer, tmp_path / "empty")
-    assert (tmp_path / "empty" / "index.jsonl").exists()
-    with pytest.raises(UsageError, match="not empty"):
-        write_raw(answer, tmp_path / "empty")
-    (tmp_path / "file").touch()
-    with pytest.raises(UsageError, match="is a file"):
-        write_raw(answer, tmp_path / "file")
-
-
-def test_raw_stream() -> None:
-    stream = io.BytesIO()
-    write_raw(Answer(batches=[(many(20), ros1_channels())]), stream)
-    assert stream.getvalue() == b"".join(bytes(many(20).payload(row)) for row in range(20))

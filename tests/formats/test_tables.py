@@ -141,17 +141,6 @@ READS = (
 )
 
 
-def test_integers_stay_integers_and_doubles_exact() -> None:
-    parts = [pa.table({"a": [1, (1 << 53) + 1]}), pa.table({"a": pa.nulls(1)})]
-    assert read_parquet(written(write_parquet, *parts))["a"].type == pa.int64()
-    parts = [pa.table({"a": [1]}), pa.table({"a": pa.array([(1 << 64) - 1], pa.uint64())})]
-    back = read_parquet(written(write_parquet, *parts))["a"]
-    assert back.type == pa.uint64()
-    assert back.to_pylist() == [1, (1 << 64) - 1]
-    parts = [pa.table({"a": [1 << 53]}), pa.table({"a": [0.5]})]
-    assert read_parquet(written(write_parquet, *parts))["a"].to_pylist() == [float(1 << 53), 0.5]
-
-
 def test_parquet_has_no_statistics_of_floats() -> None:
     import pyarrow.parquet as pq
 

@@ -25,7 +25,6 @@ from hybridlog.live.policy import priority_rule, throttle_rule
 from hybridlog.live.recorder import Recorder, RecorderOptions
 from hybridlog.live.recording import LiveOptions, LiveRecording
 from hybridlog.live.state import choose, read, running, summary_of
-from hybridlog.query.topics import matcher
 from hybridlog.record.capture import Capture
 from hybridlog.record.losses import Cause, Loss
 from hybridlog.record.marks import MARKS
@@ -265,16 +264,6 @@ def test_a_recorder_that_is_refused_at_once_leaves_no_recording(store: hl.Store)
     assert not store.directory.ids()
 
 
-def test_as_many_messages_as_wanted_and_not_one_more(store: hl.Store) -> None:
-    robot = Running(store, RecorderOptions(reserve_bytes=0, max_messages=5))
-    channel = text_channel()
-    for number in range(20):
-        robot.speaker.say(channel, text(str(number)))
-    assert robot.recorder.wait(0)
-    assert robot.rows() == {}
-    assert [m.decode().data for m in store.topic("/chatter")] == list("01234")
-
-
 def test_bounds_of_time_and_size(store: hl.Store) -> None:
     robot = Running(store, RecorderOptions(reserve_bytes=0, duration_s=0.05))
     robot.speaker.say(text_channel(), text("x"))
@@ -287,19 +276,6 @@ def test_bounds_of_time_and_size(store: hl.Store) -> None:
     assert robot.recorder.stop()[0].entry.messages == 4
     with pytest.raises(UsageError, match="duration must be above 0"):
         RecorderOptions(duration_s=0)
-
-
-def test_topics_are_chosen_before_they_are_subscribed_to(store: hl.Store) -> None:
-    robot = Running(
-        store, RecorderOptions(reserve_bytes=0, matcher=matcher(["/camera/**"], ["*depth*"]))
-    )
-    sink = robot.recorder
-    assert sink.wants("/camera/image", "x")
-    assert not sink.wants("/camera/depth_raw", "x")
-    assert not sink.wants("/scan", "x")
-    sink.topic_came("/camera/image", "sensor_msgs/Image", 1)
-    assert robot.recorder.silent() == ["/camera/image"]
-    robot.recorder.stop()
 
 
 def test_a_publisher_that_connects_again_and_again_is_one_channel(store: hl.Store) -> None:
@@ -501,21 +477,6 @@ def test_the_reserve_holds_for_what_waits_in_memory(
     assert robot.recorder.stopped_for_disk
     assert "only 157 MB left: free some, or lower --reserve." in robot.recorder.reason
     assert robot.recorder.stop() == []
-
-
-def test_what_a_recorder_says_goes_with_it(store: hl.Store) -> None:
-    folder = store.directory.path / "recorders"
-    robot = Running(store)
-    robot.recorder.look()
-    assert len([*folder.iterdir()]) == 1
-    robot.recorder.stop()
-    robot.recorder.look()
-    assert [*folder.iterdir()] == []
-    (folder / "20261128-killed-3f9a12bc04d7e615.json").write_text("{}")
-    other = Running(store)
-    other.recorder.look()
-    assert [*folder.iterdir()] == [folder / f"{other.recorder._target.id}.json"]
-    other.recorder.stop()
 
 
 def test_what_is_expected_is_ready_before_its_first_message(

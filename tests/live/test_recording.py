@@ -217,24 +217,6 @@ def test_a_batch_is_for_chunks_that_get_many_messages(
         assert [m.raw for m in store.topic(one.topic)][1:] == payloads[n::topics]
 
 
-def test_what_is_laid_down_together_keeps_its_order(
-    store: hl.Store, calls: Calls, limit: Limit
-) -> None:
-    """Of all topics, whatever the sizes are, and however much comes at one time."""
-    sizes = [0, 10, 30_000, 200, 300_000, 10, COPIED_AT_ONCE]
-    own = [channel(f"/talk{n}") for n in range(3)]
-    limit(laid_out_bytes=9_000_000)
-    appended = calls(RecordingWriter, "append")
-    payloads = [text(b"%5d" % n + bytes(sizes[n % 7])) for n in range(210)]
-    with store.start("talk") as recording, recording._laying:
-        for n, payload in enumerate(payloads):
-            recording.write(own[n % 2 if n % 5 else 2], payload, log_time=5, sequence=n)
-    # What is left behind them are too few for a batch.
-    assert len(appended) == 4
-    assert sum(batch.payload_bytes for _, batch, _ in appended) == sum(map(len, payloads[:196]))
-    assert [m.raw for m in store.query([one.topic for one in own])] == payloads
-
-
 @pytest.mark.parametrize("size", [150_000, COPIED_AT_ONCE])
 @pytest.mark.parametrize("late", [False, True])
 def test_the_index_waits_while_messages_wait_for_their_turn(
@@ -482,17 +464,6 @@ def test_abort_leaves_nothing(store: hl.Store) -> None:
     assert store.directory.ids() == []
     store.refresh()
     assert store.recordings() == []
-
-
-def test_an_error_in_the_block_keeps_what_came(store: hl.Store) -> None:
-    def speak() -> None:
-        with store.start("talk") as recording:
-            recording.write(channel("/talk"), text(b"kept"))
-            raise ZeroDivisionError
-
-    with pytest.raises(ZeroDivisionError):
-        speak()
-    assert store.topic("/talk").count() == 1
 
 
 def test_a_database_that_refuses_to_the_end_leaves_what_segments_know(

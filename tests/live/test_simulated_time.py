@@ -15,7 +15,6 @@ from hybridlog.live.policy import throttle_rule
 from hybridlog.live.recorder import RecorderOptions
 from hybridlog.query.topics import matcher
 from hybridlog.record.losses import Cause, Loss
-from hybridlog_storage.errors import UsageError
 from hybridlog_storage.messages import Channel, Schema
 from tests.calls import Calls
 from tests.limits import Limit
@@ -221,11 +220,6 @@ def test_messages_that_come_while_the_held_ones_are_passed_on_stay_behind_them(
     simulation.tick(1)
     found, _ = simulation.end()
     assert [word for word, _ in found] == ["held 0", "held 1", "held 2", "new"]
-
-
-def test_a_ring_has_another_time(store: hl.Store) -> None:
-    with pytest.raises(UsageError, match="--use-sim-time"):
-        RecorderOptions(use_sim_time=True, ring_s=10)
 
 
 @pytest.mark.parametrize(

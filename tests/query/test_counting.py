@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -60,51 +59,3 @@ def test_elements_of_an_array_that_has_two_lengths(tmp_path: Path) -> None:
         assert store.topic("/a").where("box[7] > 0").count() == 1
         with pytest.raises(WhereError, match="3 elements"):
             store.topic("/a").in_recording("of 3").where("box[7] > 0")
-
-
-FLEET = Channel("/t", "ros1", Schema("pkg/T", "ros1msg", b"float64 x\nuint64 u\nfloat64[] a"))
-
-
-@pytest.fixture(scope="module")
-def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
-    path = tmp_path_factory.mktemp("fleet") / "store"
-    with hl.open(path, create=True, mongo="none") as opened:
-        for n in range(41):
-            with opened.start(f"log {n}") as recording:
-                for row in range(5):
-                    numbers = np.full(40 if n < 3 else 1, float(n))
-                    number = np.uint64(2**63 + n if n < 20 else 2**64 - n)
-                    head = np.float64(n + row / 100).tobytes() + number.tobytes()
-                    payload = head + np.uint32(len(numbers)).tobytes() + numbers.tobytes()
-                    is_bad = n == 40 and not row
-                    payload = b"short" if is_bad else payload
-                    recording.write(FLEET, payload, log_time=(n * 100 + row) * 10**9)
-        yield opened
-
-
-@pytest.mark.parametrize(
-    ("condition", "count"),
-    {
-        "x > 30.5": 49,
-        "x == 7": 1,
-        "x in [3, 1000, 12.0]": 2,
-        "x >= 12 and x < 14 and a.n == 1": 10,
-        "u >= 18446744073709551613": 0,
-        "u == 9223372036854775809": 5,
-        "x > 3 or u == 5": 188,
-        "not (x > 3)": 16,
-        "a > 5": 174,
-        "x == nan": 0,
-    }.items(),
-)
-def test_small_recordings_in_one_table_answer_as_each_alone(
-    fleet: hl.Store, condition: str, count: int
-) -> None:
-    query = fleet.topic("/t").where(condition)
-    assert (query.count(), query.counters.unreadable) == (count, 1)
-    found = [(m.recording, m.seq) for m in query]
-    assert (len(found), query.counters.unreadable) == (count, 1)
-    alone = (query.in_recording(one.id) for one in fleet.recordings())
-    assert found == [(m.recording, m.seq) for one in alone for m in one]
-    assert query.to_arrow().num_rows == count
-    assert [m.seq for m in query.reverse().limit(3)] == [seq for _, seq in found[:-4:-1]]

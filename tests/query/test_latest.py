@@ -100,22 +100,6 @@ def test_a_chunk_is_read_once_for_who_looks_around_in_it(many: hl.Store) -> None
     assert sum(count for count, _ in read) == many.recordings()[0].chunks
 
 
-def test_a_message_chosen_by_the_index_costs_something_too(many: hl.Store) -> None:
-    query = many.topic("/state").where("n < 5")
-    assert query.at("end").fields["n"] == 4
-    cost = query.counters
-    assert (cost.messages, cost.documents_read, cost.chunks_read) == (1, 0, 1)
-    assert cost.payload_bytes > 0
-    assert cost.bytes_read > 0
-    assert cost.elapsed_s > 0
-
-
-def test_what_was_read_is_forgotten_with_its_recording(many: hl.Store) -> None:
-    assert many.topic("/state").at("end").fields["n"] == 199
-    recorded(many, {"a": [(n, "/state", {"n": -n, "name": PADDING}) for n in range(200)]})
-    assert many.topic("/state").at("end").fields["n"] == -199
-
-
 def test_a_damaged_chunk_is_named(many: hl.Store) -> None:
     entry = many.recordings()[0]
     path = places.segment(many.directory.path, entry.name)

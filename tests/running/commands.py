@@ -265,6 +265,11 @@ COMMANDS: dict[str, list[Asked]] = {
             lambda k: [(_f(m)["n"],) for m in k.of("/said")[:-6:-1]],
         ),
         asked(
+            "fetch -t said --every 7 -F jsonl --fields n",
+            lines("n"),
+            lambda k: [(_f(m)["n"],) for m in k.of("/said")[::7]],
+        ),
+        asked(
             "fetch -t arm -o OUT.parquet",
             _parquet("n", "position", "ranges"),
             lambda k: [(_f(m)["n"], _f(m)["position"], _f(m)["ranges"]) for m in k.of("/arm")],

@@ -237,23 +237,6 @@ def test_keys_of_long_lists(limit: int, regular: bool) -> None:
             assert document_of(body) == bson.encode({"l": listed})
 
 
-def test_summary_without_a_finite_element_is_null() -> None:
-    rows = [{"l": [math.nan] * 6}, {"l": [math.nan, 2.0, math.inf, 4.0, -math.inf]}]
-    kind = ("message", {"l": ("list", ("number", "f4")), "z": ("number", "u1")})
-    rows = [row | {"z": 3} for row in rows]
-    check(kind, rows)
-    check(kind, rows[:1] * 3)
-    found = bson.decode(document_of(made(column_of(kind, rows[:1]))[0]))  # type: ignore[arg-type]
-    assert found == {"l": {"n": 6, "min": None, "max": None, "mean": None}, "z": 3}
-
-
-def test_message_without_fields() -> None:
-    assert made(Records({}, 3)) == [b""] * 3
-    groups = list(bodies(Records({}, 3)))
-    assert len(groups) == 1
-    check(("message", {"e": ("message", {})}), [{"e": {}}])
-
-
 def test_names_that_the_index_uses_itself() -> None:
     assert top_level_names(["_id", "x", "_meta"]) == ["_id_", "x", "_meta_"]
     assert top_level_names(["_id", "_id_"]) == ["_id__", "_id_"]
@@ -262,11 +245,6 @@ def test_names_that_the_index_uses_itself() -> None:
     assert document_of(made(Records({"_id": one, "m": inner}, 1))[0]) == bson.encode(
         {"_id_": 1, "m": {"_id": 1}}
     )
-
-
-def test_invalid_utf8_is_mended_in_its_row_only() -> None:
-    texts = [b"plain", "süß".encode(), b"\xff\xfeab", b"cut \xc3", b"\xa9 and on", b"\xed\xa0\x80"]
-    check(("message", {"s": ("string",), "z": ("number", "i4")}), [{"s": s, "z": 1} for s in texts])
 
 
 def test_too_large_rows_are_named_and_the_others_are_made() -> None:

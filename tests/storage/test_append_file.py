@@ -121,17 +121,6 @@ def test_an_existing_file_is_not_overwritten(tmp_path: Path) -> None:
     assert (tmp_path / "file").read_bytes() == b"mine"
 
 
-def test_reopen_goes_on_at_the_end_and_cuts(tmp_path: Path) -> None:
-    path = tmp_path / "file"
-    path.write_bytes(b"0123456789")
-    file = AppendFile.reopen(path)
-    assert file.position == 10
-    file.cut(4)
-    file.append([b"ab", b"", b"c"])
-    file.finish(sync=False)
-    assert path.read_bytes() == b"0123abc"
-
-
 class Full(files.System):
     """A disk that takes the first bytes of what is written, and then no more."""
 
@@ -185,16 +174,6 @@ def test_what_is_appended_after_a_failed_write_stands_behind_what_was_whole(
     assert path.read_bytes() == b"a" * before + b"c" * 10 + b"d" * 20
 
 
-def test_bytes_are_written_over(tmp_path: Path) -> None:
-    path = tmp_path / "file"
-    path.write_bytes(b"0123456789")
-    file = AppendFile.reopen(path)
-    file.rewrite(3, b"abc")
-    file.append([b"!"])
-    file.finish(sync=False)
-    assert path.read_bytes() == b"012abc6789!"
-
-
 def test_the_file_gets_its_length_before_it_is_synced(tmp_path: Path) -> None:
     steps = Steps()
     with through(steps):
@@ -203,27 +182,6 @@ def test_the_file_gets_its_length_before_it_is_synced(tmp_path: Path) -> None:
         file.finish(sync=True)
     assert (tmp_path / "file").stat().st_size == 5000
     assert [what for what, _ in steps.log if what != "write"][-1] == "sync"
-
-
-def test_what_is_no_file_of_the_recording_is_not_opened(tmp_path: Path) -> None:
-    """No symlink is followed, nothing that is not an ordinary file is written."""
-    outside = tmp_path / "outside"
-    outside.write_bytes(b"mine")
-    link = tmp_path / "link"
-    link.symlink_to(outside)
-    for make in (AppendFile.create, AppendFile.reopen):
-        with pytest.raises(OSError, match="link"):
-            make(link)
-    os.mkfifo(tmp_path / "pipe")
-    with pytest.raises(OSError, match="ordinary"):
-        AppendFile.reopen(tmp_path / "pipe")
-    (tmp_path / "folder").mkdir()
-    (tmp_path / "hybridlog.toml").touch()
-    (tmp_path / "inside").symlink_to(tmp_path / "folder")
-    with pytest.raises(OSError, match="inside"):
-        AppendFile.create(tmp_path / "inside" / "file")
-    assert outside.read_bytes() == b"mine"
-    assert not list((tmp_path / "folder").iterdir())
 
 
 def test_a_small_file_is_there_whole_or_not_at_all(tmp_path: Path) -> None:

@@ -31,20 +31,6 @@ def made(calls: Calls) -> list[int]:
     return asked
 
 
-def test_a_buffer_is_not_taken_again_while_something_lies_over_it(made: list[int]) -> None:
-    pool = Buffers()
-    first = pool.take(LARGE)
-    first[:] = 7
-    view = memoryview(first)[10:20]
-    del first
-    pool.take(LARGE)[:] = 9
-    assert bytes(view) == bytes([7] * 10)
-    view.release()
-    kept = [pool.take(LARGE), pool.take(LARGE)]
-    assert len(made) == 2
-    assert {int(np.max(array)) for array in kept} == {7, 9}
-
-
 def test_a_bounded_number_of_bytes_is_idle_and_the_oldest_go_first(made: list[int]) -> None:
     pool = Buffers()
     held = [pool.take(LARGE) for _ in range(FEW + 5)]

@@ -2,13 +2,7 @@
 
 from __future__ import annotations
 
-import threading
-
-import numpy as np
-import pytest
-
 from hybridlog_storage.cache import Cache
-from hybridlog_storage.errors import SegmentError
 
 
 class Reading:
@@ -42,18 +36,6 @@ def test_a_value_without_room_is_given_and_not_kept() -> None:
     assert reading.made == [1, 2, 2]
 
 
-def test_nothing_is_kept_of_what_could_not_be_made() -> None:
-    cache = Cache()
-
-    def damaged() -> bytes:
-        raise SegmentError("damaged")
-
-    for _ in range(2):
-        with pytest.raises(SegmentError):
-            cache.made("chunk", "a", 1, make=damaged, size_of=len)
-    assert Reading(cache).get(1)[0] == 1
-
-
 def test_another_value_takes_the_place_of_the_one_before() -> None:
     cache = Cache(100)
     cache.put("chunk", 1, value="a", size=60)
@@ -73,24 +55,3 @@ def test_a_kind_is_dropped() -> None:
     assert (cache.get("chunk", 1), cache.get("density", 1)) == (None, "b")
     cache.put("matches", 1, value="c", size=70)  # there is room for it
     assert cache.get("density", 1) == "b"
-
-
-def test_several_threads_ask_for_the_same_values() -> None:
-    cache = Cache(5500)
-    wrong: list[int] = []
-
-    def ask(seed: int) -> None:
-        reading = Reading(cache)
-        numbers = np.random.default_rng(seed).integers(0, 10, 2000).tolist()
-        wrong.extend(number for number in numbers if reading.get(number)[0] != number)
-
-    threads = [threading.Thread(target=ask, args=(seed,)) for seed in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert not wrong
-    kept = Reading(cache)
-    for number in range(10):
-        kept.get(number)
-    assert len(kept.made) >= 5  # no more than five had room

@@ -9,9 +9,8 @@ import random
 import sqlite3
 import subprocess
 import sys
-import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import asdict, replace
 from itertools import combinations
@@ -25,12 +24,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hybridlog.entries import summary_of, topic_types
-from hybridlog.query.chunk_columns import ChunkColumns
 from hybridlog_storage.catalog import (
     CATALOG,
     Catalog,
     ChannelStats,
-    ChunkEntry,
     Described,
     RecordingEntry,
     channel_entry,
@@ -40,7 +37,6 @@ from hybridlog_storage.catalog import (
 from hybridlog_storage.cells import put
 from hybridlog_storage.messages import Channel, Schema, schema_hash
 from hybridlog_storage.segments.chunk_table import CHUNK, PART, ChunkTable
-from tests.imports import ROOT
 from tests.limits import Limit
 
 STORE = "5" * 32
@@ -167,42 +163,6 @@ class Model:
                 ],
             )
 
-    def chunks(self, *, decoded: bool = True) -> list[ChunkEntry]:
-        """What the catalog should say of all chunks."""
-        found = []
-        for number in self.tables:
-            for row, told in enumerate(self.told[number]):
-                stats = told if decoded else {c: undecoded(s) for c, s in told.items()}
-                found.append(ChunkEntry(number, row, stats))
-        return found
-
-    def wanted(
-        self,
-        channels: Sequence[int] | None,
-        bounds: tuple[int, int] | None,
-        clock: str,
-        *,
-        decoded: bool = True,
-    ) -> list[ChunkEntry]:
-        """The same question, asked of the list."""
-        suffix = {"log": "", "publish": "_publish", "header": "_stamp"}[clock]
-        found = []
-        for chunk in self.chunks(decoded=decoded):
-            for c, stats in chunk.stats.items():
-                if channels is not None and c not in channels:
-                    continue
-                first, last = getattr(stats, f"first{suffix}"), getattr(stats, f"last{suffix}")
-                may = bounds is None or (clock == "header" and not decoded)
-                if may or (
-                    bounds is not None
-                    and first is not None
-                    and first < bounds[1]
-                    and last >= bounds[0]
-                ):
-                    found.append(chunk)
-                    break
-        return found
-
 
 def undecoded(stats: ChannelStats) -> ChannelStats:
     return ChannelStats(
@@ -230,38 +190,6 @@ def model() -> Model:
 # Questions.
 
 
-@pytest.mark.parametrize("decoded", [True, False])
-@pytest.mark.parametrize("clock", ["log", "publish", "header"])
-def test_chunks_by_channel_time_and_clock(
-    catalog: Catalog, model: Model, clock: str, decoded: bool
-) -> None:
-    model.put(catalog, decoded=decoded)
-    Model(9, "other").put(catalog)
-    rng = random.Random(2)
-    questions: list[tuple[list[int] | None, tuple[int, int] | None]] = [
-        (None, None), ([], None), ([3], None), ([77], None), (None, (-(1 << 70), 1 << 70)),
-        (None, (1 << 63, 1 << 64)), (None, (-(1 << 80), -(1 << 63))), (None, (50, 50)),
-    ]  # fmt: skip
-    for _ in range(300):
-        begin = rng.randrange(-5, 105)
-        channels = rng.sample(CHANNELS, rng.randrange(1, 4)) if rng.random() < 0.8 else None
-        questions.append((channels, (begin, begin + rng.choice([0, 1, 2, 5, 30]))))
-    kinds = set()
-    for channels, bounds in questions:
-        want = model.wanted(channels, bounds, clock, decoded=decoded)
-        got = []
-        timed = [c for c in CHANNELS if c != SILENT]
-        for number in model.tables:
-            table = model.tables[number]
-            stamps = catalog.stamps(model.entry, number, table)
-            columns = ChunkColumns(number, table, channels)
-            got += columns.chunks(columns.within(bounds, clock, stamps=stamps, timed=timed))
-        assert [(c.segment, c.number) for c in got] == [(c.segment, c.number) for c in want]
-        kinds.add((len(want) > 0, len(want) < 36))
-    if decoded or clock != "header":
-        assert kinds == {(True, True), (True, False), (False, True)}
-
-
 def decoded_of(catalog: Catalog, model: Model) -> list[bytes | None]:
     """What a catalog says of the decoding of each segment."""
     found = [catalog.stamps(model.entry, number, table) for number, table in model.tables.items()]
@@ -274,56 +202,6 @@ def decoded_in(model: Model) -> list[bytes | None]:
         stamps_of(table, dict(enumerate(model.told[number]))).tobytes()
         for number, table in model.tables.items()
     ]
-
-
-def test_a_chunk_says_where_it_lies_and_when(catalog: Catalog, model: Model) -> None:
-    model.put(catalog)
-    found = [
-        chunk
-        for number, table in model.tables.items()
-        for chunk in ChunkColumns(number, table, CHANNELS).chunks()
-    ]
-    for got, want in zip(found, model.chunks(), strict=True):
-        chunk = model.tables[want.segment].chunks[want.number]
-        assert (got.place.offset, got.place.length) == (chunk["offset"], chunk["length"])
-        assert (got.first, got.last) == (chunk["first"], chunk["last"])
-        assert got.messages == want.messages
-    assert not ChunkColumns(0, model.tables[0], [99]).chunks()
-
-
-def test_the_last_chunks_come_first(model: Model) -> None:
-    for number, table in model.tables.items():
-        columns = ChunkColumns(number, table, [3])
-        for latest in range(-1, 110):
-            found = [*columns.before(latest)]
-            assert {c.number for c, _ in found} == {
-                n for n, first in zip(columns.number.tolist(), columns.first, strict=True)
-                if first <= latest
-            }  # fmt: skip
-            for place, (_, last) in enumerate(found):
-                assert last == max(c.last for c, _ in found[place:])
-
-
-def test_recordings_come_back(catalog: Catalog, model: Model) -> None:
-    other = Model(2, "other", segments=0)
-    for one in (model, other):
-        one.put(catalog)
-    found = rows_of(catalog)
-    assert found == {
-        model.id: (f"looks of {model.id}", model.entry),
-        other.id: (f"looks of {other.id}", other.entry),
-    }
-    assert found[model.id][1].span == (
-        min(a for _, a, _ in model.entry.spans), max(b for _, _, b in model.entry.spans),
-    )  # fmt: skip
-    assert found[other.id][1].span is None
-    assert model.entry.messages == sum(c.messages for c in model.chunks())
-    assert model.entry.messages_by_topic()["/ä3"] == sum(
-        c.stats[3].messages for c in model.chunks() if 3 in c.stats
-    )
-    changed = replace(other.entry, status="recovered", tags={})
-    catalog.put(replace(other.described, entry=changed, files="otherwise"))
-    assert rows_of(catalog)[other.id] == ("otherwise", changed)
 
 
 def test_totals_of_a_segment_are_those_of_its_chunks(model: Model) -> None:
@@ -340,17 +218,6 @@ def test_totals_of_a_segment_are_those_of_its_chunks(model: Model) -> None:
             )
         assert got == want
         assert channel_totals(table, None, {SILENT}) == {c: undecoded(s) for c, s in want.items()}
-
-
-def test_results_belong_to_one_content_of_a_segment(catalog: Catalog, model: Model) -> None:
-    model.put(catalog)
-    assert decoded_of(catalog, model) == decoded_in(model)
-    again = Model(3, segments=2)
-    again.id = again.entry.id = model.id
-    assert decoded_of(catalog, again) == [None, None]
-    again.put(catalog)
-    assert decoded_of(catalog, again) == decoded_in(again)
-    assert decoded_of(catalog, model)[:2] == [None, None]
 
 
 def test_stamps_of_other_bytes_are_not_believed(catalog: Catalog, model: Model) -> None:
@@ -376,16 +243,6 @@ def test_damage_is_replaced(catalog: Catalog) -> None:
     assert (catalog.damage("r"), catalog.damage("other")) == ({}, {(9, 9): "c"})
 
 
-def test_schemas(catalog: Catalog, model: Model) -> None:
-    model.put(catalog)
-    known = {schema_hash(s): s for s in SCHEMAS.values() if s is not None}
-    assert len(known) == 4
-    assert catalog.schemas(known) == known
-    one = next(iter(known))
-    assert catalog.schemas([one, "nothing"]) == {one: known[one]}
-    assert catalog.schemas([]) == {}
-
-
 def test_hashes_of_schemas_do_not_run_together() -> None:
     schemas = [
         Schema("ab", "c", b"d"), Schema("a", "bc", b"d"), Schema("a", "b", b"cd"),
@@ -407,14 +264,6 @@ def test_a_recording_is_removed_without_a_trace(catalog: Catalog, model: Model) 
     assert decoded_of(catalog, other) == decoded_in(other)
     catalog.remove(other.id)
     assert catalog.summaries() == []
-
-
-def test_one_in_memory_leaves_no_file(tmp_path: Path, model: Model) -> None:
-    with closing(Catalog(tmp_path, STORE, in_memory=True)) as made:
-        assert made.is_in_memory
-        model.put(made)
-        assert decoded_of(made, model) == decoded_in(model)
-    assert list(tmp_path.iterdir()) == []
 
 
 @given(st.lists(st.integers(0, 2**32), min_size=1, max_size=12), st.randoms(use_true_random=False))
@@ -602,17 +451,6 @@ def test_whatever_happens_to_the_file_costs_time_only(
     made_again(truth, tmp_path)
 
 
-def test_a_file_that_may_not_be_written_is_read(truth: Truth, tmp_path: Path) -> None:
-    path = tmp_path / CATALOG
-    path.write_bytes(truth.content)
-    with closing(Catalog(tmp_path, STORE, in_memory=True)) as opened:
-        assert truth.check(opened)
-        opened.remove(truth.models[0].id)
-        assert len(opened.summaries()) == 2
-    assert path.read_bytes() == truth.content
-    assert [*tmp_path.iterdir()] == [path]
-
-
 def changed_anywhere(value: Any) -> Iterator[Any]:
     """The value with one of the values in it replaced by one of another type, or gone."""
     yield from (None, 7, "x", [], {}, 1.5, [[]], 10**30)
@@ -686,23 +524,6 @@ def test_what_another_store_has_is_not_believed(tmp_path: Path, model: Model) ->
         assert rows_of(other).keys() == {another.id}
 
 
-@pytest.mark.parametrize("name", [CATALOG, *(f"{CATALOG}-{one}" for one in ("journal", "wal"))])
-@pytest.mark.parametrize("in_memory", [False, True])
-def test_a_symlink_in_its_place_is_not_followed(
-    tmp_path: Path, model: Model, name: str, in_memory: bool
-) -> None:
-    elsewhere, store = tmp_path / "elsewhere", tmp_path / "store"
-    elsewhere.write_bytes(b"precious")
-    store.mkdir()
-    (store / name).symlink_to(elsewhere)
-    with closing(Catalog(store, STORE, in_memory=in_memory)) as opened:
-        assert opened.summaries() == []
-        model.put(opened)
-        assert rows_of(opened).keys() == {model.id}
-    assert elsewhere.read_bytes() == b"precious"
-    assert (store / name).is_symlink() == in_memory
-
-
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
     """Another process writes, and does not end."""
@@ -767,73 +588,3 @@ def test_two_that_have_it_open_see_what_the_other_does(tmp_path: Path, model: Mo
         model.put(other)
         (tmp_path / CATALOG).unlink()
         assert rows_of(other).keys() == {model.id}
-
-
-WRITER = """
-import sys
-from pathlib import Path
-from tests.storage.test_catalog import STORE, Catalog, Model, decoded_in, decoded_of, rows_of
-
-first, count = int(sys.argv[2]), int(sys.argv[3])
-catalog = Catalog(Path(sys.argv[1]), STORE)
-for number in range(first, first + count):
-    model = Model(number, f"run{number}", segments=2, chunks=3)
-    model.put(catalog)
-    catalog.put_damage(model.id, {(0, number): "x"})
-    assert decoded_of(catalog, model) == decoded_in(model)
-    assert rows_of(catalog)[model.id][1] == model.entry
-    if number % 5 == 0:
-        catalog.remove(model.id)
-print("done")
-"""
-
-
-def test_two_processes_write_at_the_same_time(tmp_path: Path) -> None:
-    """From the first moment on: they also make the folder at the same time."""
-    count = 40
-    processes = [
-        subprocess.Popen(
-            [sys.executable, "-c", WRITER, str(tmp_path), str(first), str(count)],
-            cwd=ROOT,
-            env={**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "storage")])},
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        for first in (0, 1000)
-    ]
-    for process in processes:
-        assert process.communicate(timeout=120) == ("done\n", "")
-    want: Mapping[str, Model] = {
-        model.id: model
-        for first in (0, 1000)
-        for number in range(first, first + count)
-        if number % 5 and (model := Model(number, f"run{number}", segments=2, chunks=3))
-    }
-    with closing(Catalog(tmp_path, STORE)) as opened:
-        assert rows_of(opened).keys() == want.keys()
-        for model in want.values():
-            assert decoded_of(opened, model) == decoded_in(model)
-            assert len(opened.damage(model.id)) == 1
-
-
-def test_several_threads_use_one(catalog: Catalog) -> None:
-    failures: list[BaseException] = []
-
-    def use(first: int) -> None:
-        try:
-            for number in range(first, first + 10):
-                model = Model(number, f"run{number}", segments=2, chunks=3)
-                model.put(catalog)
-                assert decoded_of(catalog, model) == decoded_in(model)
-                catalog.remove(model.id)
-        except BaseException as error:
-            failures.append(error)
-
-    threads = [threading.Thread(target=use, args=(100 * n,)) for n in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert failures == []
-    assert rows_of(catalog) == {}

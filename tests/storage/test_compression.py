@@ -70,22 +70,6 @@ def test_a_noisy_picture_is_compressed_at_the_level_that_shrinks_it() -> None:
 
 
 @pytest.mark.parametrize("name", ["zstd", "lz4"])
-def test_in_a_hurry_only_what_shrinks_to_little_is_compressed(name: str) -> None:
-    def made(noise: int) -> bytes:
-        return b"".join(NOISE[n * noise : (n + 1) * noise].ljust(1000, b"a") for n in range(500))
-
-    compressor = Compressor(name)  # type: ignore[arg-type]
-    for noise in (300, 100):
-        data = made(noise)
-        compression, out = compressor.compress(data)
-        assert compression == name
-        assert len(out) < len(data) / 2
-        assert compressor.compress(data, hurried=True) == (
-            (name, out) if noise == 100 else ("", data)
-        )
-
-
-@pytest.mark.parametrize("name", ["zstd", "lz4"])
 @pytest.mark.parametrize("offset", [-1, 1, -1000, 1000])
 def test_a_size_that_is_not_what_comes_out_is_an_error(name: str, offset: int) -> None:
     with pytest.raises(SegmentError, match="claims"):

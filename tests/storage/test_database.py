@@ -13,16 +13,12 @@ import pymongo
 import pytest
 from pymongo import MongoClient
 
-from hybridlog_storage.catalog import RecordingEntry, channel_entry
 from hybridlog_storage.errors import DatabaseError, DiskFullError, UsageError, WhereError
-from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.mongo.database import (
-    CollectionStats,
     Database,
     _mapped,
     without_secrets,
 )
-from hybridlog_storage.mongo.index_state import IndexState
 from hybridlog_storage.mongo.mongod import EmbeddedMongod
 from tests.calls import Calls
 from tests.limits import Limit
@@ -170,28 +166,6 @@ def test_large_questions_go_in_several_commands(
     assert [bson.decode_all(raw) for raw in found] == [[{"x": n}] for n in range(5)] + [[], []]
 
 
-def test_small_things(database: Database, name: str) -> None:
-    database.replace(name, {"_id": 1}, {"_id": 1, "a": "x"})
-    database.replace(name, {"_id": 1}, {"_id": 1, "a": "y"})
-    assert list(database.find(name)) == [{"_id": 1, "a": "y"}]
-    database.update(name, {"_id": 1}, {"$set": {"b": 2}})
-    database.update(name, {"_id": 9}, {"$set": {"b": 2}})
-    assert database.find_one(name, {"b": 2}, {"_id": 0, "b": 1}) == {"b": 2}
-    assert database.find_one(name, {"b": 3}) is None
-    assert database.count(name) == database.count(name, {"b": 2}) == 1
-    for _ in range(2):
-        database.create_index(name, [("b", 1), ("a", -1)])
-    assert database.indexes(name) == [(("b", 1), ("a", -1))]
-    stats = database.stats(name)
-    assert stats.documents == 1
-    assert stats.storage_bytes > 0
-    assert stats.index_bytes > 0
-    assert database.stats("none") == CollectionStats(0, 0, 0)
-    assert name in database.list_collections()
-    assert database.delete(name, {"_id": 1}) == 1
-    assert database.ping()
-
-
 def test_collections_are_clustered(
     database: Database, plain: pymongo.database.Database, name: str
 ) -> None:
@@ -304,23 +278,3 @@ def test_an_old_server_is_refused(mongod: EmbeddedMongod, calls: Calls) -> None:
     calls.change(MongoClient, "server_info", lambda *_: old)
     with pytest.raises(DatabaseError, match=r"version 5\.0\.9; hybridlog needs 5\.3"):
         Database.connect(mongod.start(), timeout_s=5)
-
-
-def test_the_mirror_of_many_topics_fits_into_a_document(database: Database) -> None:
-    schema = Schema("x/msg/Y", "ros2msg", b"int8 x")
-    channels = [
-        channel_entry(n, Channel(f"/robot/part{n}", "cdr", schema), None) for n in range(65_535)
-    ]
-    entry = RecordingEntry(
-        id="0123456789abcdef" * 2,
-        name="run",
-        tags={},
-        source={},
-        created=0,
-        status="complete",
-        channels=channels,
-        digests={"0": "a"},
-    )
-    state = IndexState(database)
-    state.begin(entry, entry.digests)
-    assert state.of()[entry.key].is_whole(entry)

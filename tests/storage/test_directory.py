@@ -6,9 +6,8 @@ import fcntl
 import os
 import subprocess
 import sys
-import threading
 import tomllib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -19,7 +18,7 @@ import pytest
 from hybridlog_storage.disk import files
 from hybridlog_storage.disk.directory import LOCK, Holder, StoreDirectory
 from hybridlog_storage.errors import HeldError, StoreError, TopicError
-from tests.other_user import User, needs_root, open_place
+from tests.waiting import at_once
 
 
 @pytest.fixture
@@ -39,12 +38,6 @@ def test_a_new_store(tmp_path: Path) -> None:
     assert other.settings.store_id != made.settings.store_id
 
 
-@pytest.mark.parametrize("uri", ["mongodb://h/db", "mongodb://a:p%5Cw@h/ä?x=y"])
-def test_a_uri_is_kept_without_its_password(tmp_path: Path, uri: str) -> None:
-    StoreDirectory.create(tmp_path / "store", mongo=uri)
-    assert StoreDirectory(tmp_path / "store").settings.mongo == uri.replace(":p%5Cw", "")
-
-
 def test_what_is_no_place_for_a_store(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("x")
     (tmp_path / "full").mkdir()
@@ -56,39 +49,19 @@ def test_what_is_no_place_for_a_store(tmp_path: Path) -> None:
     assert sorted(p.name for p in tmp_path.rglob("*")) == ["file", "full", "precious.txt"]
 
 
-def test_many_make_the_same_store_at_once(tmp_path: Path) -> None:
-    for turn in range(20):
-        path = tmp_path / f"store{turn}"
-        made: list[object] = []
-        start = threading.Barrier(4)
-
-        def make(
-            path: Path = path,
-            made: list[object] = made,
-            wait: Callable[[], int] = start.wait,
-        ) -> None:
-            wait()
-            try:
-                made.append(StoreDirectory.create(path).settings.store_id)
-            except StoreError as error:
-                made.append(error)
-
-        threads = [threading.Thread(target=make) for _ in range(4)]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
-        assert set(made) == {StoreDirectory(path).settings.store_id}
-        assert sorted(p.name for p in path.iterdir()) == [
-            "hybridlog.toml",
-            "manifests",
-            "recordings",
-        ]
-
-
 def made(store: StoreDirectory, name: str = "r") -> Path:
     store.make_folder(name)
     return store.recording(name)
+
+
+def test_many_make_the_same_store_at_once(tmp_path: Path) -> None:
+    for turn in range(20):
+        path = tmp_path / f"store{turn}"
+        made: list[StoreDirectory] = []
+        at_once(*[lambda path=path, made=made: made.append(StoreDirectory.create(path))] * 4)
+        assert {one.settings.store_id for one in made} == {StoreDirectory(path).settings.store_id}
+        names = sorted(p.name for p in path.iterdir())
+        assert (len(made), names) == (4, ["hybridlog.toml", "manifests", "recordings"])
 
 
 def test_segments_are_told_by_their_numbers(store: StoreDirectory) -> None:
@@ -239,20 +212,6 @@ def test_a_recording_that_was_removed_is_not_locked(
         pass
 
 
-@pytest.mark.skipif(os.geteuid() == 0, reason="the next test does the same as another user")
-def test_a_store_that_cannot_be_written(store: StoreDirectory) -> None:
-    recordings = store.path / "recordings"
-    recordings.chmod(0o555)
-    try:
-        with pytest.raises(StoreError, match="read-only"):
-            store.check_writable()
-        with pytest.raises(StoreError, match="Not allowed"):
-            store.make_folder("r")
-    finally:
-        recordings.chmod(0o755)
-    store.check_writable()
-
-
 AS_A_READER = """
 import sys
 from pathlib import Path
@@ -265,16 +224,3 @@ for step in (store.check_writable, lambda: store.make_folder("r")):
     except StoreError as error:
         print(error)
 """
-
-
-@needs_root
-def test_a_store_that_another_user_cannot_write() -> None:
-    with open_place() as place:
-        store = StoreDirectory.create(place / "store")
-        done = User(place).python("-c", AS_A_READER, store.path)
-        assert "read-only" in done.lines[0]
-        assert "Not allowed" in done.lines[1]
-        for path in (store.path, store.path / "manifests", store.path / "recordings"):
-            path.chmod(0o777)
-        assert User(place).python("-c", AS_A_READER, store.path).lines == []
-        assert (store.path / "recordings/r").is_dir()

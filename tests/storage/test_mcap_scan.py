@@ -284,24 +284,6 @@ def test_a_loose_message_whose_length_is_wrong_costs_few(claim: int) -> None:
     assert damages(items)
 
 
-@pytest.mark.parametrize(
-    "junk",
-    [
-        bytes(100_000),
-        np.random.default_rng(1).bytes(3 << 20),
-        bytes(20) + struct.pack("<BQ", Opcode.METADATA, 8) + bytes(58),
-    ],
-    ids=["zeros", "noise", "one record"],
-)
-def test_junk_is_stepped_over(junk: bytes) -> None:
-    data = written()
-    starts, end = parts_of(data)
-    for place in [*starts[1:], end]:
-        items = items_of(data[:place] + junk + data[place:end])
-        assert payloads(items) == ALL
-        assert (damages(items)[0].offset, damages(items)[0].length) == (place, len(junk))
-
-
 def test_a_record_that_claims_too_much_costs_no_chunk_behind_it() -> None:
     data = bytearray(written())
     place = next(o for o, i in items_of(bytes(data)) if isinstance(i, Attachment))

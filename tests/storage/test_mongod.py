@@ -561,13 +561,6 @@ def test_a_runtime_directory_that_is_no_use(
 # --- which mongod ---
 
 
-def test_the_one_named_wins(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("HYBRIDLOG_MONGOD", "/bin/true")
-    assert find_mongod() == Path("/bin/true")
-    monkeypatch.setenv("HYBRIDLOG_MONGOD", "true")
-    assert find_mongod().name == "true"
-
-
 def test_the_wheel_then_the_path_then_an_error_with_every_way(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -16,7 +16,7 @@ from hybridlog.formats.log_set import open_source
 from hybridlog.live.sources import replay
 from hybridlog.live.sources.base import Cause
 from hybridlog.live.sources.replay import ReplaySource
-from hybridlog_storage.errors import SourceError, UsageError
+from hybridlog_storage.errors import UsageError
 from hybridlog_storage.messages import Batch
 from tests import independent
 from tests.calls import Calls
@@ -199,15 +199,6 @@ def test_many_small_messages_do_not_cost_a_pause_each(tmp_path: Path, calls: Cal
     assert 1 <= len(pauses) <= 501
 
 
-def test_the_order_is_by_time_as_far_as_one_looks_ahead(tmp_path: Path) -> None:
-    times = list(range(3000))
-    random.Random(1).shuffle(times)
-    path = write(tmp_path / "a.mcap", [("/a", BEGIN + at, b"%d" % at) for at in times])
-    heard = Heard()
-    play(path, heard)
-    assert heard.payloads() == [b"%d" % at for at in range(3000)]
-
-
 def test_looking_ahead_is_bounded_and_loses_nothing(tmp_path: Path, limit: Limit) -> None:
     limit(replay_window_bytes=10_000, replay_window_rows=300)
     dice = random.Random(2)
@@ -307,15 +298,6 @@ def test_what_is_not_wanted_takes_its_time_all_the_same(
 def test_a_speed_that_is_none_is_refused(tmp_path: Path, speed: float) -> None:
     with pytest.raises(UsageError, match="above zero"):
         ReplaySource(tmp_path, speed=speed)
-
-
-def test_a_file_that_is_no_log_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "a.txt").write_text("hello")
-    for name, words in (("a.txt", "not a log"), ("missing.bag", "no such file")):
-        source = ReplaySource(tmp_path / name)
-        with pytest.raises(SourceError, match=words):
-            source.start(Heard())
-        source.stop()
 
 
 def test_a_sink_that_fails_is_told(

@@ -538,30 +538,6 @@ def test_each_version_of_a_type_is_a_channel_of_its_own(tmp_path: Path) -> None:
     assert [message[:2] for message in rig.messages] == [(0, b"a"), (1, b"b"), (0, b"a")]
 
 
-def test_another_version_after_a_restart_is_known_at_its_first_message(tmp_path: Path) -> None:
-    describe(tmp_path, "RIHS01_b")
-    rig = live_topic(tmp_path, offer(type_hash="RIHS01_a"))
-    rig.ros.made[0].queue = [(b"a", info(1))]
-    rig.child._take(0.0)
-    # It is not looked for until its message has come, and then once.
-    rig.ros.graph = {("/t", "a/msg/T"): [offer(B, type_hash="RIHS01_b")]}
-    rig.ros.made[0].queue = [(b"b", info(1, B)), (b"b", info(2, B)), (b"?", info(1, b"c" * 16))] * 2
-    rig.child._take(0.0)
-    assert channels(rig) == [("RIHS01_a", ""), ("RIHS01_b", "int8 i")]
-    assert [message[:2] for message in rig.messages] == [
-        *((0, b"a"), (1, b"b"), (1, b"b"), (1, b"?")),
-        *((1, b"b"), (1, b"b"), (1, b"?")),
-    ]
-    assert rig.ros.asked == ["/t", "/t"]
-    rig.topics.look()
-    rig.ros.graph = {("/t", "a/msg/T"): [offer(A, type_hash="RIHS01_a")]}
-    rig.topics.look()
-    rig.ros.made[0].queue = [(b"a", info(1))]
-    rig.child._take(0.0)
-    assert rig.messages[-1][0] == 0
-    assert len(channels(rig)) == 2
-
-
 def test_versions_are_mixed_where_messages_do_not_name_their_publisher(tmp_path: Path) -> None:
     rig = live_topic(tmp_path, offer(type_hash="RIHS01_a"))
     unnamed(rig, 1)

@@ -13,7 +13,7 @@ from hybridlog.live.sources.base import Cause
 from hybridlog.live.sources.foxglove.protocol import MESSAGE_DATA
 from hybridlog.live.sources.foxglove.session import Notifier, Session
 from hybridlog.live.sources.ros1.stream import Stream
-from hybridlog.live.sources.sequence_gaps import SequenceGap, SequenceGapDetector, joined_gap
+from hybridlog.live.sources.sequence_gaps import SequenceGap, SequenceGapDetector
 from hybridlog_storage.messages import Channel, Schema
 from tests.live.sources.heard import Heard
 from tests.live.sources.ros1_peers import framed
@@ -175,12 +175,6 @@ def test_gaps_of_messages_that_were_received_together_are_one() -> None:
     for number in (22, 24, 26):
         detector.jump(number, 19, 20)
     assert detector.finish() == [SequenceGap(4, 19, 20, 19, 26)]
-
-
-def test_joined_gaps_span_all() -> None:
-    one, other = SequenceGap(2, 10, 11, 4, 7), SequenceGap(1, 12, 13, 8, 10)
-    assert joined_gap([one]) == one
-    assert joined_gap([one, other]) == SequenceGap(3, 10, 13, 4, 10)
 
 
 def test_foxglove_puts_close_gaps_into_few_rows() -> None:
