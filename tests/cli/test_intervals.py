@@ -17,7 +17,6 @@ from tests.limits import Limit
 
 from .running import run
 
-SECOND = 10**9
 GRIPPER = ("-t", "r_gripper_controller/command", "-r", "robot")
 
 

@@ -231,7 +231,6 @@ def test_a_stopped_record_says_what_is_stored(
         ("bag", "call Whole.__exit__"),
         ("raw", "return Directory.__init__"),
         ("raw", "call Whole.__exit__"),
-        ("tables", "return Whole.__enter__"),
     ],
 )
 def test_no_instant_leaves_a_part(form: str, moment: str, store: Path, tmp_path: Path) -> None:
@@ -239,13 +238,18 @@ def test_no_instant_leaves_a_part(form: str, moment: str, store: Path, tmp_path:
     command = ["export", str(target)]
     if form == "raw":
         command = ["fetch", "-t", "/base/scan", "-F", "raw", "-o", str(target)]
-    elif form == "tables":
-        command += ["-F", "csv"]
     ended = stop_at(moment, *command, "-r", "robot", store=store)
     assert ended.returncode == 130, ended.stderr
     assert f"{target} is not written" in ended.stderr
     assert "Traceback" not in ended.stderr
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_directory_of_tables_is_complete_or_absent(store: Path, tmp_path: Path) -> None:
+    command = ["export", str(tmp_path / "new"), "-F", "csv", "-r", "robot"]
+    ended = stop_at("return Whole.__enter__", *command, store=store)
+    assert ended.returncode == 130, ended.stderr
+    assert [*tmp_path.iterdir()] == []
 
 
 def limited(kilobytes: int) -> tuple[str, ...]:

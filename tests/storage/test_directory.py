@@ -210,17 +210,3 @@ def test_a_recording_that_was_removed_is_not_locked(
     monkeypatch.setattr(files, "open_file", opened)
     with pytest.raises(TopicError, match="no longer in the store"), store.writing("r"):
         pass
-
-
-AS_A_READER = """
-import sys
-from pathlib import Path
-from hybridlog_storage.disk.directory import StoreDirectory
-from hybridlog_storage.errors import StoreError
-store = StoreDirectory(Path(sys.argv[1]))
-for step in (store.check_writable, lambda: store.make_folder("r")):
-    try:
-        step()
-    except StoreError as error:
-        print(error)
-"""
