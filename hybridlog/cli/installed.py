@@ -19,7 +19,7 @@ NEEDED_FOR: Final = {
     "images": "compressed images, fetch -F jpg",
     "lerobot": "export -F lerobot",
     "mcp": "mcp",
-    "plot": "plot, except as a page",
+    "plot": "pictures of plot",
     "protobuf": "fields of protobuf messages",
     "remote": "stores in buckets: s3://, gs://, az://",
     "sql": "sql",

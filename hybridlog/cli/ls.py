@@ -54,7 +54,7 @@ RECORDINGS = [
     Column("topics", lambda one: one.topic_count, "right", order=1),
     Column("messages", lambda one: one.messages, "right"),
     Column("stored", lambda one: output.size(one.stored_bytes), "right", order=2),
-    Column("note", _note, cut=12),
+    Column("note", _note, cut=6),
 ]
 """Columns of a list of recordings."""
 _STATUS = {

@@ -101,7 +101,7 @@ def _topics(content: StoreContent) -> Iterator[Mapping[str, Any]]:
                 "bytes": total.payload_bytes,
                 **times(total.first, total.last),
                 "mean_skew": total.mean_skew,
-                "unset_stamps": total.unset,
+                "unset_stamps": total.unset if found.entry.is_decoded else None,
                 "problem": "; ".join(problems) or None,
             }
 
