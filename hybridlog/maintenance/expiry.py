@@ -91,7 +91,7 @@ def expire(
     going = [log for log in logs if log is not None and log.is_here and log.parts]
     if manifest.is_ended:
         _remove_arrays(directory, manifest, going)
-    ready = [log for log in going if log.number in manifest.rows]
+    ready = [log for log in going if _has_rows(directory, manifest, log)]
     _go(directory, recording, {log.number: () for log in ready}, check, copy)
     late, before = [log for log in going if log not in ready], 0
     report = reporter(progress, manifest.name, sum(log.bytes for log in late))
@@ -119,6 +119,12 @@ def expire(
         before += log.bytes
     done.freed += sum(log.bytes for log in going if log.number not in done.damaged)
     return done
+
+
+def _has_rows(directory: StoreDirectory, manifest: Manifest, log: File) -> bool:
+    """True if all files of rows of a log are there."""
+    rows, sizes = manifest.rows.get(log.number, []), directory.listing(manifest.id).rows
+    return bool(rows) and all(sizes.get(file.name) == file.bytes for file in rows)
 
 
 def _lines_of(number: int, manifest: Manifest) -> list[File]:
@@ -179,14 +185,14 @@ def _list(
     check: Check = lambda _: None,
     values: Mapping[str, str] = MappingProxyType({}),
 ) -> Manifest:
-    """List the rows of logs, unless others are listed, and change the lines of the logs."""
+    """List the rows of logs, where there are new ones, and change the lines of the logs."""
     path, manifests = directory.recording(recording), directory.manifests
 
     def how(now: Manifest) -> Manifest:
         check(now)
         for number, rows in made.items():
             line = replace(now.logs[number], **values)
-            now = with_rows(now, line, now.rows.get(number) or rows)
+            now = with_rows(now, line, rows or now.rows[number])
         return now
 
     try:

@@ -20,7 +20,7 @@ from hybridlog_storage.merging import check_origin, merged, wanted
 from hybridlog_storage.stopping import pause, safe_point
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Collection, Mapping
     from contextlib import AbstractContextManager
 
     from hybridlog_storage.copy_places import Place, Source
@@ -116,6 +116,7 @@ class _Copy:
         self._due = 0.0  # time from which more may be sent
         self._new: set[str] = set()  # paths of files that the manifest there did not list
         self._proved: dict[str, str] = {}  # digests by path
+        self._damaged: Collection[int] = ()  # numbers of logs that have lost rows there
 
     def known(self) -> Copied | None:
         """The result if there is nothing to copy, found without a lock; None if there is."""
@@ -144,6 +145,7 @@ class _Copy:
             sizes = target.sizes(here.id)
             there = self._find(sizes)
             check_origin(here, there)
+            self._damaged = self._find_damaged(there, sizes)
             logs = self._wanted(there)
             if logs and self._how.prepare is not None:
                 here, self._others = stack.enter_context(self._how.prepare(here, logs))
@@ -157,7 +159,28 @@ class _Copy:
         return copied
 
     def _wanted(self, there: Manifest | None) -> list[File]:
-        return wanted(self._here, there, awaited=self._how.prepare is None)
+        is_all = self._how.prepare is None
+        return wanted(self._here, there, awaited=is_all, damaged=self._damaged)
+
+    def _find_damaged(self, there: Manifest | None, sizes: Mapping[str, int]) -> set[int]:
+        """Numbers of logs that are here, and have lost rows there."""
+        here = {number for number, log in self._here.logs.items() if log.is_here}
+        ours = listed_files(self._here)
+        rows = [] if there is None else [file for file in there.files if file.kind == "rows"]
+        listed = [(one.number, ListedFile(one.name, one.bytes, one.digest)) for one in rows]
+        return {
+            number
+            for number, file in listed
+            if number in here
+            and file not in ours
+            and (self._must_prove or sizes.get(file.path) != file.bytes)
+            and not self._is_whole(file, sizes)
+        }
+
+    def _is_whole(self, file: ListedFile, sizes: Mapping[str, int]) -> bool:
+        reads = file.path not in self._new
+        is_there = sizes.get(file.path) == file.bytes
+        return is_there and self._target.is_whole(self._sending(file), reads=reads)
 
     def _find(self, sizes: Mapping[str, int]) -> Manifest | None:
         """The manifest there; one that is lost or damaged is made again."""
@@ -216,18 +239,16 @@ class _Copy:
         numbers = {log.number for log in logs}
         names = (f.name for f in here.files if f.is_here and f.number in numbers)
         new = [ours[name] for name in names]
-        kept = merged(here, there, numbers)
+        kept = merged(here, there, numbers, self._damaged)
         old = [listed[one.path] for one in listed_files(kept) if one.path in listed]
         self._new = {one.path for one in new}
         doubtful = [one for one in old if self._must_prove or sizes.get(one.path) != one.bytes]
         self._total = sum(one.bytes for one in (*new, *doubtful))
         for one in (*new, *doubtful):
-            sending = self._sending(one)
-            is_old = one.path not in self._new
-            if sizes.get(one.path) == one.bytes and target.is_whole(sending, reads=is_old):
+            if self._is_whole(one, sizes):
                 self._count(one.bytes, False)
             elif ours.get(one.path) == one:
-                target.send(sending)
+                target.send(self._sending(one))
                 copied.sent.append(one.path)
             else:
                 copied.lost.append(one.path)
@@ -263,7 +284,7 @@ class _Copy:
                 return made
             except RecordingExistsError:
                 pass  # another process was faster
-        return manifests.change(here.id, lambda now: merged(here, now, brought))
+        return manifests.change(here.id, lambda now: merged(here, now, brought, self._damaged))
 
     def _check_files(self) -> None:
         """Raise if files are no longer there: a removal that ends takes them along."""
