@@ -53,7 +53,7 @@ class RecordingRows:
         self._given = listed
         self._cache = cache or Cache()
         self._readers: dict[int, list[RowsFile]] = {}  # by number of the log
-        self._problems: dict[int, str] = {}  # of files that cannot be read
+        self._problems: defaultdict[int, list[str]] = defaultdict(list)  # of files, by log
         self._lock = threading.RLock()
 
     @lazy
@@ -97,13 +97,7 @@ class RecordingRows:
     ) -> TopicTable:
         """The fields of a topic in chunks of logs that are gone as a table, in no order.
 
-        Args:
-            topic: The topic.
-            chunks: Number of its messages, by log and chunk.
-            opened: Files that are open.
-
-        Raises:
-            StoreError: A file is missing or damaged.
+        `chunks` has the number of its messages by log and chunk. Errors are those of `left`.
         """
         from hybridlog.columns.column_file import TablePart
         from hybridlog.columns.layout import TopicCounts
@@ -121,7 +115,7 @@ class RecordingRows:
         return TopicTable(topic, parts, TopicCounts(rows), opened)
 
     def _missing(self, *logs: int) -> SegmentError:
-        problems = [self._problems[log] for log in sorted(logs) if log in self._problems]
+        problems = [one for log in sorted(logs) for one in self._problems[log]]
         return SegmentError(" ".join(problems) or f"Rows are in no file of {self._recording}.")
 
     def _of(self, log: int) -> list[RowsFile]:
@@ -136,8 +130,7 @@ class RecordingRows:
                     try:
                         found.append(RowsFile(self._recording, listed, self._cache))
                     except StoreError as error:
-                        known = self._problems.get(log)
-                        self._problems[log] = f"{known} {error}" if known else str(error)
+                        self._problems[log].append(str(error))
             return found
 
 

@@ -146,12 +146,13 @@ class _Copy:
             there = self._find(sizes)
             check_origin(here, there)
             self._damaged = self._find_damaged(there, sizes)
-            logs = self._wanted(there)
+            believed = self._believed(there)
+            logs = self._wanted(believed)
             if logs and self._how.prepare is not None:
                 here, self._others = stack.enter_context(self._how.prepare(here, logs))
                 logs = [here.logs[log.number] for log in logs]
-            copied = Copied(here, there is None, lacking=_lacking(here, there))
-            self._bring(here, there, logs, sizes, copied)
+            copied = Copied(here, there is None, lacking=_lacking(here, believed))
+            self._bring(here, believed, logs, sizes, copied)
             copied.manifest = self._publish(here, there, {log.number for log in logs})
             self._clear(there, copied.manifest, sizes)
             if self._how.proved is not None:
@@ -159,22 +160,28 @@ class _Copy:
         return copied
 
     def _wanted(self, there: Manifest | None) -> list[File]:
-        is_all = self._how.prepare is None
-        return wanted(self._here, there, awaited=is_all, damaged=self._damaged)
+        return wanted(self._here, there, awaited=self._how.prepare is None)
+
+    def _believed(self, there: Manifest | None) -> Manifest | None:
+        """The manifest there without the logs that are to come again."""
+        if there is None or not self._damaged:
+            return there
+        left = tuple(file for file in there.files if file.number not in self._damaged)
+        return replace(there, files=left)
 
     def _find_damaged(self, there: Manifest | None, sizes: Mapping[str, int]) -> set[int]:
-        """Numbers of logs that are here, and have lost rows there."""
-        here = {number for number, log in self._here.logs.items() if log.is_here}
-        ours = listed_files(self._here)
-        rows = [] if there is None else [file for file in there.files if file.kind == "rows"]
-        listed = [(one.number, ListedFile(one.name, one.bytes, one.digest)) for one in rows]
+        """Numbers of logs that are here, and are gone there with rows that are not here."""
+        if there is None:
+            return set()
+        logs, ours = self._here.logs, {*listed_files(self._here)}
+        gone = {n for n, log in there.logs.items() if not log.is_here}
+        gone &= {n for n, log in logs.items() if log.is_here}
         return {
             number
-            for number, file in listed
-            if number in here
-            and file not in ours
-            and (self._must_prove or sizes.get(file.path) != file.bytes)
-            and not self._is_whole(file, sizes)
+            for one in {*listed_files(there)} - ours
+            if (number := int(one.path[:6])) in gone
+            and (self._must_prove or sizes.get(one.path) != one.bytes)
+            and not self._is_whole(one, sizes)
         }
 
     def _is_whole(self, file: ListedFile, sizes: Mapping[str, int]) -> bool:
@@ -239,7 +246,7 @@ class _Copy:
         numbers = {log.number for log in logs}
         names = (f.name for f in here.files if f.is_here and f.number in numbers)
         new = [ours[name] for name in names]
-        kept = merged(here, there, numbers, self._damaged)
+        kept = merged(here, there, numbers)
         old = [listed[one.path] for one in listed_files(kept) if one.path in listed]
         self._new = {one.path for one in new}
         doubtful = [one for one in old if self._must_prove or sizes.get(one.path) != one.bytes]
@@ -284,7 +291,7 @@ class _Copy:
                 return made
             except RecordingExistsError:
                 pass  # another process was faster
-        return manifests.change(here.id, lambda now: merged(here, now, brought, self._damaged))
+        return manifests.change(here.id, lambda now: merged(here, self._believed(now), brought))
 
     def _check_files(self) -> None:
         """Raise if files are no longer there: a removal that ends takes them along."""

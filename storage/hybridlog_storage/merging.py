@@ -17,20 +17,13 @@ if TYPE_CHECKING:
     from collections.abc import Collection
 
 
-def wanted(
-    here: Manifest,
-    there: Manifest | None,
-    *,
-    awaited: bool = True,
-    damaged: Collection[int] = (),
-) -> list[File]:
+def wanted(here: Manifest, there: Manifest | None, *, awaited: bool = True) -> list[File]:
     """The logs that a copy lacks; of those that are gone here, the rows are sent.
 
     Args:
         here: The manifest of the source.
         there: That of the copy so far; None if it is new.
         awaited: Those, too, that were left for later.
-        damaged: Numbers of logs that are gone there, and have lost rows.
     """
     known = {} if there is None else there.logs
     return [
@@ -38,23 +31,16 @@ def wanted(
         for number, log in here.logs.items()
         if number not in known
         or (awaited and known[number].gone == "elsewhere" and log.gone != "elsewhere")
-        or (number in damaged and not known[number].is_here)
     ]
 
 
-def merged(
-    here: Manifest,
-    there: Manifest | None,
-    brought: Collection[int],
-    damaged: Collection[int] = (),
-) -> Manifest:
+def merged(here: Manifest, there: Manifest | None, brought: Collection[int]) -> Manifest:
     """The manifest of a copy.
 
     Args:
         here: That of the source.
         there: That of the copy so far; None if it is new.
         brought: Numbers of the logs that are there now, whole, or with their rows.
-        damaged: As of `wanted`.
 
     Raises:
         RefusedError: They are of two recordings.
@@ -62,8 +48,7 @@ def merged(
     if there is None:
         return here
     check_origin(here, there)
-    lacking = wanted(here, there, damaged=damaged)
-    new = {log.number: log for log in lacking if log.number in brought}
+    new = {log.number: log for log in wanted(here, there) if log.number in brought}
     rows = [f for f in there.files if f.kind == "rows" and f.number not in new]
     rows += [f for f in here.files if f.kind == "rows" and f.number in new]
     channels = {

@@ -13,6 +13,7 @@ import hybridlog as hl
 from hybridlog.entries import topic_of
 from hybridlog.maintenance import expiry
 from hybridlog.maintenance.copying import CopyOptions
+from hybridlog.maintenance.verify import RESTORE
 from hybridlog_storage.errors import IncompleteError, StoreError
 from hybridlog_storage.manifest import File
 from tests import places
@@ -23,7 +24,6 @@ from tests.payloads.test_expiry import TOPICS, answers, expire, recording_of, ro
 from tests.payloads.test_rows import log_of
 
 FIELDS = {"/scan": "angle_min", "/cloud": "width"}
-CURE = "`hybridlog copy --check` from a store that has it brings it back"
 
 
 def cut(path: Path) -> None:
@@ -108,7 +108,7 @@ def test_a_lost_file_is_no_message_in_any_door(
         checked = store.verify()
         assert checked.messages == entry.messages
         (finding,) = checked.findings
-        assert (finding.place, finding.cure) == (file.name, CURE)
+        assert (finding.place, finding.cure) == (file.name, RESTORE)
         assert finding.problem == f"{file.name} {fault}" or fault == "missing"
         assert [one.is_cured for one in store.verify(repair=True) if one.place == file.name] == [
             False
@@ -173,7 +173,7 @@ def test_a_flipped_byte_is_an_error_where_it_is_read(gone: Path, at: int) -> Non
         for other in {*TOPICS} - {topic}:
             assert [*store.topic(other)]
         (finding,) = store.verify().findings
-        assert (finding.place, finding.cure) == (file.name, CURE)
+        assert (finding.place, finding.cure) == (file.name, RESTORE)
 
 
 @pytest.mark.parametrize("fault", [*LOSSES.values(), lambda path: flip(path, 900)])
