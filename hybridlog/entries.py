@@ -46,14 +46,7 @@ from hybridlog_storage.manifest import (
     free_name,
     loss_of,
 )
-from hybridlog_storage.messages import (
-    EXPIRED,
-    EXPIRED_IDS,
-    NOT_COPIED,
-    REDUCED,
-    Channel,
-    schema_hash,
-)
+from hybridlog_storage.messages import EXPIRED, NOT_COPIED, REDUCED, Channel, schema_hash
 from hybridlog_storage.segments.gone_log import GoneLog, open_log
 from hybridlog_storage.segments.segment_file import (
     Sealed,
@@ -289,13 +282,10 @@ def _leave_out_lost_rows(found: Inventory, number: int, rows: Sequence[File]) ->
             problem = "is missing" if size is None else "has another size"
             found.misfits.append(Misfit(number, file.name, f"{file.name} {problem}"))
             topics.add(topic_of(file, found.manifest))
-    lost = [file for file in rows if topic_of(file, found.manifest) in topics]
-    found.lost += lost
-    if lost:
-        gone = {channel for file in lost for channel in file.parts}
-        summary = found.summaries[number]
-        left = [channel for channel in summary.counts if channel % EXPIRED_IDS not in gone]
-        found.summaries[number] = summary.only(left)
+    found.lost += [file for file in rows if topic_of(file, found.manifest) in topics]
+    summary = found.summaries[number]
+    left = [n for n in summary.counts if summary.channels[n].topic not in topics]
+    found.summaries[number] = summary.only(left)
 
 
 def steady_inventory(directory: StoreDirectory, recording: str) -> Inventory:

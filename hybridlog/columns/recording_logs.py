@@ -42,15 +42,11 @@ class RecordingRows:
 
     Args:
         recording: The recording's directory.
-        listed: The files; None for those that its manifest lists.
         cache: Keeps rows that were read.
     """
 
-    def __init__(
-        self, recording: Path, listed: Sequence[File] | None = None, cache: Cache | None = None
-    ) -> None:
+    def __init__(self, recording: Path, cache: Cache | None = None) -> None:
         self._recording = recording
-        self._given = listed
         self._cache = cache or Cache()
         self._readers: dict[int, list[RowsFile]] = {}  # by number of the log
         self._problems: defaultdict[int, list[str]] = defaultdict(list)  # of files, by log
@@ -58,20 +54,9 @@ class RecordingRows:
 
     @lazy
     def _listed(self) -> Mapping[int, Sequence[File]]:
-        """The files by number of their log.
-
-        Raises:
-            StoreError: The manifest cannot be read.
-        """
-        listed = self._given
-        if listed is None:
-            manifest = manifests_at(self._recording).find(self._recording.name)
-            listed = () if manifest is None else manifest.files
-        found: defaultdict[int, list[File]] = defaultdict(list)
-        for file in listed:
-            if file.kind == "rows":
-                found[file.number].append(file)
-        return found
+        """The files that its manifest lists, by number of their log."""
+        manifest = manifests_at(self._recording).find(self._recording.name)
+        return {} if manifest is None else manifest.rows
 
     def left(self, log: int, chunk: int) -> tuple[Batch, NDArray[np.int64]]:
         """The rows that remain of a chunk, and the arrival numbers of its messages.
@@ -84,13 +69,11 @@ class RecordingRows:
 
         try:
             found = [file.of_chunk(chunk) for file in self._of(log) if chunk in file.places]
-            if not found:
-                raise self._missing(log)
-            return messages_left(found)
-        except SegmentError:
-            raise
         except StoreError as error:
             raise SegmentError(f"{error}{RESTORE}") from error
+        if not found:
+            raise self._missing(log)
+        return messages_left(found)
 
     def expired_fields(
         self, topic: str, chunks: Mapping[tuple[int, int], int], opened: OpenFiles

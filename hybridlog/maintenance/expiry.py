@@ -91,7 +91,8 @@ def expire(
     going = [log for log in logs if log is not None and log.is_here and log.parts]
     if manifest.is_ended:
         _remove_arrays(directory, manifest, going)
-    ready = [log for log in going if _has_rows(directory, manifest, log)]
+    rows, listing = manifest.rows, directory.listing(recording)
+    ready = [log for log in going if log.number in rows and listing.has_all(rows[log.number])]
     _go(directory, recording, {log.number: () for log in ready}, check, copy)
     late, before = [log for log in going if log not in ready], 0
     report = reporter(progress, manifest.name, sum(log.bytes for log in late))
@@ -119,12 +120,6 @@ def expire(
         before += log.bytes
     done.freed += sum(log.bytes for log in going if log.number not in done.damaged)
     return done
-
-
-def _has_rows(directory: StoreDirectory, manifest: Manifest, log: File) -> bool:
-    """True if all files of rows of a log are there."""
-    rows, sizes = manifest.rows.get(log.number, []), directory.listing(manifest.id).rows
-    return bool(rows) and all(sizes.get(file.name) == file.bytes for file in rows)
 
 
 def _lines_of(number: int, manifest: Manifest) -> list[File]:

@@ -109,10 +109,7 @@ def verify(
 
 
 def damaged_files(path: Path, inventory: Inventory) -> Iterator[tuple[File, str]]:
-    """Read every byte of the files of rows; yield damaged ones and their problems.
-
-    Misfits are left out.
-    """
+    """Read every byte of files of rows that are no misfits; yield damaged ones and why."""
     told = {misfit.file for misfit in inventory.misfits}
     for file in (file for file in inventory.rows if file.name not in told):
         try:

@@ -164,21 +164,19 @@ class _Copy:
 
     def _believed(self, there: Manifest | None) -> Manifest | None:
         """The manifest there without the logs that are to come again."""
-        if there is None or not self._damaged:
-            return there
-        left = tuple(file for file in there.files if file.number not in self._damaged)
-        return replace(there, files=left)
+        files = () if there is None else there.files
+        left = tuple(file for file in files if file.number not in self._damaged)
+        return there and replace(there, files=left)
 
     def _find_damaged(self, there: Manifest | None, sizes: Mapping[str, int]) -> set[int]:
         """Numbers of logs that are here, and are gone there with rows that are not here."""
         if there is None:
             return set()
-        logs, ours = self._here.logs, {*listed_files(self._here)}
         gone = {n for n, log in there.logs.items() if not log.is_here}
-        gone &= {n for n, log in logs.items() if log.is_here}
+        gone &= {n for n, log in self._here.logs.items() if log.is_here}
         return {
             number
-            for one in {*listed_files(there)} - ours
+            for one in {*listed_files(there)} - {*listed_files(self._here)}
             if (number := int(one.path[:6])) in gone
             and (self._must_prove or sizes.get(one.path) != one.bytes)
             and not self._is_whole(one, sizes)

@@ -112,9 +112,8 @@ class ChunkTable:
         owner = np.repeat(np.arange(len(chunks)), chunks["parts"])[is_kept]
         chunks["parts"] = np.bincount(owner, minlength=len(chunks))
         starts = run_starts(owner)
-        if len(starts):
-            chunks["first"][owner[starts]] = np.minimum.reduceat(parts["first"], starts)
-            chunks["last"][owner[starts]] = np.maximum.reduceat(parts["last"], starts)
+        chunks["first"][owner[starts]] = np.minimum.reduceat(parts["first"], starts)
+        chunks["last"][owner[starts]] = np.maximum.reduceat(parts["last"], starts)
         return replace(self, chunks=chunks, parts=parts)
 
     def by_channel(self) -> NDArray[np.void]:
