@@ -117,7 +117,8 @@ class Inventory:
         manifest: Its manifest; None without one.
         summaries: Summaries of valid segments, by number.
         misfits: Files that differ from the manifest.
-        lost: Listed segments that are missing or changed.
+        lost: Listed segments that are missing or changed; of those that are gone, files of rows
+            of which nothing is believed.
     """
 
     id: str
@@ -148,9 +149,13 @@ class Inventory:
         return {} if self.manifest is None else self.manifest.logs
 
     def digest(self, number: int) -> str:
-        """Digest of the file of a valid segment; one that is not listed is read for it."""
+        """Digest of a valid segment; one that is not listed is read for it.
+
+        Where a segment is gone and rows are lost, it has the numbers of their channels, too.
+        """
         if number in self.logs:
-            return self.logs[number].digest
+            lost = {channel for one in self.lost if one.number == number for channel in one.parts}
+            return "-".join([self.logs[number].digest, *map(str, sorted(lost))])
         with open_log(self.path / self.listing.sealed[number], number) as reader:
             return reader.digest()
 
@@ -256,12 +261,31 @@ def inventory_of(
     rows = {} if manifest is None else manifest.rows
     for number, file in listed.items():
         if number not in found.summaries and number not in listing.open:
-            found.lost += [file] if file.is_here else rows[number]
+            lost = [file] if file.is_here else rows[number]
+            found.lost += lost
             if number not in listing.sealed:
-                what = file.name if file.is_here else f"what is left of {file.name}"
-                found.misfits.append(Misfit(number, "", f"{what} is missing"))
+                name = "" if file.is_here else lost[0].name
+                found.misfits.append(Misfit(number, name, f"{lost[0].name} is missing"))
+        elif not file.is_here and number in found.summaries:
+            _leave_out_lost_rows(found, number, rows[number])
     found.misfits.sort(key=lambda misfit: misfit.segment)
     return found
+
+
+def _leave_out_lost_rows(found: Inventory, number: int, rows: Sequence[File]) -> None:
+    """Leave out the topics of a segment that is gone whose files of rows are not all whole."""
+    assert found.manifest is not None
+    topics = set()
+    for file in rows:
+        size = found.listing.rows.get(file.name)
+        if size != file.bytes:
+            problem = "is missing" if size is None else "has another size"
+            found.misfits.append(Misfit(number, file.name, f"{file.name} {problem}"))
+            topics.add(topic_of(file, found.manifest))
+    found.lost += [file for file in rows if topic_of(file, found.manifest) in topics]
+    summary = found.summaries[number]
+    left = [n for n in summary.counts if summary.channels[n].topic not in topics]
+    found.summaries[number] = summary.only(left)
 
 
 def steady_inventory(directory: StoreDirectory, recording: str) -> Inventory:
@@ -272,7 +296,7 @@ def steady_inventory(directory: StoreDirectory, recording: str) -> Inventory:
     """
     for _ in range(_TRIES):
         found = take_inventory(directory, recording)
-        if not (found.misfits or found.lost or _losses_of_rows(found)):
+        if not (found.misfits or found.lost):
             return found
         if state_now(directory, recording) == found.state:
             return found
@@ -341,7 +365,6 @@ def describe(catalog: Catalog, inventory: Inventory, *, is_open: bool = False) -
     entry.stored_bytes = sum(size for _, _, size in entry.rows)
     entry.end = dict(end) if end is not None else {}
     ours = [row for sealed in inventory.lost for row in _losses_of_segment(inventory, sealed)]
-    ours += _losses_of_rows(inventory)
     ours += _losses_of_chunks(inventory, catalog.damage(inventory.id))
     if not inventory.manifest.is_ended:  # what went to make room
         ours += map(loss_values, inventory.manifest.losses)
@@ -650,10 +673,7 @@ def _status(
 def _losses_of_segment(inventory: Inventory, file: File) -> list[dict[str, Any]]:
     """Rows of the loss ledger for a listed file that is not readable."""
     reasons = [m.reason for m in inventory.misfits if m.segment == file.number]
-    return _losses_of_file(inventory, file, "; ".join(reasons) or "it cannot be read")
-
-
-def _losses_of_file(inventory: Inventory, file: File, reason: str) -> list[dict[str, Any]]:
+    reason = "; ".join(reasons) or "it cannot be read"
     channels = inventory.manifest.channels if inventory.manifest is not None else {}
     rows = [
         _loss(file.name, reason, channels[number].topic, part, length=file.bytes)
@@ -661,17 +681,6 @@ def _losses_of_file(inventory: Inventory, file: File, reason: str) -> list[dict[
         if part.messages
     ]
     return rows or [_loss(file.name, reason, "", truth.Part(0, 0), length=file.bytes)]
-
-
-def _losses_of_rows(inventory: Inventory) -> list[dict[str, Any]]:
-    """Rows of the loss ledger for missing or changed files of rows, where others are there."""
-    rows = []
-    for file in inventory.rows:
-        size, log = inventory.listing.rows.get(file.name), inventory.logs[file.number]
-        if size != file.bytes and not log.is_here and file.number in inventory.summaries:
-            problem = "is missing" if size is None else "has another size"
-            rows += _losses_of_file(inventory, file, f"a file of rows {problem}")
-    return rows
 
 
 def _losses_of_chunks(
@@ -709,7 +718,7 @@ def _fill_stats(entry: RecordingEntry, inventory: Inventory, catalog: Catalog) -
     entry.is_decoded = True
     for number, summary in inventory.summaries.items():
         found = catalog.stamps(entry, number, summary.table)
-        entry.is_decoded &= found is not None or not len(summary.table.chunks)
+        entry.is_decoded &= found is not None or not len(summary.table.parts)
         for channel_id, stats in channel_totals(summary.table, found, silent).items():
             totals.setdefault(channel_id, ChannelStats()).add(stats)
     for channel in entry.channels:

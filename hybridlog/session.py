@@ -727,7 +727,7 @@ class Session:
         return newer
 
     def expired_fields(
-        self, recording: RecordingEntry, topic: str, chunks: Collection[tuple[int, int]]
+        self, recording: RecordingEntry, topic: str, chunks: Mapping[tuple[int, int], int]
     ) -> TopicTable:
         """The fields of a topic in chunks that are gone, see `RecordingRows.expired_fields`."""
         rows = self.shared.rows(recording)

@@ -71,7 +71,7 @@ class Shared(ABC):
         self.channels: dict[str, tuple[RecordingEntry, dict[str, list[RecordedChannel]]]] = {}
         self.columns: dict[tuple[str, int, frozenset[int]], tuple[ChunkTable, ChunkColumns]] = {}
         self._segments: dict[tuple[str, str], SegmentReader] = {}
-        self._rows: dict[tuple[Path, frozenset[tuple[str, str]]], RecordingRows] = {}
+        self._rows: dict[tuple[Path, frozenset[tuple[str, ...]]], RecordingRows] = {}
         self._tables_tried: set[tuple[str, str]] = set()  # looked for, and noted if missing
         self._opening = threading.Lock()
 
@@ -212,7 +212,8 @@ class Shared(ABC):
             return self._rows_of(entry)
 
     def _rows_of(self, entry: RecordingEntry) -> RecordingRows:
-        key = self.directory.recording(entry.id), frozenset(entry.files.items())
+        gone = frozenset((name, entry.digests[number]) for number, name in entry.files.items())
+        key = self.directory.recording(entry.id), gone
         found = self._rows.get(key)
         if found is None:
             _make_room(self._rows)

@@ -530,10 +530,17 @@ class Recording:
                 yield _row(segment.path.name, place.offset, place.length, *about)
 
     def _lost_rows(self) -> Iterator[dict[str, Any]]:
+        def key(file: Mapping[str, Any]) -> tuple[int, str]:
+            return file["number"], self.manifest.topics[int(next(iter(file["parts"])))]
+
+        lost = set()
         for file in self.manifest.rows:
             path = self.path / file["name"]
             is_there = path.is_file() and path.stat().st_size == file["bytes"]
             if not is_there and file["number"] in self.segments:
+                lost.add(key(file))
+        for file in self.manifest.rows:
+            if key(file) in lost:
                 yield from self._lost_file(file)
 
     def _status(self) -> str:

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 import hybridlog as hl
+from hybridlog.maintenance.verify import RESTORE
 from hybridlog_storage.errors import SegmentError, TopicError
 from hybridlog_storage.manifests import MANIFEST_OLD
 from hybridlog_storage.messages import Channel
@@ -130,7 +131,7 @@ def test_damage_that_only_a_copy_mends_is_said(store: Path) -> None:
     with closing(hl.open(store, mongo=NOWHERE)) as opened:
         (finding,) = opened.verify().findings
         assert (finding.recording, finding.place) == where
-        assert finding.cure == "restore the file from a copy"
+        assert finding.cure == RESTORE
 
 
 def test_what_a_kill_has_left_is_sealed_before_its_manifest_is_made(store: Path) -> None:

@@ -8,13 +8,14 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from hybridlog_storage.cache import Cache
+from hybridlog_storage.catalog import file_of
 from hybridlog_storage.errors import SegmentError, StoreError
 from hybridlog_storage.lazy import lazy
 from hybridlog_storage.manifests import manifests_at
 from hybridlog_storage.segments.gone_log import open_log
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
     from pathlib import Path
 
     import numpy as np
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from hybridlog.columns.column_file import OpenFiles
     from hybridlog.columns.rows_file import RowsFile
     from hybridlog.columns.topic_table import TopicTable
+    from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.manifest import File
     from hybridlog_storage.messages import Batch
     from hybridlog_storage.segments.chunk import StoredChunk
@@ -40,36 +42,21 @@ class RecordingRows:
 
     Args:
         recording: The recording's directory.
-        listed: The files; None for those that its manifest lists.
         cache: Keeps rows that were read.
     """
 
-    def __init__(
-        self, recording: Path, listed: Sequence[File] | None = None, cache: Cache | None = None
-    ) -> None:
+    def __init__(self, recording: Path, cache: Cache | None = None) -> None:
         self._recording = recording
-        self._given = listed
         self._cache = cache or Cache()
         self._readers: dict[int, list[RowsFile]] = {}  # by number of the log
-        self._problems: dict[int, str] = {}  # of files that cannot be read
+        self._problems: defaultdict[int, list[str]] = defaultdict(list)  # of files, by log
         self._lock = threading.RLock()
 
     @lazy
     def _listed(self) -> Mapping[int, Sequence[File]]:
-        """The files by number of their log.
-
-        Raises:
-            StoreError: The manifest cannot be read.
-        """
-        listed = self._given
-        if listed is None:
-            manifest = manifests_at(self._recording).find(self._recording.name)
-            listed = () if manifest is None else manifest.files
-        found: defaultdict[int, list[File]] = defaultdict(list)
-        for file in listed:
-            if file.kind == "rows":
-                found[file.number].append(file)
-        return found
+        """The files that its manifest lists, by number of their log."""
+        manifest = manifests_at(self._recording).find(self._recording.name)
+        return {} if manifest is None else manifest.rows
 
     def left(self, log: int, chunk: int) -> tuple[Batch, NDArray[np.int64]]:
         """The rows that remain of a chunk, and the arrival numbers of its messages.
@@ -78,21 +65,23 @@ class RecordingRows:
             SegmentError: It is missing or damaged.
         """
         from hybridlog.columns.left_rows import messages_left
+        from hybridlog.columns.rows_file import RESTORE
 
         try:
             found = [file.of_chunk(chunk) for file in self._of(log) if chunk in file.places]
-            if not found:
-                raise SegmentError(self._problems.get(log) or "its rows are in no file")
-            return messages_left(found)
-        except SegmentError:
-            raise
         except StoreError as error:
-            raise SegmentError(str(error)) from error
+            raise SegmentError(f"{error}{RESTORE}") from error
+        if not found:
+            raise self._missing(log)
+        return messages_left(found)
 
     def expired_fields(
-        self, topic: str, chunks: Collection[tuple[int, int]], opened: OpenFiles
+        self, topic: str, chunks: Mapping[tuple[int, int], int], opened: OpenFiles
     ) -> TopicTable:
-        """The fields of a topic in chunks of logs that are gone as a table, in no order."""
+        """The fields of a topic in chunks of logs that are gone as a table, in no order.
+
+        `chunks` has the number of its messages by log and chunk. Errors are those of `left`.
+        """
         from hybridlog.columns.column_file import TablePart
         from hybridlog.columns.layout import TopicCounts
         from hybridlog.columns.topic_table import TopicTable
@@ -103,7 +92,14 @@ class RecordingRows:
             for file in self._of(log)
             if file.topic == topic and chunk in file.places
         ]
-        return TopicTable(topic, parts, TopicCounts(sum(part.rows for part in parts)), opened)
+        rows = sum(part.rows for part in parts)
+        if rows != sum(chunks.values()):
+            raise self._missing(*{log for log, _ in chunks})
+        return TopicTable(topic, parts, TopicCounts(rows), opened)
+
+    def _missing(self, *logs: int) -> SegmentError:
+        problems = [one for log in sorted(logs) for one in self._problems[log]]
+        return SegmentError(" ".join(problems) or f"Rows are in no file of {self._recording}.")
 
     def _of(self, log: int) -> list[RowsFile]:
         """The files of rows of a log, but for damaged or missing ones."""
@@ -117,7 +113,7 @@ class RecordingRows:
                     try:
                         found.append(RowsFile(self._recording, listed, self._cache))
                     except StoreError as error:
-                        self._problems[log] = str(error)
+                        self._problems[log].append(str(error))
             return found
 
 
@@ -157,14 +153,14 @@ class WalkedSegment:
 
 def walk(
     recording: Path,
-    names: Mapping[int, str],
+    entry: RecordingEntry,
     report: Callable[[int], None] = lambda _: None,
 ) -> Iterator[WalkedSegment]:
-    """Open sealed segments of a recording, one after the other.
+    """Open sealed segments of a recording that have messages, one after the other.
 
     Args:
         recording: The recording's directory.
-        names: Names of the segments, or of their first files of rows, by number.
+        entry: Its entry.
         report: As for `WalkedSegment`; told at the end of each segment, too.
 
     Raises:
@@ -172,8 +168,9 @@ def walk(
     """
     rows = RecordingRows(recording)
     begin = 0
-    for number, name in names.items():
-        with open_log(recording / name, number, rows) as reader:
-            yield WalkedSegment(number, reader, reader.summary(), begin, report)
+    for number in (number for number, _, _ in entry.spans if str(number) in entry.digests):
+        with open_log(recording / file_of(entry, number), number, rows) as reader:
+            summary = reader.summary().only(entry.held[str(number)])
+            yield WalkedSegment(number, reader, summary, begin, report)
             begin += reader.size
             report(begin)

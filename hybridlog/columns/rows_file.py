@@ -58,6 +58,8 @@ class RowsFile(ColumnFile):
             super().__init__(path)
         except FileNotFoundError as error:
             raise StoreError(f"The file of rows {path} is missing.{RESTORE}") from error
+        except StoreError as error:
+            raise StoreError(f"{error}{RESTORE}") from error
         rows = sum(part.messages for part in listed.parts.values())
         if (self.size_bytes, self.rows) != (listed.bytes, rows):
             raise self._other()

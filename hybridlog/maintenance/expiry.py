@@ -91,7 +91,8 @@ def expire(
     going = [log for log in logs if log is not None and log.is_here and log.parts]
     if manifest.is_ended:
         _remove_arrays(directory, manifest, going)
-    ready = [log for log in going if log.number in manifest.rows]
+    rows, listing = manifest.rows, directory.listing(recording)
+    ready = [log for log in going if log.number in rows and listing.has_all(rows[log.number])]
     _go(directory, recording, {log.number: () for log in ready}, check, copy)
     late, before = [log for log in going if log not in ready], 0
     report = reporter(progress, manifest.name, sum(log.bytes for log in late))
@@ -179,14 +180,14 @@ def _list(
     check: Check = lambda _: None,
     values: Mapping[str, str] = MappingProxyType({}),
 ) -> Manifest:
-    """List the rows of logs, unless others are listed, and change the lines of the logs."""
+    """List the rows of logs, where there are new ones, and change the lines of the logs."""
     path, manifests = directory.recording(recording), directory.manifests
 
     def how(now: Manifest) -> Manifest:
         check(now)
         for number, rows in made.items():
             line = replace(now.logs[number], **values)
-            now = with_rows(now, line, now.rows.get(number) or rows)
+            now = with_rows(now, line, rows or now.rows[number])
         return now
 
     try:

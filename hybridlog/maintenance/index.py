@@ -14,7 +14,7 @@ from hybridlog.entries import put_entry
 from hybridlog.index.indexing import ChunkIndexer
 from hybridlog.maintenance import tables
 from hybridlog.maintenance.report import Progress, RepairReport, reporter
-from hybridlog_storage.catalog import files_of, stamps_of
+from hybridlog_storage.catalog import stamps_of
 from hybridlog_storage.disk.directory import LOCK_WAIT_S
 from hybridlog_storage.errors import (
     HeldError,
@@ -234,10 +234,10 @@ def derive(
     indexer = ChunkIndexer(entry.id, has_documents=database is not None)
     sender = None if database is None else DocumentSender(entry, database)
     sent, made, damage = time.monotonic(), 0, catalog.damage(entry.id)
-    names, path = files_of(entry), directory.recording(entry.id)
+    path = directory.recording(entry.id)
     report = reporter(progress, entry.name, entry.stored_bytes)
     try:
-        for segment in walk(path, names, report=report):
+        for segment in walk(path, entry, report):
             number, summary = segment.number, segment.summary
             digest = entry.digests[str(number)]
             is_sent = sender is None or str(number) in done

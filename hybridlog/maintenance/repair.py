@@ -103,7 +103,7 @@ def _repair_one(directory: StoreDirectory, catalog: Catalog, recording: str) -> 
     inventory = take_inventory(directory, recording)
     for misfit in inventory.misfits:
         place = misfit.file or f"segment {misfit.segment}"
-        what = f"{misfit.reason}; restore it from a copy, if there is one"
+        what = f"{misfit.reason}; {RESTORE}"
         done.append(Repaired(inventory.name, place, what, is_cured=False))
     return [*done, *lost]
 
@@ -115,7 +115,7 @@ def _segments(path: Path, inventory: Inventory) -> tuple[list[Repaired], list[Re
         What was repaired, and the damage that only a copy can restore.
     """
     rebuilt = []
-    lost = [*damaged_files(path, inventory)]
+    lost = [(file.name, problem) for file, problem in damaged_files(path, inventory)]
     for number, name in inventory.listing.sealed.items():
         log = inventory.logs.get(number)
         if is_rows(name):

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 from hybridlog.columns.layout import PARTS, parts_folder, topics_of, type_prefix
 from hybridlog.columns.recording_logs import walk
 from hybridlog.maintenance.report import reporter
-from hybridlog_storage.catalog import files_of
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import SegmentError, StoreError, TopicError
 
@@ -85,9 +84,9 @@ def make(
             writer = TableWriter(directory.path, entry.id, entry.name, topics=wanted, is_new=False)
             try:
                 channels = channels_of(entry, wanted)
-                names, path = files_of(entry), directory.recording(entry.id)
+                path = directory.recording(entry.id)
                 report = reporter(progress, entry.name, entry.stored_bytes)
-                for segment in walk(path, names, report=report):
+                for segment in walk(path, entry, report):
                     for _, chunk in segment.chunks(lambda p: not channels.isdisjoint(p.channels)):
                         if time.monotonic() > until:
                             raise TimeoutError

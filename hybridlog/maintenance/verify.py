@@ -9,7 +9,7 @@ from shlex import quote
 from typing import TYPE_CHECKING
 
 from hybridlog.columns import rows_file
-from hybridlog.entries import describe, steady_inventory
+from hybridlog.entries import describe, steady_inventory, topic_of
 from hybridlog.maintenance import tables
 from hybridlog_storage.disk.directory import LOCK
 from hybridlog_storage.errors import ManifestError, SegmentError, StoreError
@@ -27,12 +27,11 @@ if TYPE_CHECKING:
     from hybridlog.maintenance.report import Progress
     from hybridlog_storage.catalog import Catalog, RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
-    from hybridlog_storage.manifest import Manifest
+    from hybridlog_storage.manifest import File, Manifest
     from hybridlog_storage.mongo.database import Database
 
 _REPAIR = "run `hybridlog verify --repair`"
-RESTORE = "restore the file from a copy"
-_COPY_AGAIN = "`hybridlog copy --check` from a store that has it brings it back"
+RESTORE = "`hybridlog copy --check` from a store that has it brings it back"
 _RESTORE_LOST = f"{RESTORE}; `hybridlog info --losses` lists the lost messages"
 _KNOWN = frozenset({LOCK})
 
@@ -101,7 +100,7 @@ def verify(
             check = _Check(directory, catalog, index, recording, result, checker=checker)
             check.run(progress)
         except ManifestError as error:
-            cure = _COPY_AGAIN if directory.is_remote else _REPAIR
+            cure = RESTORE if directory.is_remote else _REPAIR
             result.findings.append(Finding(recording, "manifest", str(error), cure))
         except StoreError as error:
             cure = "restore its files"
@@ -109,13 +108,14 @@ def verify(
     return result
 
 
-def damaged_files(path: Path, inventory: Inventory) -> Iterator[tuple[str, str]]:
-    """Read every byte of the files of rows; yield damaged ones and their problems."""
-    for file in inventory.rows:
+def damaged_files(path: Path, inventory: Inventory) -> Iterator[tuple[File, str]]:
+    """Read every byte of files of rows that are no misfits; yield damaged ones and why."""
+    told = {misfit.file for misfit in inventory.misfits}
+    for file in (file for file in inventory.rows if file.name not in told):
         try:
             rows_file.RowsFile(path, file).check()
         except StoreError as error:
-            yield file.name, str(error).removesuffix(rows_file.RESTORE)
+            yield file, str(error).removesuffix(rows_file.RESTORE)
 
 
 class _Index:
@@ -190,7 +190,7 @@ class _Check:
     def found(self, place: str, problem: str, cure: str) -> None:
         """Add a problem."""
         if self._directory.is_remote:
-            cure = _COPY_AGAIN
+            cure = RESTORE
         self._result.findings.append(Finding(self._name, place, problem, cure))
 
     def run(self, progress: Progress | None) -> None:
@@ -257,7 +257,11 @@ class _Check:
         """Check every byte of the files of rows."""
         for file, problem in damaged_files(self._path, inventory):
             self._is_damaged = True
-            self.found(file, problem, RESTORE)
+            self.found(file.name, problem, RESTORE)
+            if inventory.manifest is not None and not inventory.logs[file.number].is_here:
+                lost = sum(part.messages for part in file.parts.values())
+                self._lost[collection_of(topic_of(file, inventory.manifest))] += lost
+                self._result.messages -= lost
         self._result.bytes_read += sum(file.bytes for file in inventory.rows)
 
     def _segment(

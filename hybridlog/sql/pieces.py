@@ -21,6 +21,7 @@ from hybridlog.columns.column_file import FIRST
 from hybridlog.columns.fields import without
 from hybridlog.columns.layout import POINTS
 from hybridlog.columns.rows import Places, piece_of
+from hybridlog.columns.rows_file import RESTORE
 from hybridlog.query.question import RecordedChannel
 from hybridlog.record.losses import lost_spans
 from hybridlog.schema.arrow_types import has_empty
@@ -176,7 +177,7 @@ class TopicOfRecording:
                 for is_reduced in {one.is_reduced for one in there}:
                     own = [one for one in there if one.is_reduced is is_reduced]
                     found.append(_ChunkRows(self, chunk.segment, chunk.place, span, own))
-        gone = {(c.segment, c.number) for c in left if c.place.is_expired}
+        gone = {(c.segment, c.number): c.messages for c in left if c.place.is_expired}
         if gone:
             fields = self.session.expired_fields(self.entry, self.topic, gone)
             found += [_FieldRows(self, fields, part) for part in fields.parts]
@@ -299,7 +300,7 @@ class _FieldRows(_TableRows):
     """A row group of what is left of expired messages; it is never made again."""
 
     def _damaged(self, error: StoreError) -> StoreError:
-        return StoreError(f"{error} Restore the file from a copy.")
+        return StoreError(f"{error}{RESTORE}")
 
 
 class _ChunkRows:

@@ -656,15 +656,17 @@ class Catalog:
         path = self._store / _RECORDINGS / entry.id / file_of(entry, number)
         try:
             with open_log(path, number) as reader:
-                is_ours = not isinstance(reader, GoneLog) or reader.digest() == digest
+                is_ours = not isinstance(reader, GoneLog) or digest.startswith(reader.digest())
                 summary = reader.summary()
         except SegmentError as error:
             raise CatalogError(str(error)) from error
         said = summary.recording.get("id"), summary.recording.get("segment")
         is_ours &= said == (entry.id, number)
-        if not is_ours or {*spans_of(number, summary.table)} - {*entry.spans}:
+        held = entry.held.get(str(number)) if str(number) in entry.files else None
+        table = summary.table if held is None else summary.table.only(held)
+        if not is_ours or {*spans_of(number, table)} - {*entry.spans}:
             raise CatalogError(f"Segment {path} has changed since the store was opened.")
-        return summary.table, self.stamps(entry, number, summary.table)
+        return table, self.stamps(entry, number, table)
 
 
 def _summary_body(summary: RecordingSummary) -> bytes:
@@ -715,17 +717,11 @@ def file_of(entry: RecordingEntry, number: int) -> str:
     return entry.files.get(str(number)) or sealed_name(number)
 
 
-def files_of(entry: RecordingEntry) -> dict[int, str]:
-    """Names of the files of all sealed segments with messages, by number."""
-    numbers = [number for number, _, _ in entry.spans if str(number) in entry.digests]
-    return {number: file_of(entry, number) for number in numbers}
-
-
 def spans_of(number: int, table: ChunkTable) -> list[tuple[int, int, int]]:
     """Number of a segment, first and last log time of its messages, ns; none without any."""
-    if not len(table.chunks):
+    if not len(table.parts):
         return []
-    return [(number, int(table.chunks["first"].min()), int(table.chunks["last"].max()))]
+    return [(number, int(table.parts["first"].min()), int(table.parts["last"].max()))]
 
 
 def channel_entry(channel_id: int, channel: Channel, reason: str | None) -> ChannelEntry:

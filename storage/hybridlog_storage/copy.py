@@ -20,7 +20,7 @@ from hybridlog_storage.merging import check_origin, merged, wanted
 from hybridlog_storage.stopping import pause, safe_point
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Collection, Mapping
     from contextlib import AbstractContextManager
 
     from hybridlog_storage.copy_places import Place, Source
@@ -116,6 +116,7 @@ class _Copy:
         self._due = 0.0  # time from which more may be sent
         self._new: set[str] = set()  # paths of files that the manifest there did not list
         self._proved: dict[str, str] = {}  # digests by path
+        self._damaged: Collection[int] = ()  # numbers of logs that have lost rows there
 
     def known(self) -> Copied | None:
         """The result if there is nothing to copy, found without a lock; None if there is."""
@@ -144,12 +145,14 @@ class _Copy:
             sizes = target.sizes(here.id)
             there = self._find(sizes)
             check_origin(here, there)
-            logs = self._wanted(there)
+            self._damaged = self._find_damaged(there, sizes)
+            believed = self._believed(there)
+            logs = self._wanted(believed)
             if logs and self._how.prepare is not None:
                 here, self._others = stack.enter_context(self._how.prepare(here, logs))
                 logs = [here.logs[log.number] for log in logs]
-            copied = Copied(here, there is None, lacking=_lacking(here, there))
-            self._bring(here, there, logs, sizes, copied)
+            copied = Copied(here, there is None, lacking=_lacking(here, believed))
+            self._bring(here, believed, logs, sizes, copied)
             copied.manifest = self._publish(here, there, {log.number for log in logs})
             self._clear(there, copied.manifest, sizes)
             if self._how.proved is not None:
@@ -158,6 +161,31 @@ class _Copy:
 
     def _wanted(self, there: Manifest | None) -> list[File]:
         return wanted(self._here, there, awaited=self._how.prepare is None)
+
+    def _believed(self, there: Manifest | None) -> Manifest | None:
+        """The manifest there without the logs that are to come again."""
+        files = () if there is None else there.files
+        left = tuple(file for file in files if file.number not in self._damaged)
+        return there and replace(there, files=left)
+
+    def _find_damaged(self, there: Manifest | None, sizes: Mapping[str, int]) -> set[int]:
+        """Numbers of logs that are here, and are gone there with rows that are not here."""
+        if there is None:
+            return set()
+        gone = {n for n, log in there.logs.items() if not log.is_here}
+        gone &= {n for n, log in self._here.logs.items() if log.is_here}
+        return {
+            number
+            for one in {*listed_files(there)} - {*listed_files(self._here)}
+            if (number := int(one.path[:6])) in gone
+            and (self._must_prove or sizes.get(one.path) != one.bytes)
+            and not self._is_whole(one, sizes)
+        }
+
+    def _is_whole(self, file: ListedFile, sizes: Mapping[str, int]) -> bool:
+        reads = file.path not in self._new
+        is_there = sizes.get(file.path) == file.bytes
+        return is_there and self._target.is_whole(self._sending(file), reads=reads)
 
     def _find(self, sizes: Mapping[str, int]) -> Manifest | None:
         """The manifest there; one that is lost or damaged is made again."""
@@ -222,12 +250,10 @@ class _Copy:
         doubtful = [one for one in old if self._must_prove or sizes.get(one.path) != one.bytes]
         self._total = sum(one.bytes for one in (*new, *doubtful))
         for one in (*new, *doubtful):
-            sending = self._sending(one)
-            is_old = one.path not in self._new
-            if sizes.get(one.path) == one.bytes and target.is_whole(sending, reads=is_old):
+            if self._is_whole(one, sizes):
                 self._count(one.bytes, False)
             elif ours.get(one.path) == one:
-                target.send(sending)
+                target.send(self._sending(one))
                 copied.sent.append(one.path)
             else:
                 copied.lost.append(one.path)
@@ -263,7 +289,7 @@ class _Copy:
                 return made
             except RecordingExistsError:
                 pass  # another process was faster
-        return manifests.change(here.id, lambda now: merged(here, now, brought))
+        return manifests.change(here.id, lambda now: merged(here, self._believed(now), brought))
 
     def _check_files(self) -> None:
         """Raise if files are no longer there: a removal that ends takes them along."""

@@ -285,7 +285,9 @@ def account(
     ("seconds", "speed", "quota"),
     [
         (12, 15, 18_000_000),
-        pytest.param(450, 12, 100_000_000, marks=pytest.mark.exhaustive),
+        pytest.param(
+            450, 12, 100_000_000, marks=[pytest.mark.exhaustive, pytest.mark.timeout(1800)]
+        ),
     ],
 )
 def test_every_message_of_a_robot_is_accounted_for(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import struct
 import tempfile
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -75,8 +76,15 @@ def test_a_log_and_its_rows_say_the_same(
             compare(folder, line, made, added=EXPIRED_IDS * (1 if kind == "expired" else 2))
 
 
+def list_rows(folder: Path, line: File, made: Sequence[File]) -> None:
+    """List files of rows in a manifest, and what becomes of their log."""
+    manifest = places.manifest(folder.parent.parent, "log")
+    places.write_in(folder, truth.with_rows(manifest, line, made))
+
+
 def compare(folder: Path, line: File, made: tuple[File, ...], added: int) -> None:
-    rows = RecordingRows(folder, made)
+    list_rows(folder, line, made)
+    rows = RecordingRows(folder)
     with (
         SegmentReader(folder / line.name, line.number) as log,
         open_log(folder / made[0].name, line.number, rows) as gone,
@@ -116,6 +124,7 @@ def test_a_damaged_file_of_rows_is_told(tmp_path: Path) -> None:
     folder, (log, *_) = log_of(tmp_path / "store", [(2, b'{"n": 1}', 1, 1)])
     line = truth.replace(log, gone="expired")
     (made,) = write_rows(folder, line, folder)
+    list_rows(folder, line, [made])
     path = folder / made.name
     whole = path.read_bytes()
     for at in range(0, len(whole), 7):
@@ -129,7 +138,7 @@ def test_a_damaged_file_of_rows_is_told(tmp_path: Path) -> None:
 
 
 def check_all(folder: Path, made: File) -> None:
-    with open_log(folder / made.name, made.number, RecordingRows(folder, [made])) as gone:
+    with open_log(folder / made.name, made.number, RecordingRows(folder)) as gone:
         for place in gone.summary().chunks:
             gone.read_chunk(place)
     RowsFile(folder, made).check()

@@ -14,6 +14,7 @@ from hybridlog.columns.layout import PARTS, TABLES
 from hybridlog.columns.parquet_file import ParquetFileReader
 from hybridlog.columns.tables import Tables
 from hybridlog.maintenance import tables as making
+from hybridlog.maintenance.verify import RESTORE
 from hybridlog.record.marks import MARKS
 from tests import places
 from tests.faults import logs
@@ -115,7 +116,7 @@ def test_a_damaged_chunk_costs_no_table(few: hl.Store) -> None:
     making.make(few.directory, entry, ["/a"])
     assert contents(few) == before
     (finding,) = few.verify().findings
-    assert finding.cure == "restore the file from a copy"
+    assert finding.cure == RESTORE
     few.index.rebuild()
     assert contents(few) == before
     data[2000] ^= 1

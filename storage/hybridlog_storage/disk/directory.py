@@ -34,7 +34,7 @@ from msgspec import structs
 from hybridlog_storage.cells import Cells
 from hybridlog_storage.disk import durability, files
 from hybridlog_storage.errors import HeldError, StoreError, TopicError, unreadable
-from hybridlog_storage.manifest import Manifest
+from hybridlog_storage.manifest import File, Manifest
 from hybridlog_storage.manifests import (
     MANIFEST_LOCK,
     MANIFEST_OLD,
@@ -134,6 +134,10 @@ class Listing:
         others = {*self.others, *self.sealed.values(), *self.rows} - {*sealed.values()} - listed
         return replace(self, sealed=dict(sorted(sealed.items())), others=tuple(sorted(others)))
 
+    def has_all(self, rows: Collection[File]) -> bool:
+        """True if some files of rows are there with their sizes."""
+        return all(self.rows.get(file.name) == file.bytes for file in rows)
+
     def left_over(self, manifest: Manifest) -> list[str]:
         """Files that were to be deleted.
 
@@ -141,10 +145,10 @@ class Listing:
         """
         found, rows = [], manifest.rows
         for number, log in manifest.logs.items():
-            names = {file.name: file.bytes for file in rows.get(number, ())}
+            own = rows.get(number, [])
+            names = {file.name for file in own}
             found += [n for n in self.rows if int(n[:6]) == number and n not in names]
-            is_whole = all(self.rows.get(name) == size for name, size in names.items())
-            if not log.is_here and is_whole and number in self.sealed:
+            if not log.is_here and self.has_all(own) and number in self.sealed:
                 found.append(self.sealed[number])
         there = {**self.sealed, **{int(name[:6]): name for name in self.rows}}
         return found + [n for number, n in there.items() if manifest.has_let_go(number)]

@@ -161,10 +161,14 @@ class GoneLog(SegmentReader):
             if self._rows is None:
                 raise SegmentError("its rows are not at hand")
             batch, seq = self._rows.left(self.number, place.number)
+            channels = {channel % EXPIRED_IDS for channel in place.channels}
+            is_wanted = np.isin(batch.channel, [*channels])
+            if not is_wanted.all():  # of the others, not all files may be there
+                batch, seq = batch.take(is_wanted), seq[is_wanted]
             times = (place.first, place.last)
             is_all = (
                 len(batch)
-                and {*distinct(batch.channel).tolist()} == {c % EXPIRED_IDS for c in place.channels}
+                and {*distinct(batch.channel).tolist()} == channels
                 and (int(batch.log_time.min()), int(batch.log_time.max())) == times
             )
             if not is_all:

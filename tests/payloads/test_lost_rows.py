@@ -1,0 +1,235 @@
+"""A file of rows of a log that is gone is lost: every door says the same, until it is back."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import hybridlog as hl
+from hybridlog.entries import topic_of
+from hybridlog.maintenance import expiry
+from hybridlog.maintenance.copying import CopyOptions
+from hybridlog.maintenance.verify import RESTORE
+from hybridlog_storage.errors import IncompleteError, StoreError
+from hybridlog_storage.manifest import File
+from tests import places
+from tests.cli.within import answer
+from tests.copies import bring
+from tests.payloads.logs import COUNT, messages
+from tests.payloads.test_expiry import TOPICS, answers, expire, recording_of, row_files
+from tests.payloads.test_rows import log_of
+
+FIELDS = {"/scan": "angle_min", "/cloud": "width"}
+
+
+def cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-100])
+
+
+def flip(path: Path, at: int) -> None:
+    data = bytearray(path.read_bytes())
+    data[at] ^= 1
+    path.write_bytes(data)
+
+
+LOSSES: dict[str, Callable[[Path], None]] = {"missing": Path.unlink, "has another size": cut}
+FLIPS = {"page": 900, "footer": -300}
+
+
+@pytest.fixture
+def gone(copy: Path) -> Path:
+    """A store with a log that is gone and had two larger topics."""
+    expire(copy, [0])
+    return copy
+
+
+def rows_of(store: Path, which: int) -> tuple[File, str]:
+    """A file of rows of the first log that is gone, and its topic."""
+    manifest = places.manifest(store, "log")
+    file = manifest.rows[1][which]
+    return file, topic_of(file, manifest)
+
+
+def doors(store: hl.Store, topic: str) -> dict[str, Callable[[], Any]]:
+    """Ways to ask how many messages a topic has."""
+    query, field, table = store.topic(topic), FIELDS[topic], topic[1:]
+    (entry,) = store.recordings()
+    return {
+        "count": query.count,
+        "messages": lambda: sum(1 for message in query if message.fields),
+        "table": lambda: query.fields(field).to_arrow().num_rows,
+        "predicate": lambda: query.where(f"{field} <= 1e9").count(),
+        "between": lambda: query.between("-100s", "end").count(),
+        "sql": lambda: store.sql(f"select count(*) from {table}").rows()[0][0],
+        "sql fields": lambda: store.sql(f"select count({field}) from {table}").rows()[0][0],
+        "sql topics": lambda: store.sql(
+            f"select messages from topics where topic = '{topic}'"
+        ).rows()[0][0],
+        "info": lambda: entry.messages_by_topic()[topic],
+    }
+
+
+@pytest.mark.parametrize("has", ["tables", "nothing", "index"])
+@pytest.mark.parametrize("fault", LOSSES)
+def test_a_lost_file_is_no_message_in_any_door(
+    gone: Path, fault: str, has: str, mongo: str
+) -> None:
+    right = answers(gone)
+    if has == "index":
+        with hl.open(gone, mongo=mongo) as store:
+            store.index.rebuild()
+    else:
+        mongo = "none"
+    file, topic = rows_of(gone, 1)
+    (part,) = file.parts.values()
+    path = recording_of(gone) / file.name
+    whole = path.read_bytes()
+    LOSSES[fault](path)
+    if has == "nothing":
+        shutil.rmtree(gone / "tables")
+    with hl.open(gone, mongo=mongo) as store:
+        found = {name: ask() for name, ask in doors(store, topic).items()}
+        assert found == dict.fromkeys(found, COUNT - part.messages)
+        (entry,) = store.recordings()
+        assert entry.status == "damaged"
+        (loss,) = entry.end["losses"]
+        said = (loss["file"], loss["topic"], loss["count"], loss["from"], loss["to"])
+        assert said == (file.name, topic, part.messages, part.first, part.last)
+        missing = store.topic(topic).completeness()
+        assert (missing.messages, missing.is_exact) == (part.messages, True)
+        with pytest.raises(IncompleteError, match=f"{part.messages} messages are lost"):
+            missing.check()
+        for other in {*TOPICS} - {topic}:
+            assert len([*store.topic(other)]) == right[f"{other} count"]
+        checked = store.verify()
+        assert checked.messages == entry.messages
+        (finding,) = checked.findings
+        assert (finding.place, finding.cure) == (file.name, RESTORE)
+        assert finding.problem == f"{file.name} {fault}" or fault == "missing"
+        assert [one.is_cured for one in store.verify(repair=True) if one.place == file.name] == [
+            False
+        ]
+        told = answer("info", "log", "--losses", "--mongo", "none", store=gone)
+        assert file.name in str(told)
+        path.write_bytes(whole)
+        found = {name: ask() for name, ask in doors(store, topic).items() if name != "info"}
+        assert found == dict.fromkeys(found, COUNT)
+    assert answers(gone) == right
+
+
+def test_the_first_file_lost_takes_its_topic_or_all(gone: Path) -> None:
+    """It says what the log had; where it is only cut, the rest of its log is there."""
+    file, topic = rows_of(gone, 0)
+    _, other = rows_of(gone, 1)
+    path = recording_of(gone) / file.name
+    cut(path)
+    with hl.open(gone, mongo="none") as store:
+        assert len([*store.topic(other)]) == COUNT
+        found = {name: ask() for name, ask in doors(store, topic).items()}
+        assert len({*found.values()}) == 1
+    path.unlink()
+    with hl.open(gone, mongo="none") as store:
+        for one in (topic, other):
+            found = {name: ask() for name, ask in doors(store, one).items()}
+            assert len({*found.values()}) == 1
+        assert [finding.place for finding in store.verify().findings] == [file.name]
+
+
+def test_another_file_of_its_topic_is_not_believed(tmp_path: Path) -> None:
+    """Fields of JSON differ from chunk to chunk, and have several files."""
+    said = [(2, b'{"a%d": 1, "s": "%s"}' % (n // 20, b"x" * 60), n, n) for n in range(60)]
+    folder, (log, *_) = log_of(tmp_path / "store", said)
+    with hl.open(tmp_path / "store", mongo="none") as store:
+        (entry,) = store.recordings()
+        with store.directory.writing(entry.id, entry.name):
+            expiry.expire(store.directory, entry.id, [log.number])
+    files = places.manifest(tmp_path / "store", "log").rows[log.number]
+    assert len(files) > 1
+    (folder / files[-1].name).unlink()
+    with hl.open(tmp_path / "store", mongo="none") as store:
+        query = store.topic("/said")
+        assert (query.count(), len([*query])) == (0, 0)
+        assert query.completeness().messages == 60
+        (entry,) = store.recordings()
+        assert {row["file"] for row in entry.end["losses"]} == {file.name for file in files}
+
+
+@pytest.mark.parametrize("at", FLIPS.values(), ids=FLIPS)
+def test_a_flipped_byte_is_an_error_where_it_is_read(gone: Path, at: int) -> None:
+    file, topic = rows_of(gone, 1)
+    flip(recording_of(gone) / file.name, at)
+    shutil.rmtree(gone / "tables")
+    with hl.open(gone, mongo="none") as store:
+        asked = doors(store, topic)
+        for name in ("count", "between", "sql topics", "info"):  # by the chunk table
+            assert asked.pop(name)() == COUNT
+        for ask in asked.values():
+            with pytest.raises(StoreError, match=rf"{file.name} is damaged.*[Rr]estore"):
+                ask()
+        for other in {*TOPICS} - {topic}:
+            assert [*store.topic(other)]
+        (finding,) = store.verify().findings
+        assert (finding.place, finding.cure) == (file.name, RESTORE)
+
+
+@pytest.mark.parametrize("fault", [*LOSSES.values(), lambda path: flip(path, 900)])
+def test_a_copy_with_the_file_brings_it_back(
+    gone: Path, tmp_path: Path, fault: Callable[[Path], None]
+) -> None:
+    right = answers(gone)
+    with hl.open(tmp_path / "lab", create=True, mongo="none") as lab:
+        bring(lab, gone)
+    for path in row_files(gone):
+        fault(path)
+    with hl.open(tmp_path / "lab", mongo="none") as lab:
+        assert lab.copy(gone, None, CopyOptions(check=True)).copied == ["log"]
+    assert answers(gone) == right
+    with hl.open(gone, mongo="none") as store:
+        assert store.verify().findings == []
+
+
+@pytest.mark.parametrize("only_fields", [False, True])
+def test_a_copy_with_the_segment_brings_it_in_place_of_damaged_rows(
+    copy: Path, tmp_path: Path, only_fields: bool
+) -> None:
+    with hl.open(tmp_path / "lab", create=True, mongo="none") as lab:
+        bring(lab, copy)
+        whole = messages(lab)
+    expire(copy, [0, 1])
+    right = answers(copy)
+    file, _ = rows_of(copy, 1)
+    flip(recording_of(copy) / file.name, 900)
+    options = CopyOptions(check=True, only_fields=only_fields)
+    with hl.open(tmp_path / "lab", mongo="none") as lab:
+        report = lab.copy(copy, None, options)
+        assert (report.copied, report.refused) == (["log"], {})
+        again = lab.copy(copy, None, options)
+        assert (again.copied, again.refused) == ([], {})
+        assert messages(lab) == whole
+    assert answers(copy) == right
+    logs = places.manifest(copy, "log").logs
+    assert logs[1].gone == "elsewhere" if only_fields else logs[1].is_here
+    assert logs[3].gone == "expired"
+    with hl.open(copy, mongo="none") as store:
+        assert store.verify().findings == []
+
+
+@pytest.mark.parametrize("fault", LOSSES.values())
+def test_rows_that_are_lost_before_their_log_goes_are_made_again(
+    copy: Path, fault: Callable[[Path], None]
+) -> None:
+    right = answers(copy)
+    with hl.open(copy, mongo="none") as store:
+        (entry,) = store.recordings()
+        with store.directory.writing(entry.id, entry.name):
+            expiry.make_rows(store.directory, entry.id)
+    file, _ = rows_of(copy, 1)
+    fault(recording_of(copy) / file.name)
+    expire(copy, [0, 1])
+    assert answers(copy) == right
+    with hl.open(copy, mongo="none") as store:
+        assert store.verify().findings == []
