@@ -489,6 +489,36 @@ def test_a_full_disk_is_relieved_and_fields_stay(
     assert not hl.open(path, mongo="none").recordings()[0].end.get("losses")
 
 
+@pytest.mark.parametrize("way", ["missing", "cut", "flipped"])
+def test_a_log_goes_only_once_its_rows_are_whole(store: Path, way: str) -> None:
+    with hl.open(store, mongo="none") as opened:
+        (entry,) = opened.recordings()
+        expiry.make_rows(opened.directory, entry.id)
+    rows = sorted(places.folder(store, "run").glob("*.rows.parquet"))
+    content = rows[1].read_bytes()
+    if way == "missing":
+        rows[1].unlink()
+    else:
+        middle = len(content) // 2
+        rest = content[middle + 1 :] if way == "flipped" else b""
+        rows[1].write_bytes(content[:middle] + bytes([content[middle] ^ 1]) + rest)
+    keep("--topic", "/camera=0s", store=store)
+    assert {*payloads(store).values()} == {None}
+    check_answers(store)
+
+
+def test_the_group_of_a_damaged_log_stays(store: Path) -> None:
+    number = next(n for n, log in logs_of(store).items() if may_go(log))
+    path = places.folder(store, "run") / logs_of(store)[number].name
+    content = bytearray(path.read_bytes())
+    content[len(content) // 3] ^= 1
+    path.write_bytes(content)
+    done = answer("keep", "--quota", "1kB", store=store)
+    assert done.err.count("Its payloads stay until the file is restored from a copy") == 1
+    assert path.read_bytes() == content
+    assert logs_of(store)[number].is_here
+
+
 def test_a_log_that_goes_without_its_fields_is_counted(store: Path, calls: Calls) -> None:
     calls.fail(expiry, "write_rows", DiskFullError)
     keep("--topic", "/camera=0s", store=store)

@@ -260,7 +260,10 @@ def _print_recording(
             *(("", line_of(loss)) for loss in about["losses"]),
             *(("tag", f"{key}={value}") for key, value in sorted(entry.tags.items())),
             *(("note", note["text"]) for note in entry.notes),
-            *(("pin", f"{pin['id']}: {', '.join(filter(None, pin_cells(pin)))}") for pin in entry.pins),
+            *(
+                ("pin", f"{pin['id']}: {', '.join(filter(None, pin_cells(pin)))}")
+                for pin in entry.pins
+            ),
             *(("attachment", f"{one['name']} ({_content(one)})") for one in about["attachments"]),
             *(
                 ("metadata", f"{one['name']} ({', '.join(one['values'])})")

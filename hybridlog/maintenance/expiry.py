@@ -86,13 +86,13 @@ def expire(
     """
     manifest, done = directory.manifests.read(recording), Expired()
     logs = [manifest.logs.get(number) for number in sorted(segments)]
-    if any(log is None or digests.get(log.number, log.digest) != log.digest for log in logs):
+    if any(log and digests.get(log.number, log.digest) != log.digest for log in logs):
         raise ChangedError(f"{manifest.name}: a segment was replaced meanwhile.")
     going = [log for log in logs if log is not None and log.is_here and log.parts]
     if manifest.is_ended:
         _remove_arrays(directory, manifest, going)
-    rows, listing = manifest.rows, directory.listing(recording)
-    ready = [log for log in going if log.number in rows and listing.has_all(rows[log.number])]
+    path, rows = directory.recording(recording), manifest.rows
+    ready = [log for log in going if _are_whole(path, rows.get(log.number, ()))]
     _go(directory, recording, {log.number: () for log in ready}, check, copy)
     late, before = [log for log in going if log not in ready], 0
     report = reporter(progress, manifest.name, sum(log.bytes for log in late))
@@ -120,6 +120,18 @@ def expire(
         before += log.bytes
     done.freed += sum(log.bytes for log in going if log.number not in done.damaged)
     return done
+
+
+def _are_whole(path: Path, rows: Collection[File]) -> bool:
+    """True if files of rows are as listed: they will be all that is left."""
+    from hybridlog.columns.rows_file import RowsFile
+
+    try:
+        for line in rows:
+            RowsFile(path, line).check()
+    except StoreError:
+        return False
+    return bool(rows)
 
 
 def _lines_of(number: int, manifest: Manifest) -> list[File]:
@@ -339,10 +351,17 @@ def _remove(folder: Path, names: Collection[str]) -> None:
     Raises:
         StoreError: One cannot be removed.
     """
+    failure: OSError | None = None
+    for name in names:
+        try:
+            files.unlink(folder / name)
+        except FileNotFoundError:
+            continue
+        except OSError as error:
+            failure = failure or error
     try:
-        for name in names:
-            with suppress(FileNotFoundError):
-                files.unlink(folder / name)
+        if failure is not None:
+            raise failure
         if names:
             files.sync_folder(folder)
     except OSError as error:

@@ -210,7 +210,11 @@ class Keeper:
                 self._unproven.add(manifest.name)
                 continue
             held, failed = held_of(manifest, now), self._failed[manifest.id]
-            left = [s for s in held.segments if s.number not in failed]
+            # Of a damaged log, its group stays, too.
+            left = [
+                replace(s, may_go=False, is_pinned=True) if s.number in failed else s
+                for s in held.segments
+            ]
             if self._own is not None and held.id == self._own.id:
                 unread = self._own.first_unread
                 left = [s for s in left if s.number < unread]
@@ -227,6 +231,8 @@ class Keeper:
             found: Gets what became free, or the problem.
             how: Further arguments of `expire`.
         """
+        if self._failed[step.id] and not step.segments:
+            return  # planned before it was known: the next plan judges again
         check = partial(_check, step, rules)
         try:
             try:
@@ -285,8 +291,6 @@ def _check(step: Step, rules: Rules, manifest: Manifest) -> None:
         raise ChangedError(f"{step.recording}: a tag that keeps it was set meanwhile.")
     if manifest.pins and not step.segments and not step.groups:
         raise ChangedError(f"{step.recording}: a pin was set meanwhile.")
-    if not manifest.logs.keys() >= {*step.segments}:
-        raise ChangedError(f"{step.recording}: a segment was replaced meanwhile.")
     for number, log in manifest.logs.items():
         goes = number in step.segments or log.group in step.groups
         if goes and is_pinned(log, manifest):
