@@ -219,6 +219,55 @@ def content_of(chunk: Chunk) -> bytes:
     return builder.end()
 
 
+@pytest.mark.parametrize("compression", list(CompressionType))
+@pytest.mark.parametrize(
+    ("place", "size"), [(0, 1), (0, 1000), (0, None), (5, 1000), (5, 4500), (5, -40)]
+)
+def test_missing_bytes_cost_no_intact_chunk(
+    compression: CompressionType, place: int, size: int | None, put: Callable[[bytes], Path]
+) -> None:
+    good = make(compression, chunk_size=4000, count=1000)
+    wanted = official(put(good))
+    chunks = [
+        one
+        for one in StreamReader(io.BytesIO(good), emit_chunks=True).records
+        if isinstance(one, Chunk)
+    ]
+    raw_chunks = [content_of(chunk) for chunk in chunks]
+    at = good.index(raw_chunks[place])
+    start, length = (at, len(raw_chunks[place])) if size is None else (at + 80, size)
+    if length < 0:  # of the message indexes behind it
+        start, length = at + len(raw_chunks[place]) + 30, -length
+    bad = good[:start] + good[start + length :]
+    times = {
+        one.log_time
+        for chunk, said in zip(chunks, raw_chunks, strict=True)
+        if said in bad
+        for one in breakup_chunk(chunk)
+        if isinstance(one, Message)
+    }
+    found = read(put(bad))
+    assert found.messages == [message for message in wanted if message.log_time in times]
+    assert 800 < len(times) <= 1000
+    assert sum(lost or 0 for lost in found.lost) == 1000 - len(times)
+
+
+def test_a_chunk_in_a_payload_of_a_damaged_chunk_is_none_of_the_file(
+    put: Callable[[bytes], Path],
+) -> None:
+    out = io.BytesIO()
+    writer = Writer(out, chunk_size=1, compression=CompressionType.NONE)
+    writer.start()
+    channel = writer.register_channel("/a", "log", 0)
+    for i in range(3):
+        writer.add_message(channel, 100 + i, VARIANTS["NONE"], 100 + i)
+    writer.finish()
+    bad = bytearray(out.getvalue())
+    del bad[120:140]
+    found = read(put(bytes(bad)))
+    assert [message.log_time for message in found.messages] == [101, 102]
+
+
 @pytest.mark.parametrize("summary", [True, False])
 @pytest.mark.parametrize("name", ["NONE", "ZSTD"])
 def test_a_record_marked_as_another_kind_gives_no_wrong_payload(

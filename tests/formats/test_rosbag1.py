@@ -15,7 +15,7 @@ import lz4.frame
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from rosbags.rosbag1 import Writer
+from rosbags.rosbag1 import Reader, Writer
 
 from hybridlog.formats import reading
 from hybridlog.formats.reading import BATCH_MESSAGES, Damage, Source
@@ -508,6 +508,27 @@ def test_the_definition_is_found_in_the_index_when_its_chunk_is_lost(tmp_path: P
     found, damage = read_bytes(bytes(data))
     assert 0 < total(found) < total(expected)
     assert [each.messages_lost for each in damage] == [total(expected) - total(found)]
+
+
+@pytest.mark.parametrize("compression", ["none", "bz2", "lz4"])
+@pytest.mark.parametrize("size", [-300, 1, 200, 20_000])
+def test_the_definition_is_found_in_an_index_that_has_moved(
+    tmp_path: Path, compression: str, size: int
+) -> None:
+    path = tmp_path / "a.bag"
+    expected = make(path, compression, chunk=700, messages=2000)
+    good = path.read_bytes()
+    with Reader(path) as reader:
+        start = reader.chunk_infos[0].pos + 60
+        whole = [chunk for chunk in reader.chunk_infos if chunk.pos > start + max(size, 0)]
+    first = min(chunk.start_time for chunk in whole)
+    added = b"\xff" * max(-size, 0)
+    path.write_bytes(good[:start] + added + good[start + max(size, 0) :])
+    found, damage = read(path)
+    for key, messages in expected.items():
+        intact = [message for message in messages if message[0] >= first]
+        assert found[key][-len(intact) :] == intact
+    assert sum(one.messages_lost or 0 for one in damage) == 2000 - total(found)
 
 
 @pytest.mark.parametrize("compression", ["bz2", "lz4"])

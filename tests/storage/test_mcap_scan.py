@@ -354,6 +354,10 @@ def test_a_damaged_summary_is_none() -> None:
         bad = bytearray(data)
         bad[at] ^= 0x41
         assert Scan(io.BytesIO(bytes(bad)), len(data)).summary is None
+    for start in (0, 8, 12, 1 << 63, (1 << 64) - 1):
+        bad = bytearray(data)
+        struct.pack_into("<Q", bad, len(data) - 28, start)
+        assert payloads(items_of(bytes(bad))) == ALL
     assert Scan(io.BytesIO(MAGIC), 8).summary is None
 
 

@@ -62,6 +62,7 @@ _UNDEFINED, _TOO_MANY = -1, -2  # in the place of a channel
 _MAX_HEADER: Final = 1 << 20
 _OP: Final = b"\x04\0\0\0op="
 _LOOK_BACK: Final = 320  # most bytes in front of this field in a header that is searched for
+_MAX_INDEX: Final = 64 << 20  # of an index that is not where the bag header says
 _MAX_FOUND: Final = 4096  # longest header that is searched for
 _WINDOW = 4 << 20  # bytes of messages outside of compressed chunks that are read at once
 _UNSTATED = 16 << 20  # bytes that a chunk may unpack to whatever its header says
@@ -238,7 +239,8 @@ class Rosbag1Source(Source):
         self._numbers: dict[_Connection, int] = {}
         self._left_out: dict[int, Counter[int]] = {_UNDEFINED: Counter(), _TOO_MANY: Counter()}
         self._chunks: list[tuple[int, int]] = []  # by the index: place and number of messages
-        self._index_pos = 0
+        self._index_pos = self._index_said = 0  # the place by the bag header, if it is another
+        self._got = 0
         self._index_is_short = False
         self._zeros: list[range] = []  # between records
         self._passed = 0  # behind the header of the last record, whose length may be wrong
@@ -283,11 +285,27 @@ class Rosbag1Source(Source):
                 "decrypt it with `rosbag decrypt` first"
             )
         self._index_pos = record.number(b"index_pos")
-        if 0 < self._index_pos <= self.size_bytes:
-            self._read_index(record)
+        if self._index_pos and not self._reads_index(record):
+            self._find_index(record)
 
-    def _read_index(self, head: _Record) -> None:
-        """Read connections and chunk list; the list counts only if it is complete."""
+    def _find_index(self, head: _Record) -> None:
+        """Read the index from another place: it moves if bytes before it are missing."""
+        start = max(head.end, self.size_bytes - _MAX_INDEX)
+        last = self._read(start, _MAX_INDEX).rfind(_OP + bytes([_INDEX_DATA]))
+        found = None if last < 0 else self._search(start + last)
+        if found is None:
+            return
+        said, self._index_pos = self._index_pos, found
+        if found != said and self._reads_index(head):
+            self._index_said = said
+            self._chunks = []  # their places are wrong
+        else:
+            self._index_pos = said
+
+    def _reads_index(self, head: _Record) -> bool:
+        """Read connections and chunk list; False if they are not complete."""
+        if self._index_pos > self.size_bytes:
+            return False
         chunks: list[tuple[int, int]] = []
         times: list[int] = []
         connections, pos = 0, self._index_pos
@@ -296,11 +314,11 @@ class Rosbag1Source(Source):
             if record is None and pos > self._index_pos:  # zeros, as some recorders write them
                 end = self._search(pos) or self.size_bytes
                 if not self._are_zeros(pos, end):
-                    return
+                    return False
                 pos = end
                 continue
             if record is None or record.end > min(self.size_bytes, record.start + MAX_PAYLOAD):
-                return
+                return False
             data = self._read(record.start, record.end - record.start)
             if record.op == _CONNECTION:  # that in a chunk may be lost
                 connections += 1
@@ -311,19 +329,20 @@ class Rosbag1Source(Source):
                 chunks.append((record.number(b"chunk_pos"), int(pairs[:, 1].sum(dtype=np.int64))))
                 times += record.time(b"start_time"), record.time(b"end_time")
             else:
-                return
+                return False
             pos = record.end
         wanted = head.number(b"conn_count"), head.number(b"chunk_count")
         # An index truncated between two records is recognized by their number only.
         self._index_is_short = connections < wanted[0] or len(chunks) < wanted[1]
         if (connections, len(chunks)) != wanted:
-            return
+            return False
         self._chunks = sorted(chunks)
         # A bag without chunks has no list of messages.
         if chunks or self._index_pos == head.end:
             self.message_count = sum(count for _, count in chunks)
         if self.message_count:
             self.time_range = (min(times), max(times) + 1)
+        return True
 
     # Records of the file.
 
@@ -404,6 +423,14 @@ class Rosbag1Source(Source):
             reason = f"the file ends before the end of its index, which starts at {self._index_pos}"
             lost = 0 if self._index_is_short else None
             self._report(self.size_bytes, None, f"{reason}: it was cut short", lost)
+        if self._index_said:
+            told = sum(damage.messages_lost or 0 for damage in self.damage)
+            missing = max(0, (self.message_count or 0) - self._got - told)
+            reason = (
+                f"the bag header says that the index starts at {self._index_said}, it starts at "
+                f"{self._index_pos}: bytes have been lost, added or changed"
+            )
+            self._report(None, None, reason, missing)
         self._report_rest()
 
     def _step(self, pos: int) -> Generator[Batch, None, int]:
@@ -551,6 +578,7 @@ class Rosbag1Source(Source):
             self._meaning[conn] = meaning
         channel[done:] = self._channels(ids[done:])
         place.got += count
+        self._got += count
         batch = Batch(
             data, table[:, 0], table[:, 1], channel, times, times, np.zeros(count, np.uint32)
         )

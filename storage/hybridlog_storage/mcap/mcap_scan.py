@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import struct
 from contextlib import suppress
+from functools import cached_property
 from io import BytesIO
 from typing import TYPE_CHECKING, BinaryIO, Final, TypeAlias
 
@@ -56,6 +57,7 @@ _CODECS: Final = frozenset({"", "zstd", "lz4"})
 _WINDOW: Final = 1 << 20
 _MAX_PLAIN: Final = 1 << 26  # largest record that is neither chunk, message nor attachment
 _MAX_SUMMARY: Final = 1 << 28
+_MAX_MOVED: Final = 1 << 26  # of a summary that is not where the footer says
 _ANOTHER: Final = MAGIC + bytes([Opcode.HEADER])  # the beginning of another file
 _MAX_WHOLE: Final = 64 << 20  # content of a chunk that is decompressed at once
 
@@ -101,6 +103,7 @@ class Scan:
         # End of the fields of the last record. If its length was wrong, the search for the next
         # one starts here.
         self._behind = self._at
+        self._last = self._at  # start of the last record
         self._has_ended = False  # the data, and the summary follows
         self._is_first = True  # of logs whose bytes follow one another
         self._needs_crc = False  # messages have no checksum of their own
@@ -120,16 +123,29 @@ class Scan:
             return
         opcode, length, start, _, crc = _FOOTER.unpack_from(tail)
         is_footer = (opcode, length, bytes(tail[_FOOTER.size :])) == (Opcode.FOOTER, 20, MAGIC)
-        if not is_footer or not len(MAGIC) <= start <= end or end - start > _MAX_SUMMARY:
+        if not is_footer or start < len(MAGIC) + HEAD + 4:
             return
-        if bytes(self._read(start - HEAD - 4, HEAD)) == _DATA_END:
+        is_there = self._bytes.at(start - HEAD - 4, HEAD) == _DATA_END
+        if self._parse_summary(start, end, crc) or is_there:
             self._stop = start
-        data = self._read(start, end - start + _FOOTER.size - 4)
-        try:
-            if crc in {0, crc32(data)}:
-                self.summary, self._stop = parse_summary(data[: end - start])[0], start
-        except SegmentError:
             return
+        # Where bytes of the data are missing, the summary begins before that place. Behind it
+        # begins that of another log, whose bytes follow.
+        first = max(len(MAGIC), end - _MAX_MOVED)
+        found = bytes(self._read(first, end - first)).rfind(_DATA_END)
+        moved = first + found + HEAD + 4
+        if found >= 0 and moved < start and self._parse_summary(moved, end, crc):
+            self._stop = moved
+
+    def _parse_summary(self, start: int, end: int, crc: int) -> bool:
+        """Read the summary, if it starts there."""
+        if not 0 <= end - start <= _MAX_SUMMARY:
+            return False
+        data = self._read(start, end - start + _FOOTER.size - 4)
+        with suppress(SegmentError):
+            if crc in {0, crc32(data)}:
+                self.summary = parse_summary(data[: end - start])[0]
+        return self.summary is not None
 
     def items(self) -> Iterator[tuple[int, Item]]:
         """All items from the start to the end of the file.
@@ -174,6 +190,7 @@ class Scan:
         else:
             opcode, length = RECORD_HEAD.unpack(head)
             yield from self._record(at, opcode, at + HEAD + length)
+            self._last = at
 
     def _record(self, at: int, opcode: int, end: int) -> Iterator[tuple[int, Item]]:
         chunk = self._chunk_head(at)
@@ -226,8 +243,40 @@ class Scan:
         except SegmentError as error:
             reason = reason or f"a chunk is damaged: {error}"
         if reason:
+            another = self._chunk_before(end, chunk.start)
+            if another is not None:
+                self._at = self._behind = end = another
+                reason, self._is_torn = "bytes of a chunk are missing", False
             before = f"; {found} messages of its beginning were read" if found else ""
             yield _damage(at, end - at, reason + before)
+
+    def _chunk_before(self, end: int, start: int) -> int | None:
+        """The next chunk, if it begins before the end that the last record claims.
+
+        That record lacks bytes then. Only a chunk of the summary counts: one in the payload of a
+        message is none of this file.
+        """
+        return self._bytes.search(start, end + HEAD - 1, {Opcode.CHUNK}, self._is_listed)
+
+    @cached_property
+    def _listed(self) -> set[tuple[int, int, int, int, str]]:
+        """What the summary says of each chunk, wherever it starts."""
+        return {
+            (
+                one.message_start_time,
+                one.message_end_time,
+                one.chunk_length,
+                one.uncompressed_size,
+                one.compression,
+            )
+            for one in (self.summary.chunk_indexes if self.summary else ())
+        }
+
+    def _is_listed(self, at: int) -> bool:
+        head = self._chunk_head(at)
+        return head is not None and (
+            (head.first, head.last, head.length, head.size, head.codec) in self._listed
+        )
 
     def _contents(self, chunk: ChunkHead, end: int) -> Iterator[ChunkContent]:
         """The records of a chunk, after comparing its checksum; no checksum covers a torn one.
@@ -416,7 +465,11 @@ class Scan:
         """Skip to the next records that are whole."""
         start = self._behind if self._behind < at else at + 1
         kinds = _BETWEEN_CHUNKS if self._chunked else _IN_DATA
-        found = self._bytes.search(start, self._end_of_data, kinds, self._is_start) or self._stop
+        found = (
+            self._chunk_before(at, self._last + 1)
+            or self._bytes.search(start, self._end_of_data, kinds, self._is_start)
+            or self._stop
+        )
         if found is None:
             return self._torn(at, f"the file ends in the middle of a record: {reason}")
         where = min(at, self._behind, found)
