@@ -97,8 +97,8 @@ def repair(
     return done
 
 
-def _repair_one(directory: StoreDirectory, repairs: RepairReport, recording: str) -> list[Repaired]:
-    done = _put_manifest_right(directory, repairs, recording)
+def _repair_one(directory: StoreDirectory, report: RepairReport, recording: str) -> list[Repaired]:
+    done = _manifest(directory, report, recording)
     rebuilt, lost = _segments(directory.recording(recording), take_inventory(directory, recording))
     done += rebuilt
     inventory = take_inventory(directory, recording)
@@ -134,9 +134,7 @@ def _segments(path: Path, inventory: Inventory) -> tuple[list[Repaired], list[Re
     return rebuilt, told
 
 
-def _put_manifest_right(
-    directory: StoreDirectory, repairs: RepairReport, recording: str
-) -> list[Repaired]:
+def _manifest(directory: StoreDirectory, report: RepairReport, recording: str) -> list[Repaired]:
     manifests, manifest = directory.manifests, None
     with suppress(ManifestError):
         manifest = manifests.find(recording)
@@ -152,7 +150,7 @@ def _put_manifest_right(
         made = manifests.restore(recording, make)
         return [Repaired(made.name, "manifest", "made again")]
     if left := directory.listing(recording).left_over(manifest):
-        recover(directory, recording, repairs)
+        recover(directory, recording, report)
     done = [Repaired(manifest.name, file, "left over, and removed") for file in left]
     inventory = take_inventory(directory, recording)
     if (adopt := unlisted(inventory)) is None:

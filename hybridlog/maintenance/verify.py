@@ -9,7 +9,7 @@ from shlex import quote
 from typing import TYPE_CHECKING
 
 from hybridlog.columns import rows_file
-from hybridlog.entries import describe, steady_inventory, topic_of
+from hybridlog.entries import describe, state_of, steady_inventory, topic_of
 from hybridlog.maintenance import tables
 from hybridlog_storage.disk.directory import LOCK
 from hybridlog_storage.errors import ManifestError, SegmentError, StoreError
@@ -200,11 +200,13 @@ class _Check:
             StoreError: The recording cannot be read at all.
         """
         holder = self._directory.holder(self._recording)
-        is_held = holder is not None
         self._directory.look_closely(self._recording)
         inventory = steady_inventory(self._directory, self._recording)
+        listing, manifest = self._directory.listing(self._recording), inventory.manifest
+        is_same = manifest is not None and state_of(listing, manifest) == inventory.state
+        left = listing.left_over(manifest) if manifest is not None and is_same else []
         self._name = inventory.name
-        self._manifest(inventory.manifest)
+        self._manifest(manifest)
         self._check_rows(inventory)
         sealed, summaries = inventory.listing.sealed, inventory.summaries
         sizes = {n: s.size for n, s in summaries.items() if not is_rows(sealed[n])}
@@ -218,8 +220,8 @@ class _Check:
 
             self._segment(inventory, number, name, tell)
             before += sizes.get(number, 0)
-        self._files(inventory, is_held=is_held)
-        if inventory.manifest is None:
+        self._files(inventory, left, is_held=holder is not None)
+        if manifest is None:
             return
         is_open = holder is not None and holder.is_recording
         entry = describe(self._catalog, inventory, is_open=is_open).entry
@@ -242,7 +244,7 @@ class _Check:
                 "compare with a copy, if there is one; nothing else can prove it",
             )
 
-    def _files(self, inventory: Inventory, *, is_held: bool) -> None:
+    def _files(self, inventory: Inventory, left: list[str], *, is_held: bool) -> None:
         for misfit in inventory.misfits:
             if misfit.file in self._told and not misfit.is_unlisted:
                 continue
@@ -252,14 +254,10 @@ class _Check:
         for name in inventory.listing.open.values():
             if not is_held:
                 self.found(name, "a crash has left it open", "open the store with write permission")
-        left = set[str]()
-        if inventory.manifest is not None:
-            left.update(self._directory.listing(self._recording).left_over(inventory.manifest))
-        for name in sorted(left.union(inventory.listing.others) - _KNOWN):
-            if name not in left:
-                self.found(name, "it is not a file of a recording", "move it out of the store")
-            elif not is_held:
-                self.found(name, "it was left over by a command that was stopped", _REPAIR)
+        for name in sorted({*inventory.listing.others} - {*left, *_KNOWN}):
+            self.found(name, "it is not a file of a recording", "move it out of the store")
+        for name in () if is_held else left:
+            self.found(name, "it was left over by a command that was stopped", _REPAIR)
 
     def _check_rows(self, inventory: Inventory) -> None:
         """Check every byte of the files of rows."""

@@ -125,7 +125,7 @@ def test_a_damaged_chunk_costs_no_table(few: hl.Store) -> None:
     assert compare(few) == 90
 
 
-def test_repair_makes_missing_tables(few: hl.Store) -> None:
+def test_repair_makes_missing_tables(few: hl.Store, limit: Limit) -> None:
     before = contents(few)
     for path in (few.directory.path / TABLES).glob("*/*.parquet"):
         path.unlink()
@@ -136,6 +136,19 @@ def test_repair_makes_missing_tables(few: hl.Store) -> None:
     ]
     assert contents(few) == before
     assert not few.verify(repair=True)
+    path = next((few.directory.path / TABLES).glob("*/*.parquet"))
+    data = bytearray(path.read_bytes())
+    data[1000:1400] = bytes(400)
+    path.write_bytes(data)
+    topics = [(one.place, False) for one in few.verify().findings]
+    limit(table_reserve_bytes=1 << 60)
+    done = few.verify(repair=True)
+    assert [(one.place, one.is_cured) for one in done] == topics
+    assert topics
+    assert all("MiB of the disk are free" in one.done for one in done)
+    limit(table_reserve_bytes=0)
+    assert [one.is_cured for one in few.verify(repair=True)] == [True] * len(topics)
+    assert contents(few) == before
 
 
 def test_rows_of_another_segment_are_not_kept(few: hl.Store) -> None:
