@@ -44,7 +44,7 @@ def verify_command(given: _Given) -> None:
 
     Exits with 1 when it finds a problem, and prints a cure for each. With --repair, it restores
     the names of segments, makes damaged summaries and lost manifests again, and brings catalog and
-    index up to date; it exits with 1 when only a copy can restore the rest.
+    index up to date; it exits with 1 when something is left, as what only a copy restores.
     """
     if given.repair:
         _repair(given)

@@ -463,7 +463,7 @@ class TableWriter:
 
     def _check_room(self) -> None:
         if shutil.disk_usage(self._root).free < _RESERVE:
-            raise OSError(errno.ENOSPC, f"less than {_RESERVE >> 20} MiB of the disk are free; make room")
+            raise OSError(errno.ENOSPC, f"the disk needs {_RESERVE >> 20} MiB free; make room")
 
     def _cut_segment(self, segment: int, digest: str) -> None:
         """Finish the files of a segment; topics with few rows wait for the next one."""
