@@ -36,6 +36,7 @@ def opened_store(
     is_lasting: bool = False,
     snapshot: bool = False,
     records: bool = False,
+    verifies: bool = False,
     **how: Any,
 ) -> Iterator[Store]:
     """The open store, in a block around which its repairs are reported.
@@ -47,6 +48,7 @@ def opened_store(
         is_lasting: What the command meets is repaired while it goes on.
         snapshot: All that the command asks is of one moment.
         records: The command records, also while MongoDB is unavailable.
+        verifies: The command says itself what `hybridlog verify --repair` cures.
         how: Of `open_store`; what is not recovered is reported by another opening.
     """
     from hybridlog_storage.lazy import import_numpy_late
@@ -74,7 +76,7 @@ def opened_store(
             target = store.shared.index.index_to_record("Recording")
             doing = "so the index is made later" if target.is_wanted else "so there is no index"
         if recover:
-            notes(_recovered(store))
+            notes(_recovered(store, verifies=verifies))
         _print_rebuilt(store, doing)
         told = {*store.repairs.unreadable}
         try:
@@ -82,7 +84,8 @@ def opened_store(
             store.mend()
             _print_left(store)
         finally:
-            notes(_unreadable(store, store.repairs.unreadable.keys() - told))
+            new = store.repairs.unreadable.keys() - told
+            notes(_unreadable(store, new, verifies=verifies))
             _print_rebuilt(store, "" if records else doing)
 
 
@@ -107,14 +110,14 @@ def _reads() -> bool:
     return context is not None and any(context.info_name in GROUPS[one] for one in _READING)
 
 
-def _recovered(store: Store) -> Iterator[str]:
+def _recovered(store: Store, *, verifies: bool) -> Iterator[str]:
     """Sentences about recordings that were repaired, or cannot be, when the store was opened."""
     repairs = store.repairs
     for recording, segments in repairs.recovered.items():
         kept = counted(sum(one.messages for one in segments), "message")
         yield f"Recording {recording} was cut short by a crash: {kept} of it are recovered."
         yield from (f"  damaged: {damage}" for one in segments for damage in one.damage)
-    yield from _unreadable(store, repairs.unreadable)
+    yield from _unreadable(store, repairs.unreadable, verifies=verifies)
     if repairs.disk_full is not None:
         yield (
             "The disk of the store is full, so nothing in it is repaired or noted. Remove "
@@ -124,9 +127,11 @@ def _recovered(store: Store) -> Iterator[str]:
         yield f"The store {store.directory.path} is read-only; its segments answer."
 
 
-def _unreadable(store: Store, recordings: Iterable[str]) -> Iterator[str]:
+def _unreadable(store: Store, recordings: Iterable[str], *, verifies: bool) -> Iterator[str]:
     for recording in recordings:
-        yield f"Recording {recording} cannot be read: {store.repairs.unreadable[recording]}"
+        reason = store.repairs.unreadable[recording]
+        if not (verifies and "`hybridlog verify --repair`" in reason):
+            yield f"Recording {recording} cannot be read: {reason}"
 
 
 def _print_rebuilt(store: Store, doing: str) -> None:

@@ -44,13 +44,13 @@ def verify_command(given: _Given) -> None:
 
     Exits with 1 when it finds a problem, and prints a cure for each. With --repair, it restores
     the names of segments, makes damaged summaries and lost manifests again, and brings catalog and
-    index up to date; it exits with 1 when only a copy can restore the rest.
+    index up to date; it exits with 1 when something is left, as what only a copy restores.
     """
     if given.repair:
         _repair(given)
         return
     started = time.monotonic()
-    with given.opened(quiet=given.quiet) as store:
+    with given.opened(quiet=given.quiet, verifies=True) as store:
         chosen, unreadable = _chosen(given, store)
         total = sum(entry.stored_bytes for entry in chosen)
         names = None if given.choice.is_everything else [*(one.id for one in chosen), *unreadable]
@@ -114,7 +114,7 @@ def _repair(given: _Given) -> None:
 
         become_another(store_path(given.store), given.mongo)
         output.note("The store has a new id now.")
-    with given.opened(quiet=given.quiet) as store:
+    with given.opened(quiet=given.quiet, verifies=True) as store:
         if given.moved:
             store.shared.index.take_over()
             output.note("The index belongs to the store at this place now.")

@@ -275,7 +275,7 @@ class TableWriter:
         self._has_parts = False
         self._numbers = 0
         self._has_ended = False
-        self.has_failed = False
+        self.problem = ""  # why no table was written
         self._held: list[StoredChunk] = []  # of one segment
         self._channels: dict[int, Channel] = {}
         self._has_grown = False  # rows were decoded since the last look at their size
@@ -339,9 +339,8 @@ class TableWriter:
         try:
             yield
         except Exception as error:
-            self.has_failed = True
-            reason = getattr(error, "strerror", None) or error or repr(error)
-            _log.warning("Recording %s has no tables yet: %s", self._name, reason)
+            self.problem = str(getattr(error, "strerror", None) or error or repr(error))
+            _log.warning("No tables of recording %s were written: %s", self._name, self.problem)
             self.discard()
 
     # From chunks to rows in memory.
@@ -464,7 +463,7 @@ class TableWriter:
 
     def _check_room(self) -> None:
         if shutil.disk_usage(self._root).free < _RESERVE:
-            raise OSError(errno.ENOSPC, "the disk is nearly full")
+            raise OSError(errno.ENOSPC, f"the disk needs {_RESERVE >> 20} MiB free; make room")
 
     def _cut_segment(self, segment: int, digest: str) -> None:
         """Finish the files of a segment; topics with few rows wait for the next one."""

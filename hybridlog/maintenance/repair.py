@@ -18,7 +18,7 @@ from hybridlog.entries import (
 )
 from hybridlog.maintenance import tables
 from hybridlog.maintenance.index import StoreIndex
-from hybridlog.maintenance.opening import recover_segments
+from hybridlog.maintenance.opening import recover, recover_segments
 from hybridlog.maintenance.verify import RESTORE, damaged_files
 from hybridlog_storage.catalog import file_of
 from hybridlog_storage.disk.directory import LOCK_WAIT_S
@@ -82,12 +82,13 @@ def repair(
     for recording, name in ({one: one for one in all_ids} if names is None else names).items():
         try:
             with directory.writing(recording, name, wait_s=LOCK_WAIT_S):
-                done += _repair_one(directory, catalog, recording)
+                done += _repair_one(directory, repairs, recording)
                 entry = put_entry(directory, catalog, recording)
             if entry.status not in {"damaged", "open"}:
                 # Tables of lost data are valid again after its restoration.
-                made = checker.repair(entry)
-                done += [Repaired(entry.name, f"table of {topic}", "made again") for topic in made]
+                for topic, why in checker.repair(entry).items():
+                    what = f"it cannot be made again: {why}" if why else "made again"
+                    done.append(Repaired(entry.name, f"table of {topic}", what, is_cured=not why))
         except HeldError as error:
             if names is not None or recording in repairs.unreadable:
                 done.append(Repaired(name, "recording", str(error), is_cured=False))
@@ -96,14 +97,14 @@ def repair(
     return done
 
 
-def _repair_one(directory: StoreDirectory, catalog: Catalog, recording: str) -> list[Repaired]:
-    done = _put_manifest_right(directory, recording)
+def _repair_one(directory: StoreDirectory, report: RepairReport, recording: str) -> list[Repaired]:
+    done = _manifest(directory, report, recording)
     rebuilt, lost = _segments(directory.recording(recording), take_inventory(directory, recording))
     done += rebuilt
     inventory = take_inventory(directory, recording)
     for misfit in inventory.misfits:
         place = misfit.file or f"segment {misfit.segment}"
-        what = f"{misfit.reason}; {RESTORE}"
+        what = f"{misfit.reason.removesuffix('.')}; {RESTORE}"
         done.append(Repaired(inventory.name, place, what, is_cured=False))
     return [*done, *lost]
 
@@ -133,13 +134,11 @@ def _segments(path: Path, inventory: Inventory) -> tuple[list[Repaired], list[Re
     return rebuilt, told
 
 
-def _put_manifest_right(directory: StoreDirectory, recording: str) -> list[Repaired]:
-    manifests = directory.manifests
-    try:
-        is_lost = manifests.find(recording) is None
-    except ManifestError:
-        is_lost = True
-    if is_lost:
+def _manifest(directory: StoreDirectory, report: RepairReport, recording: str) -> list[Repaired]:
+    manifests, manifest = directory.manifests, None
+    with suppress(ManifestError):
+        manifest = manifests.find(recording)
+    if manifest is None:
         recover_segments(directory, recording, directory.listing(recording), None)
 
         def make(old: Manifest | None) -> Manifest:
@@ -150,12 +149,15 @@ def _put_manifest_right(directory: StoreDirectory, recording: str) -> list[Repai
 
         made = manifests.restore(recording, make)
         return [Repaired(made.name, "manifest", "made again")]
+    if left := directory.listing(recording).left_over(manifest):
+        recover(directory, recording, report)
+    done = [Repaired(manifest.name, file, "left over, and removed") for file in left]
     inventory = take_inventory(directory, recording)
     if (adopt := unlisted(inventory)) is None:
-        return []
+        return done
     manifests.change(recording, adopt)
     names = [misfit.file for misfit in inventory.misfits if misfit.is_unlisted]
-    return [Repaired(inventory.name, file, "listed in the manifest") for file in names]
+    return done + [Repaired(inventory.name, file, "listed in the manifest") for file in names]
 
 
 def repair_index(

@@ -55,7 +55,7 @@ def make(
     *,
     until: float = math.inf,
     progress: Progress | None = None,
-) -> bool:
+) -> str:
     """Create tables of a recording again from its segments.
 
     Args:
@@ -66,17 +66,16 @@ def make(
         progress: Called after each chunk.
 
     Returns:
-        True if tables were created; False if the recording is being written, or the store is
-            read-only.
+        Why no tables were created; empty if nothing is missing.
 
     Raises:
         TimeoutError: It was given up.
     """
     if entry.status == "open" or not directory.is_writable:
-        return False
+        return "the recording is being written, or the store is read-only"
     wanted = missing(directory, entry) if topics is None else {*topics}
     if not wanted:
-        return True
+        return ""
     try:
         with directory.writing(entry.id):
             from hybridlog.columns.table_writer import TableWriter
@@ -96,9 +95,9 @@ def make(
                 writer.close(entry)
             finally:
                 writer.discard()
-    except (StoreError, TopicError):
-        return False
-    return not writer.has_failed
+    except (StoreError, TopicError) as error:
+        return str(error)
+    return writer.problem
 
 
 def can_be_made(entry: RecordingEntry, topic: str, tables: Tables) -> bool:
@@ -124,10 +123,10 @@ def make_noted(
     """
     wanted = {*topics, *missing(directory, entry, tables)}
     try:
-        is_made = make(directory, entry, wanted, until=until)
+        problem = make(directory, entry, wanted, until=until)
     except TimeoutError:
         return False
-    if is_made:
+    if not problem:
         tables.look_again()
         made = (one for one in sorted(wanted) if tables.of(entry, one) is not None)
         report.tables += [(entry.name, one) for one in made]
@@ -149,13 +148,16 @@ class TableChecker:
         self._tables = Tables(directory.path)
         self._checked: dict[int, str] = {}
 
-    def repair(self, entry: RecordingEntry) -> list[str]:
-        """Make missing and damaged tables of a recording again; returns their topics."""
+    def repair(self, entry: RecordingEntry) -> dict[str, str]:
+        """Make missing and damaged tables again; by topic, why that failed, or nothing."""
         wanted = missing(self._directory, entry, self._tables).union(self.damage(entry))
-        if not wanted or not make(self._directory, entry, wanted):
-            return []
+        if not wanted:
+            return {}
+        problem = make(self._directory, entry, wanted)
         self._tables.look_again()
-        return sorted(wanted - missing(self._directory, entry, self._tables))
+        lacking, damaged = missing(self._directory, entry, self._tables), self.damage(entry)
+        found = {topic: problem or damaged.get(topic, "") for topic in sorted(wanted)}
+        return {one: why for one, why in found.items() if why or one not in lacking}
 
     def damage(self, entry: RecordingEntry) -> dict[str, str]:
         """Problems of the existing tables, by topic. Reads every byte of them."""

@@ -9,7 +9,7 @@ from shlex import quote
 from typing import TYPE_CHECKING
 
 from hybridlog.columns import rows_file
-from hybridlog.entries import describe, steady_inventory, topic_of
+from hybridlog.entries import describe, state_of, steady_inventory, topic_of
 from hybridlog.maintenance import tables
 from hybridlog_storage.disk.directory import LOCK
 from hybridlog_storage.errors import ManifestError, SegmentError, StoreError
@@ -101,7 +101,8 @@ def verify(
             check.run(progress)
         except ManifestError as error:
             cure = RESTORE if directory.is_remote else _REPAIR
-            result.findings.append(Finding(recording, "manifest", str(error), cure))
+            problem = str(error).removesuffix(f" {directory.manifests.cure}")
+            result.findings.append(Finding(recording, "manifest", problem, cure))
         except StoreError as error:
             cure = "restore its files"
             result.findings.append(Finding(recording, "recording", str(error), cure))
@@ -184,8 +185,7 @@ class _Check:
         self._result = result
         self._path = directory.recording(recording)
         self._lost: Counter[str] = Counter()  # messages of chunks that cannot be read
-        self._is_damaged = False
-        self._has_index = False
+        self._told: set[str] = set()  # logs whose damage is found
 
     def found(self, place: str, problem: str, cure: str) -> None:
         """Add a problem."""
@@ -200,25 +200,28 @@ class _Check:
             StoreError: The recording cannot be read at all.
         """
         holder = self._directory.holder(self._recording)
-        is_held = holder is not None
-        self._has_index = not is_held
         self._directory.look_closely(self._recording)
         inventory = steady_inventory(self._directory, self._recording)
+        listing, manifest = self._directory.listing(self._recording), inventory.manifest
+        is_same = manifest is not None and state_of(listing, manifest) == inventory.state
+        left = listing.left_over(manifest) if manifest is not None and is_same else []
         self._name = inventory.name
-        self._manifest(inventory.manifest)
-        self._files(inventory, is_held=is_held)
+        self._manifest(manifest)
         self._check_rows(inventory)
-        total = sum(summary.size for summary in inventory.summaries.values())
+        sealed, summaries = inventory.listing.sealed, inventory.summaries
+        sizes = {n: s.size for n, s in summaries.items() if not is_rows(sealed[n])}
+        total = sum(sizes.values())
         before = 0
-        for number, name in inventory.listing.sealed.items():
+        for number, name in sealed.items():
 
             def tell(at: int, before: int = before) -> None:
                 if progress is not None and total:
                     progress(self._name, min(before + at, total), total)
 
             self._segment(inventory, number, name, tell)
-            before += inventory.summaries[number].size if number in inventory.summaries else 0
-        if inventory.manifest is None:
+            before += sizes.get(number, 0)
+        self._files(inventory, left, is_held=holder is not None)
+        if manifest is None:
             return
         is_open = holder is not None and holder.is_recording
         entry = describe(self._catalog, inventory, is_open=is_open).entry
@@ -241,28 +244,31 @@ class _Check:
                 "compare with a copy, if there is one; nothing else can prove it",
             )
 
-    def _files(self, inventory: Inventory, *, is_held: bool) -> None:
+    def _files(self, inventory: Inventory, left: list[str], *, is_held: bool) -> None:
         for misfit in inventory.misfits:
+            if misfit.file in self._told and not misfit.is_unlisted:
+                continue
             place = misfit.file or f"segment {misfit.segment}"
             cure = _REPAIR if misfit.file else _RESTORE_LOST
             self.found(place, misfit.reason, RESTORE if is_rows(misfit.file) else cure)
         for name in inventory.listing.open.values():
             if not is_held:
                 self.found(name, "a crash has left it open", "open the store with write permission")
-        for name in inventory.listing.others:
-            if name not in _KNOWN:
-                self.found(name, "it is not a file of a recording", "move it out of the store")
+        for name in sorted({*inventory.listing.others} - {*left, *_KNOWN}):
+            self.found(name, "it is not a file of a recording", "move it out of the store")
+        for name in () if is_held else left:
+            self.found(name, "it was left over by a command that was stopped", _REPAIR)
 
     def _check_rows(self, inventory: Inventory) -> None:
         """Check every byte of the files of rows."""
         for file, problem in damaged_files(self._path, inventory):
-            self._is_damaged = True
             self.found(file.name, problem, RESTORE)
             if inventory.manifest is not None and not inventory.logs[file.number].is_here:
                 lost = sum(part.messages for part in file.parts.values())
                 self._lost[collection_of(topic_of(file, inventory.manifest))] += lost
                 self._result.messages -= lost
-        self._result.bytes_read += sum(file.bytes for file in inventory.rows)
+        here = (file for file in inventory.rows if inventory.listing.has_all([file]))
+        self._result.bytes_read += sum(file.bytes for file in here)
 
     def _segment(
         self, inventory: Inventory, number: int, name: str, tell: Callable[[int], None]
@@ -275,15 +281,15 @@ class _Check:
                 log = inventory.logs.get(number)
                 digest = "" if log is None else log.digest
                 found, has_summary = damage_of(self._path / name, digest, tell)
-                self._is_damaged |= bool(found)
+                cure = RESTORE if has_summary or found[1:] else _REPAIR
                 for at, problem, chunk in found:
-                    cure = RESTORE if has_summary else _REPAIR
+                    self._told.add(name)
                     self.found(f"{name} byte {at}", problem, cure)
                     lost += [] if chunk is None else [chunk]
         except SegmentError as error:
             now = self._directory.manifests.find(self._recording)
             if now is None or not now.has_let_go(number):
-                self._is_damaged = True
+                self._told.add(name)
                 self.found(name, str(error), RESTORE)
             return
         if summary is None:
@@ -293,9 +299,10 @@ class _Check:
                 topic = summary.channels[int(part["channel"])].topic
                 self._lost[collection_of(topic)] += int(part["messages"])
                 self._result.messages -= int(part["messages"])
-        self._result.chunks += len(summary.table.chunks) - len(lost)
+        if not is_rows(name):
+            self._result.chunks += len(summary.table.chunks) - len(lost)
+            self._result.bytes_read += summary.size
         self._result.messages += sum(summary.counts.values())
-        self._result.bytes_read += summary.size
 
     @property
     def _rebuild(self) -> str:

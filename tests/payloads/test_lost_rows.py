@@ -229,7 +229,18 @@ def test_rows_that_are_lost_before_their_log_goes_are_made_again(
             expiry.make_rows(store.directory, entry.id)
     file, _ = rows_of(copy, 1)
     fault(recording_of(copy) / file.name)
+    logs = {path: path.read_bytes() for path in recording_of(copy).glob("*.mcap")}
     expire(copy, [0, 1])
     assert answers(copy) == right
+    left = next(path for path in logs if not path.exists())
     with hl.open(copy, mongo="none") as store:
+        checked = store.verify()
+        assert checked.findings == []
+        stored = sum(path.stat().st_size for path in recording_of(copy).iterdir())
+        assert 0.9 * stored < checked.bytes_read < 1.1 * stored
+        left.write_bytes(logs[left])
+        (finding,) = store.verify().findings
+        assert (finding.place, finding.problem[:16]) == (left.name, "it was left over")
+        (mended,) = store.verify(repair=True)
+        assert (mended.place, mended.is_cured, left.exists()) == (left.name, True, False)
         assert store.verify().findings == []

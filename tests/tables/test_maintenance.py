@@ -100,7 +100,7 @@ def test_only_what_is_missing_is_made(few: hl.Store, tmp_path: Path, limit: Limi
     kept = other.stat().st_mtime_ns
     one.unlink()
     assert len(making.missing(few.directory, entry)) == 1
-    assert making.make(few.directory, entry)
+    assert not making.make(few.directory, entry)
     assert other.stat().st_mtime_ns == kept
     assert compare(few) == 2490
 
@@ -125,7 +125,7 @@ def test_a_damaged_chunk_costs_no_table(few: hl.Store) -> None:
     assert compare(few) == 90
 
 
-def test_repair_makes_missing_tables(few: hl.Store) -> None:
+def test_repair_makes_missing_tables(few: hl.Store, limit: Limit) -> None:
     before = contents(few)
     for path in (few.directory.path / TABLES).glob("*/*.parquet"):
         path.unlink()
@@ -136,6 +136,19 @@ def test_repair_makes_missing_tables(few: hl.Store) -> None:
     ]
     assert contents(few) == before
     assert not few.verify(repair=True)
+    path = next((few.directory.path / TABLES).glob("*/*.parquet"))
+    data = bytearray(path.read_bytes())
+    data[1000:1400] = bytes(400)
+    path.write_bytes(data)
+    topics = [(one.place, False) for one in few.verify().findings]
+    limit(table_reserve_bytes=1 << 60)
+    done = few.verify(repair=True)
+    assert [(one.place, one.is_cured) for one in done] == topics
+    assert topics
+    assert all("MiB free; make room" in one.done for one in done)
+    limit(table_reserve_bytes=0)
+    assert [one.is_cured for one in few.verify(repair=True)] == [True] * len(topics)
+    assert contents(few) == before
 
 
 def test_rows_of_another_segment_are_not_kept(few: hl.Store) -> None:
@@ -153,7 +166,7 @@ def test_rows_of_another_segment_are_not_kept(few: hl.Store) -> None:
     folders._write(path, pieces)
     assert not making.TableChecker(few.directory).damage(entry)
     assert making.missing(few.directory, entry) == {"/a", "/b"}
-    assert making.make(few.directory, entry, ["/a"])
+    assert not making.make(few.directory, entry, ["/a"])
     assert making.missing(few.directory, entry) == {"/b"}
 
 
@@ -161,7 +174,7 @@ def test_a_store_that_cannot_be_written_makes_none(few: hl.Store, limit: Limit) 
     (entry,) = few.recordings()
     limit(directory_is_writable=False)
     shutil.rmtree(few.directory.path / TABLES)
-    assert not making.make(few.directory, entry)
+    assert making.make(few.directory, entry)
     assert not folders(few)
 
 
@@ -169,5 +182,5 @@ def test_a_recording_that_is_held_is_left_alone(few: hl.Store) -> None:
     (entry,) = few.recordings()
     shutil.rmtree(few.directory.path / TABLES)
     with few.directory.writing(few.entry("few").id):
-        assert not making.make(few.directory, entry)
+        assert making.make(few.directory, entry)
     assert not folders(few)
