@@ -401,7 +401,7 @@ def test_a_ring_keeps_the_end_and_what_is_pinned(logs: Path, tmp_path: Path) -> 
         ("--ros1 '' --duration 1s", "looks like http://host:11311; this one is empty"),
         ("--ros1 {bag}", "is not an address like http://host:port"),
         ("--foxglove http://robot", "does not begin with ws://"),
-        ("--ros2 --qos /nowhere/qos.yaml", "/nowhere/qos.yaml: cannot be opened"),
+        ("--ros2 --qos /nowhere/qos.yaml", "/nowhere/qos.yaml cannot be read"),
     ],
 )
 def test_options_that_make_no_sense_leave_no_store(

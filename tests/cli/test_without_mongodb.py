@@ -35,7 +35,7 @@ main()
 COMMANDS = {
     "ls": ["ls"],
     "info": ["info", "robot"],
-    "losses": ["info", "--losses"],
+    "losses": ["info", "--losses", "--json"],
     "sql": ["sql", "select avg(ranges[1]) from scan where ranges_summary.min < 1"],
     "schema": ["info", "-t", "/imu/data"],
     "count": ["fetch", "-t", "/imu/data", "--count"],

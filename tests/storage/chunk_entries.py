@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
-from hybridlog_storage.catalog import Catalog, ChunkEntry, RecordingEntry
+from hybridlog_storage.catalog import Catalog, ChannelStats, ChunkEntry, RecordingEntry
 
 
 def chunk_entries(catalog: Catalog, entry: RecordingEntry) -> list[ChunkEntry]:
-    """All chunks of a recording."""
+    """All chunks of a recording, with the numbers of messages in them."""
     return [
-        ChunkEntry(segment, number, catalog.chunk_stats(entry, segment, number))
+        ChunkEntry(
+            segment,
+            number,
+            {
+                int(part["channel"]): ChannelStats(messages=int(part["messages"]))
+                for part in table.chunk_parts(number)
+            },
+        )
         for segment, _, _ in entry.spans
-        for number in range(len(catalog.table(entry, segment).chunks))
+        for table in [catalog.table(entry, segment)]
+        for number in range(len(table.chunks))
     ]

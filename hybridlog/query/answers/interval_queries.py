@@ -6,7 +6,7 @@ from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from itertools import groupby, pairwise
+from itertools import groupby, islice, pairwise
 from operator import itemgetter
 from typing import TYPE_CHECKING, TypeAlias, TypeVar
 
@@ -60,10 +60,13 @@ class IntervalQueries:
         gap = None if max_gap is None else parse_duration(max_gap)
         if gap == 0:
             raise UsageError("max_gap is 0; a state needs a gap of more than 0.")
-        spans = [(part, span, _bounded(part, span)) for part, span in self._spans()]
-        self._planner.batch_hint([inner for *_, inner in spans])
-        for part, span, inner in spans:
-            yield part.recording.id, self._states_in(part, span, gap, inner)
+        spans = [
+            (part, span, _bounded(part, span), _just_before(part, span))
+            for part, span in self._spans()
+        ]
+        self._planner.batch_hint([p for *_, inner, before in spans for p in (*before, inner)])
+        for part, span, inner, before in spans:
+            yield part.recording.id, self._states_in(part, span, gap, inner, before)
 
     def _certain(self, max_gap: DurationLike | None, state: str) -> Intervals:
         """The time in which a state is certain, or the time in which none is."""
@@ -159,9 +162,11 @@ class IntervalQueries:
                 for _, span in spans:
                     yield part, span
 
-    def _states_in(self, part: Part, span: Span, gap: int | None, inner: Part) -> NDArray[np.int64]:
+    def _states_in(
+        self, part: Part, span: Span, gap: int | None, inner: Part, before: Sequence[Part]
+    ) -> NDArray[np.int64]:
         # The last message before the range determines the state at its beginning.
-        last = self._last_before(part, span)
+        last = self._last_before(part, span, before)
         found = [(np.array([time]), np.array([holds])) for time, holds in last]
         found += [(one.log_time, one.holds) for one in self._planner.outcomes(inner)]
         found.append((np.empty(0, np.int64), np.empty(0, np.bool_)))
@@ -169,10 +174,16 @@ class IntervalQueries:
         end = extent_of(part.recording)[1]
         return clipped(holding(time, holds, end, gap, before=len(last)), span)
 
-    def _last_before(self, part: Part, span: Span) -> list[tuple[int, bool]]:
-        """Time and outcome of the last message before a span, if any, whether it matches or not."""
-        for begin in _earlier(part, span):
-            before = _bounded(part, (begin, span[0]))
+    def _last_before(self, part: Part, span: Span, first: Sequence[Part]) -> list[tuple[int, bool]]:
+        """Time and outcome of the last message before a span, if any, whether it matches or not.
+
+        Args:
+            part: The part.
+            span: The span.
+            first: From `_just_before`.
+        """
+        further = (_bounded(part, (begin, span[0])) for begin in [*_earlier(part, span)][1:])
+        for before in (*first, *further):
             last: list[tuple[int, bool]] = []
             for found in self._beside(self._planner.outcomes, before):
                 if len(found.log_time):
@@ -258,6 +269,11 @@ def _earlier(part: Part, span: Span) -> Iterator[int]:
     if entry_span is None or span[0] <= entry_span[0]:
         return iter(())
     return earlier(span[0], entry_span[0])
+
+
+def _just_before(part: Part, span: Span) -> list[Part]:
+    """The part in the first of the earlier spans, if there is one."""
+    return [_bounded(part, (begin, span[0])) for begin in islice(_earlier(part, span), 1)]
 
 
 def _bounded(part: Part, span: Span) -> Part:
