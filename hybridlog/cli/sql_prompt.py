@@ -78,8 +78,15 @@ def run_prompt(connection: SqlConnection, run: Callable[[str], None]) -> None:
     prompt = _Prompt(connection, run)
     sys.ps1, sys.ps2 = "sql> ", "...> "
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    with _line_editing(prompt), suppress(KeyboardInterrupt):
-        prompt.interact(_HINT, "")
+    with _line_editing(prompt):
+        hint = _HINT
+        while True:
+            try:
+                prompt.interact(hint, "")
+                return
+            except KeyboardInterrupt:  # while it handled another one
+                prompt.resetbuffer()
+                hint = ""
 
 
 @contextmanager

@@ -15,7 +15,7 @@ import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Final, TypeGuard
-from urllib.parse import SplitResult, quote, urlsplit
+from urllib.parse import SplitResult, quote
 
 from msgspec import Meta, Struct, ValidationError, convert
 from msgspec.structs import replace
@@ -175,10 +175,10 @@ def with_password(uri: str) -> str:
 
 
 def _split(uri: str) -> SplitResult:
-    try:
-        parts = urlsplit(uri, allow_fragments=False)
-    except ValueError:
-        parts = urlsplit("")
+    # The library refuses several hosts of which one is an IPv6 address.
+    found = re.fullmatch(r"([^:]*)://([^/?]*)([^?]*)(?:\?(.*))?", uri)
+    scheme, place, path, query = found.groups("") if found else [""] * 4
+    parts = SplitResult(scheme, place, path, query, "")
     is_whole = (
         parts.scheme in {"mongodb", "mongodb+srv"}
         and uri.isprintable()
