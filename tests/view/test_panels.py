@@ -257,6 +257,7 @@ def test_play_never_queues_requests(
     topics = [("image", "/camera/front/image_raw", {}), ("message", "/imu/data", {})]
     opened(page, demo_url, "robot", *topics, at=S)
     page.locator(".picture img").wait_for()
+    page.wait_for_load_state("networkidle")  # the lanes have come, too
     found = page.evaluate(
         """async () => {
           const state = await import("./state.js");
