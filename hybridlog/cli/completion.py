@@ -29,7 +29,7 @@ _TRANSFORMS: Final = 100
 
 
 def _of_store(complete: Callable[[Session, click.Context, str], Iterable[str]]) -> _Complete:
-    """A function for click, of one that gives candidates; a shell cannot show its errors."""
+    """A completion as click wants it; it gives no candidates where it fails."""
 
     @wraps(complete)
     def found(context: click.Context, _: click.Parameter, incomplete: str) -> list[str]:

@@ -72,7 +72,7 @@ def diff_command(given: _Given) -> None:
 
 
 def _side(name: str) -> Callable[[Mapping[str, Any]], str]:
-    """Gives what a recording has, in words where only it has something."""
+    """A function for the cells of one recording; they say so if only it has the topic or times."""
 
     def told(row: Mapping[str, Any]) -> str:
         is_alone = row[name] and row["what"] in {"times", "topic"}

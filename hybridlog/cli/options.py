@@ -192,7 +192,7 @@ class Choosing:
 def names_argument(
     metavar: str = "[RECORDING]...", what: str = "Only these recordings", without: str = "all"
 ) -> Any:
-    """The argument that names recordings; without one, all, or what is said."""
+    """The argument that names recordings; its help says `without` for no name."""
     return argument(
         f"{what}, as for --recording; without, {without}.",
         metavar,

@@ -66,7 +66,7 @@ def fields_of(
 
 
 def ratio(bytes_in: int, bytes_stored: int) -> str:
-    """How many times smaller a recording is than what it is of."""
+    """Bytes that came in divided by bytes stored."""
     return f"{bytes_in / (bytes_stored or math.inf):.2f}"
 
 

@@ -65,7 +65,7 @@ def _leaves(types: FieldTypes, message: Message, target: Field) -> Iterator[obje
         return
     name = ".".join(part for part in parts[:-1] if isinstance(part, str))
     is_countable = stat == "n" or types.kind(name) != "other"
-    for array in _values(message, parts[:-1]):
+    for array in _reach(message, parts[:-1]):
         if not types.known:
             has = isinstance(array, list) and _has_statistic(array, stat)
         else:
@@ -77,7 +77,7 @@ def _leaves(types: FieldTypes, message: Message, target: Field) -> Iterator[obje
 
 
 def _reach(value: object, parts: Parts) -> Iterator[object]:
-    """The values at a path; through an array, those of each element."""
+    """The values at a path; through an array, those of each element. A last array is whole."""
     if not parts:
         yield value
         return
@@ -95,25 +95,6 @@ def _reach(value: object, parts: Parts) -> Iterator[object]:
         for inner in _flat(value) if isinstance(part, str) else value:
             if isinstance(inner, Mapping):
                 yield from _reach(inner, parts)
-
-
-def _values(value: object, parts: Parts) -> Iterator[object]:
-    """The values at a path as a whole: a last array is not split into elements."""
-    if not parts:
-        yield value
-        return
-    part, rest = parts[0], parts[1:]
-    if isinstance(part, Slice):
-        if isinstance(value, list):
-            yield from _values(part.of(value), rest)
-        return
-    if isinstance(part, int) and isinstance(value, list) and part < len(value):
-        yield from _values(value[part], rest)
-    # MongoDB also accepts a number as a name.
-    inside = value if isinstance(part, int) and isinstance(value, list) else _flat(value)
-    for inner in inside:
-        if isinstance(inner, Mapping) and str(part) in inner:
-            yield from _values(inner[str(part)], rest)
 
 
 def _flat(values: object) -> Iterator[object]:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import struct
 from contextlib import suppress
-from functools import cached_property
 from io import BytesIO
 from typing import TYPE_CHECKING, BinaryIO, Final, TypeAlias
 
@@ -16,6 +15,7 @@ from mcap.records import McapRecord
 
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.errors import SegmentError
+from hybridlog_storage.lazy import lazy
 from hybridlog_storage.mcap.mcap_content import (
     LAST_KNOWN,
     MAX_CHUNK_HEAD,
@@ -258,7 +258,7 @@ class Scan:
         """
         return self._bytes.search(start, end + HEAD - 1, {Opcode.CHUNK}, self._is_listed)
 
-    @cached_property
+    @lazy
     def _listed(self) -> set[tuple[int, int, int, int, str]]:
         """What the summary says of each chunk, wherever it starts."""
         return {

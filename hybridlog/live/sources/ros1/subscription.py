@@ -206,7 +206,7 @@ class _Link:
             await self._pause()
 
     def _say_problem(self, context: Context, error: OSError | PeerError) -> None:
-        """Tells of a publisher, once; all topics of one that cannot be reached say the same."""
+        """Tells the user that a publisher fails, once for each kind of failure."""
         is_unreachable = isinstance(error, UnreachedError)
         if is_unreachable in self._told:
             return
