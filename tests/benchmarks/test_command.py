@@ -77,7 +77,9 @@ def test_ctrl_c_ends_a_real_run(tmp_path: Path) -> None:
     said = (tmp_path / "out" / "said").read_text("utf-8")
     assert "To go on: python -m benchmarks --tiny" in said
     assert "Traceback" not in said
-    assert not any(child.is_running() for child in started)
+    # A helper of the interpreter ends a moment after it; nobody may wait for it.
+    _, left = psutil.wait_procs(started, 10)
+    assert [child.status() for child in left] in ([], [psutil.STATUS_ZOMBIE])
 
 
 class Wrong(SqliteAsker):
