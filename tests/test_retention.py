@@ -58,7 +58,7 @@ def gone(number: int, age: float) -> list[File]:
     return [log, rows]
 
 
-def held(name: str, *files: File, ended: bool = True, **values: Any) -> Held:
+def held(name: str, *files: File, ended: bool = True, window: int = 0, **values: Any) -> Held:
     manifest = Manifest(
         f"{name}-{sum(name.encode()):016x}",
         name,
@@ -68,7 +68,7 @@ def held(name: str, *files: File, ended: bool = True, **values: Any) -> Held:
         files=files,
         **values,
     )
-    return held_of(manifest, NOW)
+    return held_of(manifest, NOW, window)
 
 
 def made(rules: Mapping[str, Any], *recordings: Held, used: float = 0, free: float = 1e12) -> Plan:
@@ -121,6 +121,24 @@ def test_when_room_is_short_the_oldest_goes(used: int, free: int, steps: list[An
     found = made(rules, NEW, OLD, used=used * MB, free=free * MB)
     assert [one[:3] for one in told(found)] == steps
     assert not found.is_short
+
+
+def test_a_topic_rule_leaves_what_a_trigger_may_want() -> None:
+    rules = {"quota": "100MB", "topic": {CAMERA: "1y"}}
+    running = held("running", *both(50, 40, 20), ended=False, window=25 * DAY)
+    assert [s.goes_last for s in running.segments] == [False, False, True, True, True, True]
+    assert [one[:3] for one in told(made(rules, running, used=90 * MB))] == [
+        ("running", (0,), (CAMERA,))
+    ]
+    # More is short than the others have: it goes after them, and a new recording before it.
+    order = [one[:2] for one in told(made(rules, running, NEW, used=115 * MB))]
+    assert order == [("running", (0, 1, 2)), ("new", (0, 1, 2, 3))]
+
+
+def test_a_writer_that_waits_gets_the_largest_first() -> None:
+    rules = Rules(quota=100 * MB, is_urgent=True)
+    (step,) = plan([OLD], rules, used=98 * MB, free=10**12, now=NOW).steps
+    assert step.segments == (0, 2, 4)
 
 
 def test_a_reason_says_what_was_short() -> None:

@@ -236,6 +236,7 @@ class Recorder:
                 self._target,
                 options.reserve_bytes,
                 self.say,
+                window=round((options.before_s or ring_s or 0) * 1e9),
             )
             self._target.make_room = self._retention.make_room
         except BaseException:

@@ -101,6 +101,7 @@ class Keeper:
         directory: The store.
         remove: Removes a whole recording, by its id, unless a check of its manifest raises.
         own: The recording that this process makes; None if it makes none.
+        window: The newest of it that goes last, ns: a trigger may want it.
         is_wanted: Returns whether to go on; asked before each deletion.
         changed: Called with the id of each recording that lost payloads, while it is held.
     """
@@ -111,12 +112,14 @@ class Keeper:
         remove: Remove,
         own: Own | None = None,
         *,
+        window: int = 0,
         is_wanted: Callable[[], bool] = lambda: True,
         changed: Callable[[str], object] = lambda _: None,
     ) -> None:
         self._directory = directory
         self._remove = remove
         self._own = own
+        self._window = window
         self._is_wanted = is_wanted
         self._changed = changed
         # Segments that this pass could not change, by recording; -1 for all of it.
@@ -209,7 +212,9 @@ class Keeper:
             if manifest.status == "unproven":
                 self._unproven.add(manifest.name)
                 continue
-            held, failed = held_of(manifest, now), self._failed[manifest.id]
+            failed = self._failed[manifest.id]
+            is_own = self._own is not None and manifest.id == self._own.id
+            held = held_of(manifest, now, self._window if is_own else 0)
             # Of a damaged log, its group stays, too.
             left = [
                 replace(s, may_go=False, is_pinned=True) if s.number in failed else s
@@ -364,6 +369,7 @@ class RetentionThread:
         own: The recording in progress.
         reserve: Bytes that the recorder wants free at least, where rules may make room.
         say: Shows a line to the user, each text once.
+        window: The newest of the recording that goes last, ns.
     """
 
     def __init__(
@@ -373,9 +379,13 @@ class RetentionThread:
         own: Own,
         reserve: int,
         say: Callable[[str], None],
+        *,
+        window: int,
     ) -> None:
         self._directory = directory
-        self._keeper = Keeper(directory, remove, own, is_wanted=lambda: not self._over.is_set())
+        self._keeper = Keeper(
+            directory, remove, own, window=window, is_wanted=lambda: not self._over.is_set()
+        )
         self._own = own
         self._reserve = self._wanted = reserve
         self._say = say
@@ -383,6 +393,7 @@ class RetentionThread:
         self._passed = threading.Condition()
         self._passes = 0  # that have ended
         self._asked = 0  # number of the pass that must be made
+        self._is_urgent = False  # a writer waits for it
         self._freed = 0  # bytes, by the last pass
         self._is_exhausted = False  # nothing was left to go when it was asked for
         self._thread = threading.Thread(target=self._run, name="hybridlog-keep", daemon=True)
@@ -415,6 +426,7 @@ class RetentionThread:
         """Wait for a pass, on a full disk; returns whether it freed anything."""
         with self._passed:
             self._asked = seen = self._passes + 1
+            self._is_urgent = True
             done = self._passed.wait_for(
                 lambda: self._passes >= seen or self._over.is_set(), _PATIENCE_S
             )
@@ -453,7 +465,8 @@ class RetentionThread:
                 self._passed.notify_all()
 
     def _make_pass(self) -> int:
-        done = self._keeper.keep(self._rules)
+        done = self._keeper.keep(replace(self._rules, is_urgent=self._is_urgent))
+        self._is_urgent = False
         warnings = [] if self._has_warned else done.plan.warnings
         self._has_warned = bool(done.plan.warnings)
         reasons = (f"making room: {step.reason}" for step in done.plan.steps)

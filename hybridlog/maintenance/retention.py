@@ -63,6 +63,7 @@ class Rules:
             topic the first one counts.
         never_tag: Tags of recordings of which nothing goes, None for any value.
         fields_age: Age at which whole recordings go, with fields and counts, as written.
+        is_urgent: Whether a writer waits for room: then the largest segments go first.
     """
 
     quota: int | None = None
@@ -71,6 +72,7 @@ class Rules:
     topics: tuple[TopicRule, ...] = ()
     never_tag: tuple[tuple[str, str | None], ...] = ()
     fields_age: str | None = None
+    is_urgent: bool = False
 
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> Rules:
@@ -182,6 +184,7 @@ class HeldSegment:
         topics: Its topics.
         may_go: Whether its payloads may go before its group: not those of small topics.
         is_pinned: Whether a pin keeps messages of it.
+        goes_last: Whether a trigger may still want what it holds.
     """
 
     number: int
@@ -192,6 +195,7 @@ class HeldSegment:
     topics: frozenset[str]
     may_go: bool
     is_pinned: bool
+    goes_last: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -221,14 +225,17 @@ class Held:
     pins: int = 0
 
 
-def held_of(manifest: Manifest, now: int) -> Held:
+def held_of(manifest: Manifest, now: int, window: int = 0) -> Held:
     """The content of a recording.
 
     Args:
         manifest: Its manifest.
         now: The time, ns.
+        window: What is so little older than its newest sealed message goes last, ns.
     """
     found: list[HeldSegment] = []
+    ends = [part.last or 0 for log in manifest.logs.values() for part in log.parts.values()]
+    recent = max(ends, default=0) - window
     later, last, rows = now, 0, manifest.rows
     for number, log in sorted(manifest.logs.items(), reverse=True):
         parts = _parts_of(log, manifest)
@@ -246,6 +253,7 @@ def held_of(manifest: Manifest, now: int) -> Held:
                 frozenset(topic for topic, _ in parts),
                 may_go(log),
                 is_pinned(log, manifest),
+                window > 0 and max(times, default=0) >= recent,
             )
         )
     return Held(
@@ -351,9 +359,10 @@ class _Piece(NamedTuple):
     segment: HeldSegment
 
     @property
-    def order(self) -> tuple[int, int, str, int]:
-        """The oldest first."""
-        return self.segment.written, self.held.created, self.held.id, self.segment.number
+    def order(self) -> tuple[bool, int, int, str, int]:
+        """The oldest first, and last what a trigger may want."""
+        held, one = self.held, self.segment
+        return one.goes_last, one.written, held.created, held.id, one.number
 
 
 class _Planning:
@@ -420,6 +429,8 @@ class _Planning:
     def _by_room(self) -> None:
         if self._short(_SEGMENTS_FROM, 1.0) > 0:
             need = self._short(_TOPICS_FROM, _TOPICS_BELOW)
+            if self._rules.is_urgent:
+                self._pieces.sort(key=lambda piece: (piece.segment.goes_last, -piece.segment.size))
             self._take(self._reason(_SEGMENTS_FROM, 1.0), need=need)
         for rule in self._rules.topics:
             need = self._short(_TOPICS_FROM, _TOPICS_BELOW)
@@ -433,7 +444,7 @@ class _Planning:
         """Let whole groups of ended recordings go, the oldest first, until enough is free."""
         reason = f"{self._reason(_SEGMENTS_FROM, 1.0)}, and no payloads are left to go"
         need = self._short(_TOPICS_FROM, _TOPICS_BELOW)
-        found: dict[tuple[int, int, str, int], list[_Piece]] = {}
+        found: dict[tuple[bool, int, int, str, int], list[_Piece]] = {}
         held = [one for one in self._others if one.is_ended and one.id not in self._gone]
         for one in held:
             for number in {segment.group for segment in one.segments}:
@@ -497,6 +508,8 @@ class _Planning:
                 if fits != segment.topics:
                     self._shared |= fits
                     continue
+            if age_ns is None and rule is not None and segment.goes_last:
+                continue
             if key not in self._going and not segment.is_pinned:
                 self._going.add(key)
                 need -= segment.size
