@@ -18,7 +18,6 @@ import numpy as np
 
 from hybridlog.entries import channels_of, read_again, summary_of, take_inventory
 from hybridlog.query.chunk_columns import ChunkColumns
-from hybridlog.query.chunk_counts import Parts, part_rows
 from hybridlog.query.question import RecordedChannel, field_types
 from hybridlog.query.topics import resolve
 from hybridlog.record.marks import MARKS, MARKS_SEGMENT
@@ -59,6 +58,9 @@ _MAX_NAMES = 5  # recordings in a message
 _ROW_BYTES = 44  # of a message's columns in a chunk
 _MAX_COLUMNS = 4096  # sets of chunks that are at hand
 _MAX_RESOLVED = 128  # topic patterns
+_PARTS = np.dtype(
+    [(name, "i8") for name in ("segment", "chunk", "channel", "messages", "first", "last")]
+)
 
 _P = ParamSpec("_P")
 _T = TypeVar("_T")
@@ -587,32 +589,48 @@ class Session:
 
     def parts(
         self, recording: RecordingEntry, channels: Collection[int], span: tuple[int, int]
-    ) -> Parts:
-        """The parts of chunks that may hold messages of some channels in a time range.
+    ) -> NDArray[np.void]:
+        """What chunks hold of some channels in a time range.
 
         Args:
             recording: The recording.
             channels: Channel ids.
             span: Log time `[begin, end)`, ns.
+
+        Returns:
+            Numbers of `segment` and `chunk`, id of the `channel`, number of `messages`, `first`
+            and `last` log time, ns.
         """
         ids = np.array([*channels], np.int64)
-        found = [np.empty((0, 6), np.int64)]
+        found = [np.empty(0, _PARTS)]
         for number, first, last in recording.spans_with(channels):
             if min(first, END - 1) < span[1] and last >= span[0]:
-                rows = part_rows(number, self.chunk_table(recording, number))
-                inside = (placed(rows[:, 4]) < span[1]) & (rows[:, 5] >= span[0])
-                found.append(rows[inside & np.isin(rows[:, 2], ids)])
-        return Parts.of(np.concatenate(found))
+                table = self.chunk_table(recording, number)
+                rows = np.empty(len(table.parts), _PARTS)
+                rows["segment"] = number
+                rows["chunk"] = np.repeat(np.arange(len(table.chunks)), table.chunks["parts"])
+                for name in ("channel", "messages", "first", "last"):
+                    rows[name] = table.parts[name]
+                inside = (placed(rows["first"]) < span[1]) & (rows["last"] >= span[0])
+                found.append(rows[inside & np.isin(rows["channel"], ids)])
+        return np.concatenate(found)
 
     def times(
         self, recording: RecordingEntry, segment: int, chunk: int
     ) -> dict[int, NDArray[np.int64]]:
         """Log times of a chunk's messages by channel, ascending; reads no payload."""
         place = place_of(self.chunk_table(recording, segment), chunk)
-        found = self._read(recording.id, segment, lambda reader: reader.read_times(place))
-        if not found.keys() >= {*place.channels}:
-            raise StoreError(f"Payloads of {recording.name!r} were deleted meanwhile. Ask again.")
-        return found
+
+        def read() -> dict[int, NDArray[np.int64]]:
+            found = self._read(recording.id, segment, lambda reader: reader.read_times(place))
+            if not found.keys() >= {*place.channels}:
+                raise StoreError(
+                    f"Payloads of {recording.name!r} were deleted meanwhile. Ask again."
+                )
+            return found
+
+        key = recording.id, segment, chunk, place.offset, file_of(recording, segment)
+        return self.cache.made("times", *key, make=read, size_of=_size_of_times)
 
     def chunk(
         self,
@@ -766,3 +784,7 @@ def _changed(recording: RecordingEntry) -> ChangedError:
 
 def _size_of(chunk: StoredChunk) -> int:
     return len(chunk.batch.buffer) + _ROW_BYTES * len(chunk.batch)
+
+
+def _size_of_times(times: Mapping[int, NDArray[np.int64]]) -> int:
+    return sum(own.nbytes for own in times.values())

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from hybridlog.query.chunk_scan import ChunkKey, ChunkScan, MessageRun
+from hybridlog.query.chunk_scan import ChunkScan, MessageRun
 from hybridlog.query.question import Part
 from hybridlog.query.ranges import RangeResolver
-from hybridlog.query.rows import TABLE_ERRORS, Rows, filter_of
+from hybridlog.query.rows import TABLE_ERRORS, Rows
 from hybridlog.schema.column import STAMP
 from hybridlog.schema.states import GONE
 from hybridlog_storage.errors import ChangedError, TopicError
@@ -24,12 +24,11 @@ from hybridlog_storage.lazy import lazy
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog.query.chunk_scan import ChunkTask, Offsets, ScanPlan
+    from hybridlog.query.chunk_scan import ScanPlan
     from hybridlog.query.counters import Counters
     from hybridlog.query.index_reader import IndexReader
-    from hybridlog.query.message_filter import MessageFilter
     from hybridlog.query.question import Question, RecordedChannel, Span
-    from hybridlog.query.rows import MatchColumns, Objects, Tabled, Values
+    from hybridlog.query.rows import MatchColumns, Objects, Values
     from hybridlog.schema.states import State
     from hybridlog.session import Session
     from hybridlog_storage.summary import RecordingSummary
@@ -288,51 +287,8 @@ class Planner:
         return self._again(self._plan, parts)
 
     def _plan(self, parts: Sequence[Part]) -> ScanPlan:
-        rows = self._rows
-        parts = rows.fitting(self._decided(parts))
-        plan = rows.plan(parts, filtered=False)
-        plan.reverse = self.question.reverse
-        if self.question.predicate is None or not parts:
-            return plan
-        in_tables: dict[Part, Tabled] = {}
-        filters: dict[int, MessageFilter] = {}
-        selected: dict[int, Collection[int]] = {}
-        place = {(c.recording.id, c.channel_id): i for i, c in enumerate(plan.channels)}
-        plan.filters, plan.selected = filters, selected
-
-        def read(part: Part, segments: Collection[int] = ()) -> None:
-            """Let a filter decide, but for the messages in segments with tables."""
-            decide = filter_of(part)
-            assert decide is not None
-            for channel in part.channels:
-                index = place[part.recording.id, channel.channel_id]
-                selected[index], filters[index] = segments, decide
-
-        for part in parts:
-            found = rows.tabled(part)
-            if found is None:
-                read(part)
-                continue
-            in_tables[part] = found
-            if found.segments is not None:
-                read(part, found.segments)
-
-        def select(tasks: Sequence[ChunkTask]) -> Offsets:
-            offsets: dict[ChunkKey, list[NDArray[np.int64]]] = defaultdict(list)
-            wanted = {task.key for task in tasks}
-            for part, found in [*in_tables.items()]:
-                try:
-                    places = rows.places(found)
-                except TABLE_ERRORS:
-                    read(part)  # before chunks are read for it
-                    del in_tables[part]
-                    continue
-                for key in wanted & places.keys():
-                    offsets[key].append(places[key])
-            return {key: np.concatenate(found) for key, found in offsets.items()}
-
-        plan.selector = select if in_tables else None
-        return plan
+        parts = self._rows.fitting(self._decided(parts))
+        return self._rows.plan(parts, reverse=self.question.reverse)
 
     def _count_unreadable(self, parts: Sequence[Part]) -> None:
         """Count, once, the messages that the predicate cannot test for want of fields.

@@ -11,12 +11,10 @@ from collections import Counter, defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from hybridlog.query.chunk_counts import Placed
 from hybridlog.query.chunk_scan import ChunkKey, ChunkScan, RecordingScan, ScanPlan
 from hybridlog.query.predicate.tree import is_meta
 from hybridlog.record.losses import lost_spans
@@ -25,14 +23,13 @@ from hybridlog.schema.kinds import SINGLE, element_of, width_of
 from hybridlog.snapshot import UNFINISHED
 from hybridlog_storage.catalog import ChannelStats, channel_totals
 from hybridlog_storage.errors import HybridlogError, ResourceError, SegmentError, StoreError
-from hybridlog_storage.times import inside
+from hybridlog_storage.times import inside, placed
 
 if TYPE_CHECKING:
     import pyarrow as pa
     from numpy.typing import NDArray
 
     from hybridlog.columns.topic_table import TableRows, TopicTable
-    from hybridlog.query.chunk_counts import Parts
     from hybridlog.query.chunk_scan import MessageRun
     from hybridlog.query.counters import Counters
     from hybridlog.query.message_filter import MessageFilter
@@ -44,7 +41,6 @@ if TYPE_CHECKING:
 
 _WHOLE = 32  # elements; longer arrays are summaries in tables
 _IN_FULL = SINGLE - {"uint8", "byte", "char"}  # elements of arrays in tables with arrays
-_MAX_CACHED_TIMES = 4_000_000  # of chunks with several channels, until the question is answered
 
 
 class UndecidedError(HybridlogError):
@@ -103,13 +99,6 @@ class Tabled(NamedTuple):
     segments: frozenset[int] | None = None
 
 
-class _Count(NamedTuple):
-    """Numbers of messages of a part."""
-
-    matched: int
-    unreadable: int
-
-
 class Rows:
     """Rows for the parts of one question.
 
@@ -123,11 +112,7 @@ class Rows:
         self._counters = counters
         self._candidates: dict[Part, Tabled | None] = {}
         self._tabled: dict[Part, Tabled | None] = {}
-        self._counts: dict[Part, _Count] = {}
-        self._counted: set[Part] = set()
-        self._places: dict[Part, dict[ChunkKey, NDArray[np.int64]]] = {}
-        self._cached_times: dict[tuple[str, int, int], dict[int, NDArray[np.int64]]] = {}
-        self._room = _MAX_CACHED_TIMES
+        self._counts: dict[Part, tuple[int, int]] = {}  # matching ones, and unreadable ones
 
     # The rule.
 
@@ -138,17 +123,20 @@ class Rows:
             part: The part.
             fields: Paths of the fields that are wanted; None for all.
         """
-        found = self._candidate(part)
-        if found is None or not _holds(found, fields):
-            return None
         if part not in self._tabled:
-            self._tabled[part] = found
-            if part.predicate is not None:
-                try:
-                    self._count_of(found)
-                except TABLE_ERRORS:
-                    self._tabled[part] = None
-        return self._tabled[part]
+            self._tabled[part] = self._confirmed(part)
+        found = self._tabled[part]
+        return found if found is not None and _holds(found, fields) else None
+
+    def _confirmed(self, part: Part) -> Tabled | None:
+        """The part with its table, if that decides the predicate; counts unreadable messages."""
+        found = self._candidate(part)
+        if found is not None and part.predicate is not None:
+            try:
+                self._counters.unreadable += self._count_of(found)[1]
+            except TABLE_ERRORS:
+                return None
+        return found
 
     def leave_table(self, part: Part) -> bool:
         """Read a part from chunks from now on; False if it is read from them already."""
@@ -233,7 +221,7 @@ class Rows:
             if found is None:
                 in_chunks.append(part)
                 continue
-            total += self._accepted(found).matched
+            total += self._count_of(found)[0]
             if found.rest is not None:
                 in_chunks.append(found.rest)
         return total + (self.count_in_chunks(in_chunks) if in_chunks else 0)
@@ -242,14 +230,13 @@ class Rows:
         """The parts without those of which a file of tables tells that nothing matches."""
         asked = [part for part in parts if part.predicate is not None and not part.needs_index]
         self._count_by_file(asked)
-        return [part for part in parts if self._counts.get(part) != _Count(0, 0)]
+        return [part for part in parts if self._counts.get(part) != (0, 0)]
 
     def outcomes(self, part: Part) -> Iterator[MatchColumns]:
         """For each message of the part's topic and time, whether it matches."""
         found = self.tabled(part)
         left: Part | None = part
         if found is not None:
-            self._accepted(found)
             for rows, holds in self._in_table(found):
                 yield MatchColumns(rows.t, rows.seq, holds)
             left = found.rest
@@ -269,7 +256,6 @@ class Rows:
         found = self.tabled(part, fields)
         left: Part | None = part
         if found is not None:
-            self._accepted(found)
             for rows, holds in self._in_table(found, fields):
                 chosen = rows if holds.all() else rows.take(np.flatnonzero(holds))
                 if len(chosen):
@@ -286,31 +272,13 @@ class Rows:
             found = self._decoded(channel, run.batch)
             yield run.batch.log_time[found.rows], found.plain()
 
-    def places(self, found: Tabled) -> dict[ChunkKey, NDArray[np.int64]]:
-        """Payload offsets of the matching messages that a table has, by chunk, sorted.
-
-        Raises:
-            StoreError: The table is damaged.
-        """
-        part = found.part
-        if part not in self._places:
-            self._accepted(found)
-            places = [
-                places_of(rows.own["ref"])[holds]
-                for rows, holds in self._in_table(found, own=("ref",))
-            ]
-            self._places[part] = (
-                offsets_by_chunk(part.recording.id, np.concatenate(places)) if places else {}
-            )
-        return self._places[part]
-
     # Tables.
 
-    def _count_of(self, found: Tabled) -> _Count:
-        """The count in a table, which confirms that its columns can decide.
+    def _count_of(self, found: Tabled) -> tuple[int, int]:
+        """Number of matching and of unreadable messages in a table.
 
         Raises:
-            UndecidedError: They cannot.
+            UndecidedError: Its columns cannot decide.
             StoreError: They are damaged.
         """
         part = found.part
@@ -319,18 +287,8 @@ class Rows:
             for rows, holds in self._in_table(found):
                 matched += int(holds.sum())
                 unreadable += int(rows.is_unreadable().sum())
-            self._counts[part] = _Count(matched, unreadable)
+            self._counts[part] = matched, unreadable
         return self._counts[part]
-
-    def _accepted(self, found: Tabled) -> _Count:
-        """The count of a part that its table answers; counts its unreadable messages once."""
-        if found.part.predicate is None:
-            return _Count(found.part.messages, 0)
-        count = self._count_of(found)
-        if found.part not in self._counted:
-            self._counted.add(found.part)
-            self._counters.unreadable += count.unreadable
-        return count
 
     def _count_by_file(self, parts: Sequence[Part]) -> None:
         """Count whole parts that lie in one file: the predicate is evaluated once for all rows."""
@@ -362,7 +320,7 @@ class Rows:
         sums, bad = np.concatenate(matched), np.concatenate(unreadable)
         for part, table in alike:
             places = [(before[one.group] + one.begin, one.rows) for one in table.parts]
-            self._counts[part] = _Count(
+            self._counts[part] = (
                 sum(int(sums[begin + rows] - sums[begin]) for begin, rows in places),
                 sum(int(bad[begin + rows] - bad[begin]) for begin, rows in places),
             )
@@ -406,22 +364,58 @@ class Rows:
 
     # Chunks.
 
-    def plan(self, parts: Sequence[Part], *, filtered: bool = True) -> ScanPlan:
-        """The plan for reading some parts from chunks."""
+    def plan(
+        self, parts: Sequence[Part], *, filtered: bool = True, reverse: bool = False
+    ) -> ScanPlan:
+        """The plan for reading the matching messages of some parts, or all, from chunks.
+
+        Where a table decides, it says where they are; else filters decide on what is read.
+        """
         channels: list[RecordedChannel] = []
-        filters: dict[int, MessageFilter] = {}
+        filters: dict[int, tuple[MessageFilter, Collection[int]]] = {}
+        offsets: dict[ChunkKey, list[NDArray[np.int64]]] = defaultdict(list)
         of_recording: dict[str, tuple[Part, dict[int, int]]] = {}
         for part in parts:
             _, indexes = of_recording.setdefault(part.recording.id, (part, {}))
             decide = filter_of(part) if filtered else None
+            found = None if decide is None else self._placed(part, offsets)
             for channel in part.channels:
                 indexes[channel.channel_id] = len(channels)
-                if decide is not None:
-                    filters[len(channels)] = decide
+                if decide is not None and (found is None or found.segments is not None):
+                    covered = () if found is None else found.segments
+                    filters[len(channels)] = decide, covered or ()
                 channels.append(channel)
-        scans = [self._scan(part, indexes) for part, indexes in of_recording.values()]
-        clock = parts[0].clock if parts else "log"
-        return ScanPlan(channels, scans, clock, filters=filters, counters=self._counters)
+        return ScanPlan(
+            channels,
+            [self._scan(part, indexes) for part, indexes in of_recording.values()],
+            parts[0].clock if parts else "log",
+            filters=filters,
+            offsets={key: np.concatenate(own) for key, own in offsets.items()},
+            is_chosen=filtered and any(part.predicate is not None for part in parts),
+            reverse=reverse,
+            counters=self._counters,
+        )
+
+    def _placed(
+        self, part: Part, offsets: dict[ChunkKey, list[NDArray[np.int64]]]
+    ) -> Tabled | None:
+        """The part with its table, which has added the places of its matching messages."""
+        found = self.tabled(part)
+        if found is None:
+            return None
+        try:
+            places = [
+                places_of(rows.own["ref"])[holds]
+                for rows, holds in self._in_table(found, own=("ref",))
+            ]
+        except TABLE_ERRORS:
+            self.leave_table(part)
+            return None
+        if places:
+            by_chunk = offsets_by_chunk(part.recording.id, np.concatenate(places))
+            for key, own in by_chunk.items():
+                offsets[key].append(own)
+        return found
 
     def _scan(self, part: Part, indexes: dict[int, int]) -> RecordingScan:
         """The chunks of a recording that may hold wanted messages."""
@@ -488,11 +482,16 @@ class Rows:
         Raises:
             SegmentError: A segment cannot be read, or is damaged in a part that is needed.
         """
-        edges = parts[0].log_windows.ravel()
-        counts = np.zeros((1, max(len(edges) - 1, 0)), np.int64)
-        cut = Placed.of(self._chunk_parts(parts), edges).add_known(counts)
-        cut.add_read(edges, counts, partial(self._times, parts[0].recording))
-        return int(counts[0, ::2].sum())
+        windows = parts[0].log_windows
+        edges = windows.ravel()
+        held = self._chunk_parts(parts)
+        low, high = (edges.searchsorted(placed(held[n]), "right") for n in ("first", "last"))
+        is_whole = low == high  # in one window, or between two
+        total = int(held["messages"][is_whole & (low % 2 == 1)].sum())
+        for row in held[~is_whole]:
+            times = self._times(parts[0].recording, int(row["segment"]), int(row["chunk"]))
+            total += int(inside(times[int(row["channel"])], windows).sum())
+        return total
 
     def _times_of(self, part: Part) -> NDArray[np.int64]:
         """Log times in the windows of a part, sorted.
@@ -501,15 +500,13 @@ class Rows:
             SegmentError: As for `_count_by_time`.
         """
         found = [np.empty(0, np.int64)]
-        parts = self._chunk_parts([part])
-        rows = parts.chunk_starts
-        for segment, chunk in zip(*(c[rows].tolist() for c in parts[:2]), strict=True):
-            times = self._times(part.recording, segment, chunk)
-            found += [times[c.channel_id] for c in part.channels if c.channel_id in times]
+        for row in self._chunk_parts([part]):
+            times = self._times(part.recording, int(row["segment"]), int(row["chunk"]))
+            found.append(times[int(row["channel"])])
         time = np.sort(np.concatenate(found))
         return time[inside(time, part.log_windows)]
 
-    def _chunk_parts(self, parts: Sequence[Part]) -> Parts:
+    def _chunk_parts(self, parts: Sequence[Part]) -> NDArray[np.void]:
         windows = parts[0].log_windows
         span = (int(windows[0, 0]), int(windows[-1, 1])) if len(windows) else (0, 0)
         channels = [channel.channel_id for part in parts for channel in part.channels]
@@ -518,17 +515,10 @@ class Rows:
     def _times(
         self, recording: RecordingEntry, segment: int, chunk: int
     ) -> dict[int, NDArray[np.int64]]:
-        key = recording.id, segment, chunk
-        if key in self._cached_times:
-            return self._cached_times[key]
         reader = self.session.segment(recording.id, segment)
         read_before = reader.bytes_read
         times = self.session.times(recording, segment, chunk)
         self._counters.bytes_read += reader.bytes_read - read_before
-        size = sum(map(len, times.values()))
-        if len(times) > 1 and size <= self._room:  # another topic may be asked about next
-            self._cached_times[key] = times
-            self._room -= size
         return times
 
 

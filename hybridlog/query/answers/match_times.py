@@ -77,9 +77,9 @@ def next_time(session: Session, recording: RecordingEntry, topic: str, moment: i
     while True:
         end = moment + width
         parts = session.parts(recording, channels, (moment, end))
-        found = parts.first[parts.first >= moment].tolist()
-        cut = parts.take((parts.first < moment) & (parts.last >= moment))
-        for segment, chunk, channel in zip(*(c.tolist() for c in cut[:3]), strict=True):
+        found = parts["first"][parts["first"] >= moment].tolist()
+        cut = parts[(parts["first"] < moment) & (parts["last"] >= moment)]
+        for segment, chunk, channel in cut[["segment", "chunk", "channel"]].tolist():
             with suppress(SegmentError):
                 times = session.times(recording, segment, chunk)[channel]
                 found.append(int(times[np.searchsorted(times, moment)]))
