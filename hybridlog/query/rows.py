@@ -586,14 +586,10 @@ def _decided(part: Part, rows: TableRows) -> NDArray[np.bool_]:
     predicate = part.predicate
     if predicate is None:
         return np.ones(len(rows), np.bool_)
-    from hybridlog.query.message_filter import meta_array
-    from hybridlog.query.predicate.to_mask import to_mask
+    from hybridlog.query.message_filter import mask_of
 
-    records: Any = rows.records
-    if any(map(is_meta, predicate.fields())):
-        pub = rows.own.get("pub")
-        records = meta_array(records, part.channels[0], rows.t, rows.seq, pub)
-    found = to_mask(predicate, part.field_types, records)
+    times = rows.t, rows.seq, rows.own.get("pub")
+    found = mask_of(predicate, part.field_types, rows.records, part.channels[0], *times)
     if found is None:
         raise UndecidedError(f"The table of {part.topic} cannot tell.")
     return found
