@@ -48,8 +48,6 @@ class Planner:
         self.session = session
         self.question = question
         self.counters = counters
-        self._batch: Sequence[Part] = ()  # parts that are answered one after the other
-        self._decidable: dict[Part, Part] = {}  # with what MongoDB has found
         self._counted: set[Part] = set()  # parts whose messages without fields are counted
         self._ranges = RangeResolver(session, question)
 
@@ -72,7 +70,7 @@ class Planner:
             TopicError: a topic does not have the requested clock.
         """
         found = [part for one in self._ranges.resolve() for part in self.parts_in(*one)]
-        return self.batch_hint(self._rows.fitting(found))
+        return self._rows.fitting(found)
 
     def only_part(self) -> Part | None:
         """The only part of the question; None if it has several, or none.
@@ -83,7 +81,7 @@ class Planner:
         """
         found = self._ranges.resolve()
         parts = [*self.parts_in(*found[0])] if len(found) == 1 else []
-        return self.batch_hint(parts)[0] if len(parts) == 1 else None
+        return parts[0] if len(parts) == 1 else None
 
     def parts_in(
         self, summary: RecordingSummary, bounds: Span | None, windows: NDArray[np.int64] | None
@@ -173,24 +171,23 @@ class Planner:
             part.recording.id for part in self._decided(self.parts()) if self._rows.count([part])
         }
 
-    def batch_hint(self, parts: list[Part]) -> list[Part]:
-        """Announce parts that will be asked about one by one; MongoDB is asked at once."""
-        self._batch = parts
-        return parts
+    def decided(self, parts: Sequence[Part]) -> list[Part]:
+        """Parts with predicates that columns and messages decide: MongoDB is asked about all."""
+        wanted = [part for part in parts if part.needs_index]
+        if not wanted:
+            return [*parts]
+        found = self._index.found(wanted)
+        self.counters.unreadable += found.untested
+        self.counters.not_indexed += self._lacking(found.documents)
+        decidable = dict(zip(wanted, found.parts, strict=True))
+        return [decidable.get(part, part) for part in parts]
 
     def _decided(self, parts: Sequence[Part]) -> list[Part]:
-        """Parts with predicates that columns and messages decide: MongoDB has been asked."""
+        """The same; counts the messages without fields once."""
         self._count_unreadable(parts)
-        wanted = [part for part in parts if part.needs_index and part not in self._decidable]
-        if wanted:
-            if {*wanted} <= {*self._batch}:
-                wanted = [part for part in self._batch if part.needs_index]
-            found = self._index.found(wanted)
-            self.counters.unreadable += found.untested
-            self.counters.not_indexed += self._lacking(found.documents)
-            self._counted.update(found.parts)
-            self._decidable.update(zip(wanted, found.parts, strict=True))
-        return [self._decidable.get(part, part) for part in parts]
+        found = self.decided(parts)
+        self._counted.update(found)
+        return found
 
     def outcomes(self, part: Part) -> Iterator[MatchColumns]:
         """For each message of a part, whether it matches, in order."""
@@ -204,7 +201,8 @@ class Planner:
         self, parts: Sequence[Part], fields: Collection[str] | None
     ) -> list[Iterator[Values]] | None:
         """The same of each part, if tables have the fields of all their messages."""
-        for part in self._decided(parts):
+        parts = self._decided(parts)
+        for part in parts:
             found = self._rows.tabled(part, fields)
             if found is None or found.rest is not None:
                 return None

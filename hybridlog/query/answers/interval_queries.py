@@ -60,12 +60,11 @@ class IntervalQueries:
         gap = None if max_gap is None else parse_duration(max_gap)
         if gap == 0:
             raise UsageError("max_gap is 0; a state needs a gap of more than 0.")
-        spans = [
-            (part, span, _bounded(part, span), _just_before(part, span))
-            for part, span in self._spans()
-        ]
-        self._planner.batch_hint([p for *_, inner, before in spans for p in (*before, inner)])
-        for part, span, inner, before in spans:
+        spans = [*self._spans()]
+        asked = [[*_just_before(part, span), _bounded(part, span)] for part, span in spans]
+        decided = iter(self._planner.decided([part for own in asked for part in own]))
+        for (part, span), own in zip(spans, asked, strict=True):
+            *before, inner = (next(decided) for _ in own)
             yield part.recording.id, self._states_in(part, span, gap, inner, before)
 
     def _certain(self, max_gap: DurationLike | None, state: str) -> Intervals:

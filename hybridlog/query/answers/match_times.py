@@ -50,7 +50,7 @@ def match_times(session: Session, question: Question, counters: Counters) -> Ite
     if not question.returns_all:
         raise UsageError("Times are those of all messages: leave out limit and every.")
     planner = Planner(session, question, counters)
-    for part in planner.parts():
+    for part in planner.decided(planner.parts()):
         for found in planner.outcomes(part):
             holds = found.holds
             yield MatchTimes(part.recording, part.topic, found.log_time[holds], found.seq[holds])
