@@ -12,7 +12,7 @@ from collections.abc import (
 )
 from contextlib import suppress
 from itertools import accumulate
-from typing import TYPE_CHECKING, Concatenate, ParamSpec, Protocol, TypeVar
+from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from hybridlog.entries import channels_of, read_again, summary_of, take_inventor
 from hybridlog.query.chunk_columns import ChunkColumns
 from hybridlog.query.question import RecordedChannel, field_types
 from hybridlog.query.topics import resolve
-from hybridlog.record.marks import MARKS, MARKS_SEGMENT
+from hybridlog.record.marks import MARKS
 from hybridlog.snapshot import UNFINISHED
 from hybridlog.wording import counted, listed
 from hybridlog_storage.catalog import ChannelStats, file_of
@@ -46,7 +46,6 @@ if TYPE_CHECKING:
     from hybridlog.query.question import Question
     from hybridlog.shared import Shared
     from hybridlog.snapshot import Snapshot
-    from hybridlog_storage.cache import Cache
     from hybridlog_storage.catalog import Catalog, RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.segments.chunk import StoredChunk
@@ -62,7 +61,6 @@ _PARTS = np.dtype(
     [(name, "i8") for name in ("segment", "chunk", "channel", "messages", "first", "last")]
 )
 
-_P = ParamSpec("_P")
 _T = TypeVar("_T")
 _Topics = tuple[tuple[str, ...], tuple[str, ...] | None]
 """Topics, and the ids of the recordings that have any; None for all."""
@@ -85,17 +83,13 @@ class Session:
     """An open store at one moment. Thread safe.
 
     A question takes one at its beginning, and hands it to all that it calls. What running
-    recordings have flushed by then is read when it first asks about them. A file that is gone,
-    or another one, is looked for once in the newer state of its recording.
+    recordings have flushed by then is read when it first asks about them. Where a file is gone, or
+    another one, the newer state of its recording takes the place of the one of the moment.
 
     Args:
         shared: What all moments of the store share.
         recordings: All recordings; running ones as they were at the last look.
         resolved: Topics of patterns, as long as the topics are the same.
-
-    Attributes:
-        shared: As above.
-        directory: The store's directory.
     """
 
     def __init__(
@@ -106,10 +100,10 @@ class Session:
     ) -> None:
         self.shared = shared
         self.directory = shared.directory
+        self.cache = shared.cache
         self._recordings = recordings
         self._resolved = {} if resolved is None else resolved
         self._entries: dict[str, RecordingEntry] = {}  # that were asked about, by id
-        self._newer: dict[str, Session] = {}  # has the files of a recording, by its id
 
     def now(self) -> Session:
         """This moment; refuses processes that were forked since."""
@@ -124,11 +118,6 @@ class Session:
     def catalog(self) -> Catalog:
         """Recordings, channels, chunks and schemas."""
         return self.shared.catalog
-
-    @property
-    def cache(self) -> Cache:
-        """What was read or worked out."""
-        return self.shared.cache
 
     @property
     def tables(self) -> Tables:
@@ -177,10 +166,6 @@ class Session:
                 self._recordings = snapshot.with_changes([now], {now.topics: running.topics})
                 shared.replace_latest(snapshot, self)
             return entry
-
-    def recordings(self) -> list[RecordingEntry]:
-        """All recordings, oldest first. Reads the whole catalog; see `snapshot`."""
-        return [*self.entries(self._recordings.summaries)]
 
     def entries(self, summaries: Iterable[RecordingSummary]) -> Iterator[RecordingEntry]:
         """The entries of some recordings, without those that were removed meanwhile."""
@@ -282,7 +267,7 @@ class Session:
             TopicError: no recording matches, or several do.
         """
         if names is None:
-            return self.recordings()
+            return [*self.entries(self._recordings.summaries)]
         snapshot = self._recordings
         return [self.entry_of(snapshot.summaries[place]) for place in self.named(names)]
 
@@ -562,26 +547,20 @@ class Session:
     def _of_catalog(
         self,
         recording: RecordingEntry,
-        ask: Callable[Concatenate[RecordingEntry, _P], _T],
-        *args: _P.args,
-        **kwargs: _P.kwargs,
+        ask: Callable[[RecordingEntry, int], _T],
+        number: int,
     ) -> _T:
-        """An answer of the catalog; the files are read again if they have changed.
+        """An answer of the catalog about a segment; the files are read again if they changed.
 
         Raises:
             ChangedError: They are not those of the entry any more.
         """
         try:
-            return ask(recording, *args, **kwargs)
+            return ask(recording, number)
         except CatalogError:
-            newer = self._newer_of(recording)
-            if newer is not None:
-                now = newer.entry(recording.id)
-                if (now.digests, now.files) != (recording.digests, recording.files):
-                    self._entries[recording.id] = now
-                    raise _changed(recording) from None
+            self._check_same(recording, number)
             read_again(self.directory, self.catalog, recording)
-            return ask(recording, *args, **kwargs)
+            return ask(recording, number)
 
     def chunk_table(self, recording: RecordingEntry, number: int) -> ChunkTable:
         """The chunks of a segment of a recording."""
@@ -662,12 +641,10 @@ class Session:
         """The reader of a segment of a recording, by its id. Thread safe.
 
         Raises:
-            ChangedError: It has been let go.
+            ChangedError: It has been let go, or is another file by now.
             SegmentError: It cannot be opened.
             TopicError: The recording is gone.
         """
-        if recording in self._newer and number != MARKS_SEGMENT:
-            return self._newer_segment(recording, number)
         entry = self.entry(recording)
         if number in entry.flushed:
             return entry.flushed[number].reader
@@ -676,9 +653,8 @@ class Session:
         try:
             return self.shared.segment(entry, number)
         except SegmentError:
-            if self._newer_of(entry) is None:
-                raise
-            return self._newer_segment(recording, number)
+            self._check_same(entry, number)
+            raise
 
     def hold(self, recording: RecordingEntry, segments: Iterable[int]) -> None:
         """Open segments that will be read, if a ring may let them go meanwhile.
@@ -697,15 +673,6 @@ class Session:
         now = self.directory.manifests.find(recording)
         return now is not None and number not in now.logs and now.has_let_go(number)
 
-    def _newer_segment(self, recording: str, number: int) -> SegmentReader:
-        """As of `segment`, in a newer state of the store."""
-        newer = self._newer[recording]
-        try:
-            return newer.segment(recording, number)
-        except ChangedError:
-            self._entries[recording] = newer.entry(recording)
-            raise
-
     def read_chunk(self, recording: str, number: int, place: ChunkPlace) -> StoredChunk:
         """Read a chunk of a segment of a recording, by its id.
 
@@ -716,33 +683,30 @@ class Session:
         return self._read(recording, number, lambda reader: reader.read_chunk(place))
 
     def _read(self, recording: str, number: int, read: Callable[[SegmentReader], _T]) -> _T:
-        """Read something of a segment; once more if it is another file by now."""
         try:
             return read(self.segment(recording, number))
         except SegmentError:
-            if recording in self._newer or self._newer_of(self.entry(recording)) is None:
-                raise
-            return read(self._newer_segment(recording, number))
+            self._check_same(self.entry(recording), number)
+            raise
 
-    def _newer_of(self, entry: RecordingEntry) -> Session | None:
-        """A newer state of the store, if a recording has other files there.
+    def _check_same(self, entry: RecordingEntry, number: int) -> None:
+        """See whether a segment that cannot be read is another file by now.
 
         Raises:
+            ChangedError: It is. Later questions to this moment are about the newer files.
             TopicError: The recording is gone.
         """
         place = self._recordings.by_id.get(entry.id)
         look = None if place is None else self._recordings.summaries[place].look
         if self.directory.looks([entry.id]).get(entry.id) == look:
-            return None
+            return
         self.shared.catch_up(entry.id)
-        newer: Session = self.shared.now()
-        now = newer.entry_if_there(entry.id)
+        now: RecordingEntry | None = self.shared.now().entry_if_there(entry.id)
         if now is None:
             raise gone(entry.name)
-        if _files_of(now) == _files_of(entry):
-            return None
-        self._newer[entry.id] = newer
-        return newer
+        if _file_in(now, number) != _file_in(entry, number):
+            self._entries[entry.id] = now
+            raise _changed(entry)
 
     def expired_fields(
         self, recording: RecordingEntry, topic: str, chunks: Mapping[tuple[int, int], int]
@@ -766,9 +730,10 @@ class Session:
         self.shared.repairs.noted_tables.add((recording.id, topic))
 
 
-def _files_of(entry: RecordingEntry) -> tuple[object, ...]:
-    """What tells the files of a recording from later ones."""
-    return entry.digests, entry.files, entry.flushed.keys()
+def _file_in(entry: RecordingEntry, number: int) -> tuple[object, ...]:
+    """What tells a segment of a recording from a later file of its number."""
+    key = str(number)
+    return entry.digests.get(key), entry.files.get(key), number in entry.flushed
 
 
 def _in_order(by_topic: Iterable[Sequence[RecordedChannel]]) -> list[RecordedChannel]:
