@@ -67,11 +67,7 @@ _Topics = tuple[tuple[str, ...], tuple[str, ...] | None]
 
 
 class Asked(Protocol):
-    """What is asked: an open store as it is at each question, or always at one moment.
-
-    Attributes:
-        directory: The store's directory.
-    """
+    """What is asked: an open store as it is at each question, or always at one moment."""
 
     directory: StoreDirectory
 
@@ -175,12 +171,7 @@ class Session:
                 yield entry
 
     def entry_of(self, summary: RecordingSummary) -> RecordingEntry:
-        """The entry of a recording, compared with its files once.
-
-        Raises:
-            TopicError: it was removed.
-            StoreError: its files cannot be read.
-        """
+        """The entry of a recording, compared with its files once."""
         found = self._entry_of(summary)
         if found is None:
             raise gone(summary.name)
@@ -207,11 +198,7 @@ class Session:
         return None if place is None else self._entry_of(self._recordings.summaries[place])
 
     def entry(self, recording: str) -> RecordingEntry:
-        """The entry of a recording, by its id or its name.
-
-        Raises:
-            TopicError: it does not exist.
-        """
+        """The entry of a recording, by its id or its name."""
         snapshot = self._recordings
         found = snapshot.called(recording)
         if len(found) != 1:
@@ -219,11 +206,7 @@ class Session:
         return self.entry_of(snapshot.summaries[found[0]])
 
     def chosen(self, question: Question) -> NDArray[np.intp]:
-        """Positions in the snapshot of the recordings of a question, oldest first.
-
-        Raises:
-            TopicError: a recording does not exist any more.
-        """
+        """Positions in the snapshot of the recordings of a question, oldest first."""
         snapshot = self.look(question.recordings)
         if question.recordings is None:
             return snapshot.having(question.topics)
@@ -261,11 +244,7 @@ class Session:
         return self.directory.when_empty
 
     def select(self, names: Iterable[str | RecordingEntry] | None) -> list[RecordingEntry]:
-        """Recordings by name, id, or the beginning of one of these; None for all.
-
-        Raises:
-            TopicError: no recording matches, or several do.
-        """
+        """Recordings by name, id, or the beginning of one of these; None for all."""
         if names is None:
             return [*self.entries(self._recordings.summaries)]
         snapshot = self._recordings
@@ -278,11 +257,7 @@ class Session:
         return [self.entry_of(snapshot.summaries[place]) for place in places if place >= 0]
 
     def named(self, names: Iterable[str | RecordingEntry]) -> list[int]:
-        """Positions of recordings in the snapshot, each once, in the order of the names.
-
-        Raises:
-            TopicError: no recording matches a name, or several do.
-        """
+        """Positions of recordings in the snapshot, each once, in the order of the names."""
         snapshot = self._recordings
         chosen: dict[int, None] = {}
         for given in names:
@@ -365,9 +340,6 @@ class Session:
         Args:
             topics: Full names.
             recordings: Ids, names or entries; None for all.
-
-        Raises:
-            TopicError: no recording has any of the topics.
         """
         ids = None
         if recordings is not None:
@@ -398,11 +370,7 @@ class Session:
         return names
 
     def resolve(self, names: tuple[str, ...]) -> _Topics:
-        """The topics that patterns match, and the recordings that have them.
-
-        Raises:
-            TopicError: a pattern matches no topic, or several; lists the candidates.
-        """
+        """The topics that patterns match, and the recordings that have them."""
         known = self.topics()
         if not names:
             there = f"There are: {listed(known)}." if known else self.when_empty
@@ -426,11 +394,7 @@ class Session:
         return snapshot.topics_at(np.array(places, np.intp))
 
     def resolve_in(self, names: Sequence[str], recordings: Sequence[str]) -> list[str]:
-        """The topics of some recordings that patterns match.
-
-        Raises:
-            TopicError: as for `resolve`; also lists other recordings with such a topic.
-        """
+        """The topics of some recordings that patterns match."""
         known = self.topics_of(recordings)
         snapshot = self.look(recordings)
         try:
@@ -451,11 +415,7 @@ class Session:
     def predicate(
         self, text: str, topics: tuple[str, ...], recordings: tuple[str, ...] | None
     ) -> Predicate:
-        """A predicate, or a MongoDB filter as JSON, on some topics of some recordings.
-
-        Raises:
-            WhereError: it cannot be parsed, does not fit the fields, or is not allowed.
-        """
+        """A predicate, or a MongoDB filter as JSON, on some topics of some recordings."""
         from hybridlog.query.predicate.mongo_filter import from_json, mongo_filter
         from hybridlog.query.predicate.parser import parse
         from hybridlog.query.predicate.tokens import is_filter

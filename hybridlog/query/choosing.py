@@ -56,15 +56,7 @@ class _NothingLeftError(Exception):
 
 
 def choose(session: Session, choice: Choice) -> Chosen:
-    """The recordings of a store that satisfy a choice.
-
-    Raises:
-        TopicError: A name without wildcards means no recording, or several; a topic pattern
-            is malformed.
-        TimeError: `during` is no range of times.
-        UsageError: A `where` lacks its topic.
-        WhereError: A predicate cannot be parsed, or does not fit the fields.
-    """
+    """The recordings of a store that satisfy a choice."""
     choosing = _Choosing(session)
     try:
         if not choosing.left and not choice.is_everything:
@@ -92,11 +84,7 @@ def choose(session: Session, choice: Choice) -> Chosen:
 
 
 def placed(session: Session, names: Iterable[str]) -> dict[int, None]:
-    """Positions of recordings by names and globs.
-
-    Raises:
-        TopicError: A name without wildcards means no recording, or several.
-    """
+    """Positions of recordings by names and globs."""
     snapshot = session.snapshot()
     found: dict[int, None] = {}
     for name in names:

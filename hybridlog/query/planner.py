@@ -63,22 +63,12 @@ class Planner:
         return Rows(self.session, self.counters)
 
     def parts(self) -> list[Part]:
-        """The question, split by recording and topic; recordings oldest first.
-
-        Raises:
-            TimeError: the time range is empty, or outside all recordings.
-            TopicError: a topic does not have the requested clock.
-        """
+        """The question, split by recording and topic; recordings oldest first."""
         found = [part for one in self._ranges.resolve() for part in self.parts_in(*one)]
         return self._rows.fitting(found)
 
     def only_part(self) -> Part | None:
-        """The only part of the question; None if it has several, or none.
-
-        Raises:
-            TimeError: as for `parts`.
-            TopicError: as for `parts`.
-        """
+        """The only part of the question; None if it has several, or none."""
         found = self._ranges.resolve()
         parts = [*self.parts_in(*found[0])] if len(found) == 1 else []
         return parts[0] if len(parts) == 1 else None
@@ -86,16 +76,7 @@ class Planner:
     def parts_in(
         self, summary: RecordingSummary, bounds: Span | None, windows: NDArray[np.int64] | None
     ) -> Iterator[Part]:
-        """The parts of the question in one recording.
-
-        Args:
-            summary: The recording.
-            bounds: See `Part`.
-            windows: See `Part`.
-
-        Raises:
-            TopicError: a topic does not have the requested clock, or the recording is gone.
-        """
+        """The parts of the question in one recording."""
         recording = self.session.entry_of(summary)
         wanted = set(self.question.topics)
         by_topic: dict[str, list[RecordedChannel]] = defaultdict(list)
@@ -302,12 +283,7 @@ class Planner:
                 self.counters.unreadable += self._rows.count([unseen])
 
     def count_expired(self) -> Counter[State]:
-        """Number of messages, in the range, whose payloads are gone, by state.
-
-        Raises:
-            TimeError: as for `parts`.
-            TopicError: as for `parts`.
-        """
+        """Number of messages, in the range, whose payloads are gone, by state."""
         found: Counter[State] = Counter()
         for part in self.parts():
             for state in GONE:

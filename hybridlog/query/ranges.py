@@ -109,11 +109,7 @@ class RangeResolver:
         self._question = question
 
     def resolve(self) -> Ranges:
-        """The recordings to ask, oldest first; without reading their entries.
-
-        Raises:
-            TimeError: the range is empty, or outside all recordings.
-        """
+        """The recordings to ask, oldest first; without reading their entries."""
         question = self._question
         places = self._session.chosen(question)
         snapshot = self._session.snapshot()
@@ -137,9 +133,6 @@ class RangeResolver:
 
         Args:
             first: Log times of the first messages of the recordings, ns.
-
-        Raises:
-            TimeError: `10` was written, and `+10` is meant.
         """
         assert self._question.bounds is not None
         begin, _ = self._question.bounds
@@ -173,12 +166,7 @@ class RangeResolver:
         )
 
     def spans(self) -> list[tuple[RecordingSummary, Span]]:
-        """The log time `[begin, end)`, ns, of each recording of the question.
-
-        Raises:
-            TimeError: the range is empty, or outside all recordings.
-            UsageError: the range refers to another clock.
-        """
+        """The log time `[begin, end)`, ns, of each recording of the question."""
         question = self._question
         if not question.is_by_log_time:
             raise UsageError(
@@ -257,11 +245,7 @@ class RangeResolver:
         return beside or bounds[0] >= bounds[1]
 
     def _refuse(self, places: NDArray[np.intp]) -> None:
-        """Refuse a range that overlaps no recording.
-
-        Raises:
-            TimeError: it ends before it begins, or is outside all recordings.
-        """
+        """Refuse a range that overlaps no recording."""
         assert self._question.bounds is not None
         begin, stop = self._question.bounds
         summaries = self._session.snapshot().summaries

@@ -100,12 +100,7 @@ class Tabled(NamedTuple):
 
 
 class Rows:
-    """Rows for the parts of one question.
-
-    Args:
-        session: The open store.
-        counters: Count what is read.
-    """
+    """Rows for the parts of one question."""
 
     def __init__(self, session: Session, counters: Counters) -> None:
         self.session = session

@@ -174,13 +174,7 @@ class IntervalQueries:
         return clipped(holding(time, holds, end, gap, before=len(last)), span)
 
     def _last_before(self, part: Part, span: Span, first: Sequence[Part]) -> list[tuple[int, bool]]:
-        """Time and outcome of the last message before a span, if any, whether it matches or not.
-
-        Args:
-            part: The part.
-            span: The span.
-            first: From `_just_before`.
-        """
+        """Time and outcome of the last message before a span, if any, whether it matches or not."""
         further = (_bounded(part, (begin, span[0])) for begin in [*_earlier(part, span)][1:])
         for before in (*first, *further):
             last: list[tuple[int, bool]] = []

@@ -162,11 +162,7 @@ def lost_times(session: Session, question: Question) -> Intervals:
 def _losses_in(
     session: Session, question: Question
 ) -> Iterator[tuple[RecordingEntry, Mapping[str, Any]]]:
-    """Rows of the ledger about topics and times of a question, those of a recording together.
-
-    Raises:
-        TimeError: the range is empty, or outside all recordings.
-    """
+    """Rows of the ledger about topics and times of a question, those of a recording together."""
     doubtful = {entry.id: entry for entry in session.doubtful(question)}
     if not doubtful:
         return

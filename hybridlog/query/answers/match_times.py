@@ -41,12 +41,7 @@ class MatchTimes(NamedTuple):
 
 
 def match_times(session: Session, question: Question, counters: Counters) -> Iterator[MatchTimes]:
-    """The times of an answer, some at a time; recordings and topics one after the other.
-
-    Raises:
-        UsageError: the question has `limit` or `every`.
-        TimeError: the range is outside all recordings.
-    """
+    """The times of an answer, some at a time; recordings and topics one after the other."""
     if not question.returns_all:
         raise UsageError("Times are those of all messages: leave out limit and every.")
     planner = Planner(session, question, counters)

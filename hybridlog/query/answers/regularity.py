@@ -101,11 +101,7 @@ class Stretch(NamedTuple):
 
 
 class Regularity:
-    """Answers about the times of messages.
-
-    Raises:
-        UsageError: the question has limit, every or reverse.
-    """
+    """Answers about the times of messages."""
 
     def __init__(self, session: Session, question: Question, counters: Counters) -> None:
         if not question.returns_all or question.reverse:
