@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from hybridlog.query.counters import Counters
     from hybridlog.query.index_reader import IndexReader
     from hybridlog.query.question import Question, RecordedChannel, Span
-    from hybridlog.query.rows import MatchColumns, Objects, Values
+    from hybridlog.query.rows import MatchColumns, Values
     from hybridlog.schema.states import State
     from hybridlog.session import Session
     from hybridlog_storage.summary import RecordingSummary
@@ -188,10 +188,6 @@ class Planner:
             if found is None or found.rest is not None:
                 return None
         return [self.values(part, fields) for part in parts]
-
-    def objects(self, part: Part) -> Iterator[Objects]:
-        """The matching messages of a part as plain objects, in order."""
-        return self._rows.objects(self.plan([part]))
 
     def runs(self) -> Iterator[MessageRun]:
         """The messages of the answer, in order."""

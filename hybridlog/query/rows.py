@@ -11,7 +11,7 @@ from collections import Counter, defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -77,10 +77,6 @@ class Values(NamedTuple):
     log_time: NDArray[np.int64]
     seq: NDArray[np.int64]
     records: pa.StructArray
-
-
-Objects: TypeAlias = "tuple[NDArray[np.int64], Sequence[Mapping[str, object]]]"
-"""Log times, ns, of messages in order, and the messages as `Codec.objects` makes them."""
 
 
 class Tabled(NamedTuple):
@@ -260,12 +256,6 @@ class Rows:
             decoded = self._decoded(channel, run.batch, fields)
             good = decoded.rows
             yield Values(run.batch.log_time[good], run.seq[good], decoded.arrow())
-
-    def objects(self, plan: ScanPlan) -> Iterator[Objects]:
-        """The messages of a plan as plain objects, in order."""
-        for channel, run in self._by_channel(plan):
-            found = self._decoded(channel, run.batch)
-            yield run.batch.log_time[found.rows], found.plain()
 
     # Tables.
 

@@ -6,9 +6,9 @@ from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from itertools import groupby, islice, pairwise
+from itertools import groupby, islice
 from operator import itemgetter
-from typing import TYPE_CHECKING, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
@@ -35,8 +35,6 @@ if TYPE_CHECKING:
     from hybridlog_storage.summary import RecordingSummary
 
 _T = TypeVar("_T")
-Rows: TypeAlias = "pa.StructArray | Sequence[Mapping[str, object]]"
-"""Messages, as columns or as plain objects."""
 
 
 class IntervalQueries:
@@ -190,41 +188,31 @@ class IntervalQueries:
     ) -> NDArray[np.int64]:
         """Log times of the messages in a span that differ from the one before."""
         ask = partial(self._rows, paths=paths)
-        summaries = _summaries(part, paths)
-        names = [[path] if path in summaries else path.split(".") for path in paths]
         carried = self._row_before(part, span, ask)
         found = [np.empty(0, np.int64)]
         for times, rows in ask(_bounded(part, span)):
             if len(rows):
-                differs, carried = _steps(carried, rows, names, tolerance)
+                differs, carried = _steps(carried, rows, tolerance)
                 found.append(times[differs])
         return np.concatenate(found)
 
-    def _rows(self, part: Part, paths: Collection[str]) -> Iterator[tuple[NDArray[np.int64], Rows]]:
-        """Fields of the matching messages; summaries of arrays (`ranges.min`) as fields.
-
-        Columns where one definition fixes their types. Otherwise plain objects: in columns null
-        and missing are the same, and values of different types have no common one.
-        """
+    def _rows(
+        self, part: Part, paths: Collection[str]
+    ) -> Iterator[tuple[NDArray[np.int64], pa.StructArray]]:
+        """Fields of the matching messages, as tables have them; summaries of arrays as fields."""
         from hybridlog.frames.columns import flat, with_summaries
-        from hybridlog.query.predicate.to_bool import with_statistics
+        from hybridlog.frames.names import is_summary
         from hybridlog.schema.arrow_columns import structs
 
-        summaries = _summaries(part, paths)
+        known = part.field_types or {}
+        summaries = {path for path in paths if is_summary(path, known)}
         read = {path.rpartition(".")[0] if path in summaries else path for path in paths}
-        types = {c.arrow_type(read) for c in part.channels}
-        if part.field_types is None or len(types) > 1:
-            for times, objects in self._planner.objects(part):
-                yield times, [with_statistics(each, summaries) for each in objects]
-            return
         for times, _, records in self._planner.values(part, read):
-            if summaries:
-                records = structs(with_summaries(flat(records), paths), len(times))  # noqa: PLW2901
-            yield times, records
+            yield times, structs(with_summaries(flat(records), paths), len(times))
 
     def _row_before(
-        self, part: Part, span: Span, ask: Callable[[Part], Iterator[tuple[object, Rows]]]
-    ) -> Rows | None:
+        self, part: Part, span: Span, ask: Callable[[Part], Iterator[tuple[object, pa.StructArray]]]
+    ) -> pa.StructArray | None:
         """The fields of the last matching message before a span."""
         for begin in _earlier(part, span):
             last = None
@@ -273,37 +261,19 @@ def _bounded(part: Part, span: Span) -> Part:
     return replace(part, bounds=span, clock="log", windows=None)
 
 
-def _summaries(part: Part, paths: Collection[str]) -> set[str]:
-    """Those of some paths that are summaries of arrays."""
-    from hybridlog.frames.names import is_summary
-
-    return {path for path in paths if is_summary(path, part.field_types or {})}
-
-
 def _steps(
-    carried: Rows | None, rows: Rows, paths: Sequence[Sequence[str]], tolerance: float
-) -> tuple[NDArray[np.bool_], Rows]:
+    carried: pa.StructArray | None, rows: pa.StructArray, tolerance: float
+) -> tuple[NDArray[np.bool_], pa.StructArray]:
     """Find the rows that differ from the row before them; also returns the last row."""
-    import pyarrow as pa
+    from hybridlog.columns.fields import joined
+    from hybridlog.query.rows_differ import rows_differ
 
-    from hybridlog.query.rows_differ import objects_differ, rows_differ
-
-    if not isinstance(rows, pa.StructArray):
-        first = rows[0] if carried is None else carried[0]
-        found = [objects_differ(a, b, paths, tolerance) for a, b in pairwise([first, *rows])]
-        return np.array(found, np.bool_), rows[-1:]
-    joined: pa.StructArray = rows
-    if carried is not None:
-        tables = [pa.Table.from_struct_array(part) for part in (carried, rows)]
-        joined_table = pa.concat_tables(tables, promote_options="permissive").combine_chunks()
-        joined = joined_table.to_struct_array().combine_chunks()
-    if isinstance(joined, pa.ChunkedArray):
-        joined = pa.concat_arrays(joined.chunks)
-    numbers = np.arange(1, len(joined))
-    differs = rows_differ(joined, numbers, numbers - 1, tolerance)
+    whole = rows if carried is None else joined([carried, rows])
+    numbers = np.arange(1, len(whole))
+    differs = rows_differ(whole, numbers, numbers - 1, tolerance)
     if carried is None:
         differs = np.concatenate([[False], differs])
-    return differs, rows[-1:]
+    return differs, whole[-1:]
 
 
 def _extent(recording: RecordingSummary) -> Span:

@@ -7,9 +7,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
-from typing import TypeAlias, cast
+from typing import TypeAlias
 
 from hybridlog.query.predicate.numbers import equal, ordered
 from hybridlog.query.predicate.regex import compile_regex
@@ -133,19 +133,6 @@ def statistic(stat: Stat, values: Sequence[object]) -> float | None:
         found = summary_of(numbers)
         return float(found.mean[0]) if found is not None and found.has[0] else None
     return min(finite) if stat == "min" else max(finite)
-
-
-def with_statistics(message: Message, paths: Iterable[str]) -> Message:
-    """A message with statistics of its arrays as fields of their paths (`ranges.min`)."""
-    found = dict(message)
-    for path in paths:
-        *names, stat = path.split(".")
-        array: object = message
-        for name in names:
-            array = array.get(name) if isinstance(array, Mapping) else None
-        if isinstance(array, list | bytes):
-            found[path] = statistic(cast("Stat", stat), array)
-    return found
 
 
 def _node(node: Node, types: FieldTypes) -> Test:
