@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from hybridlog.frames.names import is_summary
-from hybridlog.query.predicate.to_bool import to_bool
+from hybridlog.query.predicate.to_mask import mask_of_objects, to_mask
 from hybridlog.query.predicate.tree import Predicate, is_meta
 from hybridlog.schema.arrow_columns import structs
 from hybridlog.schema.codec import columns_of
@@ -49,7 +49,6 @@ class MessageFilter:
     def __init__(self, predicate: Predicate, types: Mapping[str, str] | None) -> None:
         self._predicate = predicate
         self._types = types
-        self._test = to_bool(predicate.root, types)
         self._elements = _elements_of(predicate, types or {})
         self._fields = {path.split(".")[0].split("[")[0] for path in predicate.fields()}
         self._asks_meta = "_meta" in self._fields
@@ -87,7 +86,7 @@ class MessageFilter:
             if self._asks_meta:
                 meta = meta_array(structs({}, len(rows)), channel, *times).to_pylist()
                 plain = [{**one, **own} for one, own in zip(plain, meta, strict=True)]
-            mask = np.fromiter(map(self._test, plain), np.bool_, len(rows))
+            mask = mask_of_objects(self._predicate, self._types, plain)
         holds[rows] = mask & ~lacking
         unread, expired = len(batch) - len(rows), int(lacking.sum())
         return Matches(holds, unread + expired, expired)
@@ -104,8 +103,6 @@ def mask_of(
 
     `times` are log times, arrival numbers and publish times, as of `meta_array`.
     """
-    from hybridlog.query.predicate.to_mask import to_mask
-
     if any(map(is_meta, predicate.fields())):
         records = meta_array(records, channel, *times)
     return to_mask(predicate, types, records)
