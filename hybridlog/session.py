@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Protocol, TypeVar
 import numpy as np
 
 from hybridlog.entries import channels_of, read_again, summary_of, take_inventory
-from hybridlog.query.chunk_columns import ChunkColumns
+from hybridlog.query.chunk_columns import PARTS, ChunkColumns
 from hybridlog.query.question import RecordedChannel, field_types
 from hybridlog.query.topics import resolve
 from hybridlog.record.marks import MARKS
@@ -57,9 +57,6 @@ _MAX_NAMES = 5  # recordings in a message
 _ROW_BYTES = 44  # of a message's columns in a chunk
 _MAX_COLUMNS = 4096  # sets of chunks that are at hand
 _MAX_RESOLVED = 128  # topic patterns
-_PARTS = np.dtype(
-    [(name, "i8") for name in ("segment", "chunk", "channel", "messages", "first", "last")]
-)
 
 _T = TypeVar("_T")
 _Topics = tuple[tuple[str, ...], tuple[str, ...] | None]
@@ -492,7 +489,7 @@ class Session:
                 yield chunk, max(last, lasts[place])
 
     def _chunk_columns(
-        self, recording: RecordingEntry, number: int, channels: Sequence[int]
+        self, recording: RecordingEntry, number: int, channels: Collection[int]
     ) -> tuple[ChunkColumns, NDArray[np.void] | None]:
         """The chunks of a segment with some channels, and header stamps of its parts."""
         table, stamps = self._of_catalog(recording, self.catalog.decoded_table, number)
@@ -529,29 +526,12 @@ class Session:
     def parts(
         self, recording: RecordingEntry, channels: Collection[int], span: tuple[int, int]
     ) -> NDArray[np.void]:
-        """What chunks hold of some channels in a time range.
-
-        Args:
-            recording: The recording.
-            channels: Channel ids.
-            span: Log time `[begin, end)`, ns.
-
-        Returns:
-            Numbers of `segment` and `chunk`, id of the `channel`, number of `messages`, `first`
-            and `last` log time, ns.
-        """
-        ids = np.array([*channels], np.int64)
-        found = [np.empty(0, _PARTS)]
+        """The `ChunkColumns.parts` that may lie in a range `[begin, end)` of log time, ns."""
+        found = [np.empty(0, PARTS)]
         for number, first, last in recording.spans_with(channels):
             if min(first, END - 1) < span[1] and last >= span[0]:
-                table = self.chunk_table(recording, number)
-                rows = np.empty(len(table.parts), _PARTS)
-                rows["segment"] = number
-                rows["chunk"] = np.repeat(np.arange(len(table.chunks)), table.chunks["parts"])
-                for name in ("channel", "messages", "first", "last"):
-                    rows[name] = table.parts[name]
-                inside = (placed(rows["first"]) < span[1]) & (rows["last"] >= span[0])
-                found.append(rows[inside & np.isin(rows["channel"], ids)])
+                rows = self._chunk_columns(recording, number, channels)[0].parts
+                found.append(rows[(placed(rows["first"]) < span[1]) & (rows["last"] >= span[0])])
         return np.concatenate(found)
 
     def times(

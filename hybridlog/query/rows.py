@@ -33,10 +33,9 @@ if TYPE_CHECKING:
     from hybridlog.query.chunk_scan import MessageRun
     from hybridlog.query.counters import Counters
     from hybridlog.query.message_filter import MessageFilter
-    from hybridlog.query.question import Part, RecordedChannel, Span
+    from hybridlog.query.question import Part, RecordedChannel
     from hybridlog.schema.codec import Decoded
     from hybridlog.session import Session
-    from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.messages import Batch
 
 _WHOLE = 32  # elements; longer arrays are summaries in tables
@@ -190,22 +189,17 @@ class Rows:
         """Number of matching messages in all parts."""
         total = 0
         in_chunks: list[Part] = []
-        alike: dict[tuple[str, Span | None, int], list[Part]] = defaultdict(list)
         asked: list[Part] = []
         for part in parts:
             if part.predicate is not None:
                 asked.append(part)
             elif part.is_unbounded:
                 total += part.messages
-            elif part.is_by_log_time:
-                alike[part.recording.id, part.bounds, id(part.windows)].append(part)
             else:
-                in_chunks.append(part)
-        for group in alike.values():
-            try:
-                total += self._count_by_time(group)
-            except SegmentError:
-                in_chunks += group
+                try:
+                    total += self._count_by_time(part)
+                except SegmentError:
+                    in_chunks.append(part)
         self._count_by_file(asked)
         for part in asked:
             found = self.tabled(part)
@@ -235,7 +229,7 @@ class Rows:
             return
         if left.predicate is None and left.is_by_log_time:
             with suppress(SegmentError):
-                time = self._times_of(left)
+                time = self._times(left, self._held(left))
                 left = None
         if left is None:
             yield MatchColumns(time, np.zeros_like(time), np.ones(len(time), np.bool_))
@@ -461,50 +455,42 @@ class Rows:
 
     # Times alone.
 
-    def _count_by_time(self, parts: Sequence[Part]) -> int:
-        """Number of messages of some topics of one recording in the same windows.
+    def _count_by_time(self, part: Part) -> int:
+        """Number of messages in the windows of a part.
 
         Raises:
             SegmentError: A segment cannot be read, or is damaged in a part that is needed.
         """
-        windows = parts[0].log_windows
-        edges = windows.ravel()
-        held = self._chunk_parts(parts)
+        if not part.is_by_log_time:
+            return self.count_in_chunks([part])
+        edges = part.log_windows.ravel()
+        held = self._held(part)
         low, high = (edges.searchsorted(placed(held[n]), "right") for n in ("first", "last"))
         is_whole = low == high  # in one window, or between two
-        total = int(held["messages"][is_whole & (low % 2 == 1)].sum())
-        for row in held[~is_whole]:
-            times = self._times(parts[0].recording, int(row["segment"]), int(row["chunk"]))
-            total += int(inside(times[int(row["channel"])], windows).sum())
-        return total
+        times = self._times(part, held[~is_whole])
+        return int(held["messages"][is_whole & (low % 2 == 1)].sum()) + len(times)
 
-    def _times_of(self, part: Part) -> NDArray[np.int64]:
-        """Log times in the windows of a part, sorted.
+    def _times(self, part: Part, held: NDArray[np.void]) -> NDArray[np.int64]:
+        """Log times in the windows of a part that some parts of chunks have, sorted.
 
         Raises:
             SegmentError: As for `_count_by_time`.
         """
         found = [np.empty(0, np.int64)]
-        for row in self._chunk_parts([part]):
-            times = self._times(part.recording, int(row["segment"]), int(row["chunk"]))
-            found.append(times[int(row["channel"])])
+        for segment, chunk, channel in held[["segment", "chunk", "channel"]].tolist():
+            reader = self.session.segment(part.recording.id, segment)
+            read_before = reader.bytes_read
+            found.append(self.session.times(part.recording, segment, chunk)[channel])
+            self._counters.bytes_read += reader.bytes_read - read_before
         time = np.sort(np.concatenate(found))
         return time[inside(time, part.log_windows)]
 
-    def _chunk_parts(self, parts: Sequence[Part]) -> NDArray[np.void]:
-        windows = parts[0].log_windows
+    def _held(self, part: Part) -> NDArray[np.void]:
+        """What chunks hold of a part."""
+        windows = part.log_windows
         span = (int(windows[0, 0]), int(windows[-1, 1])) if len(windows) else (0, 0)
-        channels = [channel.channel_id for part in parts for channel in part.channels]
-        return self.session.parts(parts[0].recording, channels, span)
-
-    def _times(
-        self, recording: RecordingEntry, segment: int, chunk: int
-    ) -> dict[int, NDArray[np.int64]]:
-        reader = self.session.segment(recording.id, segment)
-        read_before = reader.bytes_read
-        times = self.session.times(recording, segment, chunk)
-        self._counters.bytes_read += reader.bytes_read - read_before
-        return times
+        ids = [channel.channel_id for channel in part.channels]
+        return self.session.parts(part.recording, ids, span)
 
 
 def _within(
