@@ -146,6 +146,17 @@ class ScanPlan:
         return [i for i in held if i in self.filters and segment not in self.filters[i][1]]
 
 
+def with_payloads(run: MessageRun, counters: Counters) -> MessageRun:
+    """The messages without those that have no payload, which are counted."""
+    gone = [number for number, channel in enumerate(run.channels) if channel.is_reduced]
+    if not gone:
+        return run
+    for number in gone:
+        left = int((run.batch.channel == number).sum())
+        counters.leave_out(left, run.channels[number].state)
+    return run.take(~np.isin(run.batch.channel, gone))
+
+
 class ChunkScan:
     """Executes a plan.
 
@@ -236,9 +247,8 @@ class ChunkScan:
                 return
             check_wanted()
             task, loaded = loading.popleft()
-            run, size, unreadable, expired = loaded()
-            counters.chunks_read += 1
-            counters.bytes_read += size
+            run, chunk, unreadable, expired = loaded()
+            counters.add_chunk(chunk)
             counters.unreadable += unreadable
             counters.without_arrays += expired
             yield task, run, loading[0][0] if loading else None
@@ -259,7 +269,7 @@ class ChunkScan:
         undecided = self._plan.filtered(task)
         run = self._wanted(task, chunk, undecided)
         run, unreadable, expired = self._filtered(run, undecided)
-        return run, chunk.length + chunk.trailer, unreadable, expired
+        return run, chunk, unreadable, expired
 
     def _wanted(
         self,
@@ -371,8 +381,8 @@ def _up_to(tasks: Iterator[ChunkTask], room: int) -> Iterator[ChunkTask]:
             return
 
 
-_Loaded = tuple[MessageRun, int, int, int]
-"""Messages, bytes read, messages unreadable for the predicate, those of them that expired."""
+_Loaded = tuple[MessageRun, "StoredChunk", int, int]
+"""Messages and their chunk, messages unreadable for the predicate, those of them that expired."""
 
 
 def _merged(runs: list[MessageRun]) -> MessageRun:

@@ -215,9 +215,9 @@ class RangeResolver:
         """`[first, end)` of the question's topics, on the question's clock."""
         if self._question.clock == "log":
             return summary.extent
-        channels = self._session.channels(self._session.entry_of(summary))
-        wanted = (c for c in channels if c.channel.topic in self._question.topics)
-        ends = [time for channel in wanted for time in self._ends(channel)]
+        entry = self._session.entry_of(summary)
+        channels = self._session.channels_of(entry, {*self._question.topics})
+        ends = [time for channel in channels for time in self._ends(channel)]
         return span_of(min(ends), max(ends)) if ends else summary.extent
 
     def _ends(self, channel: RecordedChannel) -> Iterator[int]:

@@ -102,6 +102,7 @@ class Rows:
         self._counters = counters
         self._candidates: dict[Part, Tabled | None] = {}
         self._tabled: dict[Part, Tabled | None] = {}
+        self._answered: set[Part] = set()
         self._counts: dict[Part, tuple[int, int]] = {}  # matching ones, and unreadable ones
 
     # The rule.
@@ -119,13 +120,21 @@ class Rows:
         return found if found is not None and _holds(found, fields) else None
 
     def _confirmed(self, part: Part) -> Tabled | None:
-        """The part with its table, if that decides the predicate; counts unreadable messages."""
+        """The part with its table, if that decides the predicate."""
         found = self._candidate(part)
         if found is not None and part.predicate is not None:
             try:
-                self._counters.unreadable += self._count_of(found)[1]
+                self._count_of(found)
             except TABLE_ERRORS:
                 return None
+        return found
+
+    def _answering(self, part: Part, fields: Collection[str] | None = ()) -> Tabled | None:
+        """The same of a part that is answered; counts its unreadable messages once."""
+        found = self.tabled(part, fields)
+        if found is not None and part.predicate is not None and part not in self._answered:
+            self._answered.add(part)
+            self._counters.unreadable += self._count_of(found)[1]
         return found
 
     def leave_table(self, part: Part) -> bool:
@@ -202,7 +211,7 @@ class Rows:
                     in_chunks.append(part)
         self._count_by_file(asked)
         for part in asked:
-            found = self.tabled(part)
+            found = self._answering(part)
             if found is None:
                 in_chunks.append(part)
                 continue
@@ -219,7 +228,7 @@ class Rows:
 
     def outcomes(self, part: Part) -> Iterator[MatchColumns]:
         """For each message of the part's topic and time, whether it matches."""
-        found = self.tabled(part)
+        found = self._answering(part)
         left: Part | None = part
         if found is not None:
             for rows, holds in self._in_table(found):
@@ -238,7 +247,7 @@ class Rows:
 
     def values(self, part: Part, fields: Collection[str] | None) -> Iterator[Values]:
         """Fields of the matching messages."""
-        found = self.tabled(part, fields)
+        found = self._answering(part, fields)
         left: Part | None = part
         if found is not None:
             for rows, holds in self._in_table(found, fields):
@@ -379,7 +388,7 @@ class Rows:
         self, part: Part, offsets: dict[ChunkKey, list[NDArray[np.int64]]]
     ) -> Tabled | None:
         """The part with its table, which has added the places of its matching messages."""
-        found = self.tabled(part)
+        found = self._answering(part)
         if found is None:
             return None
         try:

@@ -63,7 +63,7 @@ def next_time(session: Session, recording: RecordingEntry, topic: str, moment: i
         topic: Full name.
         moment: The time, ns.
     """
-    channels = [c.channel_id for c in session.channels(recording) if c.channel.topic == topic]
+    channels = [channel.channel_id for channel in session.channels_of(recording, [topic])]
     if recording.span is None or not channels:
         return None
     first, last = recording.span
