@@ -236,13 +236,10 @@ class _Choosing:
             if predicate:
                 checked = self._session.predicate(predicate, tuple(topics), ids)
                 question = Question(tuple(topics), ids, predicate=checked)
-            found = {self._snapshot.by_id[one] for one in self._having_any(question)}
+            planner = Planner(self._session, question, Counters())
+            found = {self._snapshot.by_id[one] for one in planner.recordings_with_any()}
         if not self._keep(found, f"with a message for which {condition!r} holds"):
             raise _NothingLeftError(hint or f"{len(there)} with {listed(topics)} were asked.")
-
-    def _having_any(self, question: Question) -> set[str]:
-        """Ids of the recordings with at least one message of the answer."""
-        return Planner(self._session, question, Counters()).recordings_with_any()
 
 
 def _is_side(moment: TimeLike | None) -> bool:

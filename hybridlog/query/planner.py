@@ -50,6 +50,7 @@ class Planner:
         self.counters = counters
         self._counted: set[Part] = set()  # parts whose messages without fields are counted
         self._ranges = RangeResolver(session, question)
+        self._rows = Rows(session, counters)
 
     @lazy
     def _index(self) -> IndexReader:
@@ -57,10 +58,6 @@ class Planner:
         from hybridlog.query.index_reader import IndexReader
 
         return IndexReader(self.session, self.counters)
-
-    @lazy
-    def _rows(self) -> Rows:
-        return Rows(self.session, self.counters)
 
     def parts(self) -> list[Part]:
         """The question, split by recording and topic; recordings oldest first."""
@@ -88,17 +85,11 @@ class Planner:
         for topic, channels in by_topic.items():
             if not any(c.stats.messages for c in channels):
                 continue  # nothing was sent on the topic
-            undecodable = [c for c in channels if asks_fields and _has_no_fields(c)]
-            yield Part(
-                recording,
-                topic,
-                tuple(c for c in channels if not asks_fields or not _has_no_fields(c)),
-                bounds,
-                self.question.clock,
-                windows,
-                predicate,
-                tuple(undecodable),
-            )
+            # Without a definition, for example, messages are not decoded.
+            asked = tuple(c for c in channels if not asks_fields or c.codec.indexed)
+            rest = tuple(c for c in channels if asks_fields and not c.codec.indexed)
+            clock = self.question.clock
+            yield Part(recording, topic, asked, bounds, clock, windows, predicate, rest)
 
     def channels(self) -> list[RecordedChannel]:
         """Every channel of the question."""
@@ -133,17 +124,11 @@ class Planner:
 
     def count(self) -> int:
         """Number of messages in the answer; payloads are read only as the last resort."""
-        every = self.question.every
-        by_topic: dict[str, list[Part]] = defaultdict(list)
+        every, limit = self.question.every, self.question.limit
+        alike: dict[str, list[Part]] = defaultdict(list)
         for part in self.parts():
-            by_topic[part.topic].append(part)
-        if every == 1:
-            parts = [part for parts in by_topic.values() for part in parts]
-            total = self._again(self._count, parts)
-        else:
-            counts = (self._again(self._count, parts) for parts in by_topic.values())
-            total = sum(-(-count // every) for count in counts)
-        limit = self.question.limit
+            alike[part.topic if every > 1 else ""].append(part)
+        total = sum(-(-self._again(self._count, parts) // every) for parts in alike.values())
         return total if limit is None else min(total, limit)
 
     def recordings_with_any(self) -> set[str]:
@@ -345,11 +330,6 @@ class Planner:
             raise TopicError(
                 f"{topic} came without publish times (ROS 1 bags have none): use --clock log."
             )
-
-
-def _has_no_fields(channel: RecordedChannel) -> bool:
-    """True if the messages of a channel are not decoded, for example without a definition."""
-    return not channel.codec.indexed
 
 
 def _after(item: _Rows, key: tuple[int, int]) -> _Rows | None:

@@ -83,16 +83,6 @@ class Ranges(Sequence[Resolved]):
     def __len__(self) -> int:
         return len(self.places)
 
-    @property
-    def summaries(self) -> list[RecordingSummary]:
-        """The recordings."""
-        return [self._summaries[place] for place in self.places.tolist()]
-
-    def take(self, rows: NDArray[np.intp]) -> Ranges:
-        """The recordings in some rows."""
-        each = None if self._each is None else [self._each[row] for row in rows.tolist()]
-        return Ranges(self._snapshot, self.places[rows], self._shared, each, self._during)
-
     def __getitem__(self, row: int) -> Resolved:  # type: ignore[override]
         """The recording in a row."""
         summary = self._summaries[self.places[row]]

@@ -250,10 +250,15 @@ class Rows:
         found = self._answering(part, fields)
         left: Part | None = part
         if found is not None:
+            from hybridlog.schema.arrow_types import narrowed
+
+            kind = None if fields is None else found.table.fields(fields)
             for rows, holds in self._in_table(found, fields):
                 chosen = rows if holds.all() else rows.take(np.flatnonzero(holds))
                 if len(chosen):
-                    yield Values(chosen.t, chosen.seq, _only(chosen.records, fields))
+                    # Without the columns that only the predicate needs.
+                    records = chosen.records if kind is None else narrowed(chosen.records, kind)
+                    yield Values(chosen.t, chosen.seq, records)
             left = found.rest
         for channel, run in self._by_channel(self.plan([left])) if left is not None else ():
             decoded = self._decoded(channel, run.batch, fields)
@@ -621,28 +626,3 @@ def _wanted(table: TopicTable, part: Part, fields: Collection[str] | None) -> se
     if fields is None:
         return None
     return {*_paths(table, part), *(path.replace("[]", "") for path in fields)}
-
-
-def _only(records: pa.StructArray, fields: Collection[str] | None) -> pa.StructArray:
-    """The records without the columns that only the predicate needs."""
-    if fields is None:
-        return records
-    return _pruned(records, [path.replace("[]", "").split(".") for path in fields])
-
-
-def _pruned(records: pa.StructArray, paths: Sequence[Sequence[str]]) -> pa.StructArray:
-    import pyarrow as pa
-
-    from hybridlog.schema.arrow_columns import structs
-
-    names, columns = [], []
-    for field, column in zip(records.type, records.flatten(), strict=True):
-        below = [path[1:] for path in paths if path[0] == field.name]
-        if not below:
-            continue
-        is_whole = any(not path for path in below) or not pa.types.is_struct(field.type)
-        names.append(field.name)
-        columns.append(column if is_whole else _pruned(column, below))
-    if not names:
-        return structs({}, len(records))
-    return pa.StructArray.from_arrays(columns, names=names)
