@@ -159,6 +159,11 @@ class Planner:
         """For each message of a part, whether it matches, in order."""
         return self._lasting(part, self._rows.outcomes)
 
+    def times(self, part: Part) -> NDArray[np.int64]:
+        """Log times of the matching messages of a part, ns, ascending."""
+        found = [one.log_time[one.holds] for one in self.outcomes(part)]
+        return np.concatenate([np.empty(0, np.int64), *found])
+
     def values(self, part: Part, fields: Collection[str] | None) -> Iterator[Values]:
         """Fields of the matching messages of a part, in order."""
         return self._lasting(part, lambda own: self._rows.values(own, fields))

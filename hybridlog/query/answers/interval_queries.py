@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import groupby, islice
 from operator import itemgetter
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -34,7 +33,8 @@ if TYPE_CHECKING:
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.summary import RecordingSummary
 
-_T = TypeVar("_T")
+_Rows = TypeVar("_Rows", bound="tuple[Any, ...]")
+_NONE = np.empty(0, np.int64)
 
 
 class IntervalQueries:
@@ -73,7 +73,7 @@ class IntervalQueries:
             self._session, replace(self._question, predicate=None), self._planner.counters
         )
         spans = RangeResolver(self._session, self._question).spans()
-        by_recording = plain.times_in({summary.id: summary for summary, _ in spans})
+        by_recording = plain.times_in(summary for summary, _ in spans)
         whole = Intervals.of(
             (summary.id, np.array([[begin, end, 0]], np.int64)) for summary, (begin, end) in spans
         )
@@ -87,13 +87,13 @@ class IntervalQueries:
         found = held.common(known) if state == "held" else known.without(held)
         return found.counted(by_recording)
 
-    def times_in(self, summaries: Mapping[str, RecordingSummary]) -> dict[str, NDArray[np.int64]]:
+    def times_in(self, summaries: Iterable[RecordingSummary]) -> dict[str, NDArray[np.int64]]:
         """Log times of the messages of recordings, at any time, ns, ascending, by id."""
-        found: dict[str, list[NDArray[np.int64]]] = defaultdict(list)
-        for name, summary in summaries.items():
-            for part in self._planner.parts_in(summary, None, None):
-                found[name] += [o.log_time[o.holds] for o in self._planner.outcomes(part)]
-        return {name: np.concatenate(parts) for name, parts in found.items() if parts}
+        return {
+            summary.id: self._planner.times(part)
+            for summary in {one.id: one for one in summaries}.values()
+            for part in self._planner.parts_in(summary, None, None)
+        }
 
     def changes(self, fields: Sequence[str], pause: DurationLike, tolerance: float) -> Intervals:
         """Intervals in which fields change; see `Query.changes`."""
@@ -163,33 +163,45 @@ class IntervalQueries:
         self, part: Part, span: Span, gap: int | None, inner: Part, before: Sequence[Part]
     ) -> NDArray[np.int64]:
         # The last message before the range determines the state at its beginning.
-        last = self._last_before(part, span, before)
-        found = [(np.array([time]), np.array([holds])) for time, holds in last]
-        found += [(one.log_time, one.holds) for one in self._planner.outcomes(inner)]
-        found.append((np.empty(0, np.int64), np.empty(0, np.bool_)))
-        time, holds = (np.concatenate(column) for column in zip(*found, strict=True))
+        last = self._last_before(part, span, self._planner.outcomes, before)
+        found = [(one.log_time, one.holds) for one in self._planner.outcomes(inner)]
+        begun = (last.log_time[-1:], last.holds[-1:]) if last else (_NONE, _NONE.astype(np.bool_))
+        time, holds = (np.concatenate(column) for column in zip(begun, *found, strict=True))
         end = extent_of(part.recording)[1]
-        return clipped(holding(time, holds, end, gap, before=len(last)), span)
+        return clipped(holding(time, holds, end, gap, before=len(begun[0])), span)
 
-    def _last_before(self, part: Part, span: Span, first: Sequence[Part]) -> list[tuple[int, bool]]:
-        """Time and outcome of the last message before a span, if any, whether it matches or not."""
-        further = (_bounded(part, (begin, span[0])) for begin in [*_earlier(part, span)][1:])
+    def _last_before(
+        self,
+        part: Part,
+        span: Span,
+        ask: Callable[[Part], Iterator[_Rows]],
+        first: Sequence[Part] = (),
+    ) -> _Rows | None:
+        """The last rows before a span, if there are any; unreadable messages do not count.
+
+        Rows begin with the column of log times; `first` are those of `_just_before`, if at hand.
+        """
+        counters = self._planner.counters
+        unreadable = counters.unreadable, counters.without_arrays
+        begins = islice(_earlier(part, span), len(first), None)
+        further = (_bounded(part, (begin, span[0])) for begin in begins)
         for before in (*first, *further):
-            last: list[tuple[int, bool]] = []
-            for found in self._beside(self._planner.outcomes, before):
-                if len(found.log_time):
-                    last = [(int(found.log_time[-1]), bool(found.holds[-1]))]
-            if last:
+            last = None
+            for found in ask(before):
+                last = found if len(found[0]) else last
+            counters.unreadable, counters.without_arrays = unreadable
+            if last is not None:
                 return last
-        return []
+        return None
 
     def _steps_in(
         self, part: Part, span: Span, paths: Collection[str], tolerance: float
     ) -> NDArray[np.int64]:
         """Log times of the messages in a span that differ from the one before."""
         ask = partial(self._rows, paths=paths)
-        carried = self._row_before(part, span, ask)
-        found = [np.empty(0, np.int64)]
+        before = self._last_before(part, span, ask)
+        carried = None if before is None else before[1][-1:]
+        found = [_NONE]
         for times, rows in ask(_bounded(part, span)):
             if len(rows):
                 differs, carried = _steps(carried, rows, tolerance)
@@ -209,27 +221,6 @@ class IntervalQueries:
         read = {path.rpartition(".")[0] if path in summaries else path for path in paths}
         for times, _, records in self._planner.values(part, read):
             yield times, structs(with_summaries(flat(records), paths), len(times))
-
-    def _row_before(
-        self, part: Part, span: Span, ask: Callable[[Part], Iterator[tuple[object, pa.StructArray]]]
-    ) -> pa.StructArray | None:
-        """The fields of the last matching message before a span."""
-        for begin in _earlier(part, span):
-            last = None
-            for _, rows in self._beside(ask, _bounded(part, (begin, span[0]))):
-                last = rows[-1:] if len(rows) else last
-            if last is not None:
-                return last
-        return None
-
-    def _beside(self, ask: Callable[[Part], Iterator[_T]], part: Part) -> Iterator[_T]:
-        """Items of a part outside of the asked time, where unreadable messages do not count."""
-        counters = self._planner.counters
-        before = counters.unreadable, counters.without_arrays
-        for item in ask(part):
-            counters.unreadable, counters.without_arrays = before
-            yield item
-        counters.unreadable, counters.without_arrays = before
 
     def _check(self, subject: str) -> None:
         question = self._question
@@ -269,11 +260,9 @@ def _steps(
     from hybridlog.query.rows_differ import rows_differ
 
     whole = rows if carried is None else joined([carried, rows])
-    numbers = np.arange(1, len(whole))
-    differs = rows_differ(whole, numbers, numbers - 1, tolerance)
-    if carried is None:
-        differs = np.concatenate([[False], differs])
-    return differs, whole[-1:]
+    numbers = np.arange(len(whole))
+    differs = rows_differ(whole, numbers, np.maximum(numbers - 1, 0), tolerance)
+    return differs[len(whole) - len(rows) :], whole[-1:]
 
 
 def _extent(recording: RecordingSummary) -> Span:
