@@ -12,16 +12,15 @@ from collections.abc import (
 )
 from contextlib import suppress
 from itertools import accumulate
-from typing import TYPE_CHECKING, Concatenate, ParamSpec, Protocol, TypeVar
+from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import numpy as np
 
 from hybridlog.entries import channels_of, read_again, summary_of, take_inventory
-from hybridlog.query.chunk_columns import ChunkColumns
-from hybridlog.query.chunk_counts import Parts, part_rows
+from hybridlog.query.chunk_columns import PARTS, ChunkColumns
 from hybridlog.query.question import RecordedChannel, field_types
 from hybridlog.query.topics import resolve
-from hybridlog.record.marks import MARKS, MARKS_SEGMENT
+from hybridlog.record.marks import MARKS
 from hybridlog.snapshot import UNFINISHED
 from hybridlog.wording import counted, listed
 from hybridlog_storage.catalog import ChannelStats, file_of
@@ -47,7 +46,6 @@ if TYPE_CHECKING:
     from hybridlog.query.question import Question
     from hybridlog.shared import Shared
     from hybridlog.snapshot import Snapshot
-    from hybridlog_storage.cache import Cache
     from hybridlog_storage.catalog import Catalog, RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.segments.chunk import StoredChunk
@@ -60,18 +58,13 @@ _ROW_BYTES = 44  # of a message's columns in a chunk
 _MAX_COLUMNS = 4096  # sets of chunks that are at hand
 _MAX_RESOLVED = 128  # topic patterns
 
-_P = ParamSpec("_P")
 _T = TypeVar("_T")
 _Topics = tuple[tuple[str, ...], tuple[str, ...] | None]
 """Topics, and the ids of the recordings that have any; None for all."""
 
 
 class Asked(Protocol):
-    """What is asked: an open store as it is at each question, or always at one moment.
-
-    Attributes:
-        directory: The store's directory.
-    """
+    """What is asked: an open store as it is at each question, or always at one moment."""
 
     directory: StoreDirectory
 
@@ -83,17 +76,13 @@ class Session:
     """An open store at one moment. Thread safe.
 
     A question takes one at its beginning, and hands it to all that it calls. What running
-    recordings have flushed by then is read when it first asks about them. A file that is gone,
-    or another one, is looked for once in the newer state of its recording.
+    recordings have flushed by then is read when it first asks about them. Where a file is gone, or
+    another one, the newer state of its recording takes the place of the one of the moment.
 
     Args:
         shared: What all moments of the store share.
         recordings: All recordings; running ones as they were at the last look.
         resolved: Topics of patterns, as long as the topics are the same.
-
-    Attributes:
-        shared: As above.
-        directory: The store's directory.
     """
 
     def __init__(
@@ -104,10 +93,10 @@ class Session:
     ) -> None:
         self.shared = shared
         self.directory = shared.directory
+        self.cache = shared.cache
         self._recordings = recordings
         self._resolved = {} if resolved is None else resolved
         self._entries: dict[str, RecordingEntry] = {}  # that were asked about, by id
-        self._newer: dict[str, Session] = {}  # has the files of a recording, by its id
 
     def now(self) -> Session:
         """This moment; refuses processes that were forked since."""
@@ -122,11 +111,6 @@ class Session:
     def catalog(self) -> Catalog:
         """Recordings, channels, chunks and schemas."""
         return self.shared.catalog
-
-    @property
-    def cache(self) -> Cache:
-        """What was read or worked out."""
-        return self.shared.cache
 
     @property
     def tables(self) -> Tables:
@@ -176,10 +160,6 @@ class Session:
                 shared.replace_latest(snapshot, self)
             return entry
 
-    def recordings(self) -> list[RecordingEntry]:
-        """All recordings, oldest first. Reads the whole catalog; see `snapshot`."""
-        return [*self.entries(self._recordings.summaries)]
-
     def entries(self, summaries: Iterable[RecordingSummary]) -> Iterator[RecordingEntry]:
         """The entries of some recordings, without those that were removed meanwhile."""
         for summary in summaries:
@@ -188,12 +168,7 @@ class Session:
                 yield entry
 
     def entry_of(self, summary: RecordingSummary) -> RecordingEntry:
-        """The entry of a recording, compared with its files once.
-
-        Raises:
-            TopicError: it was removed.
-            StoreError: its files cannot be read.
-        """
+        """The entry of a recording, compared with its files once."""
         found = self._entry_of(summary)
         if found is None:
             raise gone(summary.name)
@@ -220,11 +195,7 @@ class Session:
         return None if place is None else self._entry_of(self._recordings.summaries[place])
 
     def entry(self, recording: str) -> RecordingEntry:
-        """The entry of a recording, by its id or its name.
-
-        Raises:
-            TopicError: it does not exist.
-        """
+        """The entry of a recording, by its id or its name."""
         snapshot = self._recordings
         found = snapshot.called(recording)
         if len(found) != 1:
@@ -232,11 +203,7 @@ class Session:
         return self.entry_of(snapshot.summaries[found[0]])
 
     def chosen(self, question: Question) -> NDArray[np.intp]:
-        """Positions in the snapshot of the recordings of a question, oldest first.
-
-        Raises:
-            TopicError: a recording does not exist any more.
-        """
+        """Positions in the snapshot of the recordings of a question, oldest first."""
         snapshot = self.look(question.recordings)
         if question.recordings is None:
             return snapshot.having(question.topics)
@@ -274,13 +241,9 @@ class Session:
         return self.directory.when_empty
 
     def select(self, names: Iterable[str | RecordingEntry] | None) -> list[RecordingEntry]:
-        """Recordings by name, id, or the beginning of one of these; None for all.
-
-        Raises:
-            TopicError: no recording matches, or several do.
-        """
+        """Recordings by name, id, or the beginning of one of these; None for all."""
         if names is None:
-            return self.recordings()
+            return [*self.entries(self._recordings.summaries)]
         snapshot = self._recordings
         return [self.entry_of(snapshot.summaries[place]) for place in self.named(names)]
 
@@ -291,11 +254,7 @@ class Session:
         return [self.entry_of(snapshot.summaries[place]) for place in places if place >= 0]
 
     def named(self, names: Iterable[str | RecordingEntry]) -> list[int]:
-        """Positions of recordings in the snapshot, each once, in the order of the names.
-
-        Raises:
-            TopicError: no recording matches a name, or several do.
-        """
+        """Positions of recordings in the snapshot, each once, in the order of the names."""
         snapshot = self._recordings
         chosen: dict[int, None] = {}
         for given in names:
@@ -378,9 +337,6 @@ class Session:
         Args:
             topics: Full names.
             recordings: Ids, names or entries; None for all.
-
-        Raises:
-            TopicError: no recording has any of the topics.
         """
         ids = None
         if recordings is not None:
@@ -411,11 +367,7 @@ class Session:
         return names
 
     def resolve(self, names: tuple[str, ...]) -> _Topics:
-        """The topics that patterns match, and the recordings that have them.
-
-        Raises:
-            TopicError: a pattern matches no topic, or several; lists the candidates.
-        """
+        """The topics that patterns match, and the recordings that have them."""
         known = self.topics()
         if not names:
             there = f"There are: {listed(known)}." if known else self.when_empty
@@ -439,11 +391,7 @@ class Session:
         return snapshot.topics_at(np.array(places, np.intp))
 
     def resolve_in(self, names: Sequence[str], recordings: Sequence[str]) -> list[str]:
-        """The topics of some recordings that patterns match.
-
-        Raises:
-            TopicError: as for `resolve`; also lists other recordings with such a topic.
-        """
+        """The topics of some recordings that patterns match."""
         known = self.topics_of(recordings)
         snapshot = self.look(recordings)
         try:
@@ -464,11 +412,7 @@ class Session:
     def predicate(
         self, text: str, topics: tuple[str, ...], recordings: tuple[str, ...] | None
     ) -> Predicate:
-        """A predicate, or a MongoDB filter as JSON, on some topics of some recordings.
-
-        Raises:
-            WhereError: it cannot be parsed, does not fit the fields, or is not allowed.
-        """
+        """A predicate, or a MongoDB filter as JSON, on some topics of some recordings."""
         from hybridlog.query.predicate.mongo_filter import from_json, mongo_filter
         from hybridlog.query.predicate.parser import parse
         from hybridlog.query.predicate.tokens import is_filter
@@ -545,7 +489,7 @@ class Session:
                 yield chunk, max(last, lasts[place])
 
     def _chunk_columns(
-        self, recording: RecordingEntry, number: int, channels: Sequence[int]
+        self, recording: RecordingEntry, number: int, channels: Collection[int]
     ) -> tuple[ChunkColumns, NDArray[np.void] | None]:
         """The chunks of a segment with some channels, and header stamps of its parts."""
         table, stamps = self._of_catalog(recording, self.catalog.decoded_table, number)
@@ -560,26 +504,20 @@ class Session:
     def _of_catalog(
         self,
         recording: RecordingEntry,
-        ask: Callable[Concatenate[RecordingEntry, _P], _T],
-        *args: _P.args,
-        **kwargs: _P.kwargs,
+        ask: Callable[[RecordingEntry, int], _T],
+        number: int,
     ) -> _T:
-        """An answer of the catalog; the files are read again if they have changed.
+        """An answer of the catalog about a segment; the files are read again if they changed.
 
         Raises:
             ChangedError: They are not those of the entry any more.
         """
         try:
-            return ask(recording, *args, **kwargs)
+            return ask(recording, number)
         except CatalogError:
-            newer = self._newer_of(recording)
-            if newer is not None:
-                now = newer.entry(recording.id)
-                if (now.digests, now.files) != (recording.digests, recording.files):
-                    self._entries[recording.id] = now
-                    raise _changed(recording) from None
+            self._check_same(recording, number)
             read_again(self.directory, self.catalog, recording)
-            return ask(recording, *args, **kwargs)
+            return ask(recording, number)
 
     def chunk_table(self, recording: RecordingEntry, number: int) -> ChunkTable:
         """The chunks of a segment of a recording."""
@@ -587,32 +525,31 @@ class Session:
 
     def parts(
         self, recording: RecordingEntry, channels: Collection[int], span: tuple[int, int]
-    ) -> Parts:
-        """The parts of chunks that may hold messages of some channels in a time range.
-
-        Args:
-            recording: The recording.
-            channels: Channel ids.
-            span: Log time `[begin, end)`, ns.
-        """
-        ids = np.array([*channels], np.int64)
-        found = [np.empty((0, 6), np.int64)]
+    ) -> NDArray[np.void]:
+        """The `ChunkColumns.parts` that may lie in a range `[begin, end)` of log time, ns."""
+        found = [np.empty(0, PARTS)]
         for number, first, last in recording.spans_with(channels):
             if min(first, END - 1) < span[1] and last >= span[0]:
-                rows = part_rows(number, self.chunk_table(recording, number))
-                inside = (placed(rows[:, 4]) < span[1]) & (rows[:, 5] >= span[0])
-                found.append(rows[inside & np.isin(rows[:, 2], ids)])
-        return Parts.of(np.concatenate(found))
+                rows = self._chunk_columns(recording, number, channels)[0].parts
+                found.append(rows[(placed(rows["first"]) < span[1]) & (rows["last"] >= span[0])])
+        return np.concatenate(found)
 
     def times(
         self, recording: RecordingEntry, segment: int, chunk: int
     ) -> dict[int, NDArray[np.int64]]:
         """Log times of a chunk's messages by channel, ascending; reads no payload."""
         place = place_of(self.chunk_table(recording, segment), chunk)
-        found = self._read(recording.id, segment, lambda reader: reader.read_times(place))
-        if not found.keys() >= {*place.channels}:
-            raise StoreError(f"Payloads of {recording.name!r} were deleted meanwhile. Ask again.")
-        return found
+
+        def read() -> dict[int, NDArray[np.int64]]:
+            found = self._read(recording.id, segment, lambda reader: reader.read_times(place))
+            if not found.keys() >= {*place.channels}:
+                raise StoreError(
+                    f"Payloads of {recording.name!r} were deleted meanwhile. Ask again."
+                )
+            return found
+
+        key = recording.id, segment, chunk, place.offset, file_of(recording, segment)
+        return self.cache.made("times", *key, make=read, size_of=_size_of_times)
 
     def chunk(
         self,
@@ -644,12 +581,10 @@ class Session:
         """The reader of a segment of a recording, by its id. Thread safe.
 
         Raises:
-            ChangedError: It has been let go.
+            ChangedError: It has been let go, or is another file by now.
             SegmentError: It cannot be opened.
             TopicError: The recording is gone.
         """
-        if recording in self._newer and number != MARKS_SEGMENT:
-            return self._newer_segment(recording, number)
         entry = self.entry(recording)
         if number in entry.flushed:
             return entry.flushed[number].reader
@@ -658,9 +593,8 @@ class Session:
         try:
             return self.shared.segment(entry, number)
         except SegmentError:
-            if self._newer_of(entry) is None:
-                raise
-            return self._newer_segment(recording, number)
+            self._check_same(entry, number)
+            raise
 
     def hold(self, recording: RecordingEntry, segments: Iterable[int]) -> None:
         """Open segments that will be read, if a ring may let them go meanwhile.
@@ -679,15 +613,6 @@ class Session:
         now = self.directory.manifests.find(recording)
         return now is not None and number not in now.logs and now.has_let_go(number)
 
-    def _newer_segment(self, recording: str, number: int) -> SegmentReader:
-        """As of `segment`, in a newer state of the store."""
-        newer = self._newer[recording]
-        try:
-            return newer.segment(recording, number)
-        except ChangedError:
-            self._entries[recording] = newer.entry(recording)
-            raise
-
     def read_chunk(self, recording: str, number: int, place: ChunkPlace) -> StoredChunk:
         """Read a chunk of a segment of a recording, by its id.
 
@@ -698,33 +623,30 @@ class Session:
         return self._read(recording, number, lambda reader: reader.read_chunk(place))
 
     def _read(self, recording: str, number: int, read: Callable[[SegmentReader], _T]) -> _T:
-        """Read something of a segment; once more if it is another file by now."""
         try:
             return read(self.segment(recording, number))
         except SegmentError:
-            if recording in self._newer or self._newer_of(self.entry(recording)) is None:
-                raise
-            return read(self._newer_segment(recording, number))
+            self._check_same(self.entry(recording), number)
+            raise
 
-    def _newer_of(self, entry: RecordingEntry) -> Session | None:
-        """A newer state of the store, if a recording has other files there.
+    def _check_same(self, entry: RecordingEntry, number: int) -> None:
+        """See whether a segment that cannot be read is another file by now.
 
         Raises:
+            ChangedError: It is. Later questions to this moment are about the newer files.
             TopicError: The recording is gone.
         """
         place = self._recordings.by_id.get(entry.id)
         look = None if place is None else self._recordings.summaries[place].look
         if self.directory.looks([entry.id]).get(entry.id) == look:
-            return None
+            return
         self.shared.catch_up(entry.id)
-        newer: Session = self.shared.now()
-        now = newer.entry_if_there(entry.id)
+        now: RecordingEntry | None = self.shared.now().entry_if_there(entry.id)
         if now is None:
             raise gone(entry.name)
-        if _files_of(now) == _files_of(entry):
-            return None
-        self._newer[entry.id] = newer
-        return newer
+        if _file_in(now, number) != _file_in(entry, number):
+            self._entries[entry.id] = now
+            raise _changed(entry)
 
     def expired_fields(
         self, recording: RecordingEntry, topic: str, chunks: Mapping[tuple[int, int], int]
@@ -748,9 +670,10 @@ class Session:
         self.shared.repairs.noted_tables.add((recording.id, topic))
 
 
-def _files_of(entry: RecordingEntry) -> tuple[object, ...]:
-    """What tells the files of a recording from later ones."""
-    return entry.digests, entry.files, entry.flushed.keys()
+def _file_in(entry: RecordingEntry, number: int) -> tuple[object, ...]:
+    """What tells a segment of a recording from a later file of its number."""
+    key = str(number)
+    return entry.digests.get(key), entry.files.get(key), number in entry.flushed
 
 
 def _in_order(by_topic: Iterable[Sequence[RecordedChannel]]) -> list[RecordedChannel]:
@@ -766,3 +689,7 @@ def _changed(recording: RecordingEntry) -> ChangedError:
 
 def _size_of(chunk: StoredChunk) -> int:
     return len(chunk.batch.buffer) + _ROW_BYTES * len(chunk.batch)
+
+
+def _size_of_times(times: Mapping[int, NDArray[np.int64]]) -> int:
+    return sum(own.nbytes for own in times.values())

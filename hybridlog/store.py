@@ -1019,7 +1019,7 @@ class Store:
                 self.directory,
                 self.catalog,
                 database,
-                self.session.recordings() if names is None else self.session.as_now(names),
+                self.session.select(None) if names is None else self.session.as_now(names),
                 progress=progress,
             )
             self.refresh()

@@ -124,7 +124,7 @@ def _times(
                 return _sorted(one.log_time for one in found), True
         ids = [channel.id for channel in recording.channels if channel.topic == topic]
         parts = session.parts(recording, ids, (BEGIN, END))
-        rows = zip(parts.first, parts.last, parts.messages, strict=True)
+        rows = zip(parts["first"], parts["last"], parts["messages"], strict=True)
         return _sorted(np.linspace(*row).astype(np.int64) for row in rows), False
 
     tails = ((n, one.table.chunks[-1:].tobytes()) for n, one in recording.flushed.items())

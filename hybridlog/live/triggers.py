@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 from hybridlog.query.predicate.parser import parse
-from hybridlog.query.predicate.to_bool import to_bool
 from hybridlog.query.predicate.types import check
 from hybridlog.query.topics import TopicMatcher, matcher, split_topic
 from hybridlog.schema.codec import plain_message
@@ -18,7 +17,7 @@ from hybridlog_storage.errors import DefinitionError, PayloadError, UsageError, 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from hybridlog.query.predicate.tree import Predicate, Test
+    from hybridlog.query.predicate.tree import Predicate
     from hybridlog_storage.messages import Channel
 
 _MAX_WARNINGS = 100  # lines about triggers
@@ -70,7 +69,7 @@ class _Watch(NamedTuple):
     """
 
     text: str
-    test: Test | None
+    test: Callable[[Mapping[str, object]], bool] | None
     names: frozenset[str] = frozenset()
 
 
@@ -146,7 +145,12 @@ class Triggers:
                 )
             else:
                 names = frozenset(path.split(".", 1)[0] for path in trigger.predicate.fields())
-                yield _Watch(trigger.text, to_bool(trigger.predicate, types), names)
+                from hybridlog.query.predicate.to_mask import mask_of_objects
+
+                def test(message, of=trigger.predicate, types=types):  # type: ignore
+                    return bool(mask_of_objects(of, types, [message])[0])
+
+                yield _Watch(trigger.text, test, names)
 
     def _warn_once(self, text: str) -> None:
         if text not in self._warned and len(self._warned) < _MAX_WARNINGS:

@@ -40,9 +40,6 @@ def spans_of(query: Query) -> dict[str, Span]:
 
     It is known without reading messages: those at its ends may not satisfy the predicate,
     or a range of another clock.
-
-    Raises:
-        TimeError: the range is empty, or outside all recordings.
     """
     found: dict[str, Span] = {}
     for part in Planner(query.session, query.question, Counters()).parts():

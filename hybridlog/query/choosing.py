@@ -56,15 +56,7 @@ class _NothingLeftError(Exception):
 
 
 def choose(session: Session, choice: Choice) -> Chosen:
-    """The recordings of a store that satisfy a choice.
-
-    Raises:
-        TopicError: A name without wildcards means no recording, or several; a topic pattern
-            is malformed.
-        TimeError: `during` is no range of times.
-        UsageError: A `where` lacks its topic.
-        WhereError: A predicate cannot be parsed, or does not fit the fields.
-    """
+    """The recordings of a store that satisfy a choice."""
     choosing = _Choosing(session)
     try:
         if not choosing.left and not choice.is_everything:
@@ -92,11 +84,7 @@ def choose(session: Session, choice: Choice) -> Chosen:
 
 
 def placed(session: Session, names: Iterable[str]) -> dict[int, None]:
-    """Positions of recordings by names and globs.
-
-    Raises:
-        TopicError: A name without wildcards means no recording, or several.
-    """
+    """Positions of recordings by names and globs."""
     snapshot = session.snapshot()
     found: dict[int, None] = {}
     for name in names:
@@ -248,13 +236,10 @@ class _Choosing:
             if predicate:
                 checked = self._session.predicate(predicate, tuple(topics), ids)
                 question = Question(tuple(topics), ids, predicate=checked)
-            found = {self._snapshot.by_id[one] for one in self._having_any(question)}
+            planner = Planner(self._session, question, Counters())
+            found = {self._snapshot.by_id[one] for one in planner.recordings_with_any()}
         if not self._keep(found, f"with a message for which {condition!r} holds"):
             raise _NothingLeftError(hint or f"{len(there)} with {listed(topics)} were asked.")
-
-    def _having_any(self, question: Question) -> set[str]:
-        """Ids of the recordings with at least one message of the answer."""
-        return Planner(self._session, question, Counters()).recordings_with_any()
 
 
 def _is_side(moment: TimeLike | None) -> bool:

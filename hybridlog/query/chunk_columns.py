@@ -43,16 +43,19 @@ class Chunk(NamedTuple):
         return self.place.number
 
 
-class ChunkColumns:
-    """Chunks of a segment with messages of some channels, in the order of the file.
+PARTS = np.dtype(
+    [(name, "i8") for name in ("segment", "chunk", "channel", "messages", "first", "last")]
+)
 
-    Args:
-        segment: Number of the segment.
-        table: Its chunks.
-        channels: Channel ids; None for all.
+
+class ChunkColumns:
+    """Chunks of a segment with messages of some channels, or all, in the order of the file.
 
     Attributes:
-        number: int64[n], their numbers.
+        parts: The messages of a channel in a chunk, a row each: number of the `segment` and of
+            the `chunk`, id of the `channel`, number of `messages`, log time, ns, of the `first`
+            and the `last` one.
+        number: int64[n], numbers of the chunks.
         first: int64[n], least log time of the channels, ns.
         last: int64[n], greatest log time, ns.
     """
@@ -62,22 +65,19 @@ class ChunkColumns:
     ) -> None:
         self._segment = segment
         self._table = table
-        parts = table.parts
-        if channels is None:
-            self._rows = np.arange(len(parts))
-        else:
-            ids = np.fromiter(channels, np.int64, len(channels))
-            self._rows = np.flatnonzero(np.isin(parts["channel"], ids))
-        chunk = np.repeat(np.arange(len(table.chunks)), table.chunks["parts"])[self._rows]
-        self._starts = run_starts(chunk) if len(chunk) else np.empty(0, np.intp)
-        self.number = chunk[self._starts]
-        parts = parts[self._rows]
-        if len(parts):
-            self.first = placed(np.minimum.reduceat(parts["first"], self._starts))
-            self.last = np.maximum.reduceat(parts["last"], self._starts)
-            self._messages = np.add.reduceat(parts["messages"].astype(np.int64), self._starts)
-        else:
-            self.first = self.last = self._messages = np.empty(0, np.int64)
+        ids = table.parts["channel"]
+        self._rows = np.flatnonzero(np.isin(ids, ids if channels is None else [*channels]))
+        self.parts: NDArray[np.void] = np.empty(len(self._rows), PARTS)
+        self.parts["segment"] = segment
+        numbers = np.repeat(np.arange(len(table.chunks)), table.chunks["parts"])
+        self.parts["chunk"] = numbers[self._rows]
+        for name in ("channel", "messages", "first", "last"):
+            self.parts[name] = table.parts[name][self._rows]
+        self._starts = run_starts(self.parts["chunk"])
+        self.number: NDArray[np.int64] = self.parts["chunk"][self._starts]
+        self.first = placed(np.minimum.reduceat(self.parts["first"], self._starts))
+        self.last = np.maximum.reduceat(self.parts["last"], self._starts)
+        self._messages = np.add.reduceat(self.parts["messages"], self._starts)
 
     def chunks(self, rows: NDArray[np.bool_] | None = None) -> list[Chunk]:
         """Some of the chunks, or all."""

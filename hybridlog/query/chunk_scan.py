@@ -14,7 +14,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -47,12 +47,6 @@ ChunkKey = tuple[str, int, int]
 """Recording id, segment number, chunk number in the segment."""
 
 
-Offsets: TypeAlias = "Mapping[ChunkKey, NDArray[np.int64]]"
-"""Payload offsets of messages in each chunk, sorted; int64[k]."""
-Selector = Callable[[Sequence["ChunkTask"]], Offsets]
-"""Finds the messages of some chunks that match."""
-
-
 @dataclass(frozen=True, slots=True)
 class RecordingScan:
     """The part of one recording to read.
@@ -71,15 +65,6 @@ class RecordingScan:
     bounds: Span | None
     chunks: Sequence[Chunk]
     windows: NDArray[np.int64] | None = None
-
-    def touches(self, first: int, last: int) -> bool:
-        """True if a chunk may have messages in a window.
-
-        Args:
-            first: Log time of its first message, ns.
-            last: Log time of its last message, ns.
-        """
-        return self.windows is None or touches(self.windows, first, last)
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,9 +107,10 @@ class ScanPlan:
         channels: Every channel that is read.
         scans: The part of each recording to read.
         clock: The clock of the bounds.
-        selector: Finds the messages of channels without a filter; None reads everything.
-        filters: Decides on each message of a channel, by index of the channel.
-        selected: Segments in which the selector finds messages of a channel with a filter.
+        filters: Decides on each message of a channel, by index of the channel, but for those
+            in some segments.
+        offsets: Payload offsets of the other messages that are wanted, by chunk; int64[k].
+        is_chosen: Only messages with offsets, or which a filter accepts, are wanted.
         reverse: Latest message first.
         counters: Count what is read.
     """
@@ -132,9 +118,9 @@ class ScanPlan:
     channels: list[RecordedChannel]
     scans: list[RecordingScan]
     clock: Clock = "log"
-    selector: Selector | None = None
-    filters: Mapping[int, MessageFilter] = field(default_factory=dict)
-    selected: Mapping[int, Collection[int]] = field(default_factory=dict)
+    filters: Mapping[int, tuple[MessageFilter, Collection[int]]] = field(default_factory=dict)
+    offsets: Mapping[ChunkKey, NDArray[np.int64]] = field(default_factory=dict)
+    is_chosen: bool = False
     reverse: bool = False
     counters: Counters = field(default_factory=Counters)
 
@@ -144,16 +130,31 @@ class ScanPlan:
             ChunkTask(scan, chunk)
             for scan in self.scans
             for chunk in scan.chunks
-            if scan.touches(chunk.first, chunk.last)
+            if scan.windows is None or touches(scan.windows, chunk.first, chunk.last)
         ]
+        if self.is_chosen:
+            found = [task for task in found if task.key in self.offsets or self.filtered(task)]
         if self.reverse:
             return sorted(found, key=lambda t: (-t.chunk.last, t.key))
         return sorted(found, key=lambda t: (t.chunk.first, t.key))
 
     def filtered(self, task: ChunkTask) -> list[int]:
         """Indexes of the channels on whose messages in a chunk filters decide."""
+        own = task.scan.channels
+        held = (own[channel] for channel in task.chunk.place.channels if channel in own)
         segment = task.chunk.segment
-        return [one for one in self.filters if segment not in self.selected.get(one, ())]
+        return [i for i in held if i in self.filters and segment not in self.filters[i][1]]
+
+
+def with_payloads(run: MessageRun, counters: Counters) -> MessageRun:
+    """The messages without those that have no payload, which are counted."""
+    gone = [number for number, channel in enumerate(run.channels) if channel.is_reduced]
+    if not gone:
+        return run
+    for number in gone:
+        left = int((run.batch.channel == number).sum())
+        counters.leave_out(left, run.channels[number].state)
+    return run.take(~np.isin(run.batch.channel, gone))
 
 
 class ChunkScan:
@@ -215,86 +216,65 @@ class ChunkScan:
             yield _merged(small)
         plan.counters.elapsed_s = time.monotonic() - started
 
-    def _selected(self, tasks: list[ChunkTask]) -> Iterator[tuple[ChunkTask, Offsets | None]]:
-        """Skip the chunks without candidates."""
-        selector = self._plan.selector
-        if selector is None:
-            yield from ((task, None) for task in tasks)
-            return
-        for group in _groups(tasks):
-            selection = selector(group)
-            for task in group:
-                own = task.scan.channels
-                held = {own[channel] for channel in task.chunk.place.channels if channel in own}
-                if task.key in selection or not held.isdisjoint(self._plan.filtered(task)):
-                    yield task, selection
-
     def loaded(self) -> Iterator[tuple[ChunkTask, MessageRun, ChunkTask | None]]:
         """Each chunk, its wanted messages, and the chunk after it."""
         tasks = self._plan.tasks()
         size = sum(task.chunk.place.length for task in tasks)
         if size < _MIN_THREADED_BYTES or not self._reads_ahead:
-            yield from self._ahead(tasks, lambda *item: partial(self._load, *item))
+            yield from self._ahead(tasks, lambda task: partial(self._load, task))
             return
         with ThreadPoolExecutor(2, thread_name_prefix="hybridlog-read") as pool:
             try:
-                yield from self._ahead(tasks, lambda *item: pool.submit(self._load, *item).result)
+                yield from self._ahead(tasks, lambda task: pool.submit(self._load, task).result)
             finally:
                 pool.shutdown(cancel_futures=True)
 
     def _ahead(
-        self,
-        tasks: list[ChunkTask],
-        start: Callable[[ChunkTask, Offsets | None], Callable[[], _Loaded]],
+        self, tasks: list[ChunkTask], start: Callable[[ChunkTask], Callable[[], _Loaded]]
     ) -> Iterator[tuple[ChunkTask, MessageRun, ChunkTask | None]]:
         counters = self._plan.counters
+        upcoming = iter(tasks)
         if tasks and self._session.segment(*tasks[0].key[:2]).is_fetched:
-            upcoming = self._announced(self._selected(tasks))
-        else:
-            upcoming = self._selected(tasks)
+            upcoming = self._announced(upcoming)
         loading: deque[tuple[ChunkTask, Callable[[], _Loaded]]] = deque()
         while True:
             while len(loading) < _LOOK_AHEAD:
-                item = next(upcoming, None)
-                if item is None:
+                wanted = next(upcoming, None)
+                if wanted is None:
                     break
-                loading.append((item[0], start(*item)))
+                loading.append((wanted, start(wanted)))
             if not loading:
                 return
             check_wanted()
             task, loaded = loading.popleft()
-            run, size, unreadable, expired = loaded()
-            counters.chunks_read += 1
-            counters.bytes_read += size
+            run, chunk, unreadable, expired = loaded()
+            counters.add_chunk(chunk)
             counters.unreadable += unreadable
             counters.without_arrays += expired
             yield task, run, loading[0][0] if loading else None
 
-    def _announced(
-        self, items: Iterator[tuple[ChunkTask, Offsets | None]]
-    ) -> Iterator[tuple[ChunkTask, Offsets | None]]:
+    def _announced(self, tasks: Iterator[ChunkTask]) -> Iterator[ChunkTask]:
         """The same, after a bucket was asked for many of them at once."""
         room = _FETCHED_BYTES if self._reads_ahead else _MERGED_BYTES
-        while group := list(_up_to(items, room)):
+        while group := list(_up_to(tasks, room)):
             by_segment: dict[tuple[str, int], list[ChunkPlace]] = {}
-            for task, _ in group:
+            for task in group:
                 by_segment.setdefault(task.key[:2], []).append(task.chunk.place)
             for segment, places in by_segment.items():
                 self._session.segment(*segment).fetch(places)
             yield from group
 
-    def _load(self, task: ChunkTask, selection: Offsets | None) -> _Loaded:
+    def _load(self, task: ChunkTask) -> _Loaded:
         chunk = self._session.read_chunk(*task.key[:2], task.chunk.place)
         undecided = self._plan.filtered(task)
-        run = self._wanted(task, chunk, selection, undecided)
+        run = self._wanted(task, chunk, undecided)
         run, unreadable, expired = self._filtered(run, undecided)
-        return run, chunk.length + chunk.trailer, unreadable, expired
+        return run, chunk, unreadable, expired
 
     def _wanted(
         self,
         task: ChunkTask,
         chunk: StoredChunk,
-        selection: Offsets | None,
         undecided: Sequence[int],
     ) -> MessageRun:
         batch, seq = chunk.batch, chunk.seq
@@ -309,8 +289,8 @@ class ChunkScan:
             )
         channel = table[batch.channel]
         mask = channel >= 0
-        if selection is not None:
-            offsets = selection.get(task.key, np.empty(0, np.int64))
+        if self._plan.is_chosen:
+            offsets = self._plan.offsets.get(task.key, np.empty(0, np.int64))
             mask &= np.isin(channel, undecided) | np.isin(batch.places[0], offsets)
         bounds = task.scan.bounds
         if bounds is not None:
@@ -337,7 +317,7 @@ class ChunkScan:
             if index in undecided:
                 rows = np.flatnonzero(run.batch.channel == index)
                 channel = self._plan.channels[index]
-                found = filters[index].matches(channel, run.batch.take(rows), run.seq[rows])
+                found = filters[index][0].matches(channel, run.batch.take(rows), run.seq[rows])
                 holds[rows] = found.holds
                 unreadable += found.unreadable
                 expired += found.expired
@@ -392,19 +372,17 @@ class ChunkScan:
         return ready, rest
 
 
-def _up_to(
-    items: Iterator[tuple[ChunkTask, Offsets | None]], room: int
-) -> Iterator[tuple[ChunkTask, Offsets | None]]:
+def _up_to(tasks: Iterator[ChunkTask], room: int) -> Iterator[ChunkTask]:
     """The next chunks, until they have so many bytes."""
-    for item in items:
-        yield item
-        room -= item[0].chunk.place.length
+    for task in tasks:
+        yield task
+        room -= task.chunk.place.length
         if room <= 0:
             return
 
 
-_Loaded = tuple[MessageRun, int, int, int]
-"""Messages, bytes read, messages unreadable for the predicate, those of them that expired."""
+_Loaded = tuple[MessageRun, "StoredChunk", int, int]
+"""Messages and their chunk, messages unreadable for the predicate, those of them that expired."""
 
 
 def _merged(runs: list[MessageRun]) -> MessageRun:
@@ -429,17 +407,3 @@ def _in_order(runs: list[MessageRun], plan: ScanPlan) -> MessageRun:
     if len(runs) == 1:
         return runs[0].take(order)
     return MessageRun(interleave([r.batch for r in runs], order), seq[order], plan.channels)
-
-
-def _groups(tasks: list[ChunkTask], limit: int = 50_000) -> Iterator[list[ChunkTask]]:
-    """Runs of chunks whose messages are selected with one query."""
-    group: list[ChunkTask] = []
-    messages = 0
-    for task in tasks:
-        group.append(task)
-        messages += task.chunk.messages
-        if messages >= limit:
-            yield group
-            group, messages = [], 0
-    if group:
-        yield group

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from hybridlog.schema.states import State
     from hybridlog_storage.messages import Batch
+    from hybridlog_storage.segments.chunk import StoredChunk
 
 
 @dataclass(slots=True)
@@ -76,6 +77,11 @@ class Counters:
             if each.name != "elapsed_s":
                 total = getattr(self, each.name) + getattr(other, each.name)
                 setattr(self, each.name, total)
+
+    def add_chunk(self, chunk: StoredChunk) -> None:
+        """Count a chunk that was read."""
+        self.chunks_read += 1
+        self.bytes_read += chunk.length + chunk.trailer
 
     def add_messages(self, batch: Batch) -> None:
         """Count messages of the answer."""

@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from hybridlog.frames.names import is_summary
-from hybridlog.query.predicate.to_bool import to_bool
-from hybridlog.query.predicate.tree import Predicate
-from hybridlog.schema.codec import columns_of, plain_message
-from hybridlog_storage.errors import DefinitionError, PayloadError
+from hybridlog.query.predicate.to_mask import mask_of_objects, to_mask
+from hybridlog.query.predicate.tree import Predicate, is_meta
+from hybridlog.schema.arrow_columns import structs
+from hybridlog.schema.codec import columns_of
+from hybridlog.schema.left import LeftFields
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -48,9 +49,10 @@ class MessageFilter:
     def __init__(self, predicate: Predicate, types: Mapping[str, str] | None) -> None:
         self._predicate = predicate
         self._types = types
-        self._test = to_bool(predicate.root, types)
         self._elements = _elements_of(predicate, types or {})
         self._fields = {path.split(".")[0].split("[")[0] for path in predicate.fields()}
+        self._asks_meta = "_meta" in self._fields
+        self._fields -= {"_meta"}
 
     def matches(self, channel: RecordedChannel, batch: Batch, seq: NDArray[np.int64]) -> Matches:
         """Decide on messages of one channel.
@@ -60,69 +62,50 @@ class MessageFilter:
             batch: The messages.
             seq: int64[n], their arrival numbers.
         """
-        if channel.is_reduced and channel.codec.indexed:
-            return self._of_left(channel, batch, seq)
+        holds = np.zeros(len(batch), np.bool_)
+        times = batch.log_time, seq, batch.publish_time
+        if not self._fields:  # what a message itself provides can be asked of any
+            mask = mask_of(self._predicate, self._types, structs({}, len(batch)), channel, *times)
+            assert mask is not None
+            return Matches(mask, 0)
         if not channel.codec.indexed:
-            return self._one_by_one(channel, batch, seq, np.arange(len(batch)))
-        from hybridlog.query.predicate.to_mask import to_mask
-
-        decoded = columns_of(channel.codec, batch, self._fields - {"_meta"})
-        records = decoded.arrow()
-        if "_meta" in self._fields:
-            good = decoded.rows
-            times = batch.log_time[good], seq[good], batch.publish_time[good]
-            records = meta_array(records, channel, *times)
-        mask = to_mask(self._predicate.root, self._types, records)
-        if mask is None:
-            return self._one_by_one(channel, batch, seq, np.arange(len(batch)))
-        holds = np.zeros(len(batch), np.bool_)
-        holds[decoded.rows] = mask
-        unreadable = np.setdiff1d(np.arange(len(batch)), decoded.rows, assume_unique=True)
-        if len(unreadable):
-            rest = self._one_by_one(channel, batch, seq, unreadable)
-            holds[unreadable] = rest.holds[unreadable]
-            return Matches(holds, rest.unreadable)
-        return Matches(holds, 0)
-
-    def _of_left(self, channel: RecordedChannel, batch: Batch, seq: NDArray[np.int64]) -> Matches:
-        """Decide on messages without payload; not where an array that is asked for is lacking."""
-        from hybridlog.schema.left import LeftFields
-
-        fields = self._elements
+            return Matches(holds, len(batch))
+        fields = self._elements if channel.is_reduced else self._fields
         decoded = columns_of(channel.codec, batch, fields)
-        assert isinstance(decoded.records, LeftFields)
-        lacking = decoded.rows[decoded.records.lacking()] if fields else decoded.rows[:0]
-        decidable = np.setdiff1d(np.arange(len(batch)), lacking, assume_unique=True)
-        known = dict(zip(decoded.rows.tolist(), decoded.plain(), strict=True))
-        found = self._one_by_one(channel, batch, seq, decidable, known)
-        return Matches(found.holds, found.unreadable + len(lacking), len(lacking))
+        rows = decoded.rows
+        times = batch.log_time[rows], seq[rows], batch.publish_time[rows]
+        lacking = np.zeros(len(rows), np.bool_)
+        if channel.is_reduced:
+            assert isinstance(decoded.records, LeftFields)
+            lacking = decoded.records.lacking() if fields else lacking
+            mask = None  # of some arrays only summaries are left
+        else:
+            mask = mask_of(self._predicate, self._types, decoded.arrow(), channel, *times)
+        if mask is None:
+            plain = decoded.plain(self._fields, whole=False)
+            if self._asks_meta:
+                meta = meta_array(structs({}, len(rows)), channel, *times).to_pylist()
+                plain = [{**one, **own} for one, own in zip(plain, meta, strict=True)]
+            mask = mask_of_objects(self._predicate, self._types, plain)
+        holds[rows] = mask & ~lacking
+        unread, expired = len(batch) - len(rows), int(lacking.sum())
+        return Matches(holds, unread + expired, expired)
 
-    def _one_by_one(
-        self,
-        channel: RecordedChannel,
-        batch: Batch,
-        seq: NDArray[np.int64],
-        rows: NDArray[np.intp],
-        known: Mapping[int, dict[str, Any]] | None = None,
-    ) -> Matches:
-        """Decide on some rows, whose fields may be known by row."""
-        holds = np.zeros(len(batch), np.bool_)
-        unreadable = 0
-        for row in rows.tolist():
-            try:
-                if known is None:
-                    fields = plain_message(channel.codec, batch.payload(row), self._fields)
-                else:
-                    fields = known[row]
-            except (PayloadError, DefinitionError, KeyError):
-                if self._fields != {"_meta"}:
-                    unreadable += 1
-                    continue
-                fields = {}
-            if "_meta" in self._fields:
-                fields["_meta"] = _meta_of(channel, batch, seq, row)
-            holds[row] = self._test(fields)
-        return Matches(holds, unreadable)
+
+def mask_of(
+    predicate: Predicate,
+    types: Mapping[str, str] | None,
+    records: pa.StructArray,
+    channel: RecordedChannel,
+    *times: Any,
+) -> NDArray[np.bool_] | None:
+    """Mask of the messages for which a predicate holds; None if columns cannot decide.
+
+    `times` are log times, arrival numbers and publish times, as of `meta_array`.
+    """
+    if any(map(is_meta, predicate.fields())):
+        records = meta_array(records, channel, *times)
+    return to_mask(predicate, types, records)
 
 
 def _elements_of(predicate: Predicate, types: Mapping[str, str]) -> set[str]:
@@ -136,20 +119,6 @@ def _elements_of(predicate: Predicate, types: Mapping[str, str]) -> set[str]:
             names = takewhile(lambda part: isinstance(part, str), parts)
             found.add(".".join(map(str, names)))
     return found - {"_meta"}
-
-
-def _meta_of(
-    channel: RecordedChannel, batch: Batch, seq: NDArray[np.int64], row: int
-) -> dict[str, Any]:
-    meta: dict[str, Any] = {
-        "t": int(batch.log_time[row]),
-        "rec": channel.recording.key,
-        "topic": channel.channel.topic,
-        "seq": int(seq[row]),
-    }
-    if channel.channel.has_publish_time:
-        meta["pub"] = int(batch.publish_time[row])
-    return meta
 
 
 def meta_array(

@@ -44,9 +44,6 @@ def question_about(
         topic: The other topic, as written.
         before: Longest time of a wanted message before one of the other topic.
         after: Longest time after it.
-
-    Raises:
-        TopicError: no such topic exists in the recordings.
     """
     recordings = question.recordings
     if recordings is None:
@@ -68,12 +65,7 @@ def question_about(
 
 
 def split_own(node: Node) -> tuple[list[Node], list[Node]]:
-    """The conditions on the message itself, and those on other topics. All of both must hold.
-
-    Raises:
-        WhereError: a condition on the message itself is joined by `or` or negated together
-            with one on another topic.
-    """
+    """The conditions on the message itself, and those on other topics. All of both must hold."""
     if not any(isinstance(inner, Near) for inner in nodes(node)):
         return [node], []
     if isinstance(node, And):

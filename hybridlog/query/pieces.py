@@ -34,11 +34,6 @@ def pieces(query: Query, how: str) -> Iterator[Piece]:
     Args:
         query: The whole question.
         how: `recording`, `mark`, or a predicate, with `TOPIC: ` in front or about the one topic.
-
-    Raises:
-        UsageError: A predicate of no topic.
-        WhereError: It cannot be parsed, or does not fit the fields.
-        TopicError: There is no such topic.
     """
     if how == "recording":
         names = _files_of(query)

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from hybridlog.query.chunk_scan import ChunkKey, ChunkScan, MessageRun
+from hybridlog.query.chunk_scan import ChunkScan, MessageRun
 from hybridlog.query.question import Part
 from hybridlog.query.ranges import RangeResolver
-from hybridlog.query.rows import TABLE_ERRORS, Rows, filter_of
+from hybridlog.query.rows import TABLE_ERRORS, Rows
 from hybridlog.schema.column import STAMP
 from hybridlog.schema.states import GONE
 from hybridlog_storage.errors import ChangedError, TopicError
@@ -24,12 +24,11 @@ from hybridlog_storage.lazy import lazy
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog.query.chunk_scan import ChunkTask, Offsets, ScanPlan
+    from hybridlog.query.chunk_scan import ScanPlan
     from hybridlog.query.counters import Counters
     from hybridlog.query.index_reader import IndexReader
-    from hybridlog.query.message_filter import MessageFilter
     from hybridlog.query.question import Question, RecordedChannel, Span
-    from hybridlog.query.rows import MatchColumns, Objects, Tabled, Values
+    from hybridlog.query.rows import MatchColumns, Values
     from hybridlog.schema.states import State
     from hybridlog.session import Session
     from hybridlog_storage.summary import RecordingSummary
@@ -49,10 +48,9 @@ class Planner:
         self.session = session
         self.question = question
         self.counters = counters
-        self._batch: Sequence[Part] = ()  # parts that are answered one after the other
-        self._decidable: dict[Part, Part] = {}  # with what MongoDB has found
         self._counted: set[Part] = set()  # parts whose messages without fields are counted
         self._ranges = RangeResolver(session, question)
+        self._rows = Rows(session, counters)
 
     @lazy
     def _index(self) -> IndexReader:
@@ -61,44 +59,21 @@ class Planner:
 
         return IndexReader(self.session, self.counters)
 
-    @lazy
-    def _rows(self) -> Rows:
-        return Rows(self.session, self.counters)
-
     def parts(self) -> list[Part]:
-        """The question, split by recording and topic; recordings oldest first.
-
-        Raises:
-            TimeError: the time range is empty, or outside all recordings.
-            TopicError: a topic does not have the requested clock.
-        """
+        """The question, split by recording and topic; recordings oldest first."""
         found = [part for one in self._ranges.resolve() for part in self.parts_in(*one)]
-        return self.batch_hint(self._rows.fitting(found))
+        return self._rows.fitting(found)
 
     def only_part(self) -> Part | None:
-        """The only part of the question; None if it has several, or none.
-
-        Raises:
-            TimeError: as for `parts`.
-            TopicError: as for `parts`.
-        """
+        """The only part of the question; None if it has several, or none."""
         found = self._ranges.resolve()
         parts = [*self.parts_in(*found[0])] if len(found) == 1 else []
-        return self.batch_hint(parts)[0] if len(parts) == 1 else None
+        return parts[0] if len(parts) == 1 else None
 
     def parts_in(
         self, summary: RecordingSummary, bounds: Span | None, windows: NDArray[np.int64] | None
     ) -> Iterator[Part]:
-        """The parts of the question in one recording.
-
-        Args:
-            summary: The recording.
-            bounds: See `Part`.
-            windows: See `Part`.
-
-        Raises:
-            TopicError: a topic does not have the requested clock, or the recording is gone.
-        """
+        """The parts of the question in one recording."""
         recording = self.session.entry_of(summary)
         wanted = set(self.question.topics)
         by_topic: dict[str, list[RecordedChannel]] = defaultdict(list)
@@ -110,17 +85,11 @@ class Planner:
         for topic, channels in by_topic.items():
             if not any(c.stats.messages for c in channels):
                 continue  # nothing was sent on the topic
-            undecodable = [c for c in channels if asks_fields and _has_no_fields(c)]
-            yield Part(
-                recording,
-                topic,
-                tuple(c for c in channels if not asks_fields or not _has_no_fields(c)),
-                bounds,
-                self.question.clock,
-                windows,
-                predicate,
-                tuple(undecodable),
-            )
+            # Without a definition, for example, messages are not decoded.
+            asked = tuple(c for c in channels if not asks_fields or c.codec.indexed)
+            rest = tuple(c for c in channels if asks_fields and not c.codec.indexed)
+            clock = self.question.clock
+            yield Part(recording, topic, asked, bounds, clock, windows, predicate, rest)
 
     def channels(self) -> list[RecordedChannel]:
         """Every channel of the question."""
@@ -155,17 +124,11 @@ class Planner:
 
     def count(self) -> int:
         """Number of messages in the answer; payloads are read only as the last resort."""
-        every = self.question.every
-        by_topic: dict[str, list[Part]] = defaultdict(list)
+        every, limit = self.question.every, self.question.limit
+        alike: dict[str, list[Part]] = defaultdict(list)
         for part in self.parts():
-            by_topic[part.topic].append(part)
-        if every == 1:
-            parts = [part for parts in by_topic.values() for part in parts]
-            total = self._again(self._count, parts)
-        else:
-            counts = (self._again(self._count, parts) for parts in by_topic.values())
-            total = sum(-(-count // every) for count in counts)
-        limit = self.question.limit
+            alike[part.topic if every > 1 else ""].append(part)
+        total = sum(-(-self._again(self._count, parts) // every) for parts in alike.values())
         return total if limit is None else min(total, limit)
 
     def recordings_with_any(self) -> set[str]:
@@ -174,28 +137,32 @@ class Planner:
             part.recording.id for part in self._decided(self.parts()) if self._rows.count([part])
         }
 
-    def batch_hint(self, parts: list[Part]) -> list[Part]:
-        """Announce parts that will be asked about one by one; MongoDB is asked at once."""
-        self._batch = parts
-        return parts
+    def decided(self, parts: Sequence[Part]) -> list[Part]:
+        """Parts with predicates that columns and messages decide: MongoDB is asked about all."""
+        wanted = [part for part in parts if part.needs_index]
+        if not wanted:
+            return [*parts]
+        found = self._index.found(wanted)
+        self.counters.unreadable += found.untested
+        self.counters.not_indexed += self._lacking(found.documents)
+        decidable = dict(zip(wanted, found.parts, strict=True))
+        return [decidable.get(part, part) for part in parts]
 
     def _decided(self, parts: Sequence[Part]) -> list[Part]:
-        """Parts with predicates that columns and messages decide: MongoDB has been asked."""
+        """The same; counts the messages without fields once."""
         self._count_unreadable(parts)
-        wanted = [part for part in parts if part.needs_index and part not in self._decidable]
-        if wanted:
-            if {*wanted} <= {*self._batch}:
-                wanted = [part for part in self._batch if part.needs_index]
-            found = self._index.found(wanted)
-            self.counters.unreadable += found.untested
-            self.counters.not_indexed += self._lacking(found.documents)
-            self._counted.update(found.parts)
-            self._decidable.update(zip(wanted, found.parts, strict=True))
-        return [self._decidable.get(part, part) for part in parts]
+        found = self.decided(parts)
+        self._counted.update(found)
+        return found
 
     def outcomes(self, part: Part) -> Iterator[MatchColumns]:
         """For each message of a part, whether it matches, in order."""
         return self._lasting(part, self._rows.outcomes)
+
+    def times(self, part: Part) -> NDArray[np.int64]:
+        """Log times of the matching messages of a part, ns, ascending."""
+        found = [one.log_time[one.holds] for one in self.outcomes(part)]
+        return np.concatenate([np.empty(0, np.int64), *found])
 
     def values(self, part: Part, fields: Collection[str] | None) -> Iterator[Values]:
         """Fields of the matching messages of a part, in order."""
@@ -205,15 +172,12 @@ class Planner:
         self, parts: Sequence[Part], fields: Collection[str] | None
     ) -> list[Iterator[Values]] | None:
         """The same of each part, if tables have the fields of all their messages."""
-        for part in self._decided(parts):
+        parts = self._decided(parts)
+        for part in parts:
             found = self._rows.tabled(part, fields)
             if found is None or found.rest is not None:
                 return None
         return [self.values(part, fields) for part in parts]
-
-    def objects(self, part: Part) -> Iterator[Objects]:
-        """The matching messages of a part as plain objects, in order."""
-        return self._rows.objects(self.plan([part]))
 
     def runs(self) -> Iterator[MessageRun]:
         """The messages of the answer, in order."""
@@ -288,51 +252,8 @@ class Planner:
         return self._again(self._plan, parts)
 
     def _plan(self, parts: Sequence[Part]) -> ScanPlan:
-        rows = self._rows
-        parts = rows.fitting(self._decided(parts))
-        plan = rows.plan(parts, filtered=False)
-        plan.reverse = self.question.reverse
-        if self.question.predicate is None or not parts:
-            return plan
-        in_tables: dict[Part, Tabled] = {}
-        filters: dict[int, MessageFilter] = {}
-        selected: dict[int, Collection[int]] = {}
-        place = {(c.recording.id, c.channel_id): i for i, c in enumerate(plan.channels)}
-        plan.filters, plan.selected = filters, selected
-
-        def read(part: Part, segments: Collection[int] = ()) -> None:
-            """Let a filter decide, but for the messages in segments with tables."""
-            decide = filter_of(part)
-            assert decide is not None
-            for channel in part.channels:
-                index = place[part.recording.id, channel.channel_id]
-                selected[index], filters[index] = segments, decide
-
-        for part in parts:
-            found = rows.tabled(part)
-            if found is None:
-                read(part)
-                continue
-            in_tables[part] = found
-            if found.segments is not None:
-                read(part, found.segments)
-
-        def select(tasks: Sequence[ChunkTask]) -> Offsets:
-            offsets: dict[ChunkKey, list[NDArray[np.int64]]] = defaultdict(list)
-            wanted = {task.key for task in tasks}
-            for part, found in [*in_tables.items()]:
-                try:
-                    places = rows.places(found)
-                except TABLE_ERRORS:
-                    read(part)  # before chunks are read for it
-                    del in_tables[part]
-                    continue
-                for key in wanted & places.keys():
-                    offsets[key].append(places[key])
-            return {key: np.concatenate(found) for key, found in offsets.items()}
-
-        plan.selector = select if in_tables else None
-        return plan
+        parts = self._rows.fitting(self._decided(parts))
+        return self._rows.plan(parts, reverse=self.question.reverse)
 
     def _count_unreadable(self, parts: Sequence[Part]) -> None:
         """Count, once, the messages that the predicate cannot test for want of fields.
@@ -348,12 +269,7 @@ class Planner:
                 self.counters.unreadable += self._rows.count([unseen])
 
     def count_expired(self) -> Counter[State]:
-        """Number of messages, in the range, whose payloads are gone, by state.
-
-        Raises:
-            TimeError: as for `parts`.
-            TopicError: as for `parts`.
-        """
+        """Number of messages, in the range, whose payloads are gone, by state."""
         found: Counter[State] = Counter()
         for part in self.parts():
             for state in GONE:
@@ -419,11 +335,6 @@ class Planner:
             raise TopicError(
                 f"{topic} came without publish times (ROS 1 bags have none): use --clock log."
             )
-
-
-def _has_no_fields(channel: RecordedChannel) -> bool:
-    """True if the messages of a channel are not decoded, for example without a definition."""
-    return not channel.codec.indexed
 
 
 def _after(item: _Rows, key: tuple[int, int]) -> _Rows | None:

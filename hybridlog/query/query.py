@@ -446,14 +446,12 @@ class Query:
 
         Messages without payload are left out; `counters.reduced` counts them.
         """
+        from hybridlog.query.chunk_scan import with_payloads
+
         for run in self._planner().runs():
-            whole = np.array([not channel.is_reduced for channel in run.channels], np.bool_)
-            batch = run.batch if whole.all() else run.batch.take(whole[run.batch.channel])
-            for number in np.flatnonzero(~whole).tolist():
-                left = int((run.batch.channel == number).sum())
-                self.counters.leave_out(left, run.channels[number].state)
-            if len(batch):
-                yield batch, run.channels
+            whole = with_payloads(run, self.counters)
+            if len(whole.batch):
+                yield whole.batch, run.channels
 
     def latched(
         self, *, original_times: bool = False

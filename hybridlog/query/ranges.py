@@ -83,16 +83,6 @@ class Ranges(Sequence[Resolved]):
     def __len__(self) -> int:
         return len(self.places)
 
-    @property
-    def summaries(self) -> list[RecordingSummary]:
-        """The recordings."""
-        return [self._summaries[place] for place in self.places.tolist()]
-
-    def take(self, rows: NDArray[np.intp]) -> Ranges:
-        """The recordings in some rows."""
-        each = None if self._each is None else [self._each[row] for row in rows.tolist()]
-        return Ranges(self._snapshot, self.places[rows], self._shared, each, self._during)
-
     def __getitem__(self, row: int) -> Resolved:  # type: ignore[override]
         """The recording in a row."""
         summary = self._summaries[self.places[row]]
@@ -109,11 +99,7 @@ class RangeResolver:
         self._question = question
 
     def resolve(self) -> Ranges:
-        """The recordings to ask, oldest first; without reading their entries.
-
-        Raises:
-            TimeError: the range is empty, or outside all recordings.
-        """
+        """The recordings to ask, oldest first; without reading their entries."""
         question = self._question
         places = self._session.chosen(question)
         snapshot = self._session.snapshot()
@@ -137,9 +123,6 @@ class RangeResolver:
 
         Args:
             first: Log times of the first messages of the recordings, ns.
-
-        Raises:
-            TimeError: `10` was written, and `+10` is meant.
         """
         assert self._question.bounds is not None
         begin, _ = self._question.bounds
@@ -173,12 +156,7 @@ class RangeResolver:
         )
 
     def spans(self) -> list[tuple[RecordingSummary, Span]]:
-        """The log time `[begin, end)`, ns, of each recording of the question.
-
-        Raises:
-            TimeError: the range is empty, or outside all recordings.
-            UsageError: the range refers to another clock.
-        """
+        """The log time `[begin, end)`, ns, of each recording of the question."""
         question = self._question
         if not question.is_by_log_time:
             raise UsageError(
@@ -227,9 +205,9 @@ class RangeResolver:
         """`[first, end)` of the question's topics, on the question's clock."""
         if self._question.clock == "log":
             return summary.extent
-        channels = self._session.channels(self._session.entry_of(summary))
-        wanted = (c for c in channels if c.channel.topic in self._question.topics)
-        ends = [time for channel in wanted for time in self._ends(channel)]
+        entry = self._session.entry_of(summary)
+        channels = self._session.channels_of(entry, {*self._question.topics})
+        ends = [time for channel in channels for time in self._ends(channel)]
         return span_of(min(ends), max(ends)) if ends else summary.extent
 
     def _ends(self, channel: RecordedChannel) -> Iterator[int]:
@@ -257,11 +235,7 @@ class RangeResolver:
         return beside or bounds[0] >= bounds[1]
 
     def _refuse(self, places: NDArray[np.intp]) -> None:
-        """Refuse a range that overlaps no recording.
-
-        Raises:
-            TimeError: it ends before it begins, or is outside all recordings.
-        """
+        """Refuse a range that overlaps no recording."""
         assert self._question.bounds is not None
         begin, stop = self._question.bounds
         summaries = self._session.snapshot().summaries

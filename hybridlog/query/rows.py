@@ -11,12 +11,10 @@ from collections import Counter, defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from hybridlog.query.chunk_counts import Placed
 from hybridlog.query.chunk_scan import ChunkKey, ChunkScan, RecordingScan, ScanPlan
 from hybridlog.query.predicate.tree import is_meta
 from hybridlog.record.losses import lost_spans
@@ -25,26 +23,23 @@ from hybridlog.schema.kinds import SINGLE, element_of, width_of
 from hybridlog.snapshot import UNFINISHED
 from hybridlog_storage.catalog import ChannelStats, channel_totals
 from hybridlog_storage.errors import HybridlogError, ResourceError, SegmentError, StoreError
-from hybridlog_storage.times import inside
+from hybridlog_storage.times import inside, placed
 
 if TYPE_CHECKING:
     import pyarrow as pa
     from numpy.typing import NDArray
 
     from hybridlog.columns.topic_table import TableRows, TopicTable
-    from hybridlog.query.chunk_counts import Parts
     from hybridlog.query.chunk_scan import MessageRun
     from hybridlog.query.counters import Counters
     from hybridlog.query.message_filter import MessageFilter
-    from hybridlog.query.question import Part, RecordedChannel, Span
+    from hybridlog.query.question import Part, RecordedChannel
     from hybridlog.schema.codec import Decoded
     from hybridlog.session import Session
-    from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.messages import Batch
 
 _WHOLE = 32  # elements; longer arrays are summaries in tables
 _IN_FULL = SINGLE - {"uint8", "byte", "char"}  # elements of arrays in tables with arrays
-_MAX_CACHED_TIMES = 4_000_000  # of chunks with several channels, until the question is answered
 
 
 class UndecidedError(HybridlogError):
@@ -83,10 +78,6 @@ class Values(NamedTuple):
     records: pa.StructArray
 
 
-Objects: TypeAlias = "tuple[NDArray[np.int64], Sequence[Mapping[str, object]]]"
-"""Log times, ns, of messages in order, and the messages as `Codec.objects` makes them."""
-
-
 class Tabled(NamedTuple):
     """A part of a question that has a table.
 
@@ -103,31 +94,16 @@ class Tabled(NamedTuple):
     segments: frozenset[int] | None = None
 
 
-class _Count(NamedTuple):
-    """Numbers of messages of a part."""
-
-    matched: int
-    unreadable: int
-
-
 class Rows:
-    """Rows for the parts of one question.
-
-    Args:
-        session: The open store.
-        counters: Count what is read.
-    """
+    """Rows for the parts of one question."""
 
     def __init__(self, session: Session, counters: Counters) -> None:
         self.session = session
         self._counters = counters
         self._candidates: dict[Part, Tabled | None] = {}
         self._tabled: dict[Part, Tabled | None] = {}
-        self._counts: dict[Part, _Count] = {}
-        self._counted: set[Part] = set()
-        self._places: dict[Part, dict[ChunkKey, NDArray[np.int64]]] = {}
-        self._cached_times: dict[tuple[str, int, int], dict[int, NDArray[np.int64]]] = {}
-        self._room = _MAX_CACHED_TIMES
+        self._answered: set[Part] = set()
+        self._counts: dict[Part, tuple[int, int]] = {}  # matching ones, and unreadable ones
 
     # The rule.
 
@@ -138,17 +114,28 @@ class Rows:
             part: The part.
             fields: Paths of the fields that are wanted; None for all.
         """
-        found = self._candidate(part)
-        if found is None or not _holds(found, fields):
-            return None
         if part not in self._tabled:
-            self._tabled[part] = found
-            if part.predicate is not None:
-                try:
-                    self._count_of(found)
-                except TABLE_ERRORS:
-                    self._tabled[part] = None
-        return self._tabled[part]
+            self._tabled[part] = self._confirmed(part)
+        found = self._tabled[part]
+        return found if found is not None and _holds(found, fields) else None
+
+    def _confirmed(self, part: Part) -> Tabled | None:
+        """The part with its table, if that decides the predicate."""
+        found = self._candidate(part)
+        if found is not None and part.predicate is not None:
+            try:
+                self._count_of(found)
+            except TABLE_ERRORS:
+                return None
+        return found
+
+    def _answering(self, part: Part, fields: Collection[str] | None = ()) -> Tabled | None:
+        """The same of a part that is answered; counts its unreadable messages once."""
+        found = self.tabled(part, fields)
+        if found is not None and part.predicate is not None and part not in self._answered:
+            self._answered.add(part)
+            self._counters.unreadable += self._count_of(found)[1]
+        return found
 
     def leave_table(self, part: Part) -> bool:
         """Read a part from chunks from now on; False if it is read from them already."""
@@ -211,29 +198,24 @@ class Rows:
         """Number of matching messages in all parts."""
         total = 0
         in_chunks: list[Part] = []
-        alike: dict[tuple[str, Span | None, int], list[Part]] = defaultdict(list)
         asked: list[Part] = []
         for part in parts:
             if part.predicate is not None:
                 asked.append(part)
             elif part.is_unbounded:
                 total += part.messages
-            elif part.is_by_log_time:
-                alike[part.recording.id, part.bounds, id(part.windows)].append(part)
             else:
-                in_chunks.append(part)
-        for group in alike.values():
-            try:
-                total += self._count_by_time(group)
-            except SegmentError:
-                in_chunks += group
+                try:
+                    total += self._count_by_time(part)
+                except SegmentError:
+                    in_chunks.append(part)
         self._count_by_file(asked)
         for part in asked:
-            found = self.tabled(part)
+            found = self._answering(part)
             if found is None:
                 in_chunks.append(part)
                 continue
-            total += self._accepted(found).matched
+            total += self._count_of(found)[0]
             if found.rest is not None:
                 in_chunks.append(found.rest)
         return total + (self.count_in_chunks(in_chunks) if in_chunks else 0)
@@ -242,14 +224,13 @@ class Rows:
         """The parts without those of which a file of tables tells that nothing matches."""
         asked = [part for part in parts if part.predicate is not None and not part.needs_index]
         self._count_by_file(asked)
-        return [part for part in parts if self._counts.get(part) != _Count(0, 0)]
+        return [part for part in parts if self._counts.get(part) != (0, 0)]
 
     def outcomes(self, part: Part) -> Iterator[MatchColumns]:
         """For each message of the part's topic and time, whether it matches."""
-        found = self.tabled(part)
+        found = self._answering(part)
         left: Part | None = part
         if found is not None:
-            self._accepted(found)
             for rows, holds in self._in_table(found):
                 yield MatchColumns(rows.t, rows.seq, holds)
             left = found.rest
@@ -257,7 +238,7 @@ class Rows:
             return
         if left.predicate is None and left.is_by_log_time:
             with suppress(SegmentError):
-                time = self._times_of(left)
+                time = self._times(left, self._held(left))
                 left = None
         if left is None:
             yield MatchColumns(time, np.zeros_like(time), np.ones(len(time), np.bool_))
@@ -266,51 +247,31 @@ class Rows:
 
     def values(self, part: Part, fields: Collection[str] | None) -> Iterator[Values]:
         """Fields of the matching messages."""
-        found = self.tabled(part, fields)
+        found = self._answering(part, fields)
         left: Part | None = part
         if found is not None:
-            self._accepted(found)
+            from hybridlog.schema.arrow_types import narrowed
+
+            kind = None if fields is None else found.table.fields(fields)
             for rows, holds in self._in_table(found, fields):
                 chosen = rows if holds.all() else rows.take(np.flatnonzero(holds))
                 if len(chosen):
-                    yield Values(chosen.t, chosen.seq, _only(chosen.records, fields))
+                    # Without the columns that only the predicate needs.
+                    records = chosen.records if kind is None else narrowed(chosen.records, kind)
+                    yield Values(chosen.t, chosen.seq, records)
             left = found.rest
         for channel, run in self._by_channel(self.plan([left])) if left is not None else ():
             decoded = self._decoded(channel, run.batch, fields)
             good = decoded.rows
             yield Values(run.batch.log_time[good], run.seq[good], decoded.arrow())
 
-    def objects(self, plan: ScanPlan) -> Iterator[Objects]:
-        """The messages of a plan as plain objects, in order."""
-        for channel, run in self._by_channel(plan):
-            found = self._decoded(channel, run.batch)
-            yield run.batch.log_time[found.rows], found.plain()
-
-    def places(self, found: Tabled) -> dict[ChunkKey, NDArray[np.int64]]:
-        """Payload offsets of the matching messages that a table has, by chunk, sorted.
-
-        Raises:
-            StoreError: The table is damaged.
-        """
-        part = found.part
-        if part not in self._places:
-            self._accepted(found)
-            places = [
-                places_of(rows.own["ref"])[holds]
-                for rows, holds in self._in_table(found, own=("ref",))
-            ]
-            self._places[part] = (
-                offsets_by_chunk(part.recording.id, np.concatenate(places)) if places else {}
-            )
-        return self._places[part]
-
     # Tables.
 
-    def _count_of(self, found: Tabled) -> _Count:
-        """The count in a table, which confirms that its columns can decide.
+    def _count_of(self, found: Tabled) -> tuple[int, int]:
+        """Number of matching and of unreadable messages in a table.
 
         Raises:
-            UndecidedError: They cannot.
+            UndecidedError: Its columns cannot decide.
             StoreError: They are damaged.
         """
         part = found.part
@@ -319,18 +280,8 @@ class Rows:
             for rows, holds in self._in_table(found):
                 matched += int(holds.sum())
                 unreadable += int(rows.is_unreadable().sum())
-            self._counts[part] = _Count(matched, unreadable)
+            self._counts[part] = matched, unreadable
         return self._counts[part]
-
-    def _accepted(self, found: Tabled) -> _Count:
-        """The count of a part that its table answers; counts its unreadable messages once."""
-        if found.part.predicate is None:
-            return _Count(found.part.messages, 0)
-        count = self._count_of(found)
-        if found.part not in self._counted:
-            self._counted.add(found.part)
-            self._counters.unreadable += count.unreadable
-        return count
 
     def _count_by_file(self, parts: Sequence[Part]) -> None:
         """Count whole parts that lie in one file: the predicate is evaluated once for all rows."""
@@ -362,7 +313,7 @@ class Rows:
         sums, bad = np.concatenate(matched), np.concatenate(unreadable)
         for part, table in alike:
             places = [(before[one.group] + one.begin, one.rows) for one in table.parts]
-            self._counts[part] = _Count(
+            self._counts[part] = (
                 sum(int(sums[begin + rows] - sums[begin]) for begin, rows in places),
                 sum(int(bad[begin + rows] - bad[begin]) for begin, rows in places),
             )
@@ -406,22 +357,58 @@ class Rows:
 
     # Chunks.
 
-    def plan(self, parts: Sequence[Part], *, filtered: bool = True) -> ScanPlan:
-        """The plan for reading some parts from chunks."""
+    def plan(
+        self, parts: Sequence[Part], *, filtered: bool = True, reverse: bool = False
+    ) -> ScanPlan:
+        """The plan for reading the matching messages of some parts, or all, from chunks.
+
+        Where a table decides, it says where they are; else filters decide on what is read.
+        """
         channels: list[RecordedChannel] = []
-        filters: dict[int, MessageFilter] = {}
+        filters: dict[int, tuple[MessageFilter, Collection[int]]] = {}
+        offsets: dict[ChunkKey, list[NDArray[np.int64]]] = defaultdict(list)
         of_recording: dict[str, tuple[Part, dict[int, int]]] = {}
         for part in parts:
             _, indexes = of_recording.setdefault(part.recording.id, (part, {}))
             decide = filter_of(part) if filtered else None
+            found = None if decide is None else self._placed(part, offsets)
             for channel in part.channels:
                 indexes[channel.channel_id] = len(channels)
-                if decide is not None:
-                    filters[len(channels)] = decide
+                if decide is not None and (found is None or found.segments is not None):
+                    covered = () if found is None else found.segments
+                    filters[len(channels)] = decide, covered or ()
                 channels.append(channel)
-        scans = [self._scan(part, indexes) for part, indexes in of_recording.values()]
-        clock = parts[0].clock if parts else "log"
-        return ScanPlan(channels, scans, clock, filters=filters, counters=self._counters)
+        return ScanPlan(
+            channels,
+            [self._scan(part, indexes) for part, indexes in of_recording.values()],
+            parts[0].clock if parts else "log",
+            filters=filters,
+            offsets={key: np.concatenate(own) for key, own in offsets.items()},
+            is_chosen=filtered and any(part.predicate is not None for part in parts),
+            reverse=reverse,
+            counters=self._counters,
+        )
+
+    def _placed(
+        self, part: Part, offsets: dict[ChunkKey, list[NDArray[np.int64]]]
+    ) -> Tabled | None:
+        """The part with its table, which has added the places of its matching messages."""
+        found = self._answering(part)
+        if found is None:
+            return None
+        try:
+            places = [
+                places_of(rows.own["ref"])[holds]
+                for rows, holds in self._in_table(found, own=("ref",))
+            ]
+        except TABLE_ERRORS:
+            self.leave_table(part)
+            return None
+        if places:
+            by_chunk = offsets_by_chunk(part.recording.id, np.concatenate(places))
+            for key, own in by_chunk.items():
+                offsets[key].append(own)
+        return found
 
     def _scan(self, part: Part, indexes: dict[int, int]) -> RecordingScan:
         """The chunks of a recording that may hold wanted messages."""
@@ -482,54 +469,42 @@ class Rows:
 
     # Times alone.
 
-    def _count_by_time(self, parts: Sequence[Part]) -> int:
-        """Number of messages of some topics of one recording in the same windows.
+    def _count_by_time(self, part: Part) -> int:
+        """Number of messages in the windows of a part.
 
         Raises:
             SegmentError: A segment cannot be read, or is damaged in a part that is needed.
         """
-        edges = parts[0].log_windows.ravel()
-        counts = np.zeros((1, max(len(edges) - 1, 0)), np.int64)
-        cut = Placed.of(self._chunk_parts(parts), edges).add_known(counts)
-        cut.add_read(edges, counts, partial(self._times, parts[0].recording))
-        return int(counts[0, ::2].sum())
+        if not part.is_by_log_time:
+            return self.count_in_chunks([part])
+        edges = part.log_windows.ravel()
+        held = self._held(part)
+        low, high = (edges.searchsorted(placed(held[n]), "right") for n in ("first", "last"))
+        is_whole = low == high  # in one window, or between two
+        times = self._times(part, held[~is_whole])
+        return int(held["messages"][is_whole & (low % 2 == 1)].sum()) + len(times)
 
-    def _times_of(self, part: Part) -> NDArray[np.int64]:
-        """Log times in the windows of a part, sorted.
+    def _times(self, part: Part, held: NDArray[np.void]) -> NDArray[np.int64]:
+        """Log times in the windows of a part that some parts of chunks have, sorted.
 
         Raises:
             SegmentError: As for `_count_by_time`.
         """
         found = [np.empty(0, np.int64)]
-        parts = self._chunk_parts([part])
-        rows = parts.chunk_starts
-        for segment, chunk in zip(*(c[rows].tolist() for c in parts[:2]), strict=True):
-            times = self._times(part.recording, segment, chunk)
-            found += [times[c.channel_id] for c in part.channels if c.channel_id in times]
+        for segment, chunk, channel in held[["segment", "chunk", "channel"]].tolist():
+            reader = self.session.segment(part.recording.id, segment)
+            read_before = reader.bytes_read
+            found.append(self.session.times(part.recording, segment, chunk)[channel])
+            self._counters.bytes_read += reader.bytes_read - read_before
         time = np.sort(np.concatenate(found))
         return time[inside(time, part.log_windows)]
 
-    def _chunk_parts(self, parts: Sequence[Part]) -> Parts:
-        windows = parts[0].log_windows
+    def _held(self, part: Part) -> NDArray[np.void]:
+        """What chunks hold of a part."""
+        windows = part.log_windows
         span = (int(windows[0, 0]), int(windows[-1, 1])) if len(windows) else (0, 0)
-        channels = [channel.channel_id for part in parts for channel in part.channels]
-        return self.session.parts(parts[0].recording, channels, span)
-
-    def _times(
-        self, recording: RecordingEntry, segment: int, chunk: int
-    ) -> dict[int, NDArray[np.int64]]:
-        key = recording.id, segment, chunk
-        if key in self._cached_times:
-            return self._cached_times[key]
-        reader = self.session.segment(recording.id, segment)
-        read_before = reader.bytes_read
-        times = self.session.times(recording, segment, chunk)
-        self._counters.bytes_read += reader.bytes_read - read_before
-        size = sum(map(len, times.values()))
-        if len(times) > 1 and size <= self._room:  # another topic may be asked about next
-            self._cached_times[key] = times
-            self._room -= size
-        return times
+        ids = [channel.channel_id for channel in part.channels]
+        return self.session.parts(part.recording, ids, span)
 
 
 def _within(
@@ -596,14 +571,10 @@ def _decided(part: Part, rows: TableRows) -> NDArray[np.bool_]:
     predicate = part.predicate
     if predicate is None:
         return np.ones(len(rows), np.bool_)
-    from hybridlog.query.message_filter import meta_array
-    from hybridlog.query.predicate.to_mask import to_mask
+    from hybridlog.query.message_filter import mask_of
 
-    records: Any = rows.records
-    if any(map(is_meta, predicate.fields())):
-        pub = rows.own.get("pub")
-        records = meta_array(records, part.channels[0], rows.t, rows.seq, pub)
-    found = to_mask(predicate, part.field_types, records)
+    times = rows.t, rows.seq, rows.own.get("pub")
+    found = mask_of(predicate, part.field_types, rows.records, part.channels[0], *times)
     if found is None:
         raise UndecidedError(f"The table of {part.topic} cannot tell.")
     return found
@@ -655,28 +626,3 @@ def _wanted(table: TopicTable, part: Part, fields: Collection[str] | None) -> se
     if fields is None:
         return None
     return {*_paths(table, part), *(path.replace("[]", "") for path in fields)}
-
-
-def _only(records: pa.StructArray, fields: Collection[str] | None) -> pa.StructArray:
-    """The records without the columns that only the predicate needs."""
-    if fields is None:
-        return records
-    return _pruned(records, [path.replace("[]", "").split(".") for path in fields])
-
-
-def _pruned(records: pa.StructArray, paths: Sequence[Sequence[str]]) -> pa.StructArray:
-    import pyarrow as pa
-
-    from hybridlog.schema.arrow_columns import structs
-
-    names, columns = [], []
-    for field, column in zip(records.type, records.flatten(), strict=True):
-        below = [path[1:] for path in paths if path[0] == field.name]
-        if not below:
-            continue
-        is_whole = any(not path for path in below) or not pa.types.is_struct(field.type)
-        names.append(field.name)
-        columns.append(column if is_whole else _pruned(column, below))
-    if not names:
-        return structs({}, len(records))
-    return pa.StructArray.from_arrays(columns, names=names)

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from hybridlog.query.predicate.numbers import equal, is_number, nearest
 from hybridlog.schema.arrow_types import is_list, lengths_of
 from hybridlog.schema.column import ranges
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
     from numpy.typing import NDArray
 
     Rows = NDArray[np.intp]
@@ -38,6 +34,8 @@ def rows_differ(
         bool[n], True where they differ.
     """
     kind = column.type
+    if isinstance(kind, pa.BaseExtensionType):  # JSON text
+        return rows_differ(column.storage, one, other)
     if pa.types.is_null(kind):
         return np.zeros(len(one), np.bool_)
     valid: NDArray[np.bool_] = np.asarray(column.is_valid(), np.bool_)
@@ -94,49 +92,3 @@ def _lists(column: pa.Array[Any], one: Rows, other: Rows, tolerance: float) -> N
         )
         found[alike] = np.logical_or.reduceat(differs, np.cumsum(count) - count)
     return found
-
-
-_MISSING: Final = object()
-
-
-def objects_differ(
-    one: object, other: object, paths: Iterable[Sequence[str]], tolerance: float = 0.0
-) -> bool:
-    """Compare some fields of two messages that are plain objects, as `rows_differ` does.
-
-    A missing field differs from null, and values of different kinds differ.
-
-    Args:
-        one: A message.
-        other: Another one.
-        paths: The names that lead to each field; through a list, to that of each element.
-        tolerance: As for `rows_differ`.
-    """
-    left: list[tuple[object, object, Sequence[str]]] = [(one, other, path) for path in paths]
-    while left:
-        a, b, path = left.pop()
-        if isinstance(a, list) and isinstance(b, list):
-            if len(a) != len(b):
-                return True
-            left += [(x, y, path) for x, y in zip(a, b, strict=True)]
-        elif path and (isinstance(a, list) or isinstance(b, list)):
-            return True
-        elif path:
-            x, y = (
-                m.get(path[0], _MISSING) if isinstance(m, Mapping) else _MISSING for m in (a, b)
-            )
-            left.append((x, y, path[1:] if x is not y else ()))
-        elif isinstance(a, Mapping) and isinstance(b, Mapping):
-            if a.keys() != b.keys():
-                return True
-            left += [(value, b[name], ()) for name, value in a.items()]
-        elif not _same(a, b, tolerance):
-            return True
-    return False
-
-
-def _same(one: object, other: object, tolerance: float) -> bool:
-    if is_number(one) and is_number(other):
-        near = tolerance > 0 and abs(nearest(one) - nearest(other)) <= tolerance
-        return near or equal(one, other)
-    return type(one) is type(other) and one == other

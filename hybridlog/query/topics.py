@@ -41,10 +41,6 @@ def resolve(patterns: Sequence[str], topics: Collection[str]) -> list[str]:
     Args:
         patterns: Patterns of the user; without any, the result is empty.
         topics: All existing topics.
-
-    Raises:
-        TopicError: a pattern that matches no topic or, as a short name, several topics;
-            the message lists candidates.
     """
     known = sorted(set(topics))
     found: dict[str, None] = {}
@@ -65,12 +61,7 @@ def split_topic(text: str) -> tuple[str, str]:
 
 
 def namesakes(patterns: Iterable[str], topics: Collection[str]) -> tuple[str, ...]:
-    """Further topics that end with a short name which is the whole name of one topic.
-
-    Args:
-        patterns: Patterns of the user.
-        topics: All existing topics.
-    """
+    """Further topics that end with a short name which is the whole name of one topic."""
     found = {topic for pattern in patterns for topic in _namesakes(pattern, topics)}
     return tuple(sorted(found))
 
@@ -93,9 +84,6 @@ class TopicMatcher:
     Args:
         include: Patterns; none means all topics.
         exclude: Patterns of topics to leave out of the included ones.
-
-    Raises:
-        TopicError: a malformed pattern.
     """
 
     def __init__(self, include: Sequence[str] = (), exclude: Sequence[str] = ()) -> None:

@@ -26,7 +26,7 @@ import hybridlog as hl
 from hybridlog.query.asked import field_types
 from hybridlog.query.intervals import Intervals
 from hybridlog.query.predicate.parser import parse
-from hybridlog.query.predicate.to_bool import to_bool
+from hybridlog.query.predicate.to_mask import mask_of_objects
 from hybridlog.query.query import Query
 from hybridlog.query.rows import Rows
 from hybridlog_storage.errors import DatabaseError, TimeError
@@ -323,10 +323,12 @@ def asked(world: World, question: dict[str, Any]) -> Query:
 
 def expected(world: World, question: dict[str, Any]) -> list[Sent]:
     """The plain evaluation: a loop over all that was written."""
-    test = None
+    matching = None
     if question["condition"] is not None:
         types = None if question["topics"] == ("/state",) else _types(world, question)
-        test = to_bool(parse(question["condition"]).root, types)
+        objects = [{**one.fields, "_meta": {"seq": one.seq}} for one in world.sent]
+        mask = mask_of_objects(parse(question["condition"]), types, objects)
+        matching = {id(one) for one, holds in zip(world.sent, mask, strict=True) if holds}
     named = {world.ids[name] for name in question["recordings"]}
     found = []
     for sent in world.sent:
@@ -343,7 +345,7 @@ def expected(world: World, question: dict[str, Any]) -> list[Sent]:
             for name, begin, n in question["windows"]
         ):
             continue
-        if test is not None and not test({**sent.fields, "_meta": {"seq": sent.seq}}):
+        if matching is not None and id(sent) not in matching:
             continue
         if question["is_raw"] and sent.seq % 3 != 1:
             continue

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
-from itertools import groupby, islice, pairwise
+from itertools import groupby, islice
 from operator import itemgetter
-from typing import TYPE_CHECKING, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -34,9 +33,8 @@ if TYPE_CHECKING:
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.summary import RecordingSummary
 
-_T = TypeVar("_T")
-Rows: TypeAlias = "pa.StructArray | Sequence[Mapping[str, object]]"
-"""Messages, as columns or as plain objects."""
+_Rows = TypeVar("_Rows", bound="tuple[Any, ...]")
+_NONE = np.empty(0, np.int64)
 
 
 class IntervalQueries:
@@ -60,12 +58,11 @@ class IntervalQueries:
         gap = None if max_gap is None else parse_duration(max_gap)
         if gap == 0:
             raise UsageError("max_gap is 0; a state needs a gap of more than 0.")
-        spans = [
-            (part, span, _bounded(part, span), _just_before(part, span))
-            for part, span in self._spans()
-        ]
-        self._planner.batch_hint([p for *_, inner, before in spans for p in (*before, inner)])
-        for part, span, inner, before in spans:
+        spans = [*self._spans()]
+        asked = [[*_just_before(part, span), _bounded(part, span)] for part, span in spans]
+        decided = iter(self._planner.decided([part for own in asked for part in own]))
+        for (part, span), own in zip(spans, asked, strict=True):
+            *before, inner = (next(decided) for _ in own)
             yield part.recording.id, self._states_in(part, span, gap, inner, before)
 
     def _certain(self, max_gap: DurationLike | None, state: str) -> Intervals:
@@ -76,7 +73,7 @@ class IntervalQueries:
             self._session, replace(self._question, predicate=None), self._planner.counters
         )
         spans = RangeResolver(self._session, self._question).spans()
-        by_recording = plain.times_in({summary.id: summary for summary, _ in spans})
+        by_recording = plain.times_in(summary for summary, _ in spans)
         whole = Intervals.of(
             (summary.id, np.array([[begin, end, 0]], np.int64)) for summary, (begin, end) in spans
         )
@@ -90,13 +87,13 @@ class IntervalQueries:
         found = held.common(known) if state == "held" else known.without(held)
         return found.counted(by_recording)
 
-    def times_in(self, summaries: Mapping[str, RecordingSummary]) -> dict[str, NDArray[np.int64]]:
+    def times_in(self, summaries: Iterable[RecordingSummary]) -> dict[str, NDArray[np.int64]]:
         """Log times of the messages of recordings, at any time, ns, ascending, by id."""
-        found: dict[str, list[NDArray[np.int64]]] = defaultdict(list)
-        for name, summary in summaries.items():
-            for part in self._planner.parts_in(summary, None, None):
-                found[name] += [o.log_time[o.holds] for o in self._planner.outcomes(part)]
-        return {name: np.concatenate(parts) for name, parts in found.items() if parts}
+        return {
+            summary.id: self._planner.times(part)
+            for summary in {one.id: one for one in summaries}.values()
+            for part in self._planner.parts_in(summary, None, None)
+        }
 
     def changes(self, fields: Sequence[str], pause: DurationLike, tolerance: float) -> Intervals:
         """Intervals in which fields change; see `Query.changes`."""
@@ -166,89 +163,64 @@ class IntervalQueries:
         self, part: Part, span: Span, gap: int | None, inner: Part, before: Sequence[Part]
     ) -> NDArray[np.int64]:
         # The last message before the range determines the state at its beginning.
-        last = self._last_before(part, span, before)
-        found = [(np.array([time]), np.array([holds])) for time, holds in last]
-        found += [(one.log_time, one.holds) for one in self._planner.outcomes(inner)]
-        found.append((np.empty(0, np.int64), np.empty(0, np.bool_)))
-        time, holds = (np.concatenate(column) for column in zip(*found, strict=True))
+        last = self._last_before(part, span, self._planner.outcomes, before)
+        found = [(one.log_time, one.holds) for one in self._planner.outcomes(inner)]
+        begun = (last.log_time[-1:], last.holds[-1:]) if last else (_NONE, _NONE.astype(np.bool_))
+        time, holds = (np.concatenate(column) for column in zip(begun, *found, strict=True))
         end = extent_of(part.recording)[1]
-        return clipped(holding(time, holds, end, gap, before=len(last)), span)
+        return clipped(holding(time, holds, end, gap, before=len(begun[0])), span)
 
-    def _last_before(self, part: Part, span: Span, first: Sequence[Part]) -> list[tuple[int, bool]]:
-        """Time and outcome of the last message before a span, if any, whether it matches or not.
+    def _last_before(
+        self,
+        part: Part,
+        span: Span,
+        ask: Callable[[Part], Iterator[_Rows]],
+        first: Sequence[Part] = (),
+    ) -> _Rows | None:
+        """The last rows before a span, if there are any; unreadable messages do not count.
 
-        Args:
-            part: The part.
-            span: The span.
-            first: From `_just_before`.
+        Rows begin with the column of log times; `first` are those of `_just_before`, if at hand.
         """
-        further = (_bounded(part, (begin, span[0])) for begin in [*_earlier(part, span)][1:])
+        counters = self._planner.counters
+        unreadable = counters.unreadable, counters.without_arrays
+        begins = islice(_earlier(part, span), len(first), None)
+        further = (_bounded(part, (begin, span[0])) for begin in begins)
         for before in (*first, *further):
-            last: list[tuple[int, bool]] = []
-            for found in self._beside(self._planner.outcomes, before):
-                if len(found.log_time):
-                    last = [(int(found.log_time[-1]), bool(found.holds[-1]))]
-            if last:
+            last = None
+            for found in ask(before):
+                last = found if len(found[0]) else last
+            counters.unreadable, counters.without_arrays = unreadable
+            if last is not None:
                 return last
-        return []
+        return None
 
     def _steps_in(
         self, part: Part, span: Span, paths: Collection[str], tolerance: float
     ) -> NDArray[np.int64]:
         """Log times of the messages in a span that differ from the one before."""
         ask = partial(self._rows, paths=paths)
-        summaries = _summaries(part, paths)
-        names = [[path] if path in summaries else path.split(".") for path in paths]
-        carried = self._row_before(part, span, ask)
-        found = [np.empty(0, np.int64)]
+        before = self._last_before(part, span, ask)
+        carried = None if before is None else before[1][-1:]
+        found = [_NONE]
         for times, rows in ask(_bounded(part, span)):
             if len(rows):
-                differs, carried = _steps(carried, rows, names, tolerance)
+                differs, carried = _steps(carried, rows, tolerance)
                 found.append(times[differs])
         return np.concatenate(found)
 
-    def _rows(self, part: Part, paths: Collection[str]) -> Iterator[tuple[NDArray[np.int64], Rows]]:
-        """Fields of the matching messages; summaries of arrays (`ranges.min`) as fields.
-
-        Columns where one definition fixes their types. Otherwise plain objects: in columns null
-        and missing are the same, and values of different types have no common one.
-        """
+    def _rows(
+        self, part: Part, paths: Collection[str]
+    ) -> Iterator[tuple[NDArray[np.int64], pa.StructArray]]:
+        """Fields of the matching messages, as tables have them; summaries of arrays as fields."""
         from hybridlog.frames.columns import flat, with_summaries
-        from hybridlog.query.predicate.to_bool import with_statistics
+        from hybridlog.frames.names import is_summary
         from hybridlog.schema.arrow_columns import structs
 
-        summaries = _summaries(part, paths)
+        known = part.field_types or {}
+        summaries = {path for path in paths if is_summary(path, known)}
         read = {path.rpartition(".")[0] if path in summaries else path for path in paths}
-        types = {c.arrow_type(read) for c in part.channels}
-        if part.field_types is None or len(types) > 1:
-            for times, objects in self._planner.objects(part):
-                yield times, [with_statistics(each, summaries) for each in objects]
-            return
         for times, _, records in self._planner.values(part, read):
-            if summaries:
-                records = structs(with_summaries(flat(records), paths), len(times))  # noqa: PLW2901
-            yield times, records
-
-    def _row_before(
-        self, part: Part, span: Span, ask: Callable[[Part], Iterator[tuple[object, Rows]]]
-    ) -> Rows | None:
-        """The fields of the last matching message before a span."""
-        for begin in _earlier(part, span):
-            last = None
-            for _, rows in self._beside(ask, _bounded(part, (begin, span[0]))):
-                last = rows[-1:] if len(rows) else last
-            if last is not None:
-                return last
-        return None
-
-    def _beside(self, ask: Callable[[Part], Iterator[_T]], part: Part) -> Iterator[_T]:
-        """Items of a part outside of the asked time, where unreadable messages do not count."""
-        counters = self._planner.counters
-        before = counters.unreadable, counters.without_arrays
-        for item in ask(part):
-            counters.unreadable, counters.without_arrays = before
-            yield item
-        counters.unreadable, counters.without_arrays = before
+            yield times, structs(with_summaries(flat(records), paths), len(times))
 
     def _check(self, subject: str) -> None:
         question = self._question
@@ -280,37 +252,17 @@ def _bounded(part: Part, span: Span) -> Part:
     return replace(part, bounds=span, clock="log", windows=None)
 
 
-def _summaries(part: Part, paths: Collection[str]) -> set[str]:
-    """Those of some paths that are summaries of arrays."""
-    from hybridlog.frames.names import is_summary
-
-    return {path for path in paths if is_summary(path, part.field_types or {})}
-
-
 def _steps(
-    carried: Rows | None, rows: Rows, paths: Sequence[Sequence[str]], tolerance: float
-) -> tuple[NDArray[np.bool_], Rows]:
+    carried: pa.StructArray | None, rows: pa.StructArray, tolerance: float
+) -> tuple[NDArray[np.bool_], pa.StructArray]:
     """Find the rows that differ from the row before them; also returns the last row."""
-    import pyarrow as pa
+    from hybridlog.columns.fields import joined
+    from hybridlog.query.rows_differ import rows_differ
 
-    from hybridlog.query.rows_differ import objects_differ, rows_differ
-
-    if not isinstance(rows, pa.StructArray):
-        first = rows[0] if carried is None else carried[0]
-        found = [objects_differ(a, b, paths, tolerance) for a, b in pairwise([first, *rows])]
-        return np.array(found, np.bool_), rows[-1:]
-    joined: pa.StructArray = rows
-    if carried is not None:
-        tables = [pa.Table.from_struct_array(part) for part in (carried, rows)]
-        joined_table = pa.concat_tables(tables, promote_options="permissive").combine_chunks()
-        joined = joined_table.to_struct_array().combine_chunks()
-    if isinstance(joined, pa.ChunkedArray):
-        joined = pa.concat_arrays(joined.chunks)
-    numbers = np.arange(1, len(joined))
-    differs = rows_differ(joined, numbers, numbers - 1, tolerance)
-    if carried is None:
-        differs = np.concatenate([[False], differs])
-    return differs, rows[-1:]
+    whole = rows if carried is None else joined([carried, rows])
+    numbers = np.arange(len(whole))
+    differs = rows_differ(whole, numbers, np.maximum(numbers - 1, 0), tolerance)
+    return differs[len(whole) - len(rows) :], whole[-1:]
 
 
 def _extent(recording: RecordingSummary) -> Span:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hybridlog.message import Documents, Message, messages_in
+from hybridlog.message import messages_in
 from hybridlog.query.answers.video import picture_of
+from hybridlog.query.chunk_scan import MessageRun
 from hybridlog.query.planner import Planner
 from hybridlog.query.times import TimeLike, is_relative, parse_time
 from hybridlog_storage.times import END, earlier, span_of
@@ -17,12 +17,12 @@ from hybridlog_storage.times import END, earlier, span_of
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from hybridlog.message import Message
     from hybridlog.query.counters import Counters
     from hybridlog.query.question import Question, Span
     from hybridlog.session import Session
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.messages import Batch
-    from hybridlog_storage.segments.chunk import StoredChunk
 
 
 def message_at(
@@ -89,54 +89,27 @@ def _last_of(
             for run in Planner(session, narrow, counters).runs():
                 return next(messages_in(run, picture_of(session)))
         return None
-    wanted = set(question.topics)
-    channels = {
-        channel.channel_id: channel
-        for channel in session.channels(recording)
-        if channel.channel.topic in wanted
-    }
-
-    def count(chunk: StoredChunk) -> None:
-        counters.chunks_read += 1
-        counters.bytes_read += chunk.length + chunk.trailer
-
+    channels = session.channels_of(recording, {*question.topics})
+    number = {channel.channel_id: row for row, channel in enumerate(channels)}
     best: tuple[int, int, Batch] | None = None
-    for entry, last in session.chunks_before(recording, list(channels), span[1]):
+    for entry, last in session.chunks_before(recording, [*number], span[1]):
         if best is not None and last < best[0]:
             break
-        chunk = session.chunk(recording, entry.segment, entry.place, count)
-        others = not all(channel in channels for channel in entry.place.channels)
-        row = _last_row(chunk.batch, channels if others else None, span[1])
-        if row is not None:
+        chunk = session.chunk(recording, entry.segment, entry.place, counters.add_chunk)
+        fits = chunk.batch.log_time <= span[1]
+        if not number.keys() >= {*entry.place.channels}:
+            fits &= np.isin(chunk.batch.channel, [*number])
+        (rows,) = fits.nonzero()
+        if len(rows):
+            # Rows are in order of arrival: of equal times, the last one is wanted.
+            row = int(rows[-1 - chunk.batch.log_time[rows][::-1].argmax()])
             place = int(chunk.batch.log_time[row]), int(chunk.seq[row])
             if best is None or place > best[:2]:
                 best = *place, chunk.batch.take(slice(row, row + 1))
     if best is None:
         return None
-    log_time, seq, batch = best
+    _, seq, batch = best
     counters.add_messages(batch)
-    return Message(
-        channels[batch.channel.item()],
-        log_time=log_time,
-        publish_time=batch.publish_time.item(),
-        sequence=batch.sequence.item(),
-        seq=seq,
-        view=batch.payload(0),
-        documents=Documents(channels, batch),
-        row=0,
-        picture_of=picture_of(session),
-    )
-
-
-def _last_row(batch: Batch, channels: Collection[int] | None, latest: int) -> int | None:
-    """The row of the last message; `channels` is None when the batch has no others."""
-    fits = batch.log_time <= latest
-    if channels is not None:
-        is_wanted = np.zeros(max(channels) + 2, np.bool_)  # last: all others
-        is_wanted[list(channels)] = True
-        fits &= is_wanted.take(batch.channel, mode="clip")
-    (rows,) = fits.nonzero()
-    if not len(rows):
-        return None
-    # Rows are in order of arrival: of equal times, the last one is wanted.
-    return int(rows[-1 - batch.log_time[rows][::-1].argmax()])
+    batch.channel = np.array([number[batch.channel.item()]], np.int32)
+    run = MessageRun(batch, np.array([seq], np.int64), channels)
+    return next(messages_in(run, picture_of(session)))

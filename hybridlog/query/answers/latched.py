@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hybridlog.query.chunk_scan import ChunkScan, RecordingScan, ScanPlan
+from hybridlog.query.chunk_scan import ChunkScan, RecordingScan, ScanPlan, with_payloads
 from hybridlog.query.counters import Counters
 from hybridlog.query.latching import depth_of, is_key_frame, is_video, publisher_of
 from hybridlog.query.planner import Planner
@@ -17,6 +18,7 @@ from hybridlog.query.ranges import RangeResolver
 
 if TYPE_CHECKING:
     from hybridlog.query.chunk_columns import Chunk
+    from hybridlog.query.chunk_scan import MessageRun
     from hybridlog.query.question import Question, RecordedChannel
     from hybridlog.session import Session
     from hybridlog_storage.catalog import RecordingEntry
@@ -81,12 +83,10 @@ def _latching(
     session: Session, question: Question, recording: RecordingEntry
 ) -> list[RecordedChannel]:
     """The latching channels of a question in a recording, and those of video."""
-    wanted = set(question.topics)
     return [
         channel
-        for channel in session.channels(recording)
-        if channel.channel.topic in wanted
-        and (depth_of(channel.channel) or is_video(channel.channel))
+        for channel in session.channels_of(recording, {*question.topics})
+        if depth_of(channel.channel) or is_video(channel.channel)
     ]
 
 
@@ -119,13 +119,9 @@ class _LatchedScan:
         cuts: list[_Key] = []
         scans: list[RecordingScan] = []
         for group in publishers.values():
-            if is_video(group[0].channel):
-                found = self._last_key_frame(group)
-                if found is None:
-                    continue
-                cut = found
-            else:
-                cut = self._first_in_force(group)
+            cut = self._cut(group)
+            if cut is None:
+                continue
             scans.append(self._scan(group, cut[0], len(own)))
             own += group
             cuts += [cut] * len(group)
@@ -133,42 +129,30 @@ class _LatchedScan:
             return
         times, numbers = np.array(cuts, np.int64).T
         plan = ScanPlan(own, [_merged_scan(scans)], counters=self._counters)
-        whole = np.array([not channel.is_reduced for channel in own], np.bool_)
         for run in ChunkScan(plan, self._session).runs():
             of, time = run.batch.channel, run.batch.log_time
             at = times[of]
             keep = (time > at) | ((time == at) & (run.seq >= numbers[of]))
-            for number, channel in enumerate(own):
-                if not whole[number]:
-                    left = int((keep & (of == number)).sum())
-                    self._counters.leave_out(left, channel.state)
-            keep &= whole[of]
             if keep.any():
-                yield run.batch.take(keep), own
+                found = with_payloads(run.take(keep), self._counters)
+                if len(found.batch):
+                    yield found.batch, own
 
-    def _first_in_force(self, group: Sequence[RecordedChannel]) -> _Key:
-        """The first of the last messages of some publishers that displace one another."""
+    def _cut(self, group: Sequence[RecordedChannel]) -> _Key | None:
+        """The first message in force, of publishers that displace one another or of video."""
+        is_of_video = is_video(group[0].channel)
         left = max(depth_of(channel.channel) for channel in group)
-        if left >= sum(channel.stats.messages for channel in group):
+        if not is_of_video and left >= sum(channel.stats.messages for channel in group):
             return _FIRST
         plan = ScanPlan([*group], [self._scan(group, 0, 0)], reverse=True, counters=self._counters)
-        cut = _FIRST
         for run in ChunkScan(plan, self._session, ahead=False).runs():
-            row = min(left, len(run.batch)) - 1
-            cut = int(run.batch.log_time[row]), int(run.seq[row])
-            left -= row + 1
-            if not left:
-                break
-        return cut
-
-    def _last_key_frame(self, group: Sequence[RecordedChannel]) -> _Key | None:
-        """The last key frame of some channels of video; None if there is none."""
-        plan = ScanPlan([*group], [self._scan(group, 0, 0)], reverse=True, counters=self._counters)
-        for run in ChunkScan(plan, self._session, ahead=False).runs():
-            for row, index in enumerate(run.batch.channel.tolist()):
-                if is_key_frame(run.channels[index].channel, run.batch.payload(row)):
-                    return int(run.batch.log_time[row]), int(run.seq[row])
-        return None
+            row = None if left > len(run.batch) else left - 1
+            if is_of_video:
+                row = next(filter(partial(_is_key, run), range(len(run.batch))), None)
+            if row is not None:
+                return int(run.batch.log_time[row]), int(run.seq[row])
+            left -= len(run.batch)
+        return None if is_of_video else _FIRST
 
     def _scan(self, group: Sequence[RecordedChannel], begin: int, first: int) -> RecordingScan:
         """The scan of some channels from a log time on; their indexes begin with `first`."""
@@ -176,6 +160,11 @@ class _LatchedScan:
         bounds = max(begin, 0), self._begin
         chunks = self._session.chunks(self._recording, [*indexes], bounds, "log")
         return RecordingScan(self._recording, indexes, bounds, chunks)
+
+
+def _is_key(run: MessageRun, row: int) -> bool:
+    channel = run.channels[int(run.batch.channel[row])].channel
+    return is_key_frame(channel, run.batch.payload(row))
 
 
 def _merged_scan(scans: Sequence[RecordingScan]) -> RecordingScan:

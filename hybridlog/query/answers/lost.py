@@ -74,13 +74,10 @@ def completeness_of(
             sentences += left_out(one, cost, _why_expired(session, one) if is_short else "")
     unreadable = _unreadable(session, question)
     by_recording: dict[str, list[Mapping[str, Any]]] = defaultdict(list)
-    known: set[tuple[Any, ...]] = set()
-    for rows in ledgers:  # a loss of unknown topics is in several
-        keys = [tuple(row.items()) for row in rows]
-        for key, row in zip(keys, rows, strict=True):
-            if key not in known:
-                by_recording[row["recording"]].append(row)
-        known.update(keys)
+    own = {tuple(row.items()) for row in ledgers[0]}
+    more = {key: row for rows in ledgers[1:] for row in rows if (key := (*row.items(),)) not in own}
+    for row in (*ledgers[0], *more.values()):  # a loss of unknown topics is in several
+        by_recording[row["recording"]].append(row)
     sentences += [*late, *unreadable]
     for name, rows in by_recording.items():
         sentences += about_losses(name, rows)
@@ -162,11 +159,7 @@ def lost_times(session: Session, question: Question) -> Intervals:
 def _losses_in(
     session: Session, question: Question
 ) -> Iterator[tuple[RecordingEntry, Mapping[str, Any]]]:
-    """Rows of the ledger about topics and times of a question, those of a recording together.
-
-    Raises:
-        TimeError: the range is empty, or outside all recordings.
-    """
+    """Rows of the ledger about topics and times of a question, those of a recording together."""
     doubtful = {entry.id: entry for entry in session.doubtful(question)}
     if not doubtful:
         return
@@ -215,29 +208,25 @@ def _unwritten(session: Session, questions: Sequence[Question]) -> tuple[int | N
         a sentence for each recording.
     """
     snapshot = session.snapshot()
-    topics: dict[int, dict[str, bool]] = {}  # by place: whether the first question asks for them
+    topics: dict[int, set[str]] = defaultdict(set)
     for question in questions:
         places = session.chosen(question)
         for place in places[snapshot.is_open[places]].tolist():
             one = snapshot.summaries[place]
             if one.status == "open" and _reaches_past(session, question, one):
-                known = topics.setdefault(place, {})
-                for topic in question.topics:
-                    known.setdefault(topic, question is questions[0])
+                topics[place].update(question.topics)
     missing: int | None = 0
     sentences: list[str] = []
-    for place, owners in topics.items():
+    for place, names in topics.items():
         one = snapshot.summaries[place]
         late = _taken(session, one)
-        if late is None:
+        number = None if late is None else sum(late.get(topic, 0) for topic in names)
+        if late is None or missing is None:
             missing = None
-            sentences.append(not_written(one.name, None, flush_interval_ns(one)))
-            continue
-        if missing is not None:
-            missing += sum(late.get(topic, 0) for topic, is_own in owners.items() if is_own)
-        messages = sum(late.get(topic, 0) for topic in owners)
-        if messages:
-            sentences.append(not_written(one.name, messages, flush_interval_ns(one)))
+        else:
+            missing += sum(late.get(topic, 0) for topic in names & {*questions[0].topics})
+        if number != 0:
+            sentences.append(not_written(one.name, number, flush_interval_ns(one)))
     return missing, sentences
 
 

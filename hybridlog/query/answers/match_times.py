@@ -41,16 +41,11 @@ class MatchTimes(NamedTuple):
 
 
 def match_times(session: Session, question: Question, counters: Counters) -> Iterator[MatchTimes]:
-    """The times of an answer, some at a time; recordings and topics one after the other.
-
-    Raises:
-        UsageError: the question has `limit` or `every`.
-        TimeError: the range is outside all recordings.
-    """
+    """The times of an answer, some at a time; recordings and topics one after the other."""
     if not question.returns_all:
         raise UsageError("Times are those of all messages: leave out limit and every.")
     planner = Planner(session, question, counters)
-    for part in planner.parts():
+    for part in planner.decided(planner.parts()):
         for found in planner.outcomes(part):
             holds = found.holds
             yield MatchTimes(part.recording, part.topic, found.log_time[holds], found.seq[holds])
@@ -68,7 +63,7 @@ def next_time(session: Session, recording: RecordingEntry, topic: str, moment: i
         topic: Full name.
         moment: The time, ns.
     """
-    channels = [c.channel_id for c in session.channels(recording) if c.channel.topic == topic]
+    channels = [channel.channel_id for channel in session.channels_of(recording, [topic])]
     if recording.span is None or not channels:
         return None
     first, last = recording.span
@@ -77,9 +72,9 @@ def next_time(session: Session, recording: RecordingEntry, topic: str, moment: i
     while True:
         end = moment + width
         parts = session.parts(recording, channels, (moment, end))
-        found = parts.first[parts.first >= moment].tolist()
-        cut = parts.take((parts.first < moment) & (parts.last >= moment))
-        for segment, chunk, channel in zip(*(c.tolist() for c in cut[:3]), strict=True):
+        found = parts["first"][parts["first"] >= moment].tolist()
+        cut = parts[(parts["first"] < moment) & (parts["last"] >= moment)]
+        for segment, chunk, channel in cut[["segment", "chunk", "channel"]].tolist():
             with suppress(SegmentError):
                 times = session.times(recording, segment, chunk)[channel]
                 found.append(int(times[np.searchsorted(times, moment)]))

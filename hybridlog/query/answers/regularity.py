@@ -101,11 +101,7 @@ class Stretch(NamedTuple):
 
 
 class Regularity:
-    """Answers about the times of messages.
-
-    Raises:
-        UsageError: the question has limit, every or reverse.
-    """
+    """Answers about the times of messages."""
 
     def __init__(self, session: Session, question: Question, counters: Counters) -> None:
         if not question.returns_all or question.reverse:
@@ -152,7 +148,7 @@ class Regularity:
         found: list[tuple[str, Times]] = []
         for recording, spans in groupby(self._ranges.spans(), lambda row: row[0].id):
             stretches = [one for row in spans for one in self._stretches(*row)]
-            times = [self._times(one.part) for one in stretches]
+            times = [self._planner.times(one.part) for one in stretches]
             limit = float(least)
             if periods is not None:
                 usual = usual_period(np.concatenate([np.empty(0, np.int64), *map(np.diff, times)]))
@@ -185,6 +181,7 @@ class Regularity:
             entry = session.entry_of(summary)
             for topic in sorted({*question.topics} & topics_of(entry)):
                 part, counts = parts.get(topic), lost[summary.name, topic]
+                times = np.empty(0, np.int64) if part is None else self._planner.times(part)
                 channels = [one.channel for one in session.channels_of(entry, [topic])]
                 types = {one.schema.name for one in channels if one.schema is not None}
                 found.append(
@@ -195,7 +192,7 @@ class Regularity:
                         span[0],
                         lost=None if None in counts else sum(count or 0 for count in counts),
                         is_latched=any(map(depth_of, channels)),
-                        **({} if part is None else _measured(self._times(part), summary, span)),
+                        **_measured(times, summary, span),
                     )
                 )
         return sorted(
@@ -212,11 +209,6 @@ class Regularity:
             for part in sorted(self._planner.parts_in(summary, None, None), key=attrgetter("topic"))
         ]
 
-    def _times(self, part: Part) -> Times:
-        """Log times of the matching messages, ns, ascending."""
-        found = [one.log_time[one.holds] for one in self._planner.outcomes(part)]
-        return np.concatenate([np.empty(0, np.int64), *found])
-
     def _overall(self, stretch: Stretch) -> _Columns:
         """First and last time, messages and mean rate."""
         part = stretch.part
@@ -226,7 +218,7 @@ class Regularity:
             lasts = [one.last for one in part.stats if one.last is not None]
             first, last = min(firsts, default=0), max(lasts, default=0)
         else:
-            times = self._times(part)
+            times = self._planner.times(part)
             count = len(times)
             first, last = (int(times[0]), int(times[-1])) if count else (0, 0)
         if not count:
@@ -243,7 +235,7 @@ class Regularity:
         low, high = stretch.span
         begin = np.arange(low, high, size, dtype=np.int64)
         end = np.append(begin[1:], high)
-        times = placed(self._times(stretch.part))
+        times = placed(self._planner.times(stretch.part))
         inside = times[(times >= low) & (times < high)]
         messages = np.bincount((inside - low) // size, minlength=len(begin))
         return begin, end, messages, messages * 1e9 / (end - begin)

@@ -57,10 +57,9 @@ def about_names(question: Question) -> Iterator[str]:
 def _channels(session: Session, question: Question) -> Iterator[RecordedChannel]:
     """The channels of the question with messages, of its first recordings."""
     summaries = session.look(question.recordings).summaries
-    wanted = set(question.topics)
     for place in session.chosen(question)[:_MAX_RECORDINGS].tolist():
-        for channel in session.channels(session.entry_of(summaries[place])):
-            if channel.channel.topic in wanted and channel.stats.messages:
+        for channel in session.channels_of(session.entry_of(summaries[place]), {*question.topics}):
+            if channel.stats.messages:
                 yield channel
 
 
@@ -180,13 +179,12 @@ def _causes(session: Session, question: Question) -> Iterator[str]:
 
 def _topics_beside(session: Session, question: Question) -> Iterator[str]:
     """Topics without a message in the time range, although their recordings have others."""
-    wanted = set(question.topics)
     spans: dict[str, list[Span]] = defaultdict(list)
     inside: set[str] = set()
     for summary, bounds, _ in islice(RangeResolver(session, question).resolve(), _MAX_RECORDINGS):
-        for channel in session.channels(session.entry_of(summary)):
+        for channel in session.channels_of(session.entry_of(summary), {*question.topics}):
             topic, stats = channel.channel.topic, channel.stats
-            if topic not in wanted or stats.first is None or stats.last is None:
+            if stats.first is None or stats.last is None:
                 continue
             spans[topic].append((stats.first, stats.last))
             if bounds is None or (stats.first < bounds[1] and stats.last >= bounds[0]):

@@ -79,9 +79,6 @@ def frames_in_front(session: Session, question: Question) -> list[Message]:
     """The frames before a range that its first frame refers to: from the last key frame on.
 
     There are none before a key frame, nor before messages that are no frames.
-
-    Raises:
-        UsageError: The question leaves out frames between others, which refer to them.
     """
     of_first = replace(question, limit=1)
     runs = Planner(session, of_first, Counters()).runs()
@@ -110,9 +107,6 @@ def back_to_key(
         session: The open store.
         message: The frame.
         stop: A frame, as log time and arrival number, that ends them before; not among them.
-
-    Raises:
-        PayloadError: There is no key frame, or a payload is missing or damaged.
     """
     last, picture = _place(message), picture_of(session)
     bounds = (None, message.log_time_ns + 1)
@@ -159,14 +153,7 @@ class VideoPictures:
         self._playing: OrderedDict[tuple[str, str], _Playing] = OrderedDict()
 
     def picture(self, session: Session, message: Message) -> NDArray[Any]:
-        """The picture of a frame, red first; read-only.
-
-        Raises:
-            PayloadError: There is no key frame before it, one between is lost or damaged, or
-                it cannot be decoded.
-            DefinitionError: No usable definition exists.
-            MissingDependencyError: PyAV is not installed.
-        """
+        """The picture of a frame, red first; read-only."""
         with self._lock:
             key, place = (message.recording, message.topic), _place(message)
             playing = self._playing.pop(key, None)
@@ -196,11 +183,7 @@ class VideoPictures:
         return _Playing(decoder, _place(message), picture)
 
     def _check_whole(self, session: Session, message: Message, form: str, begin: int) -> None:
-        """Refuse a frame that may refer to a lost one.
-
-        Raises:
-            PayloadError: Messages are lost since `begin`, ns.
-        """
+        """Refuse a frame that may refer to a lost one."""
         # Losses are noted from the last message before them to the first one behind them.
         if begin + 1 < message.log_time_ns:
             bounds = (begin + 1, message.log_time_ns)

@@ -3,19 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import TypeGuard
-
-from hybridlog.query.predicate.tree import Value
 
 LOW, HIGH = -(2**63), 2**63 - 1
 """Smallest and greatest int64."""
-ORDERS: dict[str, Callable[[float | str, float | str], bool]] = {
-    "<": lambda one, other: one < other,  # type: ignore[operator]
-    "<=": lambda one, other: one <= other,  # type: ignore[operator]
-    ">": lambda one, other: one > other,  # type: ignore[operator]
-    ">=": lambda one, other: one >= other,  # type: ignore[operator]
-}
 
 
 def is_number(value: object) -> TypeGuard[float]:
@@ -26,22 +17,6 @@ def is_number(value: object) -> TypeGuard[float]:
 def is_nan(value: object) -> bool:
     """True if a value is NaN."""
     return isinstance(value, float) and math.isnan(value)
-
-
-def equal(value: object, wanted: Value) -> bool:
-    """True if two values are equal: numbers by value, NaN with NaN, no other types mixed."""
-    if is_number(value) and is_number(wanted):
-        return value == wanted or (is_nan(value) and is_nan(wanted))
-    if isinstance(wanted, str) or wanted is None or isinstance(wanted, bool):
-        return type(value) is type(wanted) and value == wanted
-    return False
-
-
-def ordered(order: str, value: object, wanted: Value) -> bool:
-    """True if an order holds; only numbers and strings have one."""
-    if isinstance(value, str) and isinstance(wanted, str):
-        return ORDERS[order](value, wanted)
-    return is_number(value) and is_number(wanted) and ORDERS[order](value, wanted)
 
 
 def nearest(value: float) -> float:

@@ -101,11 +101,7 @@ _ONLY_INDEXED = frozenset({"inserted_at", "error", "ref"})
 
 
 def names_topics(text: str) -> bool:
-    """True if a predicate has conditions on other topics; a MongoDB filter has none.
-
-    Raises:
-        WhereError: as for `parse`.
-    """
+    """True if a predicate has conditions on other topics; a MongoDB filter has none."""
     if ":" not in text or is_filter(text):
         return False
     return any(isinstance(node, Near) for node in nodes(parse(text, across=True).root))
@@ -117,9 +113,6 @@ def parse(text: str, *, across: bool = False) -> Predicate:
     Args:
         text: The predicate.
         across: It may have conditions on other topics.
-
-    Raises:
-        WhereError: a syntax error, too long, too deep, or a refused pattern.
     """
     if not isinstance(text, str):
         raise WhereError(f"a predicate is text, not {type(text).__name__}")

@@ -41,9 +41,6 @@ def compile_regex(pattern: str, max_length: int = MAX_LENGTH) -> Regex:
     Args:
         pattern: The pattern as the user wrote it.
         max_length: Maximum length of the pattern, characters.
-
-    Raises:
-        RegexError: the pattern is refused; has the reason and the place.
     """
     if len(pattern) > max_length:
         raise RegexError(f"longer than {max_length} characters", max_length)

@@ -1,11 +1,14 @@
-"""Predicates on Arrow columns of decoded messages.
+"""Predicates on decoded messages: on their columns, or on plain objects.
 
 Columns have less information than messages: a null is a missing field or a null, and a
-summary replaces a long array. Where that matters, columns cannot decide, and messages must.
+summary replaces a long array. Where that matters, columns cannot decide, and objects must.
 """
 
 from __future__ import annotations
 
+import math
+from abc import ABC, abstractmethod
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import reduce
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
@@ -52,6 +55,8 @@ from hybridlog.schema.arrow_types import (
     lengths_of,
     statistic,
 )
+from hybridlog.schema.summary import summary_of
+from hybridlog.schema.text import repaired_text
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -103,14 +108,24 @@ def to_mask(
     return np.concatenate(masks) if masks else np.zeros(0, np.bool_)
 
 
+def mask_of_objects(
+    node: Predicate | Node,
+    types: FieldTypes | Mapping[str, str] | None,
+    messages: Sequence[Mapping[str, object]],
+) -> Mask:
+    """The same of messages as dict, list, str, bytes, bool, int, float and None: bool[messages].
+
+    For conditions on its numbers, an array may be `{n, min, max, mean}`.
+    """
+    return _Objects(FieldTypes.of(types), messages).node(root_of(node))
+
+
 def _parts(records: Records) -> Iterator[pa.StructArray]:
     """The records in pieces."""
     if isinstance(records, pa.Table):
         yield from (batch.to_struct_array() for batch in records.to_batches())
     elif isinstance(records, pa.RecordBatch):
         yield records.to_struct_array()
-    elif isinstance(records, pa.ChunkedArray):
-        yield from records.chunks
     else:
         yield records
 
@@ -130,26 +145,35 @@ class _Leaves(NamedTuple):
     """Values at a path, in any order.
 
     Attributes:
-        values: One entry for each value.
+        values: One entry for each value; of integers beyond 64 bits, no Arrow array.
         rows: The row of each value.
         is_element: True for elements of an array: a null is then null, not missing.
         is_summary: True for summaries that replace the arrays themselves.
     """
 
-    values: pa.Array
+    values: Any
     rows: Rows
     is_element: bool = False
     is_summary: bool = False
 
 
-class _Columns:
-    def __init__(self, types: FieldTypes, records: pa.StructArray) -> None:
+class _Messages(ABC):
+    """Some messages, of which a predicate is asked."""
+
+    def __init__(self, types: FieldTypes, count: int) -> None:
         self._types = types
-        self._records = records
-        self._count = len(records)
+        self._count = count
+
+    @abstractmethod
+    def exists(self, target: Field) -> Mask:
+        """Mask of the messages that have a field."""
+
+    @abstractmethod
+    def elements(self, target: Field) -> Iterator[_Leaves]:
+        """The values of a field that are no lists, the elements of lists, and nulls."""
 
     def node(self, node: Node) -> Mask:
-        """Mask of the rows for which a predicate holds.
+        """Mask of the messages for which a predicate holds.
 
         Raises:
             _UnfitError: the columns cannot decide.
@@ -162,16 +186,143 @@ class _Columns:
             case Not(item):
                 return ~self.node(item)
             case Exists(target, present):
-                found = self._exists(target)
+                found = self.exists(target)
                 return found if present else ~found
             case MongoFilter() | Near():
                 raise _UnfitError
             case Compare(order="!=") | Member(negated=True) | Match(negated=True):
-                return self._exists(node.field) & ~self._holds(node)
+                return self.exists(node.field) & ~self._holds(node)
             case _:
                 return self._holds(node)
 
-    def _exists(self, target: Field) -> Mask:
+    def _holds(self, node: Compare | Member | Match) -> Mask:
+        """Mask of the messages with a value that satisfies a condition, without its negation."""
+        found = np.zeros(self._count, np.bool_)
+        for each in self.elements(node.field):
+            found[each.rows[_tested(node, each, self._types)]] = True
+        return found
+
+
+class _Objects(_Messages):
+    """Messages as plain objects, which decide everything."""
+
+    def __init__(self, types: FieldTypes, messages: Sequence[Mapping[str, object]]) -> None:
+        super().__init__(types, len(messages))
+        self._messages = messages
+
+    def exists(self, target: Field) -> Mask:
+        found = (any(True for _ in self._at(one, target)) for one in self._messages)
+        return np.fromiter(found, np.bool_, self._count)
+
+    def elements(self, target: Field) -> Iterator[_Leaves]:
+        alike: dict[tuple[Any, bool], tuple[list[Any], list[int]]] = defaultdict(lambda: ([], []))
+        for row, message in enumerate(self._messages):
+            for found in self._at(message, target):
+                is_array = isinstance(found, list)
+                for value in _flat(found) if is_array else (found,):
+                    if not isinstance(value, Mapping | bytes):  # which equal nothing
+                        # A null is one here: what is missing is not there.
+                        values, rows = alike[_kind(value), is_array or value is None]
+                        values.append(repaired_text(value) if isinstance(value, str) else value)
+                        rows.append(row)
+        for (kind, is_element), (values, rows) in alike.items():
+            array = np.array(values, object) if kind is None else pa.array(values, kind)
+            yield _Leaves(array, np.array(rows, np.intp), is_element)
+
+    def _at(self, message: object, target: Field) -> Iterator[object]:
+        """Everything at a path: values, whole arrays, statistics of arrays."""
+        parts, types = target.parts, self._types
+        stat = types.statistic(parts)
+        if stat is None or not types.known:
+            yield from _reached(message, parts)
+        if stat is None:
+            return
+        name = ".".join(part for part in parts[:-1] if isinstance(part, str))
+        is_countable = stat == "n" or types.kind(name) != "other"
+        for array in _reached(message, parts[:-1]):
+            if not types.known:
+                has = isinstance(array, list) and _has_statistic(array, stat)
+            else:
+                has = is_countable and isinstance(array, list | bytes)
+            if has:
+                yield statistic_of(array, stat)  # type: ignore[arg-type]
+            elif types.known and isinstance(array, Mapping) and stat in array:
+                yield array[stat]
+
+
+def _reached(value: object, parts: Parts) -> Iterator[object]:
+    """The values at a path; through an array, those of each element. A last array is whole."""
+    if not parts:
+        yield value
+        return
+    part, rest = parts[0], parts[1:]
+    if isinstance(part, Slice):
+        if isinstance(value, list):
+            yield from _reached(value[part.begin : part.end], rest)
+    elif isinstance(value, Mapping):
+        if str(part) in value:
+            yield from _reached(value[str(part)], rest)
+    elif isinstance(value, list):
+        if isinstance(part, int) and part < len(value):
+            yield from _reached(value[part], rest)
+        # MongoDB also accepts a number as a name.
+        for inner in _flat(value) if isinstance(part, str) else value:
+            if isinstance(inner, Mapping):
+                yield from _reached(inner, parts)
+
+
+def _flat(values: object) -> Iterator[object]:
+    """The elements of a list, also those of the lists in it, in their order."""
+    left = [values]
+    while left:
+        value = left.pop()
+        if isinstance(value, list):
+            left += reversed(value)
+        else:
+            yield value
+
+
+def _kind(value: object) -> pa.DataType | None:
+    """The Arrow type of a value; None of an integer that has none."""
+    if value is None:
+        return pa.null()
+    if isinstance(value, bool):
+        return pa.bool_()
+    if isinstance(value, int):
+        return pa.int64() if LOW <= value <= HIGH else None
+    return pa.string() if isinstance(value, str) else pa.float64()
+
+
+def _has_statistic(values: Sequence[object], stat: Stat) -> bool:
+    """True if an array has a statistic, and its elements have no field of that name."""
+    if stat == "n":
+        return not any(isinstance(value, Mapping) and stat in value for value in values)
+    return all(isinstance(value, int | float) for value in values)
+
+
+def statistic_of(values: Sequence[object], stat: Stat) -> float | None:
+    """A statistic of an array, equal to that in its summary in the index."""
+    if stat == "n":
+        return len(values)
+    numbers = [value for value in values if isinstance(value, int | float)]
+    # True counts as 1.
+    finite = [value * 1 for value in numbers if isinstance(value, int) or math.isfinite(value)]
+    if not finite:
+        return None
+    if stat == "mean":
+        found = summary_of(numbers)
+        return float(found.mean[0]) if found is not None and found.has[0] else None
+    return min(finite) if stat == "min" else max(finite)
+
+
+class _Columns(_Messages):
+    """Messages as columns."""
+
+    def __init__(self, types: FieldTypes, records: pa.StructArray) -> None:
+        super().__init__(types, len(records))
+        self._records = records
+
+    def exists(self, target: Field) -> Mask:
         found = np.zeros(self._count, np.bool_)
         for leaves in self.leaves(target):
             if leaves.values.null_count and not leaves.is_element:
@@ -179,13 +330,9 @@ class _Columns:
             found[leaves.rows] = True
         return found
 
-    def _holds(self, node: Compare | Member | Match) -> Mask:
-        """Mask of the rows with a value that satisfies a condition, without its negation."""
-        found = np.zeros(self._count, np.bool_)
-        for leaves in self.leaves(node.field):
-            for each in _elements(leaves):
-                found[each.rows[_tested(node, each, self._types)]] = True
-        return found
+    def elements(self, target: Field) -> Iterator[_Leaves]:
+        for leaves in self.leaves(target):
+            yield from _elements(leaves)
 
     # Paths.
 
@@ -423,6 +570,8 @@ def _elements(leaves: _Leaves) -> Iterator[_Leaves]:
 
 def _tested(node: Compare | Member | Match, leaves: _Leaves, types: FieldTypes) -> Mask:
     """Mask of the values that satisfy a condition, without its negation: bool[values]."""
+    if isinstance(leaves.values, np.ndarray):
+        return _of_large(node, leaves.values)
     if leaves.is_summary:
         return _of_summaries(node, leaves, types)
     match node:
@@ -437,6 +586,17 @@ def _tested(node: Compare | Member | Match, leaves: _Leaves, types: FieldTypes) 
             if leaves.is_element and pa.types.is_floating(leaves.values.type):
                 found &= np.isfinite(_numpy(leaves.values).astype(np.float64))
             return found
+
+
+def _of_large(node: Compare | Member | Match, values: NDArray[Any]) -> Mask:
+    """The same of integers beyond 64 bits."""
+    found = np.zeros(len(values), np.bool_)
+    if isinstance(node, Compare | Member):
+        order = node.order if isinstance(node, Compare) and node.order != "!=" else "=="
+        for value in (node.value,) if isinstance(node, Compare) else node.values:
+            if is_number(value):
+                found |= _ORDERS[order](values, value).astype(np.bool_)
+    return found
 
 
 def _equal_to(leaves: _Leaves, values: Sequence[Value]) -> Mask:

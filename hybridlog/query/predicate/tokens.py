@@ -110,11 +110,7 @@ def error_at(text: str, position: int, message: str) -> WhereError:
 
 
 def tokenize(text: str) -> list[Token]:
-    """The tokens of a predicate, followed by an `end`.
-
-    Raises:
-        WhereError: too long, or a place where no token begins.
-    """
+    """The tokens of a predicate, followed by an `end`."""
     if len(text) > MAX_TEXT:
         raise WhereError(
             f"the predicate has {len(text)} characters, at most {MAX_TEXT} are allowed"
@@ -134,11 +130,7 @@ def tokenize(text: str) -> list[Token]:
 
 
 def unescape(text: str, token: Token) -> str:
-    """The value of a string token.
-
-    Raises:
-        WhereError: an unknown escape, or an unpaired surrogate.
-    """
+    """The value of a string token."""
 
     def replace(match: re.Match[str]) -> str:
         if match[1]:

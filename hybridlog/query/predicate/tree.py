@@ -7,7 +7,7 @@ meaning: their places in the text are ignored, and NaN equals NaN.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple, TypeAlias, TypeVar
 
@@ -309,7 +309,3 @@ def _literal(value: Value) -> str:
     if value is None:
         return "null"
     return str(value).lower() if isinstance(value, bool) else repr(value)
-
-
-Test: TypeAlias = Callable[[Mapping[str, object]], bool]
-"""A predicate as a test of one message after the other."""

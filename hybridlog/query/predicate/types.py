@@ -142,22 +142,14 @@ def _listed(types: tuple[tuple[str, str], ...] | None) -> FieldTypes:
 
 
 def check(predicate: Predicate, types: FieldTypes | Mapping[str, str] | None) -> None:
-    """Refuse a predicate with unknown fields, or with comparisons of different kinds.
-
-    Raises:
-        WhereError: the predicate is refused; the message has the place in its text.
-    """
+    """Refuse a predicate with unknown fields, or with comparisons of different kinds."""
     checker = _Checker(predicate.text, FieldTypes.of(types))
     for condition in predicate.conditions():
         checker.check(condition)
 
 
 def check_name(text: str, target: Field, types: FieldTypes | Mapping[str, str] | None) -> None:
-    """Refuse an unknown field in a text, whatever it is compared with.
-
-    Raises:
-        WhereError: there is no such field.
-    """
+    """Refuse an unknown field in a text, whatever it is compared with."""
     _Checker(text, FieldTypes.of(types)).check_name(target)
 
 

@@ -1,6 +1,4 @@
-"""One question, one answer: of messages in memory and of Arrow columns, which `to_bool` and
-`to_mask` give. Columns hold arrays whole, and as summaries.
-"""
+"""One question, one answer: of messages in memory and of Arrow columns, whole and summarised."""
 
 from __future__ import annotations
 
@@ -17,8 +15,7 @@ from hypothesis import strategies as st
 from hybridlog.columns.left_rows import reduced
 from hybridlog.query.message_filter import MessageFilter
 from hybridlog.query.predicate.parser import parse
-from hybridlog.query.predicate.to_bool import statistic, to_bool
-from hybridlog.query.predicate.to_mask import to_mask
+from hybridlog.query.predicate.to_mask import mask_of_objects, statistic_of, to_mask
 from hybridlog.query.predicate.tree import Predicate
 from hybridlog.query.question import RecordedChannel
 from hybridlog.schema.codecs import codec_for
@@ -57,8 +54,7 @@ SUMMARISED = ("a", "k", "w")
 def ask(messages: list[Message], questions: Iterable[str], types: Types) -> None:
     for question in questions:
         predicate = parse(question)
-        test = to_bool(predicate, types)
-        expected = {n for n, message in enumerate(messages) if test(message)}
+        expected = set(np.flatnonzero(mask_of_objects(predicate, types, messages)).tolist())
         in_columns(predicate, types, messages, expected)
 
 
@@ -90,7 +86,7 @@ def summarised(message: Message) -> Message:
     for name in SUMMARISED:
         values = message[name]
         assert isinstance(values, list)
-        shorter[name] = {stat: statistic(stat, values) for stat in ("n", "min", "max", "mean")}
+        shorter[name] = {stat: statistic_of(values, stat) for stat in ("n", "min", "max", "mean")}
     return {**message, **shorter}
 
 
@@ -362,8 +358,8 @@ def test_what_json_arrays_answer(kind: str, where: str, expected: str) -> None:
     ask(list(messages.values()), [where], None)
     for one in messages.values():
         ask([one], [where], None)  # columns of one kind
-    test = to_bool(parse(where))
-    assert [name for name, message in messages.items() if test(message)] == expected.split()
+    mask = mask_of_objects(parse(where), None, [*messages.values()])
+    assert [name for name, holds in zip(messages, mask, strict=True) if holds] == expected.split()
 
 
 doubles = st.sampled_from([-1.0, 0.0, -0.0, 0.25, 1.0, 1.5, 2.0, math.nan, math.inf, -math.inf])

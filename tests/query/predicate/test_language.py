@@ -3,12 +3,13 @@ from __future__ import annotations
 import math
 import re
 
+import numpy as np
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from hybridlog.query.predicate.parser import parse
-from hybridlog.query.predicate.to_bool import to_bool
+from hybridlog.query.predicate.to_mask import mask_of_objects
 from hybridlog.query.predicate.tree import Compare, Predicate, spelled
 from hybridlog.query.predicate.types import check
 from hybridlog_storage.errors import WhereError
@@ -242,7 +243,7 @@ def test_any_text_is_a_filter_or_an_error(where: str) -> None:
         predicate = parse(where)
     except WhereError:
         return
-    to_bool(predicate)
+    mask_of_objects(predicate, None, [{}])
     assert parse(predicate.text) == predicate
 
 
@@ -468,11 +469,12 @@ def test_messages_answer_as_the_language_says(docs: list[Document], asked: list[
             return where, [docs[n] for n in found ^ expected]  # type: ignore[index]
 
         predicate = parse(where)
-        test = to_bool(predicate, types)
-        in_memory: set[object] = {n for n, document in enumerate(docs) if test(document)}
+        mask = mask_of_objects(predicate, types, docs)
+        in_memory: set[object] = {*np.flatnonzero(mask).tolist()}
         assert in_memory == expected, wrong(in_memory)
 
 
 def test_the_deepest_predicate_is_taken() -> None:
     for where in ("not " * 49 + "m.q.min < 5", " or ".join(["m.q.mean < 5"] * 200)):
-        assert to_bool(checked(where, TYPES), TYPES)({"m": [{"q": [1.0]}]}) is ("not" not in where)
+        mask = mask_of_objects(checked(where, TYPES), TYPES, [{"m": [{"q": [1.0]}]}])
+        assert mask.tolist() == ["not" not in where]

@@ -11,8 +11,7 @@ import pytest
 
 from hybridlog.query.predicate.mongo_filter import mongo_filter
 from hybridlog.query.predicate.parser import parse
-from hybridlog.query.predicate.to_bool import to_bool
-from hybridlog.query.predicate.to_mask import to_mask
+from hybridlog.query.predicate.to_mask import mask_of_objects, to_mask
 from hybridlog.query.predicate.tree import Compare, Field
 
 ORDERS = {
@@ -50,8 +49,8 @@ def test_numbers_are_compared_by_value(name: str, order: str) -> None:
         assert mask is not None
         expected = [ORDERS[order](Fraction(v), Fraction(bound)) for v in values.tolist()]
         assert mask.tolist() == expected, bound
-        test = to_bool(asked, {"x": name})
-        assert [test({"x": value}) for value in values.tolist()] == expected
+        objects = [{"x": value} for value in values.tolist()]
+        assert mask_of_objects(asked, {"x": name}, objects).tolist() == expected
 
 
 def mask_of(text: str, records: object, types: dict[str, str] | None = None) -> list[bool] | None:
