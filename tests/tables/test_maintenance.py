@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 import hybridlog as hl
+from hybridlog.columns.column_file import ColumnFile
 from hybridlog.columns.folders import TableFolders
 from hybridlog.columns.layout import PARTS, TABLES
-from hybridlog.columns.parquet_file import ParquetFileReader
 from hybridlog.columns.tables import Tables
 from hybridlog.maintenance import tables as making
 from hybridlog.maintenance.verify import RESTORE
@@ -41,7 +41,7 @@ def contents(store: hl.Store) -> dict[str, str]:
     root = store.directory.path / TABLES
     found = {}
     for path in root.glob("*/*.parquet"):
-        reader = ParquetFileReader(path)
+        reader = ColumnFile(path)
         found[str(path.relative_to(root))] = f"{reader.about.sections} {reader.table().to_pylist()}"
     return found
 
@@ -156,7 +156,7 @@ def test_rows_of_another_segment_are_not_kept(few: hl.Store) -> None:
     (entry,) = few.recordings()
     stale = dict.fromkeys(entry.digests, "0" * 64)
     path = next((few.directory.path / TABLES).glob("*/*.parquet"))
-    reader = ParquetFileReader(path)
+    reader = ColumnFile(path)
     sections = reader.about.sections
     folders = TableFolders(few.directory.path, entry.id, entry.created, entry.digests)
     table, before, pieces = reader.table(), 0, []
