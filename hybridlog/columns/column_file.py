@@ -86,6 +86,7 @@ def leaves(schema: pa.Schema) -> Iterator[Leaf]:
     """The columns of a file in Parquet's order."""
     for top in schema:
         is_own = top.name in OWN_COLUMNS or OWN in (top.metadata or {})
+        pending: list[tuple[pa.Field, str, tuple[str, ...], tuple[str, ...] | None]]
         pending = [(top, top.name, (original_name(top),), None)]
         while pending:
             field, path, names, array = pending.pop()
