@@ -22,17 +22,17 @@ import pyarrow as pa
 from hybridlog.columns.layout import EMPTY, ORIGINAL, RESERVED, SUMMARY, column_names
 from hybridlog.schema.arrow_columns import structs
 from hybridlog.schema.arrow_types import (
-    COLUMNS,
-    WIDENED,
     Array,
     common_type,
     converted,
+    exact,
     is_array,
     is_bytes,
     is_list,
     lengths_of,
     missing_of,
     summary,
+    widened,
     with_values,
 )
 
@@ -83,33 +83,27 @@ class FieldShape:
         kind = array.type
         if kind in self._plain:
             return array
-        columns: list[Array] = []
-        about: list[tuple[str, bool, bool]] = []
+        columns: list[tuple[str, Array, dict[bytes, str]]] = []
         for number, field in enumerate(kind):
-            values = array.field(number)
+            name, values = field.name, array.field(number)
+            about = {EMPTY: ""} if _is_empty(field.type) else {}
             if _has_summary(field.type):
-                columns += self._split(values)
-                is_empty = _is_empty(field.type)
-                about += [(field.name, False, is_empty), (f"{field.name}_summary", True, False)]
+                values, summaries = self._split(values)
+                columns.append((name, values, about))
+                columns.append((f"{name}_summary", summaries, {SUMMARY: name}))
             else:
-                columns.append(self._column(values))
-                about.append((field.name, False, _is_empty(field.type)))
-        named = list(column_names([name for name, _, _ in about], reserved))
-        fields = [
-            _named(column, name, values.type, is_summary=is_summary, is_empty=is_empty)
-            for (name, column), (_, is_summary, is_empty), values in zip(
-                named, about, columns, strict=True
-            )
-        ]
+                columns.append((name, self._column(values), about))
+        fields = []
+        named = column_names([name for name, _, _ in columns], reserved)
+        for (name, column), (_, values, about) in zip(named, columns, strict=True):
+            if column != name and SUMMARY not in about:
+                about[ORIGINAL] = name
+            fields.append(pa.field(column, values.type, metadata=about or None))
         if kind == pa.struct(fields) and not any(field.metadata for field in fields):
             self._plain.add(kind)
             return array
-        return structs(
-            {column: values for (_, column), values in zip(named, columns, strict=True)},
-            len(array),
-            missing_of(array),
-            fields,
-        )
+        found = {field.name: values for field, (_, values, _) in zip(fields, columns, strict=True)}
+        return structs(found, len(array), missing_of(array), fields)
 
     def _split(self, array: Array) -> tuple[Array, Array]:
         """Arrays within the limit, and summaries of the others; or both of all."""
@@ -153,15 +147,6 @@ def _is_empty(kind: Any) -> bool:
     while is_list(kind):
         kind = kind.value_type
     return pa.types.is_struct(kind) and not kind.num_fields
-
-
-def _named(column: str, name: str, kind: Any, *, is_summary: bool, is_empty: bool) -> Any:
-    if is_summary:
-        return pa.field(column, kind, metadata={SUMMARY: name.removesuffix("_summary")})
-    about = {ORIGINAL: name} if column != name else {}
-    if is_empty:
-        about[EMPTY] = ""
-    return pa.field(column, kind, metadata=about or None)
 
 
 def original_name(field: Any) -> str:
@@ -259,7 +244,7 @@ def alike(pieces: Sequence[Array], *, by_type: bool = False) -> list[Array]:
         UnfitError: no common type exists.
     """
     try:
-        kind = common_type(pieces, WIDENED if by_type else COLUMNS)
+        kind = common_type(pieces, widened if by_type else exact, summaries=True)
         return [converted(piece, kind) for piece in pieces]
     except (pa.ArrowException, NotImplementedError) as error:
         raise UnfitError(str(error)) from error

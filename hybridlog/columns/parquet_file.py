@@ -11,6 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+import msgspec
 import pyarrow as pa
 import pyarrow.parquet as pq
 
@@ -127,7 +128,9 @@ class ParquetFileWriter:
                 self._put(self._behind)
             self._sink.end_body()
             about = About(sections, span, of_rows=dict(rows or {}))
-            self._writer.add_key_value_metadata({ABOUT.decode(): about.to_json()})
+            self._writer.add_key_value_metadata(
+                {ABOUT.decode(): msgspec.json.encode(about).decode()}
+            )
             self._writer.close()
             return self._sink.finish(sync=sync)
         except BaseException:

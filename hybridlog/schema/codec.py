@@ -239,17 +239,6 @@ def columns_of(codec: Codec, batch: Batch, fields: Collection[str] | None = None
     return codec.columns(batch.buffer, batch.offset, batch.length, fields)
 
 
-def one_message(codec: Codec, payload: Buffer) -> Decoded:
-    """The columns of one message.
-
-    Raises:
-        PayloadError: The payload does not fit its definition.
-        DefinitionError: There is no definition to read it by.
-    """
-    size = np.array([memoryview(payload).nbytes], np.int64)
-    return readable(codec.columns(payload, np.zeros(1, np.int64), size))
-
-
 def readable(decoded: Decoded) -> Decoded:
     """The same of one message.
 
@@ -274,7 +263,11 @@ def plain_message(
     Raises:
         PayloadError: The payload does not fit its definition.
     """
-    return one_message(codec, payload).plain(names, whole=False)[0] if codec.indexed else {}
+    if not codec.indexed:
+        return {}
+    size = np.array([memoryview(payload).nbytes], np.int64)
+    decoded = codec.columns(payload, np.zeros(1, np.int64), size)
+    return readable(decoded).plain(names, whole=False)[0]
 
 
 def stamps_of(codec: Codec, batch: Batch) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
