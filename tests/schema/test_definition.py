@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rosbags.interfaces import Nodetype
-from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from hybridlog.schema.definition import (
     MAX_DEFINITION,
@@ -257,22 +257,6 @@ def test_idl():
     text = f"{RULE}\nIDL: pkg/msg/T\n{IDL}\n{RULE}\nIDL: pkg/msg/Inner\n{INNER_IDL}\n"
     assert listing(parse(text, "ros2idl")) == IDL_FIELDS
     assert listing(parse(IDL + INNER_IDL, "ros2idl")) == IDL_FIELDS
-
-
-def test_idl_against_rosbags():
-    text = """
-module pkg { module msg {
-  typedef float float__3[3];
-  const long N = 6;
-  struct Part { string<4> name; float__3 values; };
-  struct T {
-    sequence<pkg::msg::Part> parts; pkg::msg::Part one; double x[N]; sequence<octet, 9> y;
-  };
-}; };
-"""
-    table = get_types_from_idl(text)
-    found = parse(text, "ros2idl")
-    assert_same_type(found, (Nodetype.NAME, "pkg/msg/T"), table)
 
 
 def test_msg_and_idl_may_be_mixed():

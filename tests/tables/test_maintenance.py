@@ -17,7 +17,6 @@ from hybridlog.maintenance import tables as making
 from hybridlog.maintenance.verify import RESTORE
 from hybridlog.record.marks import MARKS
 from tests import places
-from tests.faults import logs
 from tests.limits import Limit
 from tests.tables.logs import BASE, varied, write_log
 from tests.tables.test_writer import compare, topics_of
@@ -48,13 +47,6 @@ def contents(store: hl.Store) -> dict[str, str]:
 
 def unfinished(store: hl.Store) -> list[Path]:
     return list((store.directory.path / PARTS).glob("*"))
-
-
-def test_a_topic_that_ends_before_its_recording(store: hl.Store, tmp_path: Path) -> None:
-    """Its last file has the name of the last segment with its messages."""
-    said = {**logs.content(0, 1700), "/number": logs.content(0, 1500)["/number"]}
-    store.record(logs.write(tmp_path / "a.mcap", said), settings=logs.SETTINGS)
-    assert store.verify().findings == []
 
 
 def test_a_mark_changes_no_table(few: hl.Store) -> None:
