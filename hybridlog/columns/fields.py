@@ -183,6 +183,8 @@ def records_of(
             name = original_name(field)
             path = (*above, name)
             values = records_of(columns.field(number), is_summarised, path)
+            if EMPTY in (field.metadata or {}):
+                values = _emptied(values)
             if has_summaries(field):
                 if is_summarised(path):
                     found[name] = _filled(values, found.get(name))
@@ -194,6 +196,13 @@ def records_of(
     if is_list(kind) and _is_changed(kind.value_field):
         return with_values(columns, records_of(columns.flatten(), is_summarised, above))
     return columns
+
+
+def _emptied(array: Array) -> Array:
+    """Messages without fields, which columns have as booleans."""
+    if is_list(array.type):
+        return with_values(array, _emptied(array.flatten()))
+    return structs({}, len(array), missing_of(array))
 
 
 def _filled(summaries: Array, lists: Array | None) -> Array:
@@ -212,7 +221,7 @@ def _filled(summaries: Array, lists: Array | None) -> Array:
 
 def _is_changed(field: Any) -> bool:
     """True if a column, or one inside it, is not its field under the same name."""
-    if field.metadata and (ORIGINAL in field.metadata or SUMMARY in field.metadata):
+    if not {ORIGINAL, SUMMARY, EMPTY}.isdisjoint(field.metadata or {}):
         return True
     kind = field.type
     if pa.types.is_struct(kind):

@@ -10,12 +10,12 @@ stream. It has the columns of fields, `error`, and of `ref` size, SHA-256 and su
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from hashlib import sha256
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 from bson.int64 import Int64
 
 from hybridlog.columns.fields import (
@@ -24,18 +24,13 @@ from hybridlog.columns.fields import (
     has_summaries,
     names_of,
     original_name,
+    records_of,
 )
-from hybridlog.columns.layout import EMPTY, OWN_COLUMNS
+from hybridlog.columns.layout import OWN_COLUMNS
 from hybridlog.schema.arrow_columns import structs
-from hybridlog.schema.arrow_types import (
-    Array,
-    is_bytes,
-    is_list,
-    is_time,
-    lengths_of,
-    plain_values,
-)
+from hybridlog.schema.arrow_types import Array, is_summary, plain_values
 from hybridlog.schema.index_bodies import MAX_BYTES
+from hybridlog.schema.objects import document_cells
 from hybridlog_storage.messages import Batch, Left
 
 if TYPE_CHECKING:
@@ -47,7 +42,6 @@ if TYPE_CHECKING:
     from hybridlog_storage.messages import Buffer
 
 _OWN: Final = frozenset(OWN_COLUMNS)
-_LONG: Final = (pa.int64(), pa.uint32(), pa.uint64())
 
 
 def fields_in(rows: pa.StructArray) -> pa.StructArray:
@@ -135,51 +129,30 @@ def documents(columns: Array, *, typed: bool, summaries: bool = True) -> list[di
         typed: True if a definition fixes the width of integers.
         summaries: False to leave out arrays of which only a summary is left.
     """
-    kept = [
-        (original_name(field), _cells(column, field, typed=typed, summaries=summaries))
-        for field, column in zip(columns.type, columns.flatten(), strict=True)
-        if summaries or not has_summaries(field)
-    ]
-    rows = zip(*(cells for _, cells in kept), strict=True) if kept else [()] * len(columns)
-    names = [name for name, _ in kept]
-    return [{n: v for n, v in zip(names, row, strict=True) if v is not None} for row in rows]
+    cells = partial(document_cells, typed=typed, whole=not summaries)
+    found = plain_values(records_of(columns), cells)
+    if not summaries:
+        return found
+    also = plain_values(records_of(columns, lambda _: True), lambda a: _summaries(a) or cells(a))
+    return [_merged(*both) for both in zip(found, also, strict=True)]
 
 
-def _cells(array: Array, field: Any, *, typed: bool, summaries: bool) -> list[Any]:
-    kind, is_empty = array.type, EMPTY in (field.metadata or {})
-    if has_summaries(field):
-        found = array.to_pylist()
-        return [None if one is None else {k: _whole(v) for k, v in one.items()} for one in found]
-    if pa.types.is_struct(kind):
-        made = documents(array, typed=typed, summaries=summaries)
-        return [d if v else None for d, v in zip(made, array.is_valid().to_pylist(), strict=True)]
-    if is_list(kind):
-        inner = field if is_empty else kind.value_field
-        lengths = lengths_of(array)
-        items = array.flatten() if pa.types.is_fixed_size_list(kind) else _items(array, lengths)
-        values = iter(_cells(items, inner, typed=typed, summaries=summaries))
-        counted = zip(lengths.tolist(), array.is_valid().to_pylist(), strict=True)
-        return [[next(values) for _ in range(n)] if there else None for n, there in counted]
-    if is_bytes(kind):
-        sizes = pc.binary_length(array).to_pylist()
-        own = [None if n is None else {"n": Int64(n)} for n in sizes]
-        return own if summaries else array.to_pylist()
-    values = plain_values(array)
-    if is_empty:
-        return [None if there is None else {} for there in values]
-    return [*map(_whole, values)] if is_time(kind) or (typed and kind in _LONG) else values
+def _summaries(array: Array) -> list[Any] | None:
+    """Summaries with integers of 64 bits; None of other values."""
+    if not is_summary(array.type):
+        return None
+    found = [(one or {}).items() for one in array.to_pylist()]
+    made = [{k: Int64(v) if isinstance(v, int) else v for k, v in one} for one in found]
+    return [one or None for one in made]
 
 
-def _items(array: Array, lengths: NDArray[np.int64]) -> Array:
-    """The elements of lists; pyarrow cannot flatten those of JSON text where one is null."""
-    begin, total = array.offsets[0].as_py(), int(lengths.sum())
-    is_dense = array.offsets[-1].as_py() - begin == total
-    return array.values.slice(begin, total) if is_dense else array.flatten()
-
-
-def _whole(value: Any) -> Any:
-    """An integer as int64 of BSON, whatever its value."""
-    return Int64(value) if isinstance(value, int) else value
+def _merged(one: Any, other: Any) -> Any:
+    """Values with what the other ones have besides, in their order."""
+    if isinstance(one, dict) and isinstance(other, dict):
+        return {name: _merged(one.get(name, value), value) for name, value in other.items()}
+    if isinstance(one, list) and isinstance(other, list):
+        return [_merged(*both) for both in zip(one, other, strict=True)]
+    return one
 
 
 def reduced(codec: Codec, payload: bytes) -> bytes:

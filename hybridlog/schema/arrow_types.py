@@ -358,13 +358,11 @@ def converted(array: Array, kind: pa.DataType) -> Array:
 
 
 def narrowed(array: Array, kind: pa.DataType) -> Array:
-    """The same of structs that have more fields, or are booleans since they have none.
+    """The same of structs that have more fields.
 
     Raises:
         pa.ArrowInvalid: As `converted`.
     """
-    if _types.is_struct(kind) and not kind.num_fields:
-        return structs({}, len(array), missing_of(array))
     if _types.is_struct(kind) and _types.is_struct(array.type):
         return _with_fields(array, kind, narrowed)
     if is_list(kind) and is_list(array.type) and kind != array.type:
@@ -410,34 +408,53 @@ def _with_fields(
     return structs(children, len(array), missing_of(array), kind)
 
 
-def plain_values(array: Array) -> list[Any]:
+def plain_values(
+    array: Array, cells: Callable[[Array], list[Any] | None] = lambda _: None
+) -> list[Any]:
     """Values as in JSON, except NaN: times in nanoseconds, bytes in base64.
 
     Null fields of structs are left out.
+
+    Args:
+        array: The values.
+        cells: Returns other cells of an array, or None for these.
     """
+    made = cells(array)
+    if made is not None:
+        return made
     kind = array.type
     if kind == pa.json_():
         texts = array.storage.to_pylist()
         return [None if text is None else json.loads(text) for text in texts]
     if _types.is_struct(kind):
         names = [field.name for field in kind]
-        columns = [plain_values(child) for child in array.flatten()]
+        columns = [plain_values(child, cells) for child in array.flatten()]
         rows = [
             {n: v for n, v in zip(names, row, strict=True) if v is not None}
             for row in (zip(*columns, strict=True) if names else [()] * len(array))
         ]
         return [row if there else None for row, there in zip(rows, _is_there(array), strict=True)]
     if is_list(kind):
-        values = iter(plain_values(array.flatten()))
-        counted = zip(lengths_of(array).tolist(), _is_there(array), strict=True)
+        lengths = lengths_of(array)
+        values = iter(plain_values(_elements(array, int(lengths.sum())), cells))
+        counted = zip(lengths.tolist(), _is_there(array), strict=True)
         return [[next(values) for _ in range(n)] if there else None for n, there in counted]
     if is_time(kind):
         array = array.cast(pa.int64())
     elif is_bytes(kind):
-        cells = array.to_pylist()
-        return [None if v is None else base64.b64encode(v).decode() for v in cells]
+        found = array.to_pylist()
+        return [None if v is None else base64.b64encode(v).decode() for v in found]
     plain: list[Any] = array.to_pylist()
     return plain
+
+
+def _elements(array: Array, total: int) -> Array:
+    """The elements of lists; older pyarrow cannot flatten those of JSON text where one is null."""
+    if not _types.is_fixed_size_list(array.type):
+        begin, end = array.offsets[0].as_py(), array.offsets[-1].as_py()
+        if end - begin == total:
+            return array.values.slice(begin, total)
+    return array.flatten()
 
 
 def _is_there(array: Array) -> list[bool]:
