@@ -234,13 +234,13 @@ class Documents:
         Raises:
             PayloadError: Always.
         """
-        from hybridlog.columns.left_rows import with_rows
+        from hybridlog.columns.left_rows import digest_in, with_rows
         from hybridlog.schema.left import missing_payload
 
         state = self._channels[int(self._batch.channel[row])].state
         left = with_rows(self._batch.take(slice(row, row + 1))).left
         assert left is not None
-        raise missing_payload(state, *left.parts[left.part[0]].about(int(left.row[0])))
+        raise missing_payload(state, *digest_in(left, 0))
 
     def _make(self, index: int) -> None:
         from hybridlog.schema.index_bodies import bodies_of

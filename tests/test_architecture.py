@@ -39,7 +39,6 @@ ALLOWED = {
         "hybridlog.query.predicate.tree",
         "hybridlog.schema.index_bodies",
         "hybridlog.schema.objects",
-        "hybridlog.schema.protobuf_codec",
         "hybridlog_storage.mongo.database",
         "hybridlog_storage.mongo.mongod",
     ),
@@ -63,7 +62,7 @@ ALLOWED = {
     ),
     "mcap_protobuf": ("hybridlog.schema.protobuf_codec",),
     "msgspec": (
-        "hybridlog.columns.layout",
+        "hybridlog.columns",
         "hybridlog.entries",
         "hybridlog.live.sources.ros1",
         "hybridlog.live.sources.ros2.receiver",

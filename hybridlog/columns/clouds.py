@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import groupby
+from operator import attrgetter
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Final
 
@@ -64,7 +65,7 @@ class PointColumns:
         except (KeyError, TypeError, AttributeError):  # another type of this name
             arrays = []
         readable = [(row, array) for row, array in arrays if array is not None]
-        runs = groupby((array for _, array in readable), _layout)
+        runs = groupby((array for _, array in readable), attrgetter("dtype"))
         pieces = [_columns([*run]) for _, run in runs]
         found = joined(pieces) if pieces else pa.nulls(0, pa.struct([]))
         return without(found, np.array([row for row, _ in readable], np.intp), len(clouds))
@@ -85,11 +86,6 @@ class PointColumns:
             is_usual = len(names) <= MAX_FIELDS and bool(array.dtype.names)
             self._names = names if is_usual else self._names
             yield array.reshape(-1) if is_usual else None
-
-
-def _layout(cloud: NDArray[Any]) -> list[tuple[str, str, tuple[int, ...]]]:
-    kinds = ((name, cloud.dtype[name]) for name in cloud.dtype.names or ())
-    return [(name, str(kind.base), kind.shape) for name, kind in kinds]
 
 
 def _columns(clouds: Sequence[NDArray[Any]]) -> pa.StructArray:

@@ -1,29 +1,106 @@
-"""One file of columns, the columns to read for some fields, and what is open."""
+"""One file of columns, the columns to read for some fields, and what is open.
+
+Files are read with `pread`: truncation of a mapped file would kill the process.
+"""
 
 from __future__ import annotations
 
+import os
 import threading
 from collections import OrderedDict
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from itertools import count
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import pyarrow as pa
+import pyarrow.parquet as pq
 
-from hybridlog.columns.fields import SUMMARY_FIELDS, is_of_bytes, names_of
-from hybridlog.columns.layout import Section, TopicCounts
-from hybridlog.columns.parquet_file import Leaf, ParquetFileReader, leaves
+from hybridlog.columns.fields import (
+    SUMMARY_FIELDS,
+    has_summaries,
+    is_of_bytes,
+    names_of,
+    original_name,
+)
+from hybridlog.columns.layout import ABOUT, OWN, OWN_COLUMNS, About, Section, TopicCounts
+from hybridlog.schema.arrow_types import is_list
+from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk import files
+from hybridlog_storage.errors import HybridlogError, StoreError, exhausted
 from hybridlog_storage.lazy import lazy
+from hybridlog_storage.manifest import hasher
 
 if TYPE_CHECKING:
     from hybridlog_storage.cache import Cache
 
 _OPEN_FILES: Final = 256
 _MAX_FIELD_SETS: Final = 64  # sets of fields whose columns are known for a file
+_READ: Final = 1 << 20  # bytes read together for a digest
+_TAIL: Final = 8  # bytes: length of the footer, `PAR1`
+_SEAL: Final = 4  # bytes: CRC-32 of the footer, in front of it
+_MAX_FOOTER: Final = 256 << 20
+_NUMBERS: Final = count()
 FIRST: Final = -(1 << 63)
 """Lower bound of all log times."""
 LAST: Final = (1 << 63) - 1
 """Upper bound of all log times."""
+
+
+class ReusedBytes(NamedTuple):
+    """The row groups of the file that a new one replaces.
+
+    They keep their place in the new file, where nothing refers to them: DuckDB reads the
+    footer, and opens the file again by its name for the rows.
+
+    Attributes:
+        offset: Where they lie.
+        data: The bytes.
+    """
+
+    offset: int
+    data: bytes
+
+
+class Leaf(NamedTuple):
+    """A column in Parquet's order.
+
+    Attributes:
+        top: Name of the table's column that contains it.
+        path: Its dotted path in the file.
+        kind: Type of its values.
+        is_own: True for a column of the table itself, not of a field.
+        names: Names of the fields on the path to it, without lists.
+        array: Names of the fields on the path to the array whose summary it is part of.
+    """
+
+    top: str
+    path: str
+    kind: pa.DataType
+    is_own: bool
+    names: tuple[str, ...]
+    array: tuple[str, ...] | None = None
+
+
+def leaves(schema: pa.Schema) -> Iterator[Leaf]:
+    """The columns of a file in Parquet's order."""
+    for top in schema:
+        is_own = top.name in OWN_COLUMNS or OWN in (top.metadata or {})
+        pending: list[tuple[pa.Field, str, tuple[str, ...], tuple[str, ...] | None]]
+        pending = [(top, top.name, (original_name(top),), None)]
+        while pending:
+            field, path, names, array = pending.pop()
+            kind = field.type
+            while is_list(kind):
+                path, kind = f"{path}.list.element", kind.value_type
+            if not pa.types.is_struct(kind):
+                yield Leaf(top.name, path, kind, is_own, names, array)
+                continue
+            array = names if has_summaries(field) else array
+            pending += [
+                (inner, f"{path}.{inner.name}", (*names, original_name(inner)), array)
+                for inner in reversed(list(kind))
+            ]
 
 
 class TablePart(NamedTuple):
@@ -46,8 +123,147 @@ class TablePart(NamedTuple):
     last: int = LAST
 
 
-class ColumnFile(ParquetFileReader):
-    """A file of tables, and what is known of its columns."""
+class ColumnFile:
+    """Reads one file of a table. Thread safe.
+
+    Args:
+        path: The file.
+
+    Raises:
+        FileNotFoundError: the file does not exist.
+        StoreError: the file cannot be read, or is damaged.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.number = next(_NUMBERS)
+        """Unique number of this reader."""
+        self._lock = threading.Lock()
+        self._chosen: dict[tuple[Any, ...], dict[str, tuple[int, ...]]] = {}
+        try:
+            self._source = _Source(path)
+            metadata = pq.read_metadata(pa.BufferReader(b"PAR1" + self._source.footer))
+            self.about = About.from_json(metadata.metadata.get(ABOUT, b""))
+            self._parquet = pq.ParquetFile(
+                pa.PythonFile(self._source, mode="r"),
+                metadata=metadata,
+                pre_buffer=False,
+                buffer_size=0,
+                page_checksum_verification=True,
+            )
+            self.schema: pa.Schema = self._parquet.schema_arrow
+            numbers = range(metadata.num_row_groups)
+            self.groups = [int(metadata.row_group(number).num_rows) for number in numbers]
+            """Rows of each row group."""
+            if sum(self.groups) != sum(section.rows for section in self.about.sections):
+                raise StoreError("its rows differ from its description")
+        except FileNotFoundError:
+            raise
+        except (OSError, StoreError, pa.ArrowException, KeyError) as error:
+            raise self._damaged(error) from error
+
+    def release(self) -> None:
+        """Close the file until it is read again."""
+        self._source.release()
+
+    @property
+    def size_bytes(self) -> int:
+        """Bytes of the file."""
+        return self._source.size
+
+    @property
+    def rows(self) -> int:
+        """Rows of all recordings."""
+        return sum(self.groups)
+
+    def size(self, group: int, leaves: Sequence[int]) -> int:
+        """Stored bytes of some columns of a row group."""
+        return sum(self._column(group, leaf).total_compressed_size for leaf in leaves)
+
+    def has_values(self, group: int, leaf: int) -> bool:
+        """False if a column of a row group is known to have nulls only."""
+        column = self._column(group, leaf)
+        found = column.statistics
+        is_known = found is not None and found.has_null_count
+        return not is_known or found.null_count < column.num_values
+
+    def bounds(self, group: int, leaf: int) -> tuple[int, int] | None:
+        """Least and greatest value in a column of a row group; None if unknown."""
+        found = self._column(group, leaf).statistics
+        return (found.min, found.max) if found is not None and found.has_min_max else None
+
+    def _column(self, group: int, leaf: int) -> Any:
+        return self._parquet.metadata.row_group(group).column(leaf)
+
+    def reusable(self) -> ReusedBytes:
+        """The bytes of its row groups.
+
+        Raises:
+            StoreError: they cannot be read.
+        """
+        begin, end = self.about.span
+        try:
+            return ReusedBytes(begin, self._source.raw(begin, end))
+        except (OSError, StoreError) as error:
+            raise self._damaged(error) from error
+
+    def table(self) -> pa.Table:
+        """All rows.
+
+        Raises:
+            StoreError: they are damaged.
+        """
+        numbers = range(len(self.leaves))
+        groups = [self.read(group, numbers) for group in range(len(self.groups))]
+        table = pa.concat_tables(groups) if groups else self.schema.empty_table()
+        return table.replace_schema_metadata(None)
+
+    def read(self, group: int | None, leaves: Sequence[int]) -> pa.Table:
+        """Some columns of a row group.
+
+        Args:
+            group: Its number; None for no rows.
+            leaves: Column numbers in Parquet's order: single values, depth first.
+
+        Raises:
+            StoreError: the columns are damaged.
+        """
+        try:
+            with self._lock:
+                if group is not None:
+                    self._source.fetch(self._parquet.metadata.row_group(group), leaves)
+                reader: Any = self._parquet.reader
+                table: pa.Table = reader.read_row_groups(
+                    [] if group is None else [group],
+                    column_indices=list(leaves),
+                    use_threads=False,
+                )
+        except (OSError, StoreError, pa.ArrowException, ValueError) as error:
+            raise self._damaged(error) from error
+        if group is not None and table.num_rows != self.groups[group]:
+            raise self._damaged(StoreError("a row group has the wrong number of rows"))
+        return table
+
+    def check(self) -> str:
+        """Read every value; returns BLAKE3 of all bytes.
+
+        Raises:
+            StoreError: a part is damaged.
+        """
+        try:
+            digest = self._source.digest()
+        except (OSError, StoreError) as error:
+            raise self._damaged(error) from error
+        self.table()
+        return digest
+
+    def _damaged(self, error: Exception) -> HybridlogError:
+        if isinstance(error, OSError):
+            shortage = exhausted(error.errno, f"reading {self.path}")
+            if shortage is not None:
+                return shortage
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else error
+        return StoreError(f"The table {self.path} is damaged: {reason}.")
 
     @lazy
     def leaves(self) -> list[Leaf]:
@@ -85,15 +301,10 @@ class ColumnFile(ParquetFileReader):
         """Paths of the numbers of summaries."""
         return {leaf.names for leaf in self.leaves if leaf.array is not None}
 
-    @lazy
-    def chosen(self) -> dict[tuple[Any, ...], list[int]]:
-        """Numbers of columns that were chosen, by what `choose` was asked for."""
-        return {}
-
     def choose(
         self, paths: Collection[str] | None, own: Collection[str], *, arrays: bool = False
-    ) -> list[int]:
-        """Numbers of the columns for some fields.
+    ) -> dict[str, tuple[int, ...]]:
+        """Numbers of the columns for some fields, by the table's column that contains them.
 
         Args:
             paths: Dotted paths of fields; None for all.
@@ -101,36 +312,28 @@ class ColumnFile(ParquetFileReader):
             arrays: True if all rows have `arrays` in full, and their summaries.
         """
         key = None if paths is None else frozenset(paths), frozenset(own), arrays
-        found = self.chosen.get(key)
+        found = self._chosen.get(key)
         if found is None:
             wanted = None if paths is None else list(map(names_of, paths))
             full = self.arrays if arrays else set()
-            found = [
+            numbers = {
                 number
                 for number, leaf in enumerate(self.leaves)
                 if (leaf.top in own if leaf.is_own else self._is_wanted(leaf, wanted, full))
-            ]
+            }
             # A summary tells whether the array is there.
-            known = {self.leaves[number].array for number in found}
+            known = {self.leaves[number].array for number in numbers}
             for array, number in self.summaries.items():
-                if array in full:
-                    continue
-                if array not in known and any(p[: len(array)] == array for p in wanted or ()):
-                    found.append(number)
-            found.sort()
-            if len(self.chosen) >= _MAX_FIELD_SETS:
-                self.chosen.clear()
-            self.chosen[key] = found
-        return found
-
-    def by_top(
-        self, paths: Collection[str] | None, own: Collection[str], *, arrays: bool = False
-    ) -> dict[str, tuple[int, ...]]:
-        """The numbers of `choose` by the table's column that contains them."""
-        found: dict[str, tuple[int, ...]] = {}
-        for number in self.choose(paths, own, arrays=arrays):
-            top = self.leaves[number].top
-            found[top] = (*found.get(top, ()), number)
+                is_asked = any(path[: len(array)] == array for path in wanted or ())
+                if is_asked and array not in known and array not in full:
+                    numbers.add(number)
+            found = {}
+            for number in sorted(numbers):
+                top = self.leaves[number].top
+                found[top] = (*found.get(top, ()), number)
+            if len(self._chosen) >= _MAX_FIELD_SETS:
+                self._chosen.clear()
+            self._chosen[key] = found
         return found
 
     def _is_wanted(
@@ -162,12 +365,12 @@ class ColumnFile(ParquetFileReader):
         """Row groups with some rows of one topic."""
         time = next(number for number, leaf in enumerate(self.leaves) if leaf.top == "t")
         before = 0
-        for group, count in enumerate(self.groups):
-            low, high = max(begin, before), min(begin + rows, before + count)
+        for group, own in enumerate(self.groups):
+            low, high = max(begin, before), min(begin + rows, before + own)
             if low < high:
                 bounds = self.bounds(group, time) or (FIRST, LAST)
                 yield TablePart(self, group, low - before, high - low, *bounds)
-            before += count
+            before += own
 
     @lazy
     def counts(self) -> TopicCounts:
@@ -179,6 +382,103 @@ class ColumnFile(ParquetFileReader):
     def all_parts(self) -> list[TablePart]:
         """All rows, as if they were of one topic."""
         return [TablePart(self, group, 0, rows) for group, rows in enumerate(self.groups)]
+
+
+class _Source:
+    """Provides Parquet's bytes, after verifying the checksum of the footer."""
+
+    def __init__(self, path: Path) -> None:
+        self.closed = False
+        self._path = path
+        self._lock = threading.Lock()
+        self._fd = -1
+        self._position = 0
+        self._same: tuple[int, ...] | None = None
+        with self._lock:
+            self._open()
+        self.size = os.fstat(self._fd).st_size
+        tail = self.raw(self.size - _TAIL, self.size) if self.size > 2 * _TAIL else b""
+        length = int.from_bytes(tail[:4], "little") + _TAIL
+        if tail[4:] != b"PAR1" or length > min(self.size - _SEAL, _MAX_FOOTER):
+            raise StoreError("its end is missing")
+        sealed = self.raw(self.size - length - _SEAL, self.size)
+        self.footer = sealed[_SEAL:]
+        if crc32(self.footer) != int.from_bytes(sealed[:_SEAL], "little"):
+            raise StoreError("the checksum of its footer differs")
+
+    def digest(self) -> str:
+        """BLAKE3 of all bytes."""
+        digest = hasher()
+        for at in range(0, self.size, _READ):
+            digest.update(self.raw(at, min(at + _READ, self.size)))
+        return digest.hexdigest()
+
+    def fetch(self, group: Any, leaves: Iterable[int]) -> None:
+        """Ask a bucket once for some columns of a row group."""
+        with self._lock:
+            if self._fd < 0:
+                self._open()
+            if files.is_fetched(self._fd):
+                ranges = []
+                for column in map(group.column, leaves):
+                    begin = column.dictionary_page_offset or column.data_page_offset
+                    begin = min(begin, column.data_page_offset)
+                    end = begin + column.total_compressed_size
+                    ranges.append((begin, end))
+                files.fetch(self._fd, ranges)
+
+    def read(self, size: int = -1) -> bytes:
+        """Read from the current position."""
+        begin = self._position
+        end = self.size if size < 0 else min(begin + size, self.size)
+        self._position = max(begin, end)
+        return self.raw(begin, end) if begin < end else b""
+
+    def raw(self, begin: int, end: int) -> bytes:
+        """Some bytes of the file."""
+        with self._lock:
+            if self._fd < 0:
+                self._open()
+            data = files.pread(self._fd, end - begin, begin)
+        if len(data) != end - begin:
+            raise StoreError("it was truncated")
+        return data
+
+    def __del__(self) -> None:
+        self.release()
+
+    def release(self) -> None:
+        """Close the file until it is read again."""
+        with self._lock:
+            if self._fd >= 0:
+                os.close(self._fd)
+            self._fd = -1
+
+    def _open(self) -> None:
+        self._fd = files.open_file(self._path, os.O_RDONLY)
+        same = files.identity(self._fd)
+        if self._same is not None and same != self._same:
+            os.close(self._fd)
+            self._fd = -1
+            raise StoreError("it was replaced")
+        self._same = same
+
+    def seek(self, position: int, whence: int = os.SEEK_SET) -> int:
+        base = {os.SEEK_SET: 0, os.SEEK_CUR: self._position, os.SEEK_END: self.size}[whence]
+        self._position = base + position
+        return self._position
+
+    def tell(self) -> int:
+        return self._position
+
+    def seekable(self) -> bool:
+        return True
+
+    def readable(self) -> bool:
+        return True
+
+    def close(self) -> None:
+        """Do nothing: the file remains open as long as its reader."""
 
 
 class OpenFiles:

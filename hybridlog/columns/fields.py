@@ -22,17 +22,17 @@ import pyarrow as pa
 from hybridlog.columns.layout import EMPTY, ORIGINAL, RESERVED, SUMMARY, column_names
 from hybridlog.schema.arrow_columns import structs
 from hybridlog.schema.arrow_types import (
-    COLUMNS,
-    WIDENED,
     Array,
     common_type,
     converted,
+    exact,
     is_array,
     is_bytes,
     is_list,
     lengths_of,
     missing_of,
     summary,
+    widened,
     with_values,
 )
 
@@ -83,33 +83,27 @@ class FieldShape:
         kind = array.type
         if kind in self._plain:
             return array
-        columns: list[Array] = []
-        about: list[tuple[str, bool, bool]] = []
+        columns: list[tuple[str, Array, dict[bytes, str]]] = []
         for number, field in enumerate(kind):
-            values = array.field(number)
+            name, values = field.name, array.field(number)
+            about = {EMPTY: ""} if _is_empty(field.type) else {}
             if _has_summary(field.type):
-                columns += self._split(values)
-                is_empty = _is_empty(field.type)
-                about += [(field.name, False, is_empty), (f"{field.name}_summary", True, False)]
+                values, summaries = self._split(values)
+                columns.append((name, values, about))
+                columns.append((f"{name}_summary", summaries, {SUMMARY: name}))
             else:
-                columns.append(self._column(values))
-                about.append((field.name, False, _is_empty(field.type)))
-        named = list(column_names([name for name, _, _ in about], reserved))
-        fields = [
-            _named(column, name, values.type, is_summary=is_summary, is_empty=is_empty)
-            for (name, column), (_, is_summary, is_empty), values in zip(
-                named, about, columns, strict=True
-            )
-        ]
+                columns.append((name, self._column(values), about))
+        fields = []
+        named = column_names([name for name, _, _ in columns], reserved)
+        for (name, column), (_, values, about) in zip(named, columns, strict=True):
+            if column != name and SUMMARY not in about:
+                about[ORIGINAL] = name
+            fields.append(pa.field(column, values.type, metadata=about or None))
         if kind == pa.struct(fields) and not any(field.metadata for field in fields):
             self._plain.add(kind)
             return array
-        return structs(
-            {column: values for (_, column), values in zip(named, columns, strict=True)},
-            len(array),
-            missing_of(array),
-            fields,
-        )
+        found = {field.name: values for field, (_, values, _) in zip(fields, columns, strict=True)}
+        return structs(found, len(array), missing_of(array), fields)
 
     def _split(self, array: Array) -> tuple[Array, Array]:
         """Arrays within the limit, and summaries of the others; or both of all."""
@@ -155,15 +149,6 @@ def _is_empty(kind: Any) -> bool:
     return pa.types.is_struct(kind) and not kind.num_fields
 
 
-def _named(column: str, name: str, kind: Any, *, is_summary: bool, is_empty: bool) -> Any:
-    if is_summary:
-        return pa.field(column, kind, metadata={SUMMARY: name.removesuffix("_summary")})
-    about = {ORIGINAL: name} if column != name else {}
-    if is_empty:
-        about[EMPTY] = ""
-    return pa.field(column, kind, metadata=about or None)
-
-
 def original_name(field: Any) -> str:
     """Name of the field of a column; of summaries, that of their array."""
     about = field.metadata or {}
@@ -198,6 +183,8 @@ def records_of(
             name = original_name(field)
             path = (*above, name)
             values = records_of(columns.field(number), is_summarised, path)
+            if EMPTY in (field.metadata or {}):
+                values = _emptied(values)
             if has_summaries(field):
                 if is_summarised(path):
                     found[name] = _filled(values, found.get(name))
@@ -209,6 +196,13 @@ def records_of(
     if is_list(kind) and _is_changed(kind.value_field):
         return with_values(columns, records_of(columns.flatten(), is_summarised, above))
     return columns
+
+
+def _emptied(array: Array) -> Array:
+    """Messages without fields, which columns have as booleans."""
+    if is_list(array.type):
+        return with_values(array, _emptied(array.flatten()))
+    return structs({}, len(array), missing_of(array))
 
 
 def _filled(summaries: Array, lists: Array | None) -> Array:
@@ -227,7 +221,7 @@ def _filled(summaries: Array, lists: Array | None) -> Array:
 
 def _is_changed(field: Any) -> bool:
     """True if a column, or one inside it, is not its field under the same name."""
-    if field.metadata and (ORIGINAL in field.metadata or SUMMARY in field.metadata):
+    if not {ORIGINAL, SUMMARY, EMPTY}.isdisjoint(field.metadata or {}):
         return True
     kind = field.type
     if pa.types.is_struct(kind):
@@ -259,7 +253,7 @@ def alike(pieces: Sequence[Array], *, by_type: bool = False) -> list[Array]:
         UnfitError: no common type exists.
     """
     try:
-        kind = common_type(pieces, WIDENED if by_type else COLUMNS)
+        kind = common_type(pieces, widened if by_type else exact, summaries=True)
         return [converted(piece, kind) for piece in pieces]
     except (pa.ArrowException, NotImplementedError) as error:
         raise UnfitError(str(error)) from error

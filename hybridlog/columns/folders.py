@@ -24,19 +24,9 @@ from typing import Any, Final
 
 import pyarrow as pa
 
-from hybridlog.columns.layout import (
-    SHARED,
-    SUFFIX,
-    TABLES,
-    Section,
-    parts_folder,
-)
-from hybridlog.columns.parquet_file import (
-    NoRoomError,
-    ParquetFileReader,
-    ParquetFileWriter,
-    ReusedBytes,
-)
+from hybridlog.columns.column_file import ColumnFile, ReusedBytes
+from hybridlog.columns.layout import SHARED, SUFFIX, TABLES, Section, parts_folder
+from hybridlog.columns.parquet_file import NoRoomError, ParquetFileWriter
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import StoreError, unreadable
 
@@ -170,7 +160,7 @@ class TableFolders:
         for name in sorted(names):
             if name.startswith(f"{self._recording}-"):
                 try:
-                    about = ParquetFileReader(place / name).about
+                    about = ColumnFile(place / name).about
                     topics = [one.topic for one in about.sections]
                 except (OSError, StoreError):
                     found.append(name)
@@ -198,7 +188,7 @@ class TableFolders:
     def _rewrite(
         self,
         path: Path,
-        reader: ParquetFileReader,
+        reader: ColumnFile,
         addition: Addition,
         goes: Callable[[str], bool],
     ) -> None:
@@ -226,7 +216,7 @@ class TableFolders:
             files.unlink(path)
 
     def _write(
-        self, path: Path, pieces: Iterable[_Piece], before: ParquetFileReader | None = None
+        self, path: Path, pieces: Iterable[_Piece], before: ColumnFile | None = None
     ) -> None:
         """Write a shared file, and give it its name by one rename.
 
@@ -366,14 +356,14 @@ class Listing:
         return True
 
 
-def files_of(root: Path, prefixes: Collection[str] = ("",)) -> Iterator[ParquetFileReader]:
+def files_of(root: Path, prefixes: Collection[str] = ("",)) -> Iterator[ColumnFile]:
     """The tables in some folders; those that cannot be read are left out."""
     with suppress(OSError):
         for folder in _folders(root):
             if folder.startswith(tuple(prefixes)):
                 for name in sorted(files.names(root / TABLES / folder)):
                     with suppress(OSError, StoreError):
-                        yield ParquetFileReader(root / TABLES / folder / name)
+                        yield ColumnFile(root / TABLES / folder / name)
 
 
 def recordings_of(root: Path) -> set[str]:
@@ -381,10 +371,10 @@ def recordings_of(root: Path) -> set[str]:
     return {section.id for file in files_of(root) for section in file.about.sections}
 
 
-def _reader(path: Path) -> ParquetFileReader | None:
+def _reader(path: Path) -> ColumnFile | None:
     """A shared file; one that cannot be read is removed, since all of it can be made again."""
     try:
-        return ParquetFileReader(path)
+        return ColumnFile(path)
     except FileNotFoundError:
         return None
     except StoreError as error:

@@ -226,10 +226,6 @@ class About:
         """True if it has rows of a recording."""
         return any(one.id == recording for one in self.sections)
 
-    def to_json(self) -> str:
-        """The description as JSON text."""
-        return msgspec.json.encode(self).decode()
-
     @classmethod
     def from_json(cls, text: bytes) -> About:
         """The description from its JSON text.

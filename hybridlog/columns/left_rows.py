@@ -10,12 +10,12 @@ stream. It has the columns of fields, `error`, and of `ref` size, SHA-256 and su
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from hashlib import sha256
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 from bson.int64 import Int64
 
 from hybridlog.columns.fields import (
@@ -26,17 +26,11 @@ from hybridlog.columns.fields import (
     original_name,
     records_of,
 )
-from hybridlog.columns.layout import EMPTY, OWN_COLUMNS
+from hybridlog.columns.layout import OWN_COLUMNS
 from hybridlog.schema.arrow_columns import structs
-from hybridlog.schema.arrow_types import (
-    Array,
-    is_bytes,
-    is_list,
-    is_time,
-    lengths_of,
-    plain_values,
-)
+from hybridlog.schema.arrow_types import Array, is_summary, plain_values
 from hybridlog.schema.index_bodies import MAX_BYTES
+from hybridlog.schema.objects import document_cells
 from hybridlog_storage.messages import Batch, Left
 
 if TYPE_CHECKING:
@@ -48,75 +42,30 @@ if TYPE_CHECKING:
     from hybridlog_storage.messages import Buffer
 
 _OWN: Final = frozenset(OWN_COLUMNS)
-_LONG: Final = (pa.int64(), pa.uint32(), pa.uint64())
 
 
-class LeftRows:
-    """Rows of messages of a topic; see `hybridlog.schema.left.Part`.
+def fields_in(rows: pa.StructArray) -> pa.StructArray:
+    """The columns of fields among all columns of rows."""
+    fields = [field for field in rows.type if field.name not in _OWN]
+    return structs({one.name: rows.field(one.name) for one in fields}, len(rows), None, fields)
 
-    Args:
-        all_columns: Its rows; a struct has all columns.
-    """
 
-    def __init__(self, all_columns: pa.StructArray) -> None:
-        self._all = all_columns
-        names = [field.name for field in all_columns.type if field.name not in _OWN]
-        fields = [all_columns.type.field(name) for name in names]
-        self._columns = structs(
-            {name: all_columns.field(name) for name in names}, len(all_columns), None, fields
-        )
+def digest_in(left: Left, message: int) -> tuple[int, bytes]:
+    """Bytes and SHA-256 of the payload that a message had."""
+    row = left.parts[left.part[message]].field("ref")[int(left.row[message])].as_py()
+    return row["size"], row["sha256"]
 
-    def errors(self, rows: NDArray[np.int64]) -> list[tuple[NDArray[np.intp], str]]:
-        """Rows that did not fit their definition, by reason."""
-        error = self._all.field("error").take(pa.array(rows))
-        found = []
-        for reason in pc.unique(error.drop_null()).to_pylist():
-            is_so = pc.equal(error, reason).fill_null(fill_value=False)
-            found.append((np.flatnonzero(is_so.to_numpy(zero_copy_only=False)), reason))
-        return found
 
-    def surplus(self, rows: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """bool[n], True where bytes were left over behind the message."""
-        return self._all.field("ref").field("surplus").to_numpy(zero_copy_only=False)[rows]
-
-    def about(self, row: int) -> tuple[int, bytes]:
-        """Bytes and SHA-256 of a payload."""
-        ref = self._all.field("ref")
-        return ref.field("size")[row].as_py(), ref.field("sha256")[row].as_py()
-
-    def columns(self, rows: NDArray[np.int64]) -> pa.StructArray:
-        """The columns of fields."""
-        return self._columns.take(pa.array(rows))
-
-    def documents(
-        self, rows: NDArray[np.int64], *, typed: bool, summaries: bool = True
-    ) -> list[dict[str, object]]:
-        """The fields as in index documents.
-
-        Args:
-            rows: The rows.
-            typed: True to tell int64 from int32.
-            summaries: False to leave out arrays of which only a summary is left.
-        """
-        return _documents(self._columns.take(pa.array(rows)), typed=typed, summaries=summaries)
-
-    def records(
-        self, rows: NDArray[np.int64], summarised: Collection[str] | None = ()
-    ) -> pa.StructArray:
-        """The fields. Long arrays are null; those at some paths, or all (None), are summaries."""
-        columns = self._columns.take(pa.array(rows))
-        return records_of(columns, lambda path: summarised is None or ".".join(path) in summarised)
-
-    def lacking(
-        self, rows: NDArray[np.int64], fields: Collection[str] | None, but: Collection[str]
-    ) -> NDArray[np.bool_]:
-        """bool[n], True where a wanted array is not there."""
-        wanted = None if fields is None else [names_of(path) for path in fields]
-        found = np.zeros(len(rows), np.bool_)
-        for path, summary in _summaries_in(self._columns.take(pa.array(rows))):
-            if ".".join(path) not in but and (wanted is None or _asks(wanted, path)):
-                found |= summary.is_valid().to_numpy(zero_copy_only=False)
-        return found
+def lacking(
+    columns: pa.StructArray, fields: Collection[str] | None, but: Collection[str]
+) -> NDArray[np.bool_]:
+    """bool[n], True where a wanted array is not there."""
+    wanted = None if fields is None else [names_of(path) for path in fields]
+    found = np.zeros(len(columns), np.bool_)
+    for path, summary in _summaries_in(columns):
+        if ".".join(path) not in but and (wanted is None or _asks(wanted, path)):
+            found |= summary.is_valid().to_numpy(zero_copy_only=False)
+    return found
 
 
 def _asks(wanted: Sequence[tuple[str, ...]], array: tuple[str, ...]) -> bool:
@@ -155,7 +104,7 @@ def messages_left(parts: Sequence[pa.StructArray]) -> tuple[Batch, NDArray[np.in
         numbers("t", np.int64),
         numbers("pub", np.int64),
         numbers("sequence", np.uint32, of_ref=True),
-        Left([*map(LeftRows, parts)], part, row, *place),
+        Left(parts, part, row, *place),
     )
     return batch, numbers("seq", np.int64)
 
@@ -172,59 +121,38 @@ def _summaries_in(
             yield from _summaries_in(column, path)
 
 
-def _documents(columns: Array, *, typed: bool, summaries: bool = True) -> list[dict[str, Any]]:
+def documents(columns: Array, *, typed: bool, summaries: bool = True) -> list[dict[str, Any]]:
     """Columns as index documents: arrays, or summaries of long ones, and without what is null.
 
     Args:
         columns: A struct array; its fields are the columns.
         typed: True if a definition fixes the width of integers.
-        summaries: False to leave out summaries.
+        summaries: False to leave out arrays of which only a summary is left.
     """
-    kept = [
-        (original_name(field), _cells(column, field, typed=typed, summaries=summaries))
-        for field, column in zip(columns.type, columns.flatten(), strict=True)
-        if summaries or not has_summaries(field)
-    ]
-    rows = zip(*(cells for _, cells in kept), strict=True) if kept else [()] * len(columns)
-    names = [name for name, _ in kept]
-    return [{n: v for n, v in zip(names, row, strict=True) if v is not None} for row in rows]
+    cells = partial(document_cells, typed=typed, whole=not summaries)
+    found = plain_values(records_of(columns), cells)
+    if not summaries:
+        return found
+    also = plain_values(records_of(columns, lambda _: True), lambda a: _summaries(a) or cells(a))
+    return [_merged(*both) for both in zip(found, also, strict=True)]
 
 
-def _cells(array: Array, field: Any, *, typed: bool, summaries: bool) -> list[Any]:
-    kind, is_empty = array.type, EMPTY in (field.metadata or {})
-    if has_summaries(field):
-        found = array.to_pylist()
-        return [None if one is None else {k: _whole(v) for k, v in one.items()} for one in found]
-    if pa.types.is_struct(kind):
-        made = _documents(array, typed=typed, summaries=summaries)
-        return [d if v else None for d, v in zip(made, array.is_valid().to_pylist(), strict=True)]
-    if is_list(kind):
-        inner = field if is_empty else kind.value_field
-        lengths = lengths_of(array)
-        items = array.flatten() if pa.types.is_fixed_size_list(kind) else _items(array, lengths)
-        values = iter(_cells(items, inner, typed=typed, summaries=summaries))
-        counted = zip(lengths.tolist(), array.is_valid().to_pylist(), strict=True)
-        return [[next(values) for _ in range(n)] if there else None for n, there in counted]
-    if is_bytes(kind):
-        sizes = pc.binary_length(array).to_pylist()
-        own = [None if n is None else {"n": Int64(n)} for n in sizes]
-        return own if summaries else array.to_pylist()
-    values = plain_values(array)
-    if is_empty:
-        return [None if there is None else {} for there in values]
-    return [*map(_whole, values)] if is_time(kind) or (typed and kind in _LONG) else values
+def _summaries(array: Array) -> list[Any] | None:
+    """Summaries with integers of 64 bits; None of other values."""
+    if not is_summary(array.type):
+        return None
+    found = [(one or {}).items() for one in array.to_pylist()]
+    made = [{k: Int64(v) if isinstance(v, int) else v for k, v in one} for one in found]
+    return [one or None for one in made]
 
 
-def _items(array: Array, lengths: NDArray[np.int64]) -> Array:
-    """The elements of lists; pyarrow cannot flatten those of JSON text where one is null."""
-    begin, total = array.offsets[0].as_py(), int(lengths.sum())
-    is_dense = array.offsets[-1].as_py() - begin == total
-    return array.values.slice(begin, total) if is_dense else array.flatten()
-
-
-def _whole(value: Any) -> Any:
-    """An integer as int64 of BSON, whatever its value."""
-    return Int64(value) if isinstance(value, int) else value
+def _merged(one: Any, other: Any) -> Any:
+    """Values with what the other ones have besides, in their order."""
+    if isinstance(one, dict) and isinstance(other, dict):
+        return {name: _merged(one.get(name, value), value) for name, value in other.items()}
+    if isinstance(one, list) and isinstance(other, list):
+        return [_merged(*both) for both in zip(one, other, strict=True)]
+    return one
 
 
 def reduced(codec: Codec, payload: bytes) -> bytes:
@@ -273,7 +201,7 @@ def with_rows(batch: Batch) -> Batch:
         number, same = found.setdefault(columns, (len(found), []))
         places[:, at] = number, len(same)
         same.append(row)
-    parts = [LeftRows(pa.concat_arrays(same)) for _, same in found.values()]
+    parts = [pa.concat_arrays(same) for _, same in found.values()]
     left = Left(parts, places[0].astype(np.int32), places[1], *batch.places)
     return replace(batch, left=left)
 

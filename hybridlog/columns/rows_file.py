@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import pyarrow as pa
 
 from hybridlog.columns.column_file import ColumnFile
-from hybridlog.columns.parquet_file import ParquetFileReader
 from hybridlog_storage.cache import Cache
 from hybridlog_storage.errors import StoreError
 from hybridlog_storage.manifest import File, Part, hasher, rows_line
@@ -70,7 +69,7 @@ class RowsFile(ColumnFile):
             raise StoreError(f"The description in {path} is invalid: {error!r}.") from error
 
     def check(self) -> str:
-        """As of `ParquetFileReader`; it is the file that the manifest lists."""
+        """As of `ColumnFile`; it is the file that the manifest lists."""
         digest = super().check()
         if digest != self.listed.digest:
             raise self._other()
@@ -127,7 +126,7 @@ def lines_of(folder: Path, log: File, names: Iterable[str]) -> list[File]:
     """
     found = []
     for name in names:
-        about = ParquetFileReader(folder / name).about
+        about = ColumnFile(folder / name).about
         data = (folder / name).read_bytes()
         parts = {int(n): Part(*part) for n, part in about.of_rows["parts"].items()}
         found.append(rows_line(log, name, len(data), hasher(data).hexdigest(), parts))

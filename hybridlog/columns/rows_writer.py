@@ -12,7 +12,7 @@ import pyarrow as pa
 
 from hybridlog.columns.fields import FieldShape
 from hybridlog.columns.layout import Section, TopicCounts, table_schema_of
-from hybridlog.columns.left_rows import with_rows
+from hybridlog.columns.left_rows import digest_in, with_rows
 from hybridlog.columns.parquet_file import ParquetFileWriter
 from hybridlog.columns.rows import Places, as_table, columns_from, piece_of
 from hybridlog.schema.arrow_columns import structs
@@ -202,8 +202,7 @@ def _table(
     if (left := batch.left) is None:
         about = [(len(p), sha256(p).digest()) for p in map(batch.payload, range(len(batch)))]
     else:
-        places = zip(left.part.tolist(), left.row.tolist(), strict=True)
-        about = [left.parts[part].about(row) for part, row in places]
+        about = [digest_in(left, row) for row in range(len(batch))]
     ref = piece.own["ref"]
     more = {
         **dict(zip([field.name for field in ref.type], ref.flatten(), strict=True)),

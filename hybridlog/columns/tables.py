@@ -15,10 +15,9 @@ import threading
 from collections import OrderedDict, defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from stat import S_ISDIR
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from hybridlog.columns.column_file import ColumnFile, OpenFiles, TablePart
 from hybridlog.columns.fields import UnfitError
@@ -44,8 +43,7 @@ _MAX_RUNNING: Final = 16  # recordings in progress whose tables are kept open
 _MAX_FOUND: Final = 65_536  # tables that are kept
 
 
-@dataclass(frozen=True)
-class _Rows:
+class TopicRows(NamedTuple):
     """The rows of a topic of a recording in a file.
 
     Attributes:
@@ -78,14 +76,14 @@ class _Folder:
         self._shared: list[int] = []  # numbers in the names of shared files
         self._own: dict[str, list[str]] = {}  # files of long topics, by recording
         self._files: dict[str, tuple[tuple[int, int, int], ColumnFile | None]] = {}
-        self._rows: dict[tuple[str, str], list[_Rows]] = {}  # by recording and topic
+        self._rows: dict[tuple[str, str], list[TopicRows]] = {}  # by recording and topic
 
     @property
     def damaged(self) -> list[str]:
         """Files that were looked at and cannot be read."""
         return [str(self._path / name) for name, (_, file) in self._files.items() if file is None]
 
-    def rows(self, recording: str, topic: str) -> list[_Rows]:
+    def rows(self, recording: str, topic: str) -> list[TopicRows]:
         """The rows of a topic in the files that were looked at."""
         return self._rows.get((recording, topic), [])
 
@@ -95,8 +93,7 @@ class _Folder:
         for name in self._own.get(recording.id, ()):
             self._open(name)
         for name in shared_for(self._shared, recording.created):
-            self._open(name)
-            file = self._files[name][1] if name in self._files else None
+            file = self._open(name)
             if file is not None and file.about.has(recording.id):
                 break
 
@@ -112,44 +109,40 @@ class _Folder:
         if not self._listing.look():
             return
         names = self._listing.names
-        before = self._files
-        self._files = {
-            name: known
-            for name, known in before.items()
-            if name in names and known[0] == _identity(names[name])
-        }
-        if len(self._files) < len(before):
-            self._rows = {}
-            for _, file in self._files.values():
-                self._add(file)
+        before, self._files, self._rows = self._files, {}, {}
+        for name, (identity, file) in before.items():
+            if name in names and identity == _identity(names[name]):
+                self._add(name, identity, file)
         tables = sorted(name for name in names if name.endswith(SUFFIX))
         self._shared = shared_times(tables)
         self._own = {}
         for name in tables:
             self._own.setdefault(name.rpartition("-")[0], []).append(name)
 
-    def _open(self, name: str) -> None:
+    def _open(self, name: str) -> ColumnFile | None:
+        """A file, if there is one that can be read."""
         status = self._listing.names.get(name)
         if name in self._files or status is None:
-            return
+            return self._files[name][1] if status is not None else None
         file: ColumnFile | None = None
         for _ in range(2):  # of an object in a bucket, the first look tells that it has gone
             try:
                 file = ColumnFile(self._path / name)
             except FileNotFoundError:
-                return
+                return None
             except StoreError:
                 continue
             self._opened.opened(file)
             break
-        self._files[name] = _identity(status), file
-        self._add(file)
+        self._add(name, _identity(status), file)
+        return file
 
-    def _add(self, file: ColumnFile | None) -> None:
+    def _add(self, name: str, identity: tuple[int, int, int], file: ColumnFile | None) -> None:
+        self._files[name] = identity, file
         if file is not None:
             for begin, section in file.sections():
-                key = section.id, section.topic
-                self._rows.setdefault(key, []).append(_Rows(file, begin, section))
+                rows = TopicRows(file, begin, section)
+                self._rows.setdefault((section.id, section.topic), []).append(rows)
 
 
 def _identity(status: os.stat_result) -> tuple[int, int, int]:
@@ -168,31 +161,23 @@ class _Folders:
         self._place = place
         self._opened = opened
         self._listing = Listing(place)
-        self._known: dict[str, _Folder] = {}
-        self._by_type: dict[str, list[_Folder]] = {}
+        self._known: dict[str, dict[str, _Folder]] = {}  # by the beginning of their names
 
     def look(self) -> None:
         """Look which folders there are."""
         if not self._listing.look():
             return
-        before = self._known
-        self._known = {
-            name: before.get(name) or _Folder(self._place / name, self._opened)
-            for name, about in sorted(self._listing.names.items())
-            if S_ISDIR(about.st_mode)
-        }
-        self._by_type = {}
+        before, self._known = self._known, {}
+        for name, about in sorted(self._listing.names.items()):
+            if S_ISDIR(about.st_mode):
+                begin = f"{name.rpartition('~')[0]}~"
+                folder = before.get(begin, {}).get(name)
+                folder = folder or _Folder(self._place / name, self._opened)
+                self._known.setdefault(begin, {})[name] = folder
 
     def of(self, types: Iterable[str]) -> list[_Folder]:
         """The folders of some message types."""
-        found: list[_Folder] = []
-        for one in types:
-            if one not in self._by_type:
-                prefix = type_prefix(one)
-                folders = self._known.items()
-                self._by_type[one] = [own for name, own in folders if name.startswith(prefix)]
-            found += self._by_type[one]
-        return found
+        return [f for one in types for f in self._known.get(type_prefix(one), {}).values()]
 
 
 class Tables:
@@ -263,7 +248,9 @@ class Tables:
             raise FileNotFoundError
         with self._lock:
             self._look(recording, [topic])
-            rows, damaged = self._known_rows(recording, topic), self._damaged(recording, topic)
+            folders = self._folders.of(self._types_of(recording, topic))
+            rows = self._known_rows(recording, topic)
+            damaged = [path for folder in folders for path in folder.damaged]
         table = self._table(recording, topic, rows)
         if table is None:
             if damaged:
@@ -285,26 +272,26 @@ class Tables:
         }
         return len(found) == 1
 
-    def sections_of(self, recording: RecordingEntry) -> list[tuple[ColumnFile, int, Section]]:
-        """The files with rows of a recording, the first of these rows, and what they are."""
+    def sections_of(self, recording: RecordingEntry) -> list[TopicRows]:
+        """The rows of a recording in files."""
         topics = sorted({channel.topic for channel in recording.channels})
         with self._lock:
             self._look(recording, topics)
-            known = [rows for topic in topics for rows in self._known_rows(recording, topic)]
-        return [(rows.file, rows.begin, rows.section) for rows in known]
+            return [rows for topic in topics for rows in self._known_rows(recording, topic)]
 
     def lacking(self, recording: RecordingEntry, topics: Collection[str]) -> set[str]:
         """Topics of which files lack messages, whatever their definitions are."""
         try:
             with self._lock:
                 self._look(recording, topics)
-                return {topic for topic in topics if not self._has_all(recording, topic)}
+                known = {topic: self._known_rows(recording, topic) for topic in topics}
         except StoreError:
             return set(topics)
-
-    def _has_all(self, recording: RecordingEntry, topic: str) -> bool:
-        own = self._known_rows(recording, topic)
-        return self._has_rows(recording, topic) and all(one.is_of(recording) for one in own)
+        return {
+            topic
+            for topic, rows in known.items()
+            if not all(one.is_of(recording) for one in rows) or not self._has_rows(recording, topic)
+        }
 
     def _look(self, recording: RecordingEntry, topics: Collection[str]) -> None:
         """Look at the folders of some topics, once for all, if rows of them are missing."""
@@ -324,13 +311,9 @@ class Tables:
         rows = self._known_rows(recording, topic)
         return sum(one.section.rows for one in rows) == self._messages_of(recording, topic)
 
-    def _known_rows(self, recording: RecordingEntry, topic: str) -> list[_Rows]:
+    def _known_rows(self, recording: RecordingEntry, topic: str) -> list[TopicRows]:
         folders = self._folders.of(self._types_of(recording, topic))
         return [rows for folder in folders for rows in folder.rows(recording.id, topic)]
-
-    def _damaged(self, recording: RecordingEntry, topic: str) -> list[str]:
-        folders = self._folders.of(self._types_of(recording, topic))
-        return [path for folder in folders for path in folder.damaged]
 
     def _messages_of(self, recording: RecordingEntry, topic: str) -> int:
         return sum(one.stats.messages for one in self._channels_of(recording, topic))
@@ -339,7 +322,7 @@ class Tables:
         return {channel.type for channel in self._channels_of(recording, topic)}
 
     def _table(
-        self, recording: RecordingEntry, topic: str, found: Sequence[_Rows]
+        self, recording: RecordingEntry, topic: str, found: Sequence[TopicRows]
     ) -> TopicTable | None:
         """The table of a topic from some files; None without rows of it, or with stale ones.
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import chain
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -154,8 +155,9 @@ class TopicTable:
         """
         own = {"t", "seq", *own}
         return sum(
-            part.file.size(part.group, part.file.choose(paths, own, arrays=self.has_arrays))
+            part.file.size(part.group, numbers)
             for part in self._parts
+            for numbers in part.file.choose(paths, own, arrays=self.has_arrays).values()
         )
 
     def scan(
@@ -242,8 +244,8 @@ class TopicTable:
             StoreError: the data read is damaged.
         """
         check_wanted()
-        by_top = part.file.by_top(paths, own, arrays=self.has_arrays)
-        columns = {top: self._column(part, top, numbers) for top, numbers in by_top.items()}
+        chosen = part.file.choose(paths, own, arrays=self.has_arrays)
+        columns = {top: self._column(part, top, numbers) for top, numbers in chosen.items()}
         ours = {name: columns.pop(name) for name in own if name in columns}
         return ours, self._records(part.file, columns, part.rows)
 
@@ -275,10 +277,7 @@ class TopicTable:
 
     def _has_summary(self, part: TablePart, array: tuple[str, ...]) -> bool:
         leaf = part.file.summaries.get(array)
-        if leaf is None:
-            return False
-        nulls = part.file.nulls(part.group, leaf)
-        if nulls is not None and nulls == part.file.values(part.group, leaf):
+        if leaf is None or not part.file.has_values(part.group, leaf):
             return False
         top = part.file.leaves[leaf].top
         column = self._column(part, top, (leaf,))
@@ -300,7 +299,8 @@ class TopicTable:
     def _find_type(self, paths: Collection[str] | None) -> Any:
         found = []
         for file in self.files:
-            table = file.read(None, file.choose(paths, (), arrays=self.has_arrays))
+            chosen = file.choose(paths, (), arrays=self.has_arrays).values()
+            table = file.read(None, [*chain.from_iterable(chosen)])
             columns = [(field.name, pa.nulls(0, field.type)) for field in table.schema]
             found.append(self._records(file, dict(columns), 0))
         return alike(found, by_type=True)[0].slice(0, 0)

@@ -16,7 +16,7 @@ import pyarrow.compute as pc
 import pyarrow.csv
 import pyarrow.parquet
 
-from hybridlog.columns.parquet_file import leaves
+from hybridlog.columns.column_file import leaves
 from hybridlog.formats.answer import Answer
 from hybridlog.formats.json_text import (
     PIECE_BYTES,

@@ -16,7 +16,7 @@ from hybridlog_storage.disk import files
 from hybridlog_storage.errors import SegmentError, StoreError, TopicError
 
 if TYPE_CHECKING:
-    from hybridlog.columns.parquet_file import ParquetFileReader
+    from hybridlog.columns.column_file import ColumnFile
     from hybridlog.columns.tables import Tables
     from hybridlog.maintenance.report import Progress, RepairReport
     from hybridlog.snapshot import Snapshot
@@ -174,7 +174,7 @@ class TableChecker:
                 found[topic] = problem
         return found
 
-    def _problem(self, file: ParquetFileReader) -> str:
+    def _problem(self, file: ColumnFile) -> str:
         """The damage of a file; empty without any."""
         if file.number not in self._checked:
             try:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import base64
 import json
-from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
@@ -39,6 +39,7 @@ Array = Any
 """An Arrow array. Its stubs differ too much between versions to be useful here."""
 Kinds: TypeAlias = "Sequence[pa.DataType]"
 Arrays: TypeAlias = "Sequence[Array]"
+_Common: TypeAlias = "Callable[[Arrays], pa.DataType]"
 
 
 # Kinds of types.
@@ -147,47 +148,66 @@ def with_values(array: Array, values: Array) -> Array:
 # Common types.
 
 
-@dataclass(frozen=True, slots=True)
-class Rules:
-    """Rules for the common type of values of several types.
+def exact(kinds: Kinds, arrays: Arrays) -> pa.DataType:
+    """The type of values that are neither structs nor lists; JSON text where none is exact."""
+    if all(is_number(kind) or is_time(kind) for kind in kinds):
+        return _exact_number(kinds, arrays)
+    if all(map(is_text, kinds)):
+        return pa.large_string()
+    return pa.large_binary() if all(map(is_bytes, kinds)) else pa.json_()
 
-    Attributes:
-        leaf: The type for values that are neither structs nor lists.
-        summaries: True if arrays become summaries beside summaries.
+
+def widened(kinds: Kinds, arrays: Arrays) -> pa.DataType:
+    """The same by types alone: all values of the types fit.
+
+    Raises:
+        pa.ArrowInvalid: There is none.
     """
+    whole = all(map(_types.is_integer, kinds)) and not (
+        pa.uint64() in kinds and any(map(_types.is_signed_integer, kinds))
+    )
+    if whole or all(map(_types.is_floating, kinds)) or all(map(is_text, kinds)):
+        return exact(kinds, arrays)
+    raise pa.ArrowInvalid(f"{', '.join(map(str, kinds))} have no common type")
 
-    leaf: Callable[[Kinds, Arrays], pa.DataType]
-    summaries: bool = False
 
-
-def common_type(arrays: Arrays, rules: Rules | None = None) -> pa.DataType:
+def common_type(
+    arrays: Arrays,
+    leaf: Callable[[Kinds, Arrays], pa.DataType] = exact,
+    *,
+    summaries: bool = False,
+) -> pa.DataType:
     """The type that represents the values of all arrays exactly.
 
     Args:
         arrays: The arrays.
-        rules: Other rules for values that are neither structs nor lists.
+        leaf: Returns the type of values that are neither structs nor lists.
+        summaries: True if arrays become summaries beside summaries.
+
+    Raises:
+        pa.ArrowInvalid: A name stands for two fields.
     """
-    rules = rules or EXACT_VALUES
+    inner = partial(common_type, leaf=leaf, summaries=summaries)
     kinds = list(dict.fromkeys(array.type for array in arrays))
     if len(kinds) > 1 and pa.null() in kinds:
         kinds.remove(pa.null())
         arrays = [array for array in arrays if array.type != pa.null()]
     if len(kinds) <= 1:
         return kinds[0] if kinds else pa.null()
-    if rules.summaries and _are_summaries(kinds):
+    if summaries and _are_summaries(kinds):
         arrays = [array if is_summary(array.type) else summary(array) for array in arrays]
-        found = _common_struct(arrays, rules)
+        found = _common_struct(arrays, inner)
     elif all(map(_types.is_struct, kinds)):
-        found = _common_struct(arrays, rules)
+        found = _common_struct(arrays, inner)
     elif all(map(is_list, kinds)):
-        found = _common_list(kinds, arrays, rules)
+        found = _common_list(kinds, arrays, inner)
     else:
-        found = rules.leaf(kinds, arrays)
+        found = leaf(kinds, arrays)
     if found != pa.json_():
         return found
     # The type of an array without values, such as the elements of empty lists, is irrelevant.
     valued = [array for array in arrays if array.null_count < len(array)]
-    return common_type(valued, rules) if 0 < len(valued) < len(arrays) else found
+    return inner(valued) if 0 < len(valued) < len(arrays) else found
 
 
 def _are_summaries(kinds: Kinds) -> bool:
@@ -195,15 +215,15 @@ def _are_summaries(kinds: Kinds) -> bool:
     return any(map(is_summary, kinds)) and all(is_summary(k) or is_array(k) for k in kinds)
 
 
-def _common_list(kinds: Kinds, arrays: Arrays, rules: Rules) -> pa.DataType:
-    item = common_type([array.flatten() for array in arrays], rules)
+def _common_list(kinds: Kinds, arrays: Arrays, inner: _Common) -> pa.DataType:
+    item = inner([array.flatten() for array in arrays])
     sizes = {kind.list_size if _types.is_fixed_size_list(kind) else None for kind in kinds}
     if len(sizes) == 1 and None not in sizes:
         return pa.list_(item, sizes.pop())
     return pa.large_list(item) if any(map(_types.is_large_list, kinds)) else pa.list_(item)
 
 
-def _common_struct(arrays: Arrays, rules: Rules) -> pa.DataType:
+def _common_struct(arrays: Arrays, inner: _Common) -> pa.DataType:
     fields: dict[str, pa.Field] = {}
     children: dict[str, list[Array]] = {}
     for array in arrays:
@@ -212,17 +232,7 @@ def _common_struct(arrays: Arrays, rules: Rules) -> pa.DataType:
             if known.metadata != field.metadata:
                 raise pa.ArrowInvalid(f"{field.name} stands for two fields")
             children.setdefault(field.name, []).append(child)
-    return pa.struct(
-        [field.with_type(common_type(children[name], rules)) for name, field in fields.items()]
-    )
-
-
-def _exact(kinds: Kinds, arrays: Arrays) -> pa.DataType:
-    if all(is_number(kind) or is_time(kind) for kind in kinds):
-        return _exact_number(kinds, arrays)
-    if all(map(is_text, kinds)):
-        return pa.large_string()
-    return pa.large_binary() if all(map(is_bytes, kinds)) else pa.json_()
+    return pa.struct([field.with_type(inner(children[name])) for name, field in fields.items()])
 
 
 def _exact_number(kinds: Kinds, arrays: Arrays) -> pa.DataType:
@@ -264,22 +274,6 @@ def _range(arrays: Any) -> tuple[int, int]:
         if found["min"].is_valid:
             low, high = min(low, found["min"].as_py()), max(high, found["max"].as_py())
     return low, high
-
-
-def _widened(kinds: Kinds, arrays: Arrays) -> pa.DataType:
-    whole = all(map(_types.is_integer, kinds)) and not (
-        pa.uint64() in kinds and any(map(_types.is_signed_integer, kinds))
-    )
-    if whole or all(map(_types.is_floating, kinds)) or all(map(is_text, kinds)):
-        return _exact(kinds, arrays)
-    raise pa.ArrowInvalid(f"{', '.join(map(str, kinds))} have no common type")
-
-
-EXACT_VALUES: Final = Rules(_exact)
-COLUMNS: Final = Rules(_exact, summaries=True)
-"""For columns of tables: arrays become summaries beside summaries."""
-WIDENED: Final = Rules(_widened, summaries=True)
-"""For columns of tables whose later values are unknown: all values of the types must fit."""
 
 
 def common_schema(tables: Iterable[pa.Table]) -> pa.Schema:
@@ -364,13 +358,11 @@ def converted(array: Array, kind: pa.DataType) -> Array:
 
 
 def narrowed(array: Array, kind: pa.DataType) -> Array:
-    """The same of structs that have more fields, or are booleans since they have none.
+    """The same of structs that have more fields.
 
     Raises:
         pa.ArrowInvalid: As `converted`.
     """
-    if _types.is_struct(kind) and not kind.num_fields:
-        return structs({}, len(array), missing_of(array))
     if _types.is_struct(kind) and _types.is_struct(array.type):
         return _with_fields(array, kind, narrowed)
     if is_list(kind) and is_list(array.type) and kind != array.type:
@@ -416,34 +408,53 @@ def _with_fields(
     return structs(children, len(array), missing_of(array), kind)
 
 
-def plain_values(array: Array) -> list[Any]:
+def plain_values(
+    array: Array, cells: Callable[[Array], list[Any] | None] = lambda _: None
+) -> list[Any]:
     """Values as in JSON, except NaN: times in nanoseconds, bytes in base64.
 
     Null fields of structs are left out.
+
+    Args:
+        array: The values.
+        cells: Returns other cells of an array, or None for these.
     """
+    made = cells(array)
+    if made is not None:
+        return made
     kind = array.type
     if kind == pa.json_():
         texts = array.storage.to_pylist()
         return [None if text is None else json.loads(text) for text in texts]
     if _types.is_struct(kind):
         names = [field.name for field in kind]
-        columns = [plain_values(child) for child in array.flatten()]
+        columns = [plain_values(child, cells) for child in array.flatten()]
         rows = [
             {n: v for n, v in zip(names, row, strict=True) if v is not None}
             for row in (zip(*columns, strict=True) if names else [()] * len(array))
         ]
         return [row if there else None for row, there in zip(rows, _is_there(array), strict=True)]
     if is_list(kind):
-        values = iter(plain_values(array.flatten()))
-        counted = zip(lengths_of(array).tolist(), _is_there(array), strict=True)
+        lengths = lengths_of(array)
+        values = iter(plain_values(_elements(array, int(lengths.sum())), cells))
+        counted = zip(lengths.tolist(), _is_there(array), strict=True)
         return [[next(values) for _ in range(n)] if there else None for n, there in counted]
     if is_time(kind):
         array = array.cast(pa.int64())
     elif is_bytes(kind):
-        cells = array.to_pylist()
-        return [None if v is None else base64.b64encode(v).decode() for v in cells]
+        found = array.to_pylist()
+        return [None if v is None else base64.b64encode(v).decode() for v in found]
     plain: list[Any] = array.to_pylist()
     return plain
+
+
+def _elements(array: Array, total: int) -> Array:
+    """The elements of lists; older pyarrow cannot flatten those of JSON text where one is null."""
+    if not _types.is_fixed_size_list(array.type):
+        begin, end = array.offsets[0].as_py(), array.offsets[-1].as_py()
+        if end - begin == total:
+            return array.values.slice(begin, total)
+    return array.flatten()
 
 
 def _is_there(array: Array) -> list[bool]:

@@ -80,24 +80,20 @@ class Decoded:
 
         return records_array(self.records)
 
-    def plain(
-        self, names: Collection[str] | None = None, *, whole: bool = True
-    ) -> list[dict[str, object]]:
+    def plain(self, *, whole: bool = True) -> list[dict[str, object]]:
         """The messages as plain values: dict, list, str, bytes, bool, int, float, None.
 
         A field that a message lacks is not there. Times and durations are integer nanoseconds.
 
         Args:
-            names: Fields of the top level that are needed, at least; None for all.
             whole: False for `{"n": length}` in place of protobuf's `bytes`.
         """
         if not isinstance(self.records, Records):
             return self.records.plain(whole=whole)
         columns = self.records.fields
-        spelled = zip(top_level_names(columns), columns.values(), strict=True)
-        chosen = [(n, column) for n, column in spelled if names is None or n in names]
+        named = [*zip(top_level_names(columns), columns.values(), strict=True)]
         rows = range(self.records.rows)
-        return [{name: row_of(column, row) for name, column in chosen} for row in rows]
+        return [{name: row_of(column, row) for name, column in named} for row in rows]
 
 
 class Codec(Protocol):
@@ -239,17 +235,6 @@ def columns_of(codec: Codec, batch: Batch, fields: Collection[str] | None = None
     return codec.columns(batch.buffer, batch.offset, batch.length, fields)
 
 
-def one_message(codec: Codec, payload: Buffer) -> Decoded:
-    """The columns of one message.
-
-    Raises:
-        PayloadError: The payload does not fit its definition.
-        DefinitionError: There is no definition to read it by.
-    """
-    size = np.array([memoryview(payload).nbytes], np.int64)
-    return readable(codec.columns(payload, np.zeros(1, np.int64), size))
-
-
 def readable(decoded: Decoded) -> Decoded:
     """The same of one message.
 
@@ -274,7 +259,11 @@ def plain_message(
     Raises:
         PayloadError: The payload does not fit its definition.
     """
-    return one_message(codec, payload).plain(names, whole=False)[0] if codec.indexed else {}
+    if not codec.indexed:
+        return {}
+    size = np.array([memoryview(payload).nbytes], np.int64)
+    decoded = codec.columns(payload, np.zeros(1, np.int64), size, names)
+    return readable(decoded).plain(whole=False)[0]
 
 
 def stamps_of(codec: Codec, batch: Batch) -> tuple[NDArray[np.intp], NDArray[np.int64]]:

@@ -200,7 +200,7 @@ def parse_for_release(schema: Schema, release: Release) -> tuple[MessageType, fr
     if top not in types:
         top = first
     resolver = _Resolver(schema.name, types, ros, release)
-    fields = resolver.message(top).fields
+    fields = resolver.message(top)[0].fields
     return MessageType(schema.name, fields), frozenset(resolver.supplied)
 
 
@@ -305,7 +305,7 @@ class _Resolver:
     """Resolves type names to types, each type once."""
 
     def __init__(
-        self, owner: str, types: dict[str, list[RawField]], ros: int, release: Release = ""
+        self, owner: str, types: dict[str, list[RawField]], ros: int, release: Release
     ) -> None:
         self.supplied: set[str] = set()
         self._owner = owner
@@ -321,10 +321,7 @@ class _Resolver:
     def _fail(self, what: str) -> DefinitionError:
         return DefinitionError(f"{self._owner}: {what}")
 
-    def message(self, name: str) -> MessageType:
-        return self._message(name)[0]
-
-    def _message(self, name: str) -> tuple[MessageType, _Extent]:
+    def message(self, name: str) -> tuple[MessageType, _Extent]:
         if name in self._done:
             return self._done[name]
         if name in self._open:
@@ -403,7 +400,7 @@ class _Resolver:
         name = self._name(owner, kind)
         if (instant := self._instant(name)) is not None:
             return instant, _Extent(0, 0, 0, 8)
-        return self._message(name)
+        return self.message(name)
 
     def _name(self, owner: str, kind: str) -> str:
         """The canonical name of a type spelled `kind` within `owner`."""

@@ -1,20 +1,16 @@
 """Parses OMG IDL as ROS 2 uses it: modules, structs, typedefs, constants, enums.
 
 A tokenizer and a recursive-descent parser for the few constructs with a ROS wire form.
-Every other construct is refused by name. Constants matter only as array sizes: integer
-expressions are evaluated, other constants are skipped.
+Every other construct is refused by name. Constants matter only as array sizes. As for rosidl,
+a size is a number or the name of a constant, and no expression of several.
 
 The parser of rosbags is not used: it does not know enums, and fails on deep nesting.
 """
 
 from __future__ import annotations
 
-import ast
-import operator
 import re
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from fractions import Fraction
 
 from hybridlog.schema.definition_text import RawField, canonical
 from hybridlog.schema.kinds import INTEGERS
@@ -32,24 +28,6 @@ _TOKEN = re.compile(
 )
 _MAX_DEPTH = 16
 _MAX_DIGITS = 20
-_MAX_VALUE = 1 << 64
-_MAX_TOKENS = 200  # of an expression
-
-_OPERATORS: Mapping[type[ast.operator], Callable[[int, int], int]] = {
-    ast.BitOr: operator.or_,
-    ast.BitXor: operator.xor,
-    ast.BitAnd: operator.and_,
-    ast.LShift: operator.lshift,
-    ast.RShift: operator.rshift,
-    ast.Add: operator.add,
-    ast.Sub: operator.sub,
-    ast.Mult: operator.mul,
-    ast.Div: lambda one, other: int(Fraction(one, other)),
-    ast.Mod: lambda one, other: one - other * int(Fraction(one, other)),
-}
-"""Operators of integer expressions, which bind as in Python. Division cuts."""
-_SIGNS = frozenset("()|^&<>+-*/%")
-
 _WORDS = {
     "boolean": "bool",
     "octet": "byte",
@@ -286,34 +264,24 @@ class _Parser:
         return number
 
     def _until(self, end: str) -> list[str]:
-        """The tokens before a sign outside of parentheses, which is skipped."""
+        """The tokens before a sign, which is skipped."""
         tokens: list[str] = []
-        depth = 0
-        while (token := self._next()) != end or depth > 0:
-            depth += {"(": 1, ")": -1}.get(token, 0)
+        while (token := self._next()) != end:
             tokens.append(token)
         return tokens
 
     def _evaluated(self, tokens: list[str], scope: str) -> int | None:
-        """The value of an integer expression; None for any other."""
-
-        def value(token: str) -> str:
-            number = _integer(token)
-            for candidate in _candidates(scope, token) if number is None else ():
-                if candidate in self._types.constants:
-                    number = self._types.constants[candidate]
-                    break
-            if number is None:
-                raise ValueError(token)
-            return f" {number} "
-
-        if len(tokens) > _MAX_TOKENS:
+        """The value of a number or a constant with or without a sign; None for anything else."""
+        sign = -1 if tokens[:1] == ["-"] else 1
+        rest = tokens[1:] if tokens[:1] in (["-"], ["+"]) else tokens
+        if len(rest) != 1:
             return None
-        try:
-            text = "".join(token if token in _SIGNS else value(token) for token in tokens)
-            return _value(ast.parse(text.strip(), mode="eval").body)
-        except (ValueError, SyntaxError, MemoryError, RecursionError, ZeroDivisionError):
-            return None
+        number = _integer(rest[0])
+        known = self._types.constants
+        for candidate in _candidates(scope, rest[0]) if number is None else ():
+            if candidate in known:
+                return sign * known[candidate]
+        return None if number is None else sign * number
 
     def _constant(self, scope: list[str]) -> None:
         self._type("/".join([*scope, ""]))
@@ -328,30 +296,6 @@ class _Parser:
         self._expect("{")
         while self._next() != "}":
             pass
-
-
-def _value(node: ast.expr) -> int:
-    """The value of an integer expression.
-
-    Raises:
-        ValueError: It is none, or too large.
-        ZeroDivisionError: It divides by zero.
-    """
-    match node:
-        case ast.Constant(value=int(found)):
-            return found
-        case ast.UnaryOp(op=ast.UAdd(), operand=inner):
-            return _value(inner)
-        case ast.UnaryOp(op=ast.USub(), operand=inner):
-            return -_value(inner)
-        case ast.BinOp(op=sign, left=left, right=right) if type(sign) in _OPERATORS:
-            one, other = _value(left), _value(right)
-            if isinstance(sign, ast.LShift | ast.RShift) and not 0 <= other < 64:
-                raise ValueError(other)
-            found = _OPERATORS[type(sign)](one, other)
-            if abs(found) <= _MAX_VALUE:
-                return found
-    raise ValueError(ast.dump(node)[:40])
 
 
 def _integer(token: str) -> int | None:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.schema.codec import Codec, Decoded
-    from hybridlog_storage.messages import Batch, Buffer
+    from hybridlog_storage.messages import Batch
 
 ARRAY_LIMIT: Final = 32
 """Arrays of more elements are summarised."""
@@ -43,44 +43,24 @@ class BodyGroup(NamedTuple):
     surplus: NDArray[np.intp] = no_rows()
 
 
-def index_bodies(
-    codec: Codec,
-    buffer: Buffer,
-    offset: NDArray[np.int64],
-    length: NDArray[np.int64],
-    *,
-    array_limit: int = ARRAY_LIMIT,
-) -> Iterator[BodyGroup]:
-    """Make index bodies; each row of the input is in exactly one group.
-
-    Args:
-        codec: The codec of the messages.
-        buffer: Holds the payloads.
-        offset: int64[n], where each payload starts.
-        length: int64[n], bytes of each payload.
-        array_limit: Arrays of more elements are summarised.
-    """
-    if not codec.indexed:
-        if len(offset):
-            yield BodyGroup(np.arange(len(offset)), np.empty((len(offset), 0), np.uint8), None)
-        return
-    yield from decoded_bodies(codec.columns(buffer, offset, length), array_limit=array_limit)
-
-
 def bodies_of(codec: Codec, batch: Batch) -> Iterator[BodyGroup]:
-    """Make index bodies of messages of one channel, with or without payloads."""
+    """Make index bodies of messages of one channel, with or without payloads.
+
+    Each message is in exactly one group.
+    """
     if codec.indexed:
-        return decoded_bodies(columns_of(codec, batch))
-    return index_bodies(codec, batch.buffer, batch.offset, batch.length)
+        yield from decoded_bodies(columns_of(codec, batch))
+    elif len(batch):
+        yield BodyGroup(np.arange(len(batch)), np.empty((len(batch), 0), np.uint8), None)
 
 
-def decoded_bodies(decoded: Decoded, *, array_limit: int = ARRAY_LIMIT) -> Iterator[BodyGroup]:
-    """Make index bodies of decoded messages; see `index_bodies`."""
+def decoded_bodies(decoded: Decoded) -> Iterator[BodyGroup]:
+    """Make index bodies of decoded messages."""
     surplus = decoded.surplus
     if isinstance(decoded.records, Records):
-        yield from _of_columns(decoded, decoded.records, array_limit)
+        yield from _of_columns(decoded, decoded.records)
     else:
-        for made, own in decoded.records.bodies(array_limit, MAX_BYTES):
+        for made, own in decoded.records.bodies(ARRAY_LIMIT, MAX_BYTES):
             rows = decoded.rows[own]
             left = np.intersect1d(rows, surplus) if len(surplus) else no_rows()
             if isinstance(made, str):
@@ -91,9 +71,9 @@ def decoded_bodies(decoded: Decoded, *, array_limit: int = ARRAY_LIMIT) -> Itera
         yield _error(bad.rows, bad.reason)
 
 
-def _of_columns(decoded: Decoded, records: Records, array_limit: int) -> Iterator[BodyGroup]:
+def _of_columns(decoded: Decoded, records: Records) -> Iterator[BodyGroup]:
     stamps = header_stamps(records)
-    for group in bodies(records, array_limit=array_limit, max_bytes=MAX_BYTES):
+    for group in bodies(records, array_limit=ARRAY_LIMIT, max_bytes=MAX_BYTES):
         rows = decoded.rows[group.rows]
         if isinstance(group, TooLarge):
             yield _error(rows, f"its fields take more than {MAX_BYTES >> 20} MiB")
@@ -105,15 +85,6 @@ def _of_columns(decoded: Decoded, records: Records, array_limit: int) -> Iterato
 
 def _error(rows: NDArray[np.intp], error: str) -> BodyGroup:
     return BodyGroup(rows, np.empty((len(rows), 0), np.uint8), error)
-
-
-def index_fields(
-    codec: Codec, payload: Buffer, *, array_limit: int = ARRAY_LIMIT
-) -> dict[str, object]:
-    """The fields of a message in its index document; empty without any."""
-    size = np.array([memoryview(payload).nbytes], np.int64)
-    groups = index_bodies(codec, payload, np.zeros(1, np.int64), size, array_limit=array_limit)
-    return document_of(next(groups).body.tobytes())
 
 
 def document_of(body: bytes) -> dict[str, object]:

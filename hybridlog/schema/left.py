@@ -13,33 +13,41 @@ from hybridlog.schema.states import CAUSES, State
 from hybridlog_storage.errors import PayloadError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Sequence
+    from collections.abc import Collection, Sequence
 
     import pyarrow as pa
     from numpy.typing import NDArray
 
     from hybridlog.schema.codec import Codec
     from hybridlog.schema.definition import FieldPath
-    from hybridlog_storage.messages import Batch, Buffer, Left
+    from hybridlog_storage.messages import Batch, Buffer
 
 
 class LeftFields(Objects):
     """Fields of messages whose payloads are gone.
 
     Args:
-        places: Where their rows are; parts are `hybridlog.columns.left_rows.LeftRows`.
+        parts: Columns of tables, those of one type together; a struct has all of them.
+        order: int64[n], the row of each message among those of all parts.
         fields: Dotted paths of those wanted in `arrow`, each with all below it; None for all.
         empty: No messages, as the codec of the payloads decodes them.
     """
 
-    def __init__(self, places: Left, fields: Collection[str] | None, empty: Decoded) -> None:
+    def __init__(
+        self,
+        parts: Sequence[pa.StructArray],
+        order: NDArray[np.int64],
+        fields: Collection[str] | None,
+        empty: Decoded,
+    ) -> None:
         super().__init__([], fields)
-        self._places = places
+        self._parts = parts
+        self._order = order
         self._empty = empty
 
     def __len__(self) -> int:
         """Number of messages."""
-        return len(self._places.row)
+        return len(self._order)
 
     @property
     def is_typed(self) -> bool:
@@ -48,19 +56,18 @@ class LeftFields(Objects):
 
     def take(self, rows: NDArray[np.bool_]) -> LeftFields:
         """Select messages."""
-        return LeftFields(self._places.take(rows), self.fields, self._empty)
+        return LeftFields(self._parts, self._order[rows], self.fields, self._empty)
 
     def plain(self, *, whole: bool) -> list[dict[str, object]]:
         """The messages as plain values, long arrays and bytes as summaries."""
         return self._documents(summaries=True)
 
     def _documents(self, *, summaries: bool) -> list[dict[str, object]]:
-        found: list[dict[str, object]] = [{}] * len(self)
-        for part, own, rows in self._places.by_part():
-            made = part.documents(rows, typed=self.is_typed, summaries=summaries)
-            for at, one in zip(own.tolist(), made, strict=True):
-                found[at] = one
-        return found
+        from hybridlog.columns.left_rows import documents
+
+        made = (documents(p, typed=self.is_typed, summaries=summaries) for p in self._parts)
+        found = [one for part in made for one in part]
+        return [found[row] for row in self._order.tolist()]
 
     def arrow(self) -> pa.StructArray:
         """The messages as an Arrow array; arrays of which only a summary is left are null."""
@@ -68,8 +75,7 @@ class LeftFields(Objects):
             from hybridlog.schema.arrow_objects import objects_array
 
             return objects_array(self._documents(summaries=False), self.wanted())
-        found = [part.records(rows) for part, _, rows in self._places.by_part()]
-        return _placed(self._places, found, self._empty.arrow().type)
+        return self._narrowed(self._records(()), self._empty.arrow().type)
 
     def columns(self) -> pa.StructArray:
         """The messages as columns of tables.
@@ -77,7 +83,7 @@ class LeftFields(Objects):
         Raises:
             UnfitError: They have no common type.
         """
-        return self._joined(lambda part, rows: part.columns(rows))
+        return self._joined(self._parts)
 
     def summarised(self) -> pa.StructArray:
         """The messages as an Arrow array in which arrays are summaries.
@@ -85,13 +91,33 @@ class LeftFields(Objects):
         Raises:
             UnfitError: They have no common type.
         """
-        return self._joined(lambda part, rows: part.records(rows, None))
+        return self._joined(self._records(None))
 
-    def _joined(self, made: Callable[[Any, NDArray[np.int64]], pa.StructArray]) -> pa.StructArray:
+    def _joined(self, parts: Sequence[pa.StructArray]) -> pa.StructArray:
         from hybridlog.columns.fields import joined
 
-        found = [made(part, rows) for part, _, rows in self._places.by_part()]
-        return _in_order(self._places, joined(found))
+        return joined(parts).take(self._order)
+
+    def _records(self, summarised: Collection[str] | None) -> list[pa.StructArray]:
+        """The fields of each part; arrays at some paths, or all (None), are summaries."""
+        from hybridlog.columns.fields import records_of
+
+        def is_summarised(path: tuple[str, ...]) -> bool:
+            return summarised is None or ".".join(path) in summarised
+
+        return [records_of(part, is_summarised) for part in self._parts]
+
+    def _narrowed(self, parts: Sequence[pa.Array[Any] | None], kind: Any) -> Any:
+        """Values of each part, or None, as one array of a type."""
+        import pyarrow as pa
+
+        from hybridlog.schema.arrow_types import narrowed
+
+        arrays = [
+            pa.nulls(len(part), kind) if one is None else narrowed(one, kind)
+            for one, part in zip(parts, self._parts, strict=True)
+        ]
+        return pa.concat_arrays([pa.nulls(0, kind), *arrays]).take(pa.array(self._order))
 
     def statistic(self, path: str, what: str) -> pa.Array[Any] | None:
         """One number of the summary of an array in each message; None if there is none.
@@ -102,12 +128,10 @@ class LeftFields(Objects):
         """
         from hybridlog.schema.arrow_types import part_of_summary
 
-        found = [
-            part_of_summary(part.records(rows, {path}), path.split("."), what)
-            for part, _, rows in self._places.by_part()
-        ]
-        kinds = [one.type for one in found if one is not None]
-        return _placed(self._places, found, kinds[0]) if kinds else None
+        names = path.split(".")
+        found = [part_of_summary(part, names, what) for part in self._records({path})]
+        kind = next((one.type for one in found if one is not None), None)
+        return None if kind is None else self._narrowed(found, kind)
 
     def lacking(self, but: Collection[str] = ()) -> NDArray[np.bool_]:
         """bool[n], True for messages of which a wanted array has only its summary left.
@@ -115,34 +139,10 @@ class LeftFields(Objects):
         Args:
             but: Dotted paths of arrays of which only summaries are wanted.
         """
-        found = np.zeros(len(self), np.bool_)
-        for part, own, rows in self._places.by_part():
-            found[own] = part.lacking(rows, self.fields, but)
-        return found
+        from hybridlog.columns.left_rows import lacking
 
-
-def _placed(places: Left, found: Sequence[Any], kind: Any) -> Any:
-    """Values of each part as one array of a type, in the order of the messages."""
-    import pyarrow as pa
-
-    from hybridlog.schema.arrow_types import narrowed
-
-    arrays = [pa.nulls(0, kind)]
-    for array, (_, own, _) in zip(found, places.by_part(), strict=True):
-        arrays.append(pa.nulls(len(own), kind) if array is None else narrowed(array, kind))
-    return _in_order(places, pa.concat_arrays(arrays))
-
-
-def _in_order(places: Left, whole: Any) -> Any:
-    """Values of one part after the other, in the order of the messages."""
-    import pyarrow as pa
-
-    order = [own for _, own, _ in places.by_part()]
-    if len(order) < 2:
-        return whole
-    row = np.empty(len(whole), np.int64)
-    row[np.concatenate(order)] = np.arange(len(whole))
-    return whole.take(pa.array(row))
+        found = [lacking(part, self.fields, but) for part in self._parts]
+        return np.concatenate([np.zeros(0, np.bool_), *found])[self._order]
 
 
 class LeftCodec:
@@ -175,25 +175,35 @@ class LeftCodec:
 
     def columns_of(self, batch: Batch, fields: Collection[str] | None = None) -> Decoded:
         """The fields that are left; see `Codec.columns`."""
-        if self.state is State.REDUCED and self.indexed:
-            from hybridlog.columns.left_rows import with_rows
+        from hybridlog.columns.left_rows import fields_in, with_rows
 
+        if self.state is State.REDUCED and self.indexed:
             batch = with_rows(batch)
         places = batch.left
         if places is None:
             return self.columns(b"", no_rows(), no_rows(), fields)
-        bad: dict[str, list[NDArray[np.intp]]] = {}
-        is_good = np.ones(len(places.row), np.bool_)
-        has_surplus = np.zeros(len(places.row), np.bool_)
+        parts: list[pa.StructArray] = []
+        order = np.zeros(len(places.row), np.int64)
+        errors: list[str | None] = [None] * len(order)
+        surplus: list[NDArray[np.intp]] = [no_rows()]
         for part, own, rows in places.by_part():
-            has_surplus[own] = part.surplus(rows)
-            for of, reason in part.errors(rows):
-                bad.setdefault(reason, []).append(own[of])
-                is_good[own[of]] = False
+            found = part.take(rows)
+            order[own] = np.arange(len(own)) + sum(map(len, parts))
+            parts.append(fields_in(found))
+            error = found.field("error")
+            for row, reason in zip(own.tolist(), error.to_pylist(), strict=True):
+                errors[row] = reason
+            has_surplus = found.field("ref").field("surplus").to_numpy(zero_copy_only=False)
+            surplus.append(own[has_surplus])
+        bad: dict[str, list[int]] = {}
+        for row, reason in enumerate(errors):
+            if reason is not None:
+                bad.setdefault(reason, []).append(row)
+        good = np.setdiff1d(np.arange(len(order)), [row for own in bad.values() for row in own])
         empty = self.original.columns(b"", no_rows(), no_rows(), fields)
-        records = LeftFields(places.take(is_good), fields, empty)
-        unreadable = [Unreadable(np.sort(np.concatenate(r)), text) for text, r in bad.items()]
-        return Decoded(np.flatnonzero(is_good), records, unreadable, np.flatnonzero(has_surplus))
+        records = LeftFields(parts, order[good], fields, empty)
+        unreadable = [Unreadable(np.array(own, np.intp), why) for why, own in bad.items()]
+        return Decoded(good, records, unreadable, np.sort(np.concatenate(surplus)))
 
     def decode(self, payload: Buffer) -> NoReturn:
         """Refuses.

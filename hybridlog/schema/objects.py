@@ -21,7 +21,7 @@ from hybridlog.schema.text import repaired_text
 from hybridlog_storage.errors import PayloadError
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator
+    from collections.abc import Callable, Collection, Iterator
 
     import pyarrow as pa
     from numpy.typing import NDArray
@@ -49,6 +49,33 @@ class Duration(Nanoseconds):
     """A duration."""
 
     kind = "duration"
+
+
+_LONG = frozenset(("int64", "uint32", "uint64"))
+
+
+def document_cells(array: pa.Array[Any], *, typed: bool, whole: bool) -> list[Any] | None:
+    """Cells of an array as plain values and index documents have them, for `plain_values`.
+
+    Args:
+        array: The array.
+        typed: True if a definition fixes the width of integers.
+        whole: False for `{"n": length}` in place of bytes.
+    """
+    from hybridlog.schema.arrow_types import is_bytes, is_time, lengths_of
+
+    kind = str(array.type)
+    if is_bytes(array.type) and not whole:
+        counted = zip(lengths_of(array).tolist(), array.is_valid().to_pylist(), strict=True)
+        return [{"n": Int64(n)} if there else None for n, there in counted]
+    made: Callable[[Any], Any] = bytes
+    if is_time(array.type):
+        made, array = Duration if kind.startswith("d") else Nanoseconds, array.view("int64")
+    elif typed and kind in _LONG:
+        made = Int64
+    elif not is_bytes(array.type):
+        return None
+    return [None if value is None else made(value) for value in array.to_pylist()]
 
 
 @dataclass(slots=True)

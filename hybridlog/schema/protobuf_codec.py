@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from graphlib import CycleError, TopologicalSorter
 from importlib import import_module
-from typing import TYPE_CHECKING, cast
-
-from bson.int64 import Int64
+from typing import TYPE_CHECKING
 
 from hybridlog.schema.arrow_protobuf import (
     TIMES,
@@ -15,13 +14,11 @@ from hybridlog.schema.arrow_protobuf import (
     is_map,
     is_message,
     is_repeated,
-    map_key,
-    nanoseconds_of,
 )
 from hybridlog.schema.codec import ObjectCodec
 from hybridlog.schema.column import top_level_names
 from hybridlog.schema.definition import MAX_DEFINITION, FieldPath
-from hybridlog.schema.objects import Duration, Nanoseconds, Objects, top
+from hybridlog.schema.objects import Objects, document_cells
 from hybridlog_storage.errors import DefinitionError, PayloadError
 
 if TYPE_CHECKING:
@@ -29,12 +26,11 @@ if TYPE_CHECKING:
     from collections.abc import Set as AbstractSet
 
     import pyarrow as pa
-    from google.protobuf.descriptor import Descriptor, FieldDescriptor
+    from google.protobuf.descriptor import Descriptor
     from google.protobuf.descriptor_pb2 import FileDescriptorProto
     from google.protobuf.descriptor_pool import DescriptorPool
     from google.protobuf.message import Message
 
-    from hybridlog.schema.objects import Plain
     from hybridlog_storage.messages import Buffer, Schema
 
 _MAX_DEPTH = 32
@@ -115,8 +111,9 @@ class _Messages(Objects):
 
     def plain(self, *, whole: bool) -> list[dict[str, object]]:
         """The fields that are set, or that do not track whether they are."""
-        made = (top(_plain(message, whole=whole)) for message in self.values)
-        return cast("list[dict[str, object]]", list(made))
+        from hybridlog.schema.arrow_types import plain_values
+
+        return plain_values(self.arrow(), partial(document_cells, typed=True, whole=whole))
 
     def arrow(self) -> pa.StructArray:
         """Arrays of the types that the definition names."""
@@ -215,46 +212,6 @@ def _standard_file(name: str) -> FileDescriptorProto:
 
     module = import_module(f"{name.removesuffix('.proto').replace('/', '.')}_pb2")
     return FileDescriptorProto.FromString(module.DESCRIPTOR.serialized_pb)
-
-
-def _plain(message: Message, *, whole: bool) -> dict[str, Plain]:
-    """A message as a plain object, its fields in the order of the definition.
-
-    Args:
-        message: The message.
-        whole: `bytes` as they are, not as their length.
-    """
-    found: dict[str, Plain] = {}
-    for field in message.DESCRIPTOR.fields:
-        if field.has_presence and not message.HasField(field.name):
-            continue
-        value = getattr(message, field.name)
-        if not is_repeated(field):
-            found[field.name] = _value(field, value, whole)
-        elif is_map(field):
-            inner = field.message_type.fields_by_name["value"]
-            # Maps have no order of their own; index documents must be reproducible.
-            found[field.name] = {map_key(k): _value(inner, value[k], whole) for k in sorted(value)}
-        else:
-            found[field.name] = [_value(field, v, whole) for v in value]
-    return found
-
-
-def _value(field: FieldDescriptor, value: object, whole: bool) -> Plain:  # noqa: FBT001
-    if is_message(field):
-        kind = TIMES.get(field.message_type.full_name)
-        if kind is not None:
-            return _nanoseconds(cast("Message", value), kind)
-        return _plain(cast("Message", value), whole=whole)
-    if isinstance(value, bytes):
-        return value if whole else {"n": Int64(len(value))}
-    if TYPES[field.type] in {"uint32", "int64", "uint64"}:
-        return Int64(cast("int", value))
-    return cast("Plain", value)
-
-
-def _nanoseconds(message: Message, kind: str) -> Nanoseconds:
-    return (Duration if kind == "duration" else Nanoseconds)(nanoseconds_of(message))
 
 
 def _add_paths(

@@ -61,22 +61,15 @@ class WireReader:
             `transforms[].child_frame_id`; the brackets are optional). A path includes
             everything below it. Unknown paths are ignored. None reads all. Fields that are
             not read are still checked.
-        source: Gathers columns from a buffer.
 
     Raises:
         DefinitionError: The type cannot be read with bounded cost.
     """
 
     def __init__(
-        self,
-        message_type: MessageType,
-        wire: Wire,
-        fields: Collection[str] | None = None,
-        *,
-        source: type[Source] = Source,
+        self, message_type: MessageType, wire: Wire, fields: Collection[str] | None = None
     ) -> None:
         self._wire: Wire = wire
-        self._source = source
         self._program = compile_type(message_type, wire, fields)
 
     def read(self, buffer: Buffer, offset: NDArray[np.int64], length: NDArray[np.int64]) -> Decoded:
@@ -99,7 +92,7 @@ class WireReader:
             odd.bad["lies outside of the chunk"] = [np.flatnonzero(outside)]
         if self._wire == "ros1":
             everything = np.arange(len(offset)) if rows is None else rows
-            good, records = self._read(self._source(buffer, "<"), everything, offset, end, odd)
+            good, records = self._read(Source(buffer, "<"), everything, offset, end, odd)
         else:
             good, records = self._read_cdr(buffer, rows, offset, end, odd)
         unreadable = [Unreadable(np.sort(np.concatenate(r)), why) for why, r in odd.bad.items()]
@@ -134,7 +127,7 @@ class WireReader:
             odd.bad["is shorter than a CDR header"] = [rows[short]]
             rows = rows[~short]
         start = offset + _HEADER
-        little = self._source(buffer, "<")
+        little = Source(buffer, "<")
         if len(rows) == 0:
             return self._read(little, rows, start, end, odd)
         begin = offset[rows]
@@ -148,7 +141,7 @@ class WireReader:
                 odd.bad[f"encapsulation 0x{code:04x} ({name}) is not read"] = [rows[kind == code]]
         orders: tuple[tuple[Literal["<", ">"], int], ...] = (("<", _LITTLE), (">", _BIG))
         (first_rows, first), (second_rows, second) = (
-            self._read(self._source(buffer, order), rows[kind == code], start, end, odd)
+            self._read(Source(buffer, order), rows[kind == code], start, end, odd)
             for order, code in orders
         )
         if len(second_rows) == 0:

@@ -21,7 +21,6 @@ from hybridlog.schema.arrow_columns import structs
 from hybridlog.schema.arrow_objects import json_array
 from hybridlog.schema.arrow_types import (
     COMPUTED_AS,
-    Rules,
     common_type,
     is_array,
     is_bytes,
@@ -149,7 +148,7 @@ def merged(kinds: Sequence[Any]) -> Any:
 
     Integers beside floats become doubles. Values that no type represents become JSON text.
     """
-    return common_type([pa.nulls(0, kind) for kind in kinds], _MERGES)
+    return common_type([pa.nulls(0, kind) for kind in kinds], _merged_leaves)
 
 
 def _merged_leaves(kinds: Sequence[Any], _: Sequence[Any]) -> Any:
@@ -169,9 +168,6 @@ def _merged_numbers(kinds: Sequence[Any]) -> Any:
         return pa.type_for_alias(f"uint{max(unsigned)}")
     bits = max([*signed, *(2 * width for width in unsigned)])
     return pa.type_for_alias(f"int{bits}") if bits <= 64 else pa.decimal128(20, 0)
-
-
-_MERGES: Final = Rules(_merged_leaves)
 
 
 def whole_message(kind: Any) -> Any:

@@ -125,7 +125,7 @@ class Left:
     """The rows of messages without payload. All columns have the same length n.
 
     Attributes:
-        parts: Rows of files, see `hybridlog.columns.left_rows.LeftRows`.
+        parts: Rows of files, struct arrays of all their columns.
         part: int32[n], index in these; -1 of a message that has its payload.
         row: int64[n], row of the part.
         offset: int64[n], byte where each payload starts in its chunk, whether it is there or not.

@@ -22,8 +22,8 @@ from rosbags.typesys import Stores, get_typestore
 import hybridlog as hl
 from hybridlog.arrays.message_arrays import to_numpy
 from hybridlog.columns.clouds import PointColumns
+from hybridlog.columns.column_file import ColumnFile
 from hybridlog.columns.fields import FieldShape
-from hybridlog.columns.parquet_file import ParquetFileReader
 from hybridlog.query.planner import Planner
 from hybridlog.query.rows import Rows
 from hybridlog.schema.codecs import codec_for
@@ -225,8 +225,8 @@ def test_shared_files_have_no_holes_and_cost_what_it_says(copy: Path, tmp_path: 
                 paths = files_of(store, kind)
                 assert one.bytes_after == sum(path.stat().st_size for path in paths)
                 for path in paths:
-                    footer = int.from_bytes(path.read_bytes()[-8:-4], "little") + 8
-                    assert [*ParquetFileReader(path).about.span] == [
+                    footer = int.from_bytes(path.read_bytes()[-8:-4], "little") + 12
+                    assert [*ColumnFile(path).about.span] == [
                         4,
                         path.stat().st_size - footer,
                     ]

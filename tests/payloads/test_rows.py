@@ -21,7 +21,6 @@ from hybridlog.columns.rows_file import RowsFile
 from hybridlog.entries import put_entry
 from hybridlog.maintenance.expiry import expire, write_rows
 from hybridlog.schema.codecs import codec_for
-from hybridlog.schema.index_bodies import index_fields
 from hybridlog_storage import manifest as truth
 from hybridlog_storage.errors import PayloadError, SegmentError, StoreError
 from hybridlog_storage.manifest import File
@@ -30,6 +29,7 @@ from hybridlog_storage.segments.gone_log import GoneLog, open_log
 from hybridlog_storage.segments.segment_reader import SegmentReader
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import places
+from tests.indexed import index_fields
 
 POINT = Schema("a/Point", "ros1msg", b"int64 n\nuint8[] data\n")
 CHANNELS = [

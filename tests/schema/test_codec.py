@@ -20,9 +20,9 @@ from hypothesis import strategies as st
 
 from hybridlog.schema.codec import Codec, plain_message
 from hybridlog.schema.codecs import codec_for
-from hybridlog.schema.index_bodies import index_bodies, index_fields
 from hybridlog_storage.errors import DefinitionError, PayloadError
 from hybridlog_storage.messages import Channel, Schema
+from tests.indexed import groups_of, index_fields
 from tests.schema.test_document import assert_same_but_for_rounded_means, document_of
 
 
@@ -33,7 +33,7 @@ def joined(payloads: list[bytes]) -> tuple[bytes, np.ndarray, np.ndarray]:  # ty
 
 def bodies_of(codec: Codec, payloads: list[bytes]) -> list[bytes | str]:
     found: dict[int, bytes | str] = {}
-    for group in index_bodies(codec, *joined(payloads)):
+    for group in groups_of(codec, *payloads):
         assert len(group.rows) == len(group.body)
         if group.error is not None:
             assert group.body.shape[1] == 0
@@ -77,7 +77,7 @@ def test_objects_of_payloads_with_bytes_left_over(surplus: bytes) -> None:
         assert (found.s, found.n) == ("hi", 9)
     with pytest.raises(PayloadError, match="does not fit"):
         plain.decode(b"\x02\0\0\0\x07\x08\x01")
-    for group in index_bodies(plain, b"\0\0\0\0\1\2" + surplus, np.zeros(2, int), np.array([6, 7])):
+    for group in groups_of(plain, b"\0\0\0\0\1\2", b"\0\0\0\0\1\2" + surplus):
         assert group.surplus.tolist() == [1]
 
 

@@ -14,10 +14,10 @@ from hybridlog.schema.codec import plain_message
 from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.completion import completed
 from hybridlog.schema.definition import parse_definition, typestore
-from hybridlog.schema.index_bodies import index_bodies
 from hybridlog_storage.errors import DefinitionError
 from hybridlog_storage.messages import REPLACED, SUPPLIED, Channel, Schema
 from tests.calls import Calls
+from tests.indexed import groups_of
 from tests.ros_values import ROS1, message_of, same
 
 DIFFERENT = [
@@ -73,7 +73,7 @@ def test_the_release_that_fits_is_chosen(name: str, release: str) -> None:
     codec = codec_for(found)
     for message, payload in pairs:
         same(codec.decode(payload), message)
-        (group,) = index_bodies(codec, payload, np.zeros(1, np.int64), np.array([len(payload)]))
+        (group,) = groups_of(codec, payload)
         assert group.error is None
         assert not len(group.surplus)
 
@@ -132,9 +132,7 @@ def test_a_message_that_is_empty_has_no_fields() -> None:
     own = cdr("p/msg/T", Schema("p/msg/T", "ros2msg", b"# nothing\nuint8 A=1\n"))
     assert completed(own, [b"\0\1\0\0\0"]) is own
     assert plain_message(codec_for(own), b"\0\1\0\0\0\0\0\0") == {}
-    (group,) = index_bodies(
-        codec_for(own), b"\0\1\0\0\5\0\0\0hallo", np.zeros(1, int), np.array([13])
-    )
+    (group,) = groups_of(codec_for(own), b"\0\1\0\0\5\0\0\0hallo")
     assert group.error is not None
     assert "8 bytes left over: the definition has no fields" in group.error
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rosbags.interfaces import Nodetype
-from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from hybridlog.schema.definition import (
     MAX_DEFINITION,
@@ -259,22 +259,6 @@ def test_idl():
     assert listing(parse(IDL + INNER_IDL, "ros2idl")) == IDL_FIELDS
 
 
-def test_idl_against_rosbags():
-    text = """
-module pkg { module msg {
-  typedef float float__3[3];
-  const long N = 6;
-  struct Part { string<4> name; float__3 values; };
-  struct T {
-    sequence<pkg::msg::Part> parts; pkg::msg::Part one; double x[N]; sequence<octet, 9> y;
-  };
-}; };
-"""
-    table = get_types_from_idl(text)
-    found = parse(text, "ros2idl")
-    assert_same_type(found, (Nodetype.NAME, "pkg/msg/T"), table)
-
-
 def test_msg_and_idl_may_be_mixed():
     text = f"pkg/Inner a\n{RULE}\nIDL: pkg/msg/Inner\n{INNER_IDL}\n"
     assert listing(parse(text)) == {"a": "pkg/Inner", "a.x": "int32"}
@@ -295,15 +279,10 @@ def test_msg_and_idl_may_be_mixed():
         ("typedef a b; typedef b a; struct T { a x; }; }; };", "circle"),
         ("struct T { long x[N]; };", "must be a number or a constant, found 'N'"),
         ("struct T { long x[]; };", "must be a number or a constant"),
-        ("struct T { long x[1 +]; };", "must be a number or a constant, found '1 +'"),
-        ("struct T { long x[(1]; };", "ends too early"),
-        ("struct T { long x[2 3]; };", "must be a number or a constant"),
-        ("struct T { long x[1 / 0]; };", "must be a number or a constant"),
-        ("struct T { long x[1 - 2]; };", "must be a number or a constant"),
-        ("struct T { long x[1 << 64]; };", "must be a number or a constant"),
+        ("struct T { long x[2 * 3]; };", "must be a number or a constant, found '2 * 3'"),
+        ("struct T { long x[-1]; };", "must be a number or a constant"),
         ("struct T { long x[1.5]; };", "must be a number or a constant"),
-        ("const long N = 1 << 60 << 60; struct T { long x[N]; };", "found 'N'"),
-        (f"struct T {{ long x[{'(' * 101}1{')' * 101}]; }};", "must be a number or a constant"),
+        ("const long N = 1 << 4; struct T { long x[N]; };", "found 'N'"),
         ("struct B; struct T { B x; }; }; };", "does not say what"),
         ("struct T { long x", "ends too early"),
         ("struct T { Other x; }; }; };", "does not say what"),
@@ -321,30 +300,13 @@ def test_idl_that_is_refused(body, reason):
     assert reason in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("size", "value"),
-    [
-        ("2 * (3 + 1)", 8),
-        ("1 << 4", 16),
-        ("0xFF & 0x0F | 16 ^ 1", 31),
-        ("20 - 10 - 5", 5),
-        ("100 / 10 / 5", 2),
-        ("-7 / 2 + 10", 7),
-        ("-7 % 4 + 10", 7),
-        ("- -+5", 5),
-        ("LOW * -2", 6),
-        ("1 + 1 << 2 - 1", 4),
-        ("64 >> 2 * 2", 4),
-        ("12 & 6 << 1", 12),
-        (f"{'(' * 15}7{')' * 15}", 7),
-    ],
-)
-def test_integer_expressions_of_idl(size, value):
+@pytest.mark.parametrize(("size", "value"), [("0x1F", 31), ("017", 15), ("+5", 5), ("-LOW", 3)])
+def test_sizes_of_idl(size, value):
     text = f"""module pkg {{ module msg {{
       const long LOW = -3; const double HALF = 0.5 * 2; const string S = "a;b]";
       const long N = {size};
-      struct T {{ long a[{size}]; sequence<long, ({size})> b; string<N> c; long d[N]; }};
-    }}; }};""".replace("(64 >> 2 * 2)", "(64 >> 4)")
+      struct T {{ long a[{size}]; sequence<long, {size}> b; string<N> c; long d[N]; }};
+    }}; }};"""
     expected = {
         "a": f"int32[{value}]",
         "b": f"int32[<={value}]",

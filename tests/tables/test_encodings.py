@@ -59,13 +59,6 @@ def test_an_empty_message_that_is_missing_at_times(store: hl.Store, tmp_path: Pa
     assert [row["e"] is None for row in found] == [False, True, False]
 
 
-def test_json_of_mixed_types(store: hl.Store, tmp_path: Path) -> None:
-    record(store, tmp_path, [{"a": 1}, {"a": "x"}, {"a": {"b": 2}}, {}])
-    found = rows(store)
-    assert found is not None
-    assert [row["a"] and json.loads(row["a"]) for row in found] == [1, "x", {"b": 2}, None]
-
-
 def test_json_that_gets_fields_later(store: hl.Store, tmp_path: Path, limit: Limit) -> None:
     """A file has one type: what comes later goes to another one, and all is one table."""
     limit(table_pending_bytes=1, table_left_bytes=0, table_arena_bytes=1)

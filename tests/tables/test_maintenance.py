@@ -9,15 +9,14 @@ from pathlib import Path
 import pytest
 
 import hybridlog as hl
+from hybridlog.columns.column_file import ColumnFile
 from hybridlog.columns.folders import TableFolders
 from hybridlog.columns.layout import PARTS, TABLES
-from hybridlog.columns.parquet_file import ParquetFileReader
 from hybridlog.columns.tables import Tables
 from hybridlog.maintenance import tables as making
 from hybridlog.maintenance.verify import RESTORE
 from hybridlog.record.marks import MARKS
 from tests import places
-from tests.faults import logs
 from tests.limits import Limit
 from tests.tables.logs import BASE, varied, write_log
 from tests.tables.test_writer import compare, topics_of
@@ -41,20 +40,13 @@ def contents(store: hl.Store) -> dict[str, str]:
     root = store.directory.path / TABLES
     found = {}
     for path in root.glob("*/*.parquet"):
-        reader = ParquetFileReader(path)
+        reader = ColumnFile(path)
         found[str(path.relative_to(root))] = f"{reader.about.sections} {reader.table().to_pylist()}"
     return found
 
 
 def unfinished(store: hl.Store) -> list[Path]:
     return list((store.directory.path / PARTS).glob("*"))
-
-
-def test_a_topic_that_ends_before_its_recording(store: hl.Store, tmp_path: Path) -> None:
-    """Its last file has the name of the last segment with its messages."""
-    said = {**logs.content(0, 1700), "/number": logs.content(0, 1500)["/number"]}
-    store.record(logs.write(tmp_path / "a.mcap", said), settings=logs.SETTINGS)
-    assert store.verify().findings == []
 
 
 def test_a_mark_changes_no_table(few: hl.Store) -> None:
@@ -156,7 +148,7 @@ def test_rows_of_another_segment_are_not_kept(few: hl.Store) -> None:
     (entry,) = few.recordings()
     stale = dict.fromkeys(entry.digests, "0" * 64)
     path = next((few.directory.path / TABLES).glob("*/*.parquet"))
-    reader = ParquetFileReader(path)
+    reader = ColumnFile(path)
     sections = reader.about.sections
     folders = TableFolders(few.directory.path, entry.id, entry.created, entry.digests)
     table, before, pieces = reader.table(), 0, []

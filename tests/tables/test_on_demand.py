@@ -43,39 +43,6 @@ def store(tmp_path: Path) -> Iterator[hl.Store]:
         yield opened
 
 
-def files(store: hl.Store) -> list[str]:
-    return sorted(p.name for p in (store.directory.path / "tables").rglob("*.parquet"))
-
-
-@pytest.mark.parametrize("fault", ["removed", "cut", "flipped"])
-def test_a_table_that_a_question_misses_is_made_again(store: hl.Store, fault: str) -> None:
-    before = files(store)
-    assert before
-    path = store.directory.path / "tables"
-    if fault == "removed":
-        shutil.rmtree(path)
-    for file in path.rglob("*.parquet") if fault != "removed" else ():
-        data = bytearray(file.read_bytes())
-        if fault == "cut":
-            del data[len(data) // 2 :]
-        else:
-            data[len(data) // 2] ^= 1
-        file.write_bytes(data)
-    store.refresh()
-    query = store.topic("/imu").where(f"n >= {2**63 + 1000}")
-    assert query.count() == 500
-    assert [m.log_time_ns for m in query.limit(1)] == [1000 * SECOND]
-    counted = store.sql(f"select count(*), max(n) from imu where n >= {2**63 + 1000}")
-    assert counted.rows() == [(500, 2**63 + 1499)]
-    store.mend()
-    assert set(files(store)) <= set(before)
-    # Another process finds the table, and reads no chunk.
-    with hl.open(store.directory.path) as other:
-        again = other.topic("/imu").where(f"n >= {2**63 + 1000}")
-        assert again.count() == 500
-        assert again.counters.chunks_read == again.counters.documents_read == 0
-
-
 def test_a_topic_without_a_table_is_tried_once(
     store: hl.Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -26,7 +25,6 @@ from hybridlog.maintenance import tables as making
 from hybridlog_storage.cache import Cache
 from hybridlog_storage.errors import StoreError
 from tests.some import in_turn
-from tests.tables.conftest import SMALL_CHUNKS
 from tests.tables.logs import decoded
 from tests.tables.test_writer import compare, topics_of
 
@@ -194,24 +192,6 @@ def test_damage_that_is_met_while_reading(recorded: hl.Store, tables: Tables) ->
         list(table.scan(None))
     tables.reject(entry, "/large")
     assert tables.of(entry, "/large") is None  # from now on
-
-
-def test_tables_of_other_recordings_are_not_believed(
-    recorded: hl.Store, recorded_once: Path
-) -> None:
-    log = recorded_once.parent / "log.mcap"
-    recorded.record(log, name="other", again=True, settings=SMALL_CHUNKS)
-    one, other = recorded.entry("log"), recorded.entry("other")
-    making.remove(recorded.directory, one.id)
-    tables = Tables(recorded.directory.path)
-    assert all(tables.of(one, topic) is None for topic in topics_of(one))
-    assert all(tables.of(other, topic) for topic in topics_of(other))
-    forged = replace(one, id=other.id, digests=dict.fromkeys(one.digests, "0" * 64))
-    for topic in topics_of(one):
-        with pytest.raises(FileNotFoundError):
-            tables.check(forged, topic)
-    assert not making.make(recorded.directory, one)
-    assert compare(recorded) == 3600
 
 
 def test_a_segment_more_or_less_is_noticed(recorded: hl.Store, tables: Tables) -> None:

@@ -10,12 +10,11 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 
 import hybridlog as hl
 from hybridlog.columns.folders import TableFolders
-from hybridlog.columns.layout import OWN_COLUMNS, PARTS, TABLES, parts_folder
+from hybridlog.columns.layout import OWN_COLUMNS, TABLES, parts_folder
 from hybridlog.columns.table_writer import TableWriter
 from hybridlog.columns.tables import Tables
 from hybridlog.columns.topic_table import TableRows
@@ -151,18 +150,6 @@ def test_where_a_message_lies(recorded: hl.Store) -> None:
         (r["seg"], r["chunk"], r["off"], r["len"]) for r in (d["_meta"]["ref"] for d in documents)
     ]
     assert [r for block in table.scan(own=["ref"]) for r in references(block)] == want
-
-
-def test_topics_of_few_rows_share_a_file_a_type(recorded: hl.Store) -> None:
-    (path,) = files_of(recorded)
-    (entry,) = recorded.recordings()
-    assert path.parent.name.startswith("test_State~")
-    assert path.name == "shared-00000000000000000000.parquet"
-    table = pq.read_table(path, columns=["recording", "topic"])
-    assert set(table.column("recording").to_pylist()) == {entry.id}
-    topics = table.column("topic").to_pylist()
-    assert topics == ["/large"] * 1200 + ["/small/one"] * 300 + ["/small/two"] * 300
-    assert not (recorded.directory.path / PARTS / f"r{recorded.recordings()[0].id}").exists()
 
 
 def test_a_segment_has_its_tables_once_it_is_sealed(store: hl.Store, limit: Limit) -> None:

@@ -17,8 +17,8 @@ from hybridlog.live.sources.ros2.child.definitions import Definitions
 from hybridlog.live.sources.ros2.source import Ros2Source
 from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.definition import parse_definition
-from hybridlog.schema.index_bodies import index_fields
 from hybridlog_storage.messages import Schema
+from tests.indexed import index_fields
 from tests.limits import Limit
 from tests.live.sources.heard import Heard
 from tests.live.sources.ros2_peers import (
