@@ -48,7 +48,6 @@ PLACES = {
     "ros2_hello_s": "hybridlog.live.sources.ros2.process.HELLO_S",
     "ros2_hand_over_s": "hybridlog.live.sources.ros2.source._HAND_OVER_S",
     "ros2_pause_s": "hybridlog.live.sources.ros2.source._PAUSE_S",
-    "ros2_term_s": "hybridlog.live.sources.ros2.source._TERM_S",
     "shown_bytes": "hybridlog.message._MAX_SHOWN",
     "merged_bytes": "hybridlog.query.chunk_scan._MERGED_BYTES",
     "min_threaded_bytes": "hybridlog.query.chunk_scan._MIN_THREADED_BYTES",
