@@ -92,6 +92,16 @@ class _Message(NamedTuple):
     payload: Buffer
 
 
+@dataclass(slots=True)
+class _Taken:
+    """What was taken of a channel: log times in ns."""
+
+    index: int
+    first: int
+    last: int = 0
+    messages: int = 0
+
+
 class LiveRecording:
     """A recording that takes messages as they come.
 
@@ -126,11 +136,8 @@ class LiveRecording:
         self._small_bound = options.budget_bytes * 5 // 4
         self._on_close = on_close
         self._started = time.monotonic()
-        self._ids: dict[Channel, int] = {}
+        self._taken: dict[Channel, _Taken] = {}
         self._channels: list[Channel] = []
-        self._taken: list[int] = []  # messages, by index of the channel
-        self._first: list[int] = []  # log time of the first one
-        self._last: list[int] = []  # log time of the last one
         self._least = _MAX_NS  # log time of all
         self._inbox: deque[_Message] = deque()
         self._received = 0  # bytes of all messages, with their heads
@@ -259,19 +266,16 @@ class LiveRecording:
                 self._room.wait()
             self._room.notify()  # there may be room for another writer
             self._check()
-            index = self._ids.get(channel) if isinstance(channel, Channel) else None
-            if index is None:
+            taken = self._taken.get(channel) if isinstance(channel, Channel) else None
+            if taken is None:
                 _check_channel(channel)
-                index = self._ids[channel] = len(self._channels)
                 self._channels.append(channel)
-                self._taken.append(0)
-                self._first.append(now)
-                self._last.append(now)
-            self._last[index] = now
+                taken = self._taken[channel] = _Taken(len(self._channels) - 1, now)
+            taken.last = now
+            taken.messages += 1
             self._least = min(self._least, now)
-            self._taken[index] += 1
             # Ctrl-C may interrupt the main thread anywhere: a message is in the queue or not.
-            self._inbox.append(_Message(index, now, sent, sequence, payload))
+            self._inbox.append(_Message(taken.index, now, sent, sequence, payload))
             self._received += size
             enough = self._received - self._moved >= self._worth_waking
         if enough:
@@ -292,7 +296,7 @@ class LiveRecording:
     @property
     def progress(self) -> tuple[int, int]:
         """Messages taken, and those of them that are written to the disk."""
-        return sum(self._taken), self._capture.writer.written.total()
+        return sum(self.taken.values()), self._capture.writer.written.total()
 
     @property
     def sealed(self) -> int:
@@ -317,15 +321,15 @@ class LiveRecording:
     @property
     def is_empty(self) -> bool:
         """True if it has taken no message."""
-        return not any(self._taken)
+        return not self._channels
 
     @property
     def taken(self) -> Counter[str]:
         """Messages taken so far, by topic."""
         found: Counter[str] = Counter()
         with self._lock:
-            for channel, messages in zip(self._channels, self._taken, strict=True):
-                found[channel.topic] += messages
+            for channel, taken in self._taken.items():
+                found[channel.topic] += taken.messages
         return found
 
     @property
@@ -399,15 +403,13 @@ class LiveRecording:
     def _cut_off(self) -> list[dict[str, Any]]:
         """Rows of the ledger, with the messages that were taken but not written."""
         writer = self._capture.writer
-        for index, channel in enumerate(self._channels):
-            count = self._taken[index] - writer.written_of(channel)
+        for channel, taken in self._taken.items():
+            count = taken.messages - writer.written_of(channel)
             if count:
                 self.cut_off[channel.topic] += count
                 written = writer.last_time_of(channel)
                 # The clock may have been set back since.
-                first, last = sorted(
-                    (self._first[index] if written is None else written, self._last[index])
-                )
+                first, last = sorted((taken.first if written is None else written, taken.last))
                 detail = "the disk was full"
                 self.ledger.note(Loss(channel.topic, Cause.DISK, count, first, last, detail))
         return self.ledger.take(everything=True)
