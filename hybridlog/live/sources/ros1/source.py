@@ -12,9 +12,9 @@ import secrets
 import threading
 from typing import TYPE_CHECKING, Final
 
-from hybridlog.live.sources.base import LiveSource, one_line
+from hybridlog.live.sources.base import LiveSource, PeerError, one_line
+from hybridlog.live.sources.network import Endpoint, Network, endpoint_of
 from hybridlog.live.sources.ros1.graph import Graph, Master
-from hybridlog.live.sources.ros1.network import Endpoint, Network, PeerError, endpoint_of
 from hybridlog.live.sources.ros1.reader import Reader
 from hybridlog.live.sources.ros1.rpc import RpcServer
 from hybridlog.live.sources.ros1.slave import listen, methods, uri_of
