@@ -35,9 +35,6 @@ PLACES = {
     "expected_topics": "hybridlog.live.recorder._MAX_EXPECTED",
     "full_manifest_bytes": "hybridlog.live.recorder._FULL_BYTES",
     "slow_write_s": "hybridlog.live.recorder._SLOW_WRITE_S",
-    "late_times": "hybridlog.live.recording._LATE_TIMES",
-    "laid_out_bytes": "hybridlog.live.recording._MAX_BATCH_BYTES",
-    "pressure_hold_s": "hybridlog.live.recording._PRESSURE_HOLD_S",
     "foxglove_ping_s": "hybridlog.live.sources.foxglove.connection._PING_S",
     "foxglove_message_bytes": "hybridlog.live.sources.foxglove.session.Session.max_bytes",
     "foxglove_channels": "hybridlog.live.sources.foxglove.session._MAX_CHANNELS",
@@ -51,7 +48,6 @@ PLACES = {
     "ros2_hello_s": "hybridlog.live.sources.ros2.process.HELLO_S",
     "ros2_hand_over_s": "hybridlog.live.sources.ros2.source._HAND_OVER_S",
     "ros2_pause_s": "hybridlog.live.sources.ros2.source._PAUSE_S",
-    "ros2_term_s": "hybridlog.live.sources.ros2.source._TERM_S",
     "shown_bytes": "hybridlog.message._MAX_SHOWN",
     "merged_bytes": "hybridlog.query.chunk_scan._MERGED_BYTES",
     "min_threaded_bytes": "hybridlog.query.chunk_scan._MIN_THREADED_BYTES",
@@ -80,7 +76,6 @@ PLACES = {
     "segment_chunks": "hybridlog_storage.segments.segment_group._MAX_CHUNKS",
     "segment_parts": "hybridlog_storage.segments.segment_group._MAX_PARTS",
     "sync_stride_bytes": "hybridlog_storage.segments.segment_writer._SYNC_STRIDE",
-    "compression_turn_s": "hybridlog_storage.segments.segment_writer._TURN_S",
     "foxglove_tick_s": "hybridlog.live.sources.foxglove.connection._TICK_S",
     "server_wait_s": "hybridlog_storage.sftp.WAIT_S",
     "bucket_whole_bytes": "hybridlog_storage.remote.bucket.PART_BYTES",
@@ -93,7 +88,6 @@ PLACES = {
     "index_interval": "hybridlog.live.recording._index_interval_s",
     "index_interval_bytes": "hybridlog.index.index_writer._INTERVAL_BYTES",
     "recording_filled": "hybridlog.live.recording.LiveRecording.filled",
-    "recording_is_under_pressure": "hybridlog.live.recording.LiveRecording._is_under_pressure",
 }
 
 

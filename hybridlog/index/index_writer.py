@@ -12,10 +12,10 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from queue import Empty, SimpleQueue
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -47,7 +47,6 @@ INTERVAL_S = 5.0
 _INTERVAL_BYTES = 64 << 20  # content that was flushed since the last pass, at most
 _SEND_BYTES = 8 << 20  # documents that are sent together, at most
 _GROUP_BYTES = 1 << 20  # content of small chunks that are decoded together
-_PAUSE_S = 0.002
 _RETRY_S = 2.0  # between attempts after the database has failed
 
 
@@ -169,8 +168,6 @@ class IndexWriter:
         target: Where documents go.
         catalog: Gets the decoding results of each segment.
         tables: Gets each chunk once, in the order of the file.
-        pause_indexing: Returns whether the recorder has more than it can write; this then waits.
-        cpu_slots: Processors for what can wait. One is held while documents or tables are made.
         interval_s: Longest time between two passes, seconds.
 
     Attributes:
@@ -186,8 +183,6 @@ class IndexWriter:
         catalog: Catalog,
         *,
         tables: TableWriter,
-        pause_indexing: Callable[[], bool] = lambda: False,
-        cpu_slots: AbstractContextManager[Any] | None = None,
         interval_s: float = INTERVAL_S,
     ) -> None:
         self.failure = self._last_failure = target.failure
@@ -197,8 +192,6 @@ class IndexWriter:
         self._target = target
         self._catalog = catalog
         self._tables = tables
-        self._pause_indexing = pause_indexing
-        self._cpu_slots = cpu_slots or nullcontext()
         self._interval_s = interval_s
         self._indexer = ChunkIndexer(entry.id, has_documents=target.is_wanted)
         self._channels: Mapping[int, Channel] = {}
@@ -322,8 +315,6 @@ class IndexWriter:
         group: list[StoredChunk] = []
         size = 0
         for place in places:
-            while self._pause_indexing():
-                time.sleep(_PAUSE_S)
             try:
                 chunk = reader.read_chunk(place)
             except SegmentError as error:
@@ -341,10 +332,8 @@ class IndexWriter:
         """Make rows and documents of chunks of one segment."""
         segment = chunks[0].segment
         for chunk in chunks:
-            with self._cpu_slots:
-                self._tables.add(chunk, self._channels)
-        with self._cpu_slots:
-            documents, entries = self._indexer.documents_of(chunks, self._channels)
+            self._tables.add(chunk, self._channels)
+        documents, entries = self._indexer.documents_of(chunks, self._channels)
         self._stats.setdefault(segment, {}).update({entry.number: entry.stats for entry in entries})
         if self._sender is None:
             self._gaps.add(segment)
@@ -354,8 +343,7 @@ class IndexWriter:
 
     def _end_segment(self, segment: int, digest: str) -> None:
         """Store the decoding results of a segment, if all of it could be read."""
-        with self._cpu_slots:
-            self._tables.cut(segment, digest)
+        self._tables.cut(segment, digest)
         stats, count = self._stats.pop(segment, {}), len(self._places[segment])
         if len(stats) == count:
             rows = decoded_rows([stats[number] for number in range(count)])

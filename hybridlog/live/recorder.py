@@ -11,7 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from operator import attrgetter
 from typing import TYPE_CHECKING
@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 from hybridlog.entries import text as as_text
 from hybridlog.live.clocks import CLOCK, MachineClock, SimulatedTime
 from hybridlog.live.incidents import Hit, Incidents
-from hybridlog.live.memory import default_budget, resident_bytes
+from hybridlog.live.memory import resident_bytes
 from hybridlog.live.policy import (
     PAYLOAD_STRIDE,
     SMALL_BYTES,
@@ -31,7 +31,6 @@ from hybridlog.live.policy import (
     retention,
 )
 from hybridlog.live.recording import (
-    LIVE_SETTINGS,
     LiveOptions,
     indexed_within_s,
 )
@@ -68,7 +67,6 @@ if TYPE_CHECKING:
     from hybridlog.record.recorder import RecordReport
     from hybridlog.store import Store
     from hybridlog_storage.manifest import Manifest
-    from hybridlog_storage.segments.segment_writer import SegmentSettings
 
 _MAX_REPORTS = 1000
 _MAX_CACHED = 4096  # channel objects that are found without comparing their content
@@ -82,12 +80,11 @@ _SLOW_WRITE_S = 2.0  # to pack and write a chunk, on a disk that is busy
 
 
 @dataclass(frozen=True, slots=True)
-class RecorderOptions:
-    """Options of a recorder.
+class RecorderOptions(LiveOptions):
+    """Options of a recorder, and of its recording.
 
     Attributes:
         name: Name of the recording.
-        tags: Tags of the recording.
         matcher: Selects topics; None for all.
         throttles: Maximum rates of topics, Hz by log time; the first matching rule applies.
         priorities: Priorities of topics under pressure; the first matching rule applies.
@@ -95,20 +92,15 @@ class RecorderOptions:
         max_messages: Stop after this number of messages.
         max_bytes: Stop after this number of payload bytes.
         reserve_bytes: Stop when the disk has less free space.
-        budget_bytes: Payload bytes that may be in memory.
-        flush_interval_s: Seconds of messages that a `kill -9` can cost.
-        settings: Settings of segments and chunks.
         ring_s: Seconds after which messages go that no pin touches; None to keep all.
         triggers: Conditions on messages, which are marked and pinned.
         before_s: Seconds before a trigger or signal that are pinned; None for those of the ring.
         after_s: Seconds after it.
-        no_index: Selects topics whose messages get no documents in MongoDB; None for none.
         use_sim_time: Log times are those of `/clock`.
         contract: Topics that are silent for longer than it allows are told and marked.
     """
 
     name: str = "live"
-    tags: Mapping[str, str] = field(default_factory=dict)
     matcher: TopicMatcher | None = None
     throttles: Sequence[Rule] = ()
     priorities: Sequence[Rule] = ()
@@ -116,19 +108,16 @@ class RecorderOptions:
     max_messages: int | None = None
     max_bytes: int | None = None
     reserve_bytes: int = 1 << 30
-    budget_bytes: int = field(default_factory=default_budget)
-    flush_interval_s: float = 1.0
-    settings: SegmentSettings = LIVE_SETTINGS
     ring_s: float | None = None
     triggers: Sequence[Trigger] = ()
     before_s: float | None = None
     after_s: float = 0.0
-    no_index: TopicMatcher | None = None
     use_sim_time: bool = False
     contract: Contract | None = None
 
     def __post_init__(self) -> None:
         """Refuse limits that would stop the recorder at once, and a ring that holds too little."""
+        LiveOptions.__post_init__(self)
         ring_s = self.ring_s
         if self.use_sim_time and ring_s is not None:
             raise UsageError("--ring goes by the time of this machine: leave out --use-sim-time.")
@@ -216,7 +205,7 @@ class Recorder:
         if options.use_sim_time:
             self._simulated = SimulatedTime(self, options.budget_bytes // _HELD_SHARE)
         self._sink: Sink = self._simulated or self
-        self._target = store.start(options.name, self._live_options())
+        self._target = store.start(options.name, self._of_recording())
         self.name = self._target.name
         self._says = StateFile(store.directory, self._target.id)
         ring_s = options.ring_s
@@ -243,25 +232,19 @@ class Recorder:
             self._target.abort()
             raise
 
-    def _live_options(self) -> LiveOptions:
+    def _of_recording(self) -> LiveOptions:
         options, settings = self._options, self._options.settings
         if options.ring_s is not None:
             group_s = options.ring_s / GROUPS
             span_s = min(settings.segment_span_s or group_s, group_s)
             settings = replace(settings, segment_span_s=span_s)
-        return LiveOptions(
-            tags=options.tags,
-            source={
-                "kind": ", ".join(source.kind for source in self._sources)
-                + (f", by {CLOCK}" if options.use_sim_time else ""),
-                "path": ", ".join(source.address for source in self._sources),
-            },
-            budget_bytes=options.budget_bytes,
-            flush_interval_s=options.flush_interval_s,
-            settings=settings,
-            no_index=options.no_index,
-            is_ring=options.ring_s is not None,
-        )
+        by = f", by {CLOCK}" if options.use_sim_time else ""
+        source = {
+            "kind": ", ".join(source.kind for source in self._sources) + by,
+            "path": ", ".join(source.address for source in self._sources),
+        }
+        is_ring = options.ring_s is not None
+        return replace(options, source=source, settings=settings, is_ring=is_ring)
 
     # Methods for the program that runs the recorder.
 

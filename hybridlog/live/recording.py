@@ -1,10 +1,8 @@
 """Recording messages as they come, from any number of threads.
 
-`LiveRecording.write` copies a large message into its chunk at once, and queues a small
-one. A writing thread moves queued messages into chunks in batches, and closes old chunks.
-The index has the lowest priority: it waits while messages come faster than the disk
-writes, and later catches up from the segments. So the disk limits the rate, and the
-budget limits the memory: when it is used up, `write` waits.
+To take a message is to append it to a queue. A writing thread moves queued messages into
+chunks, and closes old chunks; other threads pack and write them. The budget limits the bytes
+that were taken and not written yet: when it is used up, `write` waits.
 """
 
 from __future__ import annotations
@@ -12,8 +10,8 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from operator import index as index_of
 from queue import Empty, SimpleQueue
@@ -25,15 +23,14 @@ from hybridlog.columns.table_writer import load
 from hybridlog.index.index_writer import INTERVAL_S
 from hybridlog.live.memory import MIN_USER_BUDGET, default_budget
 from hybridlog.live.policy import SMALL_BYTES
-from hybridlog.record.capture import Backpressure, Capture
+from hybridlog.record.capture import Capture
 from hybridlog.record.losses import Cause, Ledger, Loss
 from hybridlog.record.recorder import RecordReport
-from hybridlog_storage.disk.copying import COPIED_AT_ONCE
 from hybridlog_storage.errors import DatabaseError, DiskFullError, HybridlogError, UsageError
+from hybridlog_storage.mcap.mcap_content import MESSAGE_HEAD
 from hybridlog_storage.messages import Channel, LooseBatch, Schema
 from hybridlog_storage.segments.segment_format import LOSSES_METADATA, json_metadata
-from hybridlog_storage.segments.segment_writer import AT_WORK, PACKERS, SegmentSettings
-from hybridlog_storage.threads import processors
+from hybridlog_storage.segments.segment_writer import SegmentSettings
 
 if TYPE_CHECKING:
     from hybridlog.index.index_writer import IndexTarget
@@ -44,21 +41,12 @@ if TYPE_CHECKING:
     from hybridlog_storage.messages import Buffer
 
 
-_LARGE = 1 << 17  # bytes from which a payload is copied into its chunk at once
-_MAX_BATCH_BYTES = 8 << 20  # bytes of one batch: after it, writers that wait for room are notified
 _WAKE_BYTES = 4 << 20  # queued bytes that wake the writing thread: a batch has a fixed cost
 _TICK_S = 0.1  # interval of the writing thread when little comes
-_MIN_BATCH = 10  # messages per chunk: fewer cost less one by one than as a batch
 _FLUSH_AT = 0.95  # share of the flush interval after which chunks are closed
 _INDEX_INTERVALS = 4  # flush intervals between two passes of the index
 _INDEXING_S = 2.0  # time to pack, write, convert and send the documents of a chunk
-_SKIP_COMPRESSION_AT = 8 << 20  # unwritten bytes; above it only chunks that shrink a lot are packed
-_DELAY_INDEX_AT = 32 << 20  # above it the index waits
-_MAX_COPYING = 2  # threads that copy large messages at the same time
-_NO_LIMIT = nullcontext()
-_PRESSURE_HOLD_S = 1.0  # both measures last so long afterwards, or they would cause the next delay
-_LATE_S = 0.01  # a large message that waits longer for its copy starts both measures,
-_LATE_TIMES = 20  # for this multiple of its waiting time
+_BEHIND_BYTES = 64 << 20  # unwritten bytes; above it only chunks that shrink a lot are packed
 _MAX_NS = 1 << 63
 _SOURCE = {"path": "", "kind": "live", "profile": "", "bytes": 0}
 LIVE_SETTINGS = SegmentSettings(segment_size=1 << 30, segment_span_s=600.0)
@@ -72,7 +60,7 @@ class LiveOptions:
     Attributes:
         tags: Tags of the recording.
         source: Origin of the messages, as the catalog shows it.
-        budget_bytes: Payload bytes that may be in memory, not written yet.
+        budget_bytes: Bytes of messages that may be in memory, not written yet.
         flush_interval_s: Seconds after which a message is in the segment at the latest. A
             `kill -9` can cost the messages of this time.
         settings: Settings of segments and chunks; segments of 1 GiB or ten minutes.
@@ -104,21 +92,14 @@ class _Message(NamedTuple):
     payload: Buffer
 
 
-class _PressureTimer:
-    """Tells whether unwritten bytes exceed a bound, or did so a moment ago."""
+@dataclass(slots=True)
+class _Taken:
+    """What was taken of a channel: log times in ns."""
 
-    def __init__(self, bound: int) -> None:
-        self._bound = bound
-        self._high_until = 0.0
-
-    def hold(self, seconds: float) -> None:
-        """Keep the pressure high for some time, whatever is unwritten."""
-        self._high_until = max(self._high_until, time.monotonic() + seconds)
-
-    def is_high(self, unwritten: int) -> bool:
-        if unwritten > self._bound:
-            self.hold(_PRESSURE_HOLD_S)
-        return time.monotonic() < self._high_until
+    index: int
+    first: int
+    last: int = 0
+    messages: int = 0
 
 
 class LiveRecording:
@@ -155,28 +136,21 @@ class LiveRecording:
         self._small_bound = options.budget_bytes * 5 // 4
         self._on_close = on_close
         self._started = time.monotonic()
-        self._ids: dict[Channel, int] = {}
+        self._taken: dict[Channel, _Taken] = {}
         self._channels: list[Channel] = []
-        self._taken: list[int] = []  # messages, by index of the channel
-        self._first: list[int] = []  # log time of the first one
-        self._last: list[int] = []  # log time of the last one
         self._least = _MAX_NS  # log time of all
         self._inbox: deque[_Message] = deque()
-        self._inbox_bytes = 0
+        self._received = 0  # bytes of all messages, with their heads
+        self._moved = 0  # of those that are in chunks
         self._worth_waking = min(_WAKE_BYTES, options.budget_bytes // 4)
-        self._taken_bytes = 0  # taken, and not in a chunk yet
-        self._beyond = 0  # bytes of closed chunks that wait, as last counted; `write` reads it
+        self._is_tight = False  # a message found no room
         self._lock = threading.Lock()
         self._room = threading.Condition(self._lock)
-        self._laying = threading.Lock()  # guards the open chunks; taken before `_lock`
-        self._copying = threading.BoundedSemaphore(_MAX_COPYING)
         # No event: a thread that is interrupted in `set` may leave it locked forever.
         self._calls: SimpleQueue[None] = SimpleQueue()
         self._ended = False
         self._closing = threading.RLock()
         self._is_closing = False
-        self._compression_pressure = _PressureTimer(_SKIP_COMPRESSION_AT)
-        self._index_pressure = _PressureTimer(_DELAY_INDEX_AT)
         self.failure: BaseException | None = None
         """The error that stopped the recording, None while it works."""
         self._report: RecordReport | None = None
@@ -198,13 +172,9 @@ class LiveRecording:
             no_index=options.no_index,
             is_ring=options.is_ring,
             make_room=self._when_full,
-            pressure=Backpressure(
-                skip_compression=lambda: self._is_under_pressure(self._compression_pressure),
-                pause_indexing=lambda: self._is_under_pressure(self._index_pressure),
-                index_interval_s=_index_interval_s(options.flush_interval_s),
-                cpu_slots=threading.BoundedSemaphore(_idle_processors()),
-                on_written=self._make_room,
-            ),
+            skip_compression=self._is_behind,
+            on_written=self._notify,
+            index_interval_s=_index_interval_s(options.flush_interval_s),
         )
         self.id = self._capture.entry.id
         """Recording id."""
@@ -284,47 +254,38 @@ class LiveRecording:
             ) from error
         if not (0 <= now < _MAX_NS and 0 <= sent < _MAX_NS and 0 <= sequence < 1 << 32):
             raise UsageError("a time or the sequence number of a message is out of range")
-        size = len(payload)
-        # Ctrl-C may interrupt the main thread anywhere, and must not leave half a message.
-        at_once = size >= _LARGE and threading.current_thread() is not threading.main_thread()
+        bound = self._small_bound if len(payload) <= SMALL_BYTES else self._options.budget_bytes
+        size = len(payload) + MESSAGE_HEAD.itemsize
         with self._lock:
-            bound = self._small_bound if size <= SMALL_BYTES else self._options.budget_bytes
-            while (unwritten := self._taken_bytes + self._beyond) and unwritten + size > bound:
+            while (unwritten := self._unwritten) > 0 and unwritten + size > bound:
                 self._check()
+                self._is_tight = True
+                self._wake()
                 if not wait:
                     return False
-                self._wake()
                 self._room.wait()
             self._room.notify()  # there may be room for another writer
             self._check()
-            index = self._ids.get(channel) if isinstance(channel, Channel) else None
-            if index is None:
+            taken = self._taken.get(channel) if isinstance(channel, Channel) else None
+            if taken is None:
                 _check_channel(channel)
-                index = self._ids[channel] = len(self._channels)
                 self._channels.append(channel)
-                self._taken.append(0)
-                self._first.append(now)
-                self._last.append(now)
-            message = _Message(index, now, sent, sequence, payload)
-            self._taken[index] += 1
-            self._last[index] = now
+                taken = self._taken[channel] = _Taken(len(self._channels) - 1, now)
+            taken.last = now
+            taken.messages += 1
             self._least = min(self._least, now)
-            self._taken_bytes += size
-            if not at_once:
-                self._inbox.append(message)
-                self._inbox_bytes += size
-            enough = self._inbox_bytes >= self._worth_waking
-        if at_once:
-            self._append_now(message)
-        elif enough:
+            # Ctrl-C may interrupt the main thread anywhere: a message is in the queue or not.
+            self._inbox.append(_Message(taken.index, now, sent, sequence, payload))
+            self._received += size
+            enough = self._received - self._moved >= self._worth_waking
+        if enough:
             self._wake()
         return True
 
     @property
     def filled(self) -> float:
         """Used share of the memory budget, 0 to 1."""
-        # An open chunk counts once it is closed, and may then exceed the budget.
-        return min(self._unwritten() / self._options.budget_bytes, 1.0)
+        return min(max(self._unwritten, 0) / self._options.budget_bytes, 1.0)
 
     @property
     def stored(self) -> tuple[int, int]:
@@ -335,7 +296,7 @@ class LiveRecording:
     @property
     def progress(self) -> tuple[int, int]:
         """Messages taken, and those of them that are written to the disk."""
-        return sum(self._taken), self._capture.writer.written.total()
+        return sum(self.taken.values()), self._capture.writer.written.total()
 
     @property
     def sealed(self) -> int:
@@ -360,15 +321,15 @@ class LiveRecording:
     @property
     def is_empty(self) -> bool:
         """True if it has taken no message."""
-        return not any(self._taken)
+        return not self._channels
 
     @property
     def taken(self) -> Counter[str]:
         """Messages taken so far, by topic."""
         found: Counter[str] = Counter()
         with self._lock:
-            for channel, messages in zip(self._channels, self._taken, strict=True):
-                found[channel.topic] += messages
+            for channel, taken in self._taken.items():
+                found[channel.topic] += taken.messages
         return found
 
     @property
@@ -442,15 +403,13 @@ class LiveRecording:
     def _cut_off(self) -> list[dict[str, Any]]:
         """Rows of the ledger, with the messages that were taken but not written."""
         writer = self._capture.writer
-        for index, channel in enumerate(self._channels):
-            count = self._taken[index] - writer.written_of(channel)
+        for channel, taken in self._taken.items():
+            count = taken.messages - writer.written_of(channel)
             if count:
                 self.cut_off[channel.topic] += count
                 written = writer.last_time_of(channel)
                 # The clock may have been set back since.
-                first, last = sorted(
-                    (self._first[index] if written is None else written, self._last[index])
-                )
+                first, last = sorted((taken.first if written is None else written, taken.last))
                 detail = "the disk was full"
                 self.ledger.note(Loss(channel.topic, Cause.DISK, count, first, last, detail))
         return self.ledger.take(everything=True)
@@ -465,20 +424,18 @@ class LiveRecording:
             self._end()
             self._capture.rollback()
 
-    def _closed_beyond(self) -> int:
-        """Bytes of closed chunks beyond those in normal operation."""
-        usual = AT_WORK * self._options.settings.chunk_size
-        return max(self._capture.writer.waiting - usual, 0)
-
+    @property
     def _unwritten(self) -> int:
-        """Unwritten bytes: those not in chunks yet, and those of waiting chunks."""
-        return self._taken_bytes + self._closed_beyond()
+        """Bytes that were taken and are not in a file."""
+        return self._received - self._capture.writer.stored_bytes
 
-    def _make_room(self, appended: int = 0) -> None:
-        """Update the unwritten bytes: a chunk was closed or written, or bytes were copied."""
+    def _is_behind(self) -> bool:
+        most = min(self._options.budget_bytes // 4, _BEHIND_BYTES)
+        return self._unwritten > most and not self._ended
+
+    def _notify(self) -> None:
+        """There is room for another message."""
         with self._lock:
-            self._taken_bytes -= appended
-            self._beyond = self._closed_beyond()
             self._room.notify()
 
     def _when_full(self) -> bool:
@@ -495,12 +452,8 @@ class LiveRecording:
         if self._ended:
             raise UsageError(f"The recording {self.name!r} was closed.")
 
-    def _is_under_pressure(self, timer: _PressureTimer) -> bool:
-        return timer.is_high(self._unwritten()) and not self._ended
-
     def _stop(self) -> None:
-        # A message that is being copied at this moment is part of the recording.
-        with self._laying, self._lock:
+        with self._lock:
             self._ended = True
             self._room.notify_all()
         self._wake()
@@ -516,21 +469,28 @@ class LiveRecording:
                 with suppress(Empty):
                     self._calls.get(timeout=tick)
                 ended = self._ended
-                with self._laying:
-                    self._take()
-                    if ended:
-                        self._write_losses(everything=True)
-                        return
-                    now = time.monotonic()
-                    if now - flushed >= tick:
-                        # As late as possible: a chunk of a slow topic costs more than its
-                        # content. A message has waited for one tick, and waits for another.
-                        self._capture.writer.flush_older(interval * _FLUSH_AT - 2 * tick)
-                        self._make_room()
-                        flushed = now
-                    if now - reported >= interval / 4:
-                        self._write_losses()
-                        reported = now
+                self._take()
+                if ended:
+                    self._write_losses(everything=True)
+                    return
+                now = time.monotonic()
+                if now - flushed >= tick or self._is_tight:
+                    # As late as possible: a chunk of a slow topic costs more than its
+                    # content. A message has waited for one tick, and waits for another.
+                    age = interval * _FLUSH_AT - 2 * tick
+                    self._capture.writer.flush_older(age, most=self._most_open())
+                    flushed = now
+                if now - reported >= interval / 4:
+                    self._write_losses()
+                    reported = now
+
+    def _most_open(self) -> int | None:
+        """Bytes that open chunks may have: what they hold is missing in the budget."""
+        if self._is_tight:
+            self._is_tight = False
+            return 0
+        budget = self._options.budget_bytes
+        return budget // 8 if self._unwritten > budget // 4 else None
 
     @contextmanager
     def _failing(self) -> Iterator[None]:
@@ -548,76 +508,13 @@ class LiveRecording:
         if rows:
             self._capture.writer.add_extra(json_metadata(LOSSES_METADATA, {"rows": rows}))
 
-    def _append_now(self, message: _Message) -> None:
-        """Copy a message into its chunk, after the queued ones.
-
-        The thread that brings the message copies it. In a queue it would need memory of
-        its own, and new memory may be slow to get. Only a few threads copy large messages
-        at a time: many would keep the interpreter from the threads that write chunks.
-        """
-        # A small copy holds the interpreter anyway, and no other thread can run.
-        limit = self._copying if len(message.payload) >= COPIED_AT_ONCE else _NO_LIMIT
-        since = time.monotonic()
-        try:
-            with limit:
-                with self._laying:
-                    self._raise_pressure(time.monotonic() - since)
-                    self._check()
-                    with self._failing():
-                        self._take()
-                        copy = self._place(message)
-                copy()
-        except BaseException:
-            with self._lock:
-                self._taken[message.channel] -= 1
-            raise
-        finally:
-            self._make_room(len(message.payload))
-
-    def _raise_pressure(self, waited: float) -> None:
-        """Relieve processors and disk after a message has waited long for its copy."""
-        if waited > _LATE_S:
-            for timer in (self._compression_pressure, self._index_pressure):
-                timer.hold(min(_LATE_TIMES * waited, _PRESSURE_HOLD_S))
-
     def _take(self) -> None:
-        """Move queued messages into chunks; the caller holds `_laying`."""
+        """Move queued messages into chunks."""
         with self._lock:
-            inbox, size = self._inbox, self._inbox_bytes
-            self._inbox, self._inbox_bytes = deque(), 0
+            inbox, self._inbox = self._inbox, deque()
+            self._moved = self._received
         if inbox:
-            for group in [inbox] if size <= _MAX_BATCH_BYTES else _groups(inbox):
-                self._make_room(self._append_batch(group))
-
-    def _append_batch(self, group: Sequence[_Message]) -> int:
-        """Write some messages into chunks; returns their payload bytes."""
-        if len(group) >= _MIN_BATCH * self._count_chunks(group):
-            batch = _batch(group)
-            self._capture.writer.append(batch, self._channels)
-            return batch.payload_bytes
-        for message in group:
-            self._place(message)()
-        return sum(len(message.payload) for message in group)
-
-    def _count_chunks(self, group: Sequence[_Message]) -> int:
-        """Approximate number of chunks that some messages go to."""
-        channels = [self._channels[index] for index in {message.channel for message in group}]
-        return self._capture.writer.count_chunks(channels)
-
-    def _place(self, message: _Message) -> Callable[[], None]:
-        """Reserve a message's place in a chunk; the returned function copies it there."""
-        return self._capture.writer.place_one(
-            self._channels[message.channel],
-            message.payload,
-            message.log_time,
-            message.publish_time,
-            message.sequence,
-        )
-
-
-def _idle_processors() -> int:
-    """Processors for background work: one is left for incoming messages if possible."""
-    return min(PACKERS + 1, max(processors() - 1, 1))
+            self._capture.writer.append(_batch(inbox), self._channels)
 
 
 def _pinned(payload: object) -> memoryview:
@@ -666,18 +563,7 @@ def indexed_within_s(flush_interval_s: float) -> float:
     return flush_interval_s + _index_interval_s(flush_interval_s) + _INDEXING_S
 
 
-def _groups(inbox: deque[_Message]) -> Iterator[Sequence[_Message]]:
-    """Split the queue into batches, and empty it."""
-    while inbox:
-        group = [inbox.popleft()]
-        size = len(group[0].payload)
-        while inbox and size < _MAX_BATCH_BYTES:
-            group.append(inbox.popleft())
-            size += len(group[-1].payload)
-        yield group
-
-
-def _batch(messages: Sequence[_Message]) -> LooseBatch:
+def _batch(messages: deque[_Message]) -> LooseBatch:
     channel, log_time, publish_time, sequence, payloads = zip(*messages, strict=True)
     return LooseBatch(
         np.fromiter(payloads, np.object_, len(payloads)),

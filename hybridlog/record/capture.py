@@ -11,8 +11,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, replace
-from threading import BoundedSemaphore
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 from msgspec import convert
@@ -59,28 +58,6 @@ _REMOTE_SEGMENTS: Final = 64 << 20, 256 << 20
 """Least and greatest size in bytes: what a cut costs again, and what requests cost."""
 
 
-@dataclass(frozen=True, slots=True)
-class Backpressure:
-    """Settings of a live recording, which cannot wait for compression, disk and index.
-
-    Attributes:
-        skip_compression: Returns whether writing is behind. Then only chunks that shrink to a
-            fifth are compressed.
-        pause_indexing: Returns whether writing is so far behind that indexing pauses.
-        index_interval_s: Longest time between two passes of the index, seconds.
-        cpu_slots: Semaphore of the processors for packing that can wait, and for making documents
-            and tables.
-        on_written: Called on another thread when less content waits for the disk. `append`
-            then never waits; its caller watches `writer.waiting`.
-    """
-
-    skip_compression: Callable[[], bool]
-    pause_indexing: Callable[[], bool]
-    index_interval_s: float
-    cpu_slots: BoundedSemaphore
-    on_written: Callable[[], None]
-
-
 class Capture:
     """Records the messages of one new recording.
 
@@ -93,7 +70,11 @@ class Capture:
         tags: Tags of the recording.
         source: Origin of its messages, for the catalog.
         settings: Rotation, chunks and compression of segments.
-        pressure: Settings for a caller that cannot wait for compression, disk and index.
+        skip_compression: Returns whether writing is behind. Then only chunks that shrink to a
+            fifth are compressed.
+        on_written: Called on another thread when less content waits for the disk; for a caller
+            that cannot wait for it.
+        index_interval_s: Longest time between two passes of the index, seconds.
         no_index: Returns whether the messages of a topic get no documents in MongoDB; None for
             no topic.
         is_ring: Whether files of it go while it is recorded. Then nothing is derived of it, and
@@ -119,7 +100,9 @@ class Capture:
         tags: Mapping[str, str],
         source: Mapping[str, Any],
         settings: SegmentSettings,
-        pressure: Backpressure | None = None,
+        skip_compression: Callable[[], bool] | None = None,
+        on_written: Callable[[], None] | None = None,
+        index_interval_s: float = INTERVAL_S,
         no_index: Callable[[str], bool] | None = None,
         is_ring: bool = False,
         check: Callable[[Snapshot], None] | None = None,
@@ -169,9 +152,7 @@ class Capture:
             target,
             catalog,
             tables=self._tables,
-            pause_indexing=pressure.pause_indexing if pressure else lambda: False,
-            cpu_slots=pressure.cpu_slots if pressure else None,
-            interval_s=pressure.index_interval_s if pressure else INTERVAL_S,
+            interval_s=index_interval_s,
         )
         self.writer = RecordingWriter(
             folder,
@@ -184,9 +165,8 @@ class Capture:
             latched_apart=is_ring,
             on_sealing=self._announce,
             make_room=make_room,
-            skip_compression=pressure.skip_compression if pressure else None,
-            cpu_slots=pressure.cpu_slots if pressure else None,
-            on_written=pressure.on_written if pressure else None,
+            skip_compression=skip_compression,
+            on_written=on_written,
         )
 
     @property

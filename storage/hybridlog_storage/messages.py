@@ -229,7 +229,7 @@ class Batch:
 
 @dataclass(slots=True)
 class LooseBatch:
-    """Messages with a separate buffer each, to be copied once. All columns have length n.
+    """Messages with a separate buffer each, to be joined once. All columns have length n.
 
     Rows are in arrival order.
 
@@ -248,6 +248,21 @@ class LooseBatch:
     def __len__(self) -> int:
         """Number of messages."""
         return len(self.length)
+
+    @classmethod
+    def of(cls, batch: Batch) -> LooseBatch:
+        """Copies of the payloads of a batch: one of them may outlast its buffer."""
+        source = batch.buffer if isinstance(batch.buffer, bytes) else memoryview(batch.buffer)
+        places = zip(batch.offset.tolist(), batch.length.tolist(), strict=True)
+        payloads = [bytes(source[start : start + size]) for start, size in places]
+        return cls(
+            np.fromiter(payloads, np.object_, len(payloads)),
+            batch.length,
+            batch.channel,
+            batch.log_time,
+            batch.publish_time,
+            batch.sequence,
+        )
 
     def take(self, rows: NDArray[np.intp] | NDArray[np.bool_] | slice) -> LooseBatch:
         """Select rows."""

@@ -23,7 +23,7 @@ from hybridlog.cli.record_live import recorder_options
 from hybridlog.live import recorder as recorder_module
 from hybridlog.live.policy import priority_rule, throttle_rule
 from hybridlog.live.recorder import Recorder, RecorderOptions
-from hybridlog.live.recording import LiveOptions, LiveRecording
+from hybridlog.live.recording import LiveOptions
 from hybridlog.live.state import choose, read, running, summary_of
 from hybridlog.record.capture import Capture
 from hybridlog.record.losses import Cause, Loss
@@ -37,7 +37,7 @@ from hybridlog_storage.errors import (
     UsageError,
 )
 from hybridlog_storage.messages import SUPPLIED, Channel, Schema
-from hybridlog_storage.segments.segment_writer import SegmentSettings
+from hybridlog_storage.segments.segment_writer import RecordingWriter, SegmentSettings
 from tests import places
 from tests.calls import Calls
 from tests.indexed import documents_of
@@ -66,7 +66,7 @@ class Running(Recorded):
 def block_writing(calls: Calls) -> threading.Event:
     """Nothing is laid into chunks until the event is set."""
     blocked = threading.Event()
-    calls(LiveRecording, "_append_batch", lambda *_: blocked.wait())
+    calls(RecordingWriter, "append", lambda *_: blocked.wait())
     return blocked
 
 
@@ -184,7 +184,7 @@ def test_when_the_budget_is_spent_the_rest_is_counted(store: hl.Store, calls: Ca
     blocked.set()
     rows = robot.rows()
     kept = in_segments(store, robot.recorder.name)
-    assert 300 < kept["/chatter", "ros1"] < 340
+    assert 300 < kept["/chatter", "ros1"] < 330
     assert rows == {("/chatter", "queue"): 1000 - kept["/chatter", "ros1"]}
 
 
@@ -321,7 +321,7 @@ def test_a_recorder_that_writes_nothing_is_stalled(
     robot = Running(store, RecorderOptions(reserve_bytes=0, flush_interval_s=0.05))
     wait_for(lambda: not robot.recorder.look().stalled_s)
     blocked = threading.Event()
-    owner, name = LiveRecording, "_append_batch"
+    owner, name = RecordingWriter, "append"
     if place == "before the disk":
         owner, name = append_file.AppendFile, "append"
     calls(owner, name, lambda *_: blocked.wait())

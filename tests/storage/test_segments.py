@@ -26,13 +26,12 @@ from mcap.stream_reader import StreamReader
 
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk.append_file import BLOCK, AppendFile
-from hybridlog_storage.disk.copying import COPIED_AT_ONCE
 from hybridlog_storage.errors import DiskFullError, SegmentError, StoreError, UsageError
-from hybridlog_storage.messages import Batch, Buffer, Channel, LooseBatch, Schema
-from hybridlog_storage.segments import chunk_builder, segment_writer
+from hybridlog_storage.messages import Batch, Channel, LooseBatch, Schema
+from hybridlog_storage.segments import open_chunk, segment_writer
 from hybridlog_storage.segments.attachments import Attachment
 from hybridlog_storage.segments.chunk import StoredChunk
-from hybridlog_storage.segments.compression import Compressor, FilePart
+from hybridlog_storage.segments.compression import FilePart
 from hybridlog_storage.segments.recovery import Recovered, recover_segment
 from hybridlog_storage.segments.segment_check import damage_of
 from hybridlog_storage.segments.segment_file import Sealed, SegmentFile
@@ -160,10 +159,10 @@ def messages_in(path: Path) -> list[tuple[str, int, bytes]]:
     st.lists(
         st.tuples(
             st.lists(
-                st.sampled_from([0, 10, 30_000, COPIED_AT_ONCE - 1, COPIED_AT_ONCE, 3_000_000]),
+                st.sampled_from([0, 10, 30_000, 1_000_000, 3_000_000]),
                 max_size=9,
             ),
-            st.sampled_from(["a batch", "loose", "one by one"]),
+            st.sampled_from(["a batch", "loose"]),
         ),
         max_size=5,
     ),
@@ -186,19 +185,8 @@ def test_chunks_are_as_large_as_their_bound_however_messages_come(
         rows = [(0, payloads[n], n, n, n) for n in range(first, len(payloads))]
         if way == "a batch":
             writer.append(batch_of(rows), CHANNELS)
-        elif way == "loose" and rows:
+        elif rows:
             writer.append(loose(rows), CHANNELS)
-        else:
-            buffers = [*map(bytearray, payloads[first:])]
-            copies = [
-                writer.place_one(CHANNELS[0], buffer, n, n, n)
-                for n, buffer in enumerate(buffers, first)
-            ]
-            for buffer in buffers:
-                if len(buffer) < COPIED_AT_ONCE:
-                    buffer[:] = bytes(len(buffer))  # it was copied, so this changes nothing
-            for copy in reversed(copies):
-                copy()
     (path,) = writer.close()
     assert messages_in(path) == [
         (CHANNELS[0].topic, n, payload) for n, payload in enumerate(payloads)
@@ -211,79 +199,6 @@ def test_chunks_are_as_large_as_their_bound_however_messages_come(
             assert size + 31 + len(payloads[int(chunks[number + 1].seq[0])]) > bound
 
 
-@pytest.mark.parametrize(("spare", "hurried"), [(1, False), (1, True), (2, False)])
-def test_no_more_threads_pack_than_may_but_in_a_hurry(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: Limit, spare: int, hurried: bool
-) -> None:
-    is_alone = spare == 1 and not hurried
-    side_by_side = threading.Barrier(2)
-    met = []
-
-    def compress(_: object, data: Buffer, *, hurried: bool) -> tuple[str, Buffer]:
-        try:
-            side_by_side.wait(0.1 if is_alone else 30)
-        except threading.BrokenBarrierError:
-            side_by_side.reset()
-        else:
-            met.append(hurried)
-        return "", bytes(data)
-
-    monkeypatch.setattr(Compressor, "compress", compress)
-    limit(compression_turn_s=30)
-    writer = recorder(
-        tmp_path,
-        setup=SegmentSettings(chunk_size=1 << 10),
-        skip_compression=lambda: hurried,
-        cpu_slots=threading.BoundedSemaphore(spare),
-        on_written=done,
-    )
-    payloads = [bytes([n]) * 1024 for n in range(4)]
-    for n, payload in enumerate(payloads):
-        writer.place_one(CHANNELS[0], payload, n, n, n)()
-    (path,) = writer.close()
-    assert [data for _, _, data in messages_in(path)] == payloads
-    assert met == ([] if is_alone else [hurried] * 4)
-
-
-def test_packing_does_not_wait_for_who_keeps_all_processors(tmp_path: Path) -> None:
-    spare = threading.BoundedSemaphore(1)
-    with spare:  # as the index does, of which nobody knows how long it takes
-        writer = recorder(
-            tmp_path, setup=SegmentSettings(chunk_size=1 << 10), cpu_slots=spare, on_written=done
-        )
-        for n in range(4):
-            writer.place_one(CHANNELS[0], bytes([n]) * 1024, n, n, n)()
-        (path,) = writer.close()
-    assert [data[0] for _, _, data in messages_in(path)] == [0, 1, 2, 3]
-    with pytest.raises(ValueError, match="released too many"):
-        spare.release()  # it was given back as often as it was taken
-
-
-def test_what_says_little_holds_little_memory_however_large_chunks_are(tmp_path: Path) -> None:
-    """From its second chunk on, and until one is larger than those before."""
-    writer = recorder(tmp_path, setup=SegmentSettings(chunk_size=8 << 20), on_written=done)
-    payloads = []
-
-    def place(*sizes: int) -> int:
-        for size in sizes:
-            payloads.append(bytes([len(payloads) % 251]) * size)
-            n = len(payloads)
-            writer.place_one(CHANNELS[0], payloads[-1], n, n, n)()
-        (builder,) = writer._clusters.values()
-        return len(builder._buffer)
-
-    assert place(5000) == 8 << 20
-    writer.flush()
-    assert place(5000) < 100_000
-    assert place(*[5000] * 100) < 2_000_000
-    # What is copied outside of the lock needs a place that stays.
-    assert place(COPIED_AT_ONCE) == 8 << 20
-    writer.flush()
-    assert place(5000) == 8 << 20
-    (path,) = writer.close()
-    assert [data for _, _, data in messages_in(path)] == payloads
-
-
 @pytest.mark.parametrize("noise", [0.3, 0.1])
 def test_chunks_that_wait_are_stored_as_they_are_once_there_is_a_hurry(
     tmp_path: Path, noise: float
@@ -293,28 +208,30 @@ def test_chunks_that_wait_are_stored_as_they_are_once_there_is_a_hurry(
     Not so what shrinks to a fifth, which is written sooner for it.
     """
     chunks: list[StoredChunk] = []
-    hurried = False
-    writer = recorder(
-        tmp_path,
-        chunks,
-        SegmentSettings(chunk_size=COPIED_AT_ONCE),
-        skip_compression=lambda: hurried,
-        on_written=done,
-    )
-    pieces = range(COPIED_AT_ONCE >> 10)
+    hurried, go_on = False, threading.Event()
+
+    def is_hurried() -> bool:
+        go_on.wait(60)
+        return hurried
+
+    size = 1 << 20
+    setup = SegmentSettings(chunk_size=size)
+    writer = recorder(tmp_path, chunks, setup, skip_compression=is_hurried, on_written=done)
     payloads = [
-        b"".join(os.urandom(int(noise * 1024)).ljust(1024, bytes([n])) for _ in pieces)
+        b"".join(os.urandom(int(noise * 1024)).ljust(1024, bytes([n])) for _ in range(size >> 10))
         for n in range(8)
     ]
-    copies = [writer.place_one(CHANNELS[0], p, n, n, n) for n, p in enumerate(payloads)]
-    for n, copy in enumerate(copies):
+    for n, payload in enumerate(payloads):
         if n == 4:
+            go_on.set()
             while len(chunks) < 4:
                 time.sleep(0.001)
-            hurried = True
-        copy()
+            go_on.clear()
+        writer.append(loose([(0, payload, n, n, n)]), CHANNELS)
+    hurried = True
+    go_on.set()
     (path,) = writer.close()
-    shrunk = [chunk.compressed_size < len(payloads[0]) / 2 for chunk in chunks]
+    shrunk = [chunk.compressed_size < size / 2 for chunk in chunks]
     assert shrunk == [True] * 4 + [noise < 0.2] * 4
     assert [data for _, _, data in messages_in(path)] == payloads
 
@@ -349,8 +266,8 @@ def test_chunks_that_wait_are_written_together(tmp_path: Path, calls: Calls) -> 
     writer = recorder(tmp_path, chunks, setup, on_written=done)
     payloads = [bytes([n]) * 100_000 for n in range(35)]
     for n, payload in enumerate(payloads):
-        writer.place_one(CHANNELS[0], payload, n, n, n)
-    writer.place_one(CHANNELS[1], b"last", 99, 99, 99)
+        writer.append(loose([(0, payload, n, n, n)]), CHANNELS)
+    writer.append(loose([(1, b"last", 99, 99, 99)]), CHANNELS)
     while not all(future.done() for future in writer._packed):
         time.sleep(0.01)
     go_on.set()
@@ -383,15 +300,14 @@ def test_no_chunk_follows_one_that_failed(tmp_path: Path, calls: Calls) -> None:
     calls(SegmentFile, "append_chunks", full)
     writer = recorder(tmp_path, setup=SegmentSettings(chunk_size=100_000), on_written=done)
     for _ in range(50):
-        writer.place_one(CHANNELS[0], bytes(100_000), 0, 0, 0)
+        writer.append(loose([(0, bytes(100_000), 0, 0, 0)]), CHANNELS)
     failing.set()
     with pytest.raises(DiskFullError) as caught:
         writer.flush()
     # It is told of once, not once a chunk that waited, and again to who goes on.
     assert len(caught.traceback) < 20
     with pytest.raises(DiskFullError):
-        writer.place_one(CHANNELS[0], bytes(100_000), 0, 0, 0)
-    # Nobody waits for a payload that nobody copies any more.
+        writer.append(loose([(0, bytes(100_000), 0, 0, 0)]), CHANNELS)
     writer.abort()
     assert writer.written.total() == 0
 
@@ -574,7 +490,7 @@ def test_old_chunks_are_flushed_and_young_ones_are_not(
 ) -> None:
     chunks: list[StoredChunk] = []
     now = 100.0
-    for module in (chunk_builder, segment_writer):
+    for module in (open_chunk, segment_writer):
         monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: now))
     writer = recorder(tmp_path, chunks)
     writer.append(batch_of([(0, b"old", 1, 1, 1)]), CHANNELS)

@@ -100,6 +100,10 @@ class Sink(Protocol):
         ...
 
 
+class PeerError(Exception):
+    """A peer is unreachable or violates the protocol; the message names the problem."""
+
+
 class LiveSource(ABC):
     """A source of messages. Start it once; as a context manager it stops at the end.
 

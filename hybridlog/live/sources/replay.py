@@ -75,6 +75,14 @@ class ReplaySource(LiveSource):
         self._speed = speed
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
+        self._source: Source
+        self._sink: Sink
+        self._is_late = False
+        self._publishers: Counter[str] = Counter()
+        self._channels: list[Channel | None] = []
+        self._told = 0  # damaged places
+        self._failure = ""
+        self._waited_for = -1
 
     def check(self) -> None:
         """Check that the log can be opened.
@@ -90,9 +98,8 @@ class ReplaySource(LiveSource):
         Raises:
             SourceError: The file is not a readable log.
         """
-        source = open_source(self._path)
-        player = _Player(source, sink, self.address, self._speed, self._stop)
-        self._thread = threading.Thread(target=player.run, name="hybridlog-replay", daemon=True)
+        self._source, self._sink = open_source(self._path), sink
+        self._thread = threading.Thread(target=self._run, name="hybridlog-replay", daemon=True)
         self._thread.start()
 
     def stop(self) -> None:
@@ -101,41 +108,14 @@ class ReplaySource(LiveSource):
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join(_JOIN_S)
 
-
-class _Player:
-    """Reads a log, and sends its messages when they are due.
-
-    Args:
-        source: The log.
-        sink: Takes the messages.
-        name: Name of the log for messages to the user.
-        speed: Seconds of the log per second.
-        stop: Set to stop playing.
-    """
-
-    def __init__(
-        self, source: Source, sink: Sink, name: str, speed: float, stop: threading.Event
-    ) -> None:
-        self._source = source
-        self._sink = sink
-        self._name = name
-        self._speed = speed
-        self._stop = stop
-        self._is_late = False
-        self._publishers: Counter[str] = Counter()
-        self._channels: list[Channel | None] = []
-        self._told = 0  # damaged places
-        self._failure = ""
-        self._waited_for = -1
-
-    def run(self) -> None:
+    def _run(self) -> None:
         """Play the log to its end, or until it is stopped."""
         try:
             with self._source:
                 self._play()
         except BaseException as error:
             if not self._stop.is_set():
-                self._sink.ended(f"{self._name}: playing failed ({error!r})")
+                self._sink.ended(f"{self.address}: playing failed ({error!r})")
             raise
         if not self._stop.is_set():
             for topic in self._publishers:
@@ -144,7 +124,7 @@ class _Player:
 
     def _play(self) -> None:
         start, first, newest = time.monotonic(), None, 0
-        for message in self.messages():
+        for message in self._messages():
             if first is None:
                 start, first = time.monotonic(), message.log_time
             due = start + (message.log_time - first) / (1e9 * self._speed)
@@ -159,7 +139,7 @@ class _Player:
             if self._stop.is_set():
                 return
 
-    def messages(self) -> Iterator[_Message]:
+    def _messages(self) -> Iterator[_Message]:
         """The messages in the order of log time, as far as one looks ahead."""
         waiting: list[_Message] = []
         places = count()
@@ -233,7 +213,7 @@ class _Player:
         if pause > _LONG_S and moment != self._waited_for:
             self._waited_for = moment
             self._sink.say(
-                f"{self._name}: the log has no message until {moment / 1e9:.3f} s since the "
+                f"{self.address}: the log has no message until {moment / 1e9:.3f} s since the "
                 f"epoch; that takes {pause:.0f} s, less at a higher speed"
             )
         return self._stop.wait(min(max(pause, _MIN_PAUSE_S), _MAX_PAUSE_S))
@@ -242,7 +222,7 @@ class _Player:
         if behind > _LATE_S and not self._is_late:
             self._is_late = True
             self._sink.say(
-                f"{self._name}: cannot be played at speed {self._speed:g}, messages are "
+                f"{self.address}: cannot be played at speed {self._speed:g}, messages are "
                 f"{behind:.1f} s late; none is skipped, but a lower speed keeps their timing"
             )
 

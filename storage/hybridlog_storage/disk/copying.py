@@ -8,18 +8,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hybridlog_storage.messages import Batch, Buffer, Left, LooseBatch
+from hybridlog_storage.messages import Batch, Buffer, Left
 from hybridlog_storage.ordering import distinct
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-
-COPIED_AT_ONCE = 1 << 20
-"""Bytes below which a new payload is copied without releasing the interpreter lock.
-
-The copy takes a tenth of a millisecond, or two. After a release, getting the lock back
-from a computing thread takes five milliseconds.
-"""
 
 _SLICE_FROM = 2048  # mean payload bytes from which one slice copy per message is cheapest
 
@@ -31,13 +24,8 @@ def windows(buffer: Buffer, width: int) -> NDArray[np.void]:
     )
 
 
-def copy_payloads(
-    batch: Batch | LooseBatch, target: bytearray | memoryview, starts: NDArray[np.int64]
-) -> None:
+def copy_payloads(batch: Batch, target: bytearray | memoryview, starts: NDArray[np.int64]) -> None:
     """Copy each payload of a batch to its position in a large enough buffer."""
-    if isinstance(batch, LooseBatch):
-        _copy_loose(batch, target, starts)
-        return
     if batch.payload_bytes >= _SLICE_FROM * len(batch):
         # numpy copies between arrays without the interpreter lock.
         source = np.frombuffer(batch.buffer, np.uint8)
@@ -52,18 +40,6 @@ def copy_payloads(
         rows = slice(None) if len(lengths) == 1 else batch.length == length
         places = windows(target, length)
         places[starts[rows]] = windows(batch.buffer, length)[batch.offset[rows]]
-
-
-def _copy_loose(
-    batch: LooseBatch, target: bytearray | memoryview, starts: NDArray[np.int64]
-) -> None:
-    for to, size, payload in zip(
-        starts.tolist(), batch.length.tolist(), batch.payloads.tolist(), strict=True
-    ):
-        if size < COPIED_AT_ONCE:
-            target[to : to + size] = payload
-        else:
-            np.frombuffer(target, np.uint8, size, to)[:] = np.frombuffer(payload, np.uint8)
 
 
 def joined(batches: Sequence[Batch]) -> Batch:

@@ -30,7 +30,6 @@ class PackedChunk:
     Attributes:
         batch: Its messages over the uncompressed content; `channel` holds channel ids.
         seq: int64[n], arrival numbers.
-        uncompressed_size: Bytes of content.
         head: The chunk record up to the compressed content.
         data: The compressed content.
         head_crc: CRC-32 of the head.
@@ -42,7 +41,6 @@ class PackedChunk:
 
     batch: Batch
     seq: NDArray[np.int64]
-    uncompressed_size: int
     head: bytes
     data: Buffer
     head_crc: int
@@ -56,7 +54,6 @@ def pack(
     compressor: Compressor,
     batch: Batch,
     seq: NDArray[np.int64],
-    size: int,
     *,
     hurried: bool = False,
 ) -> PackedChunk:
@@ -67,7 +64,7 @@ def pack(
     head = chunk_head(
         first=first,
         last=last,
-        uncompressed_size=size,
+        uncompressed_size=len(batch.buffer),
         crc=crc32(batch.buffer),
         compression=compression,
         compressed_size=len(data),
@@ -80,7 +77,6 @@ def pack(
     return PackedChunk(
         batch=batch,
         seq=seq,
-        uncompressed_size=size,
         head=head,
         data=data,
         head_crc=crc32(head),

@@ -11,13 +11,11 @@ from __future__ import annotations
 
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
-from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from threading import BoundedSemaphore, Lock
 from typing import TYPE_CHECKING, Literal, TypeVar
 
 import numpy as np
@@ -25,11 +23,11 @@ from mcap.records import Metadata
 
 from hybridlog_storage.errors import DiskFullError, StoreError, UsageError
 from hybridlog_storage.mcap.mcap_content import MESSAGE_HEAD
-from hybridlog_storage.messages import MAX_CHANNELS, Batch, Buffer, Channel, LooseBatch, Schema
+from hybridlog_storage.messages import MAX_CHANNELS, Batch, Channel, LooseBatch, Schema
 from hybridlog_storage.segments.attachments import Attachment
 from hybridlog_storage.segments.chunk import PackedChunk, StoredChunk, pack
-from hybridlog_storage.segments.chunk_builder import ChunkBuilder
 from hybridlog_storage.segments.compression import Compressor
+from hybridlog_storage.segments.open_chunk import OpenChunk
 from hybridlog_storage.segments.segment_file import Sealed, SegmentFile
 from hybridlog_storage.segments.segment_format import (
     END_METADATA,
@@ -42,15 +40,12 @@ from hybridlog_storage.stopping import safe_point
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    _Count = TypeVar("_Count", int, NDArray[np.int64])
     _Done = TypeVar("_Done")
 from hybridlog_storage.threads import Threads
 
-PACKERS = 2
-"""Threads that pack chunks."""
+_PACKERS = 2
 AT_WORK = 8
 """Closed chunks that may be in work before the writer counts as late."""
-_TURN_S = 0.1  # seconds: longest wait of a chunk before it is packed
 _SHARED = -1
 _LATCHED = -2
 _MAX_SPAN = 3600 * 10**9  # ns
@@ -130,10 +125,8 @@ class RecordingWriter:
         settings: How to divide and compress.
         skip_compression: Returns whether to compress only chunks that shrink to a fifth or
             less; None for never.
-        cpu_slots: Semaphore of the processors for work that can wait. Packing a chunk takes one
-            if there is no skip_compression, and waits for it a tenth of a second at most.
         on_written: Called on a writer thread when less content is waiting. With it `append`
-            never waits for the disk, and the caller watches `waiting`. Without it `append`
+            never waits for the disk, and the caller watches `stored_bytes`. Without it `append`
             waits for a slow disk.
         no_index: Returns whether the messages of a topic get no documents in MongoDB; None
             for no topic. The segments keep that.
@@ -156,7 +149,6 @@ class RecordingWriter:
         settings: SegmentSettings | None = None,
         *,
         skip_compression: Callable[[], bool] | None = None,
-        cpu_slots: BoundedSemaphore | None = None,
         on_written: Callable[[], None] | None = None,
         no_index: Callable[[str], bool] | None = None,
         is_named: Callable[[str], bool] | None = None,
@@ -170,20 +162,21 @@ class RecordingWriter:
         self.channels: dict[int, Channel] = {}
         self.written: Counter[int] = Counter()
         """Number of messages in the files, by channel id."""
+        self.stored_bytes = 0
+        """Bytes of content in the files, before compression."""
         self._last_times: dict[int, int] = {}  # in the files, by channel id
         self._directory = directory
         self._recording = recording
         self._on_chunk = on_chunk
         self._known: dict[Channel, _Known] = {}
         self._schema_ids: dict[Schema, int] = {}
-        self._clusters: dict[int, ChunkBuilder] = {}
+        self._clusters: dict[int, OpenChunk] = {}
         self._latched: set[int] = set()  # ids of channels whose messages lie apart
         self._movable: set[int] = set()  # ids of channels that need not be in the first segment
         self._compressor = Compressor(self.settings.compression, self.settings.level)
-        self._pool = Threads(PACKERS, "hybridlog-pack")
+        self._pool = Threads(_PACKERS, "hybridlog-pack")
         self._disk = Threads(1, "hybridlog-disk")
         self._skip_compression = skip_compression or (lambda: False)
-        self._cpu_slots = cpu_slots or BoundedSemaphore(PACKERS)
         self._on_written = on_written
         self._no_index = no_index or (lambda _: False)
         self._latched_apart = latched_apart
@@ -192,8 +185,6 @@ class RecordingWriter:
         self._make_room = make_room
         large, own = self.settings.large_payload, self.settings.own_payload
         self._division = Division(own, large, is_named or (lambda _: False))
-        self._closed_bytes = 0
-        self._stored_bytes = 0
         self._packed: deque[Future[PackedChunk]] = deque()  # in file order
         self._storing: deque[Future[None]] = deque()
         self._extras: list[Metadata | Attachment] = []  # not in a segment yet
@@ -204,11 +195,6 @@ class RecordingWriter:
         self._closed: list[Path] = []
         self._synced = 0
         self._syncing: Future[None] | None = None
-
-    @property
-    def waiting(self) -> int:
-        """Bytes of content in closed chunks that are not in the file yet."""
-        return self._closed_bytes - self._stored_bytes
 
     def append(self, batch: Batch | LooseBatch, channels: Sequence[Channel]) -> None:
         """Append a batch; `batch.channel` indexes `channels`.
@@ -230,7 +216,8 @@ class RecordingWriter:
                 channel, float(sizes[index] / counts[index])
             )
             ids[index], cluster[index] = known.channel_id, known.cluster
-        own = replace(batch, channel=ids[batch.channel])
+        loose = batch if isinstance(batch, LooseBatch) else LooseBatch.of(batch)
+        own = replace(loose, channel=ids[batch.channel])
         clusters = sorted({int(cluster[index]) for index in present})
         if len(clusters) == 1:
             self._fill(clusters[0], own, seq)
@@ -242,53 +229,6 @@ class RecordingWriter:
         self.totals.messages += len(batch)
         self.totals.payload_bytes += batch.payload_bytes
         self._limit_queue(limit=4)
-
-    def place_one(
-        self, channel: Channel, payload: Buffer, log_time: int, publish_time: int, sequence: int
-    ) -> Callable[[], None]:
-        """Append one message; for large payloads this costs less than a batch.
-
-        Returns:
-            A function that copies the payload, unless it was copied at once (below
-            `COPIED_AT_ONCE`). Call it once, on any thread, also while others append; the
-            message's chunk is not written before.
-
-        Raises:
-                DiskFullError: No space; flushed chunks stay.
-        """
-        known = self._known.get(channel) or self._meet(channel, len(payload))
-        key = known.cluster
-        builder = self._builder(key)
-        if len(builder):
-            size = len(builder) + MESSAGE_HEAD.itemsize + len(payload)
-            away = abs(log_time - builder.first_log_time)
-            is_far = away >= self._span_of(len(builder))
-            if (key != _SHARED and is_far) or size > builder.capacity:
-                self._close_chunk(key)
-                builder = self._builder(key)
-        copy = builder.place_one(
-            payload,
-            channel=known.channel_id,
-            log_time=log_time,
-            publish_time=publish_time,
-            sequence=sequence,
-            seq=self._next_seq,
-        )
-        self._next_seq += 1
-        self.totals.messages += 1
-        self.totals.payload_bytes += len(payload)
-        if len(builder) >= builder.capacity:
-            try:
-                self._close_chunk(key)
-            except BaseException:
-                copy()  # or packing the chunk would wait for ever
-                raise
-        return copy
-
-    def count_chunks(self, channels: Iterable[Channel]) -> int:
-        """Number of open chunks with messages of some channels; a new channel counts as one."""
-        known = self._known
-        return len({known[c].cluster if c in known else c for c in channels})
 
     def declare(self, channel: Channel) -> None:
         """Store a channel even if it has no message."""
@@ -307,11 +247,23 @@ class RecordingWriter:
             self._close_chunk(key)
         self._drain(limit=0)
 
-    def flush_older(self, seconds: float) -> None:
-        """Close chunks of at least this age, and write packed chunks."""
+    def flush_older(self, seconds: float, *, most: int | None = None) -> None:
+        """Close chunks of at least this age, then large ones; write packed chunks.
+
+        Args:
+            seconds: Their age.
+            most: Bytes that may remain in open chunks; None for any number.
+        """
         limit = time.monotonic() - seconds
-        for key, builder in self._clusters.items():
-            if builder.opened <= limit:
+        for key, chunk in [*self._clusters.items()]:
+            if chunk.opened <= limit:
+                self._close_chunk(key)
+        if most is not None:
+            left = sum(chunk.size for chunk in self._clusters.values())
+            for key, chunk in sorted(self._clusters.items(), key=lambda one: -one[1].size):
+                if left <= most:
+                    break
+                left -= chunk.size
                 self._close_chunk(key)
         self._limit_queue(limit=4)
 
@@ -395,60 +347,43 @@ class RecordingWriter:
         self.channels[channel_id] = channel
         return known
 
-    def _builder(self, key: int) -> ChunkBuilder:
-        """The open chunk of a cluster."""
-        builder = self._clusters.get(key)
-        if builder is None:
-            builder = self._clusters[key] = ChunkBuilder(self.settings.chunk_size)
-        return builder
-
-    def _fill(self, key: int, batch: Batch | LooseBatch, seq: NDArray[np.int64]) -> None:
+    def _fill(self, key: int, batch: LooseBatch, seq: NDArray[np.int64]) -> None:
         """Append messages to a cluster's chunk, closing chunks at their bounds."""
         sizes = np.cumsum(batch.length + MESSAGE_HEAD.itemsize)
-        start, total = 0, len(batch)
+        start, total, capacity = 0, len(batch), self.settings.chunk_size
         while start < total:
-            builder = self._builder(key)
+            chunk = self._clusters.get(key)
+            held = 0 if chunk is None else chunk.size
             before = int(sizes[start - 1]) if start else 0
-            room = builder.capacity - len(builder)
-            end = int(np.searchsorted(sizes, before + room, side="right"))
-            if not len(builder):
+            end = int(np.searchsorted(sizes, before + capacity - held, side="right"))
+            if chunk is None:
+                chunk = self._clusters[key] = OpenChunk(int(batch.log_time[start]))
                 end = max(end, start + 1)  # a message larger than a chunk is a chunk of its own
             if key != _SHARED:
-                end = min(end, self._span_end(builder, batch, start))
+                end = min(end, self._span_end(chunk, batch, start))
             if end > start:
                 rows = slice(start, end)
-                builder.append(batch.take(rows), seq[rows])
+                chunk.append(batch.take(rows), seq[rows])
                 start = end
-            if start < total or len(builder) >= builder.capacity:
+            if start < total or chunk.size >= capacity:
                 self._close_chunk(key)
 
-    def _span_of(self, held: _Count) -> _Count:
-        """Longest log time, ns, of a chunk of one channel that holds so many bytes."""
-        is_small = held < self.settings.span_size
-        return self.settings.chunk_span_ns * (1 + (_SMALL_SPANS - 1) * is_small)
-
-    def _span_end(self, builder: ChunkBuilder, batch: Batch | LooseBatch, start: int) -> int:
+    def _span_end(self, chunk: OpenChunk, batch: LooseBatch, start: int) -> int:
         """First row from `start` on whose log time is too far from the chunk's first."""
-        log_time = batch.log_time[start:]
-        first = builder.first_log_time if len(builder) else int(log_time[0])
-        away = np.abs(log_time - first)
-        if int(away.max()) < self.settings.chunk_span_ns:
+        span = self.settings.chunk_span_ns
+        away = np.abs(batch.log_time[start:] - chunk.first_log_time)
+        if int(away.max()) < span:
             return len(batch)
         sizes = batch.length[start:] + MESSAGE_HEAD.itemsize
-        held = np.cumsum(sizes) - sizes + len(builder)
-        far = away >= self._span_of(held)
+        is_small = np.cumsum(sizes) - sizes + chunk.size < self.settings.span_size
+        far = away >= span * (1 + (_SMALL_SPANS - 1) * is_small)
         return start + int(far.argmax()) if far.any() else len(batch)
 
     def _close_chunk(self, key: int) -> None:
-        builder = self._clusters[key]
-        if len(builder):
-            copying = builder.copying
-            batch, seq, size = builder.take()
-            self._closed_bytes += size
-            packed = self._pool.submit(self._pack, copying, batch, seq, size)
-            self._packed.append(packed)
-            self._storing.append(self._disk.submit(self._store, packed))
-            self._limit_queue(limit=AT_WORK)
+        packed = self._pool.submit(self._pack, self._clusters.pop(key))
+        self._packed.append(packed)
+        self._storing.append(self._disk.submit(self._store, packed))
+        self._limit_queue(limit=AT_WORK)
 
     def _limit_queue(self, limit: int) -> None:
         """Wait as `_drain` does, or with `on_written` only raise a failure."""
@@ -462,28 +397,10 @@ class RecordingWriter:
         if self._broken is not None:
             raise self._broken
 
-    def _pack(
-        self, copying: Sequence[Lock], batch: Batch, seq: NDArray[np.int64], size: int
-    ) -> PackedChunk:
-        """Pack a chunk once all payloads are copied, which takes microseconds."""
-        for lock in copying:
-            lock.acquire()
-        # Checked here: topics of equal rate close their chunks at the same time, and the
-        # skip_compression shows only when most of these are waiting.
-        hurried = self._skip_compression()
-        with nullcontext() if hurried else self._turn():
-            hurried = hurried or self._skip_compression()
-            return pack(self._compressor, batch, seq, size, hurried=hurried)
-
-    @contextmanager
-    def _turn(self) -> Iterator[None]:
-        """Hold a spare processor, if one is free soon."""
-        has_one = self._cpu_slots.acquire(timeout=_TURN_S)
-        try:
-            yield
-        finally:
-            if has_one:
-                self._cpu_slots.release()
+    def _pack(self, chunk: OpenChunk) -> PackedChunk:
+        batch, seq = chunk.laid_out()
+        # Asked now: topics of equal rate close their chunks at the same time.
+        return pack(self._compressor, batch, seq, hurried=self._skip_compression())
 
     # The methods below run on the writing thread only.
 
@@ -614,7 +531,7 @@ class RecordingWriter:
             self.written[channel_id] += messages
             self._last_times[channel_id] = last
         self._on_chunk(stored, self.channels)
-        self._stored_bytes += chunk.uncompressed_size
+        self.stored_bytes += len(chunk.batch.buffer)
         if self._on_written is not None:
             self._on_written()
 

@@ -191,7 +191,7 @@ def test_nothing_comes_before_its_time(
 def test_many_small_messages_do_not_cost_a_pause_each(tmp_path: Path, calls: Calls) -> None:
     count = 5000
     path = write(tmp_path / "a.mcap", [("/a", BEGIN + at * 100_000, b"") for at in range(count)])
-    pauses = calls(replay._Player, "_pause")
+    pauses = calls(ReplaySource, "_pause")
     heard = Heard()
     play(path, heard, speed=1.0)
     assert len(heard.taken) == count
@@ -211,8 +211,9 @@ def test_looking_ahead_is_bounded_and_loses_nothing(tmp_path: Path, limit: Limit
     times.append(5_000_000)
     size = {time: dice.choice([20, 50]) for time in times} | {5_000_000: 20_000}
     path = write(tmp_path / "a.mcap", [("/a", at + 5, bytes(size[at])) for at in times])
+    player = ReplaySource(path)
     with open_source(path) as source:
-        player = replay._Player(source, Heard(), "log", 1.0, threading.Event())
+        player._source, player._sink = source, Heard()
         read, batches = 0, source.batches
 
         def counted() -> Iterator[Batch]:
@@ -223,7 +224,7 @@ def test_looking_ahead_is_bounded_and_loses_nothing(tmp_path: Path, limit: Limit
 
         source.batches = counted  # type: ignore[method-assign]
         numbers, sent = [], 0
-        for message in player.messages():
+        for message in player._messages():
             assert read - sent < 10_000 + 20_000 + 1000
             sent += len(message.payload)
             numbers.append(message.log_time - 5)

@@ -12,14 +12,14 @@ import warnings
 
 import pytest
 
-from hybridlog.live.sources.base import Cause, one_line
+from hybridlog.live.sources.base import Cause, PeerError, one_line
+from hybridlog.live.sources.network import endpoint_of
 from hybridlog.live.sources.ros1.handshake import (
     WireError,
     channel_of,
     decode_header,
     encode_header,
 )
-from hybridlog.live.sources.ros1.network import PeerError, endpoint_of
 from hybridlog.live.sources.ros1.rpc import RpcServer
 from hybridlog.live.sources.ros1.stream import Stream
 from hybridlog.live.sources.sequence_gaps import has_sequence_numbers

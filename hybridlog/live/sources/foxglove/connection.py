@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import os
 import socket
 import ssl
 import threading
@@ -23,9 +22,10 @@ from picows import (
     ws_connect,
 )
 
-from hybridlog.live.sources.base import Cause, Loss, Sink
-from hybridlog.live.sources.foxglove.protocol import Address, PeerError
+from hybridlog.live.sources.base import Cause, Loss, PeerError, Sink
+from hybridlog.live.sources.foxglove.protocol import Address
 from hybridlog.live.sources.foxglove.session import Notifier, Session
+from hybridlog.live.sources.network import Endpoint, Network, reason_of
 
 _TICK_S: Final = 0.25  # interval at which a silent connection checks whether to stop
 _OPEN_S: Final = 10.0
@@ -134,8 +134,10 @@ class Client:
         Raises:
             PeerError: The connection failed; the message names reason and remedy.
         """
+        place = Endpoint(self._address.host, self._address.port)
         try:
-            transport, listener = await self._shake_hands(await self._reach(), session)
+            made = await Network().connect(place)
+            transport, listener = await self._shake_hands(made, session)
         except WSHandshakeError as error:
             raise PeerError(_refusal(error)) from error
         except ssl.SSLCertVerificationError as error:
@@ -147,6 +149,9 @@ class Client:
             raise PeerError(
                 f"does not speak TLS ({error.reason or error}); try ws:// instead of wss://"
             ) from error
+        except socket.gaierror as error:
+            reason = f"host {place.host!r} is unknown ({error.strerror}); check its spelling"
+            raise PeerError(reason) from error
         except OSError as error:
             raise PeerError(_reason_of(error)) from error
         if listener is None:
@@ -182,29 +187,6 @@ class Client:
             made.close()
             raise
 
-    async def _reach(self) -> socket.socket:
-        host = self._address.host
-        try:
-            found = socket.getaddrinfo(host, self._address.port, type=socket.SOCK_STREAM)
-        except (socket.gaierror, UnicodeError) as error:
-            reason = error.strerror if isinstance(error, OSError) else "not a host name"
-            raise PeerError(f"host {host!r} is unknown ({reason}); check its spelling") from error
-        last: OSError = ConnectionRefusedError()
-        for family, kind, protocol, _, place in found:
-            made = socket.socket(family, kind, protocol)
-            made.setblocking(False)
-            try:
-                await asyncio.get_running_loop().sock_connect(made, place)
-            except OSError as error:
-                made.close()
-                last = error
-            except BaseException:
-                made.close()
-                raise
-            else:
-                return made
-        raise last
-
 
 _NO_WEBSOCKET = "not a websocket server; check the port (foxglove_bridge uses 8765)"
 
@@ -231,4 +213,4 @@ def _reason_of(error: OSError) -> str:
         return "refuses connections; start foxglove_bridge or the program, or correct the port"
     if isinstance(error, ConnectionResetError | BrokenPipeError):
         return "the connection broke"
-    return f"cannot be reached ({os.strerror(error.errno) if error.errno else error})"
+    return f"cannot be reached ({reason_of(error)})"

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from typing import Final, NamedTuple, TypeGuard
 from urllib.parse import unquote, urlsplit
 
-from hybridlog.live.sources.base import one_line
+from hybridlog.live.sources.base import PeerError, one_line
 from hybridlog_storage.errors import UsageError
 from hybridlog_storage.messages import Channel, Schema
 
@@ -38,10 +38,6 @@ _MAX_ID = 1 << 64
 _MAX_SHOWN = 200  # characters of an address that are shown
 _REMEDY = "give an address like ws://robot:8765"
 _PORTS = {"ws": 80, "wss": 443}
-
-
-class PeerError(Exception):
-    """The server is unreachable or violates the protocol; the message is for the user."""
 
 
 class Address(NamedTuple):

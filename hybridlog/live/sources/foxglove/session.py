@@ -15,14 +15,13 @@ from typing import Final
 
 from picows import WSCloseCode, WSFrame, WSListener, WSMsgType, WSTransport
 
-from hybridlog.live.sources.base import Cause, Loss, Sink, one_line
+from hybridlog.live.sources.base import Cause, Loss, PeerError, Sink, one_line
 from hybridlog.live.sources.foxglove.protocol import (
     MAX_TEXT,
     MESSAGE_DATA,
     SUBPROTOCOLS,
     TIME,
     Offer,
-    PeerError,
     parse_channel,
     parse_text,
 )

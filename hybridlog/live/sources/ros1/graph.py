@@ -15,16 +15,15 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
 import msgspec
 
-from hybridlog.live.sources.base import one_line
+from hybridlog.live.sources.base import PeerError, one_line
 from hybridlog.live.sources.ros1.handshake import ANY
-from hybridlog.live.sources.ros1.network import PeerError
 from hybridlog.live.sources.ros1.rpc import RefusedError, call
 from hybridlog.live.sources.ros1.subscription import Subscription
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Iterable
 
-    from hybridlog.live.sources.ros1.network import Network
+    from hybridlog.live.sources.network import Network
     from hybridlog.live.sources.ros1.subscription import Context
 
 _Item = TypeVar("_Item")

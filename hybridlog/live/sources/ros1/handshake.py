@@ -14,15 +14,8 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 import msgspec
 
-from hybridlog.live.sources.base import one_line
-from hybridlog.live.sources.ros1.network import (
-    PATIENCE_S,
-    Endpoint,
-    Network,
-    PeerError,
-    UnreachedError,
-    reason_of,
-)
+from hybridlog.live.sources.base import PeerError, one_line
+from hybridlog.live.sources.network import PATIENCE_S, Endpoint, Network, UnreachedError, reason_of
 from hybridlog.live.sources.ros1.rpc import call
 from hybridlog_storage.messages import Channel, Schema
 

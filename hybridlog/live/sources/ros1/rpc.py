@@ -15,12 +15,11 @@ from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import urlsplit
 from xml.parsers.expat import ExpatError
 
-from hybridlog.live.sources.base import one_line
-from hybridlog.live.sources.ros1.network import (
+from hybridlog.live.sources.base import PeerError, one_line
+from hybridlog.live.sources.network import (
     PATIENCE_S,
     Endpoint,
     Network,
-    PeerError,
     UnreachedError,
     endpoint_of,
     reason_of,

@@ -7,12 +7,12 @@ import socket
 from typing import TYPE_CHECKING, Final
 
 from hybridlog.live.sources.base import one_line
-from hybridlog.live.sources.ros1.network import Endpoint, reason_of
+from hybridlog.live.sources.network import Endpoint, reason_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from hybridlog.live.sources.ros1.network import Addresses, Network
+    from hybridlog.live.sources.network import Addresses, Network
     from hybridlog.live.sources.ros1.rpc import Method
 
 _BACKLOG: Final = 64

@@ -12,9 +12,9 @@ import secrets
 import threading
 from typing import TYPE_CHECKING, Final
 
-from hybridlog.live.sources.base import LiveSource, one_line
+from hybridlog.live.sources.base import LiveSource, PeerError, one_line
+from hybridlog.live.sources.network import Endpoint, Network, endpoint_of
 from hybridlog.live.sources.ros1.graph import Graph, Master
-from hybridlog.live.sources.ros1.network import Endpoint, Network, PeerError, endpoint_of
 from hybridlog.live.sources.ros1.reader import Reader
 from hybridlog.live.sources.ros1.rpc import RpcServer
 from hybridlog.live.sources.ros1.slave import listen, methods, uri_of
@@ -111,15 +111,16 @@ class Ros1Source(LiveSource):
     def _run(self, sink: Sink, uri: str) -> None:
         """The thread of the event loop."""
         try:
-            asyncio.run(self._main(sink, uri))
+            asyncio.run(self._follow(sink, uri))
         except BaseException as error:
             sink.ended(f"the ROS 1 source failed: {one_line(repr(error))}")
             raise
 
-    async def _main(self, sink: Sink, uri: str) -> None:
-        """Makes `end` callable from any thread until the source has ended."""
+    async def _follow(self, sink: Sink, uri: str) -> None:
+        """Runs all tasks until the source is stopped or one of them fails."""
         loop = asyncio.get_running_loop()
         over: asyncio.Future[None] = loop.create_future()
+        tasks: set[asyncio.Task[None]] = set()
 
         def settle(error: BaseException | None) -> None:
             if over.done():
@@ -132,27 +133,6 @@ class Ros1Source(LiveSource):
         def end(error: BaseException | None) -> None:
             loop.call_soon_threadsafe(settle, error)
 
-        with self._lock:
-            if self._is_stopped:
-                return
-            self._end = end
-        try:
-            await self._follow(sink, uri, over, end)
-        finally:
-            with self._lock:
-                self._end = None
-
-    async def _follow(
-        self,
-        sink: Sink,
-        uri: str,
-        over: asyncio.Future[None],
-        end: Callable[[BaseException | None], None],
-    ) -> None:
-        """Runs all tasks until the source is stopped or one of them fails."""
-        loop = asyncio.get_running_loop()
-        tasks: set[asyncio.Task[None]] = set()
-
         def finished(task: asyncio.Task[None]) -> None:
             tasks.discard(task)
             if not task.cancelled() and (error := task.exception()) is not None:
@@ -163,26 +143,34 @@ class Ros1Source(LiveSource):
             tasks.add(task)
             task.add_done_callback(finished)
 
-        network = Network()
-        listening, host = await listen(network, os.environ, sink.say)
-        master = Master(network, uri, self.caller, uri_of(host, listening))
-        graph = Graph(master, uri, self._poll_s, self._reached)
-        server = RpcServer(listening, methods(uri, graph.topics, graph.hint, sink.say))
-        reader = Reader(end)
-        context = Context(
-            *(network, self.caller, sink, reader, self._max_message_bytes),
-            *(spawn, graph.hint),
-        )
-        reader.start()
+        with self._lock:
+            if self._is_stopped:
+                return
+            self._end = end
         try:
-            spawn(server.serve())
-            spawn(graph.watch(context))
-            await over
+            network = Network()
+            listening, host = await listen(network, os.environ, sink.say)
+            master = Master(network, uri, self.caller, uri_of(host, listening))
+            graph = Graph(master, uri, self._poll_s, self._reached)
+            server = RpcServer(listening, methods(uri, graph.topics, graph.hint, sink.say))
+            reader = Reader(end)
+            context = Context(
+                *(network, self.caller, sink, reader, self._max_message_bytes),
+                *(spawn, graph.hint),
+            )
+            reader.start()
+            try:
+                spawn(server.serve())
+                spawn(graph.watch(context))
+                await over
+            finally:
+                while tasks:
+                    for task in tuple(tasks):
+                        task.cancel()
+                    await asyncio.wait(tuple(tasks), timeout=1)
+                listening.close()
+                reader.stop()
+                await graph.farewell()
         finally:
-            while tasks:
-                for task in tuple(tasks):
-                    task.cancel()
-                await asyncio.wait(tuple(tasks), timeout=1)
-            listening.close()
-            reader.stop()
-            await graph.farewell()
+            with self._lock:
+                self._end = None

@@ -7,9 +7,9 @@ import contextlib
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from hybridlog.live.sources.base import one_line
+from hybridlog.live.sources.base import PeerError, one_line
+from hybridlog.live.sources.network import UnreachedError, reason_of
 from hybridlog.live.sources.ros1.handshake import ANY, channel_of, subscribe
-from hybridlog.live.sources.ros1.network import PeerError, UnreachedError, reason_of
 from hybridlog.live.sources.ros1.stream import Stream
 
 if TYPE_CHECKING:
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Iterable, Mapping
 
     from hybridlog.live.sources.base import Sink
-    from hybridlog.live.sources.ros1.network import Network
+    from hybridlog.live.sources.network import Network
     from hybridlog.live.sources.ros1.reader import Reader
     from hybridlog_storage.messages import Channel
 

@@ -189,10 +189,6 @@ class Process:
         with suppress(OSError):
             self.peer.shutdown(socket.SHUT_WR)
 
-    def terminate(self) -> None:
-        """Terminates the child."""
-        self._process.terminate()
-
     def kill(self) -> None:
         """Kills the child, and ends reads from it."""
         self._process.kill()
@@ -200,15 +196,13 @@ class Process:
             self.peer.shutdown(socket.SHUT_RDWR)
 
     def end(self) -> None:
-        """Ends the child within two seconds."""
+        """Ends the child within a second."""
         self.end_input()
-        for harder, seconds in ((self._process.terminate, 1.0), (self._process.kill, None)):
-            if self._process.poll() is not None:
-                break
-            harder()
-            with suppress(subprocess.TimeoutExpired):
-                self._process.wait(seconds)
-        self._process.wait()
+        try:
+            self._process.wait(1.0)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
         self._listener.join(1.0)
         self.peer.close()
 

@@ -11,11 +11,9 @@ import msgspec
 
 from hybridlog.live.sources.base import Cause, Loss, one_line
 from hybridlog.live.sources.ros2.child.wire import (
-    COUNT,
     ENTRY,
     EVENT,
     HEADER,
-    MESSAGES,
     WireError,
     check_frame,
     parse_object,
@@ -121,8 +119,6 @@ class Receiver:
                 check_frame(kind, length)
                 if kind == EVENT:
                     self._event(_parsed(_read(file, length)))
-                elif kind == MESSAGES:
-                    self._messages(_read(file, length))
                 else:
                     self._message(file, length)
                 self.last_received = time.time_ns()
@@ -141,28 +137,6 @@ class Receiver:
             sent=sent or None,
             sequence=sequence if sequence >= 0 else None,
         )
-
-    def _messages(self, body: bytes) -> None:
-        count = COUNT.unpack_from(body)[0]
-        at = COUNT.size + count * ENTRY.size
-        if at > len(body):
-            raise WireError("more messages than the frame has room for")
-        take = self._sink.take
-        channels = self._channels
-        for number, size, received, sent, sequence in ENTRY.iter_unpack(
-            memoryview(body)[COUNT.size : at]
-        ):
-            end = at + size
-            if end > len(body) or number not in channels:
-                raise WireError("a message longer than its frame, or of an unknown channel")
-            take(
-                channels[number],
-                body[at:end],
-                received=received,
-                sent=sent or None,
-                sequence=sequence if sequence >= 0 else None,
-            )
-            at = end
 
     def _event(self, event: _Event) -> None:
         match event:

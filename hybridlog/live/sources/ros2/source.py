@@ -28,7 +28,6 @@ _PAUSE_S = 0.5
 _MAX_PAUSE_S = 30.0
 _STABLE_S = 30.0
 _HAND_OVER_S = 3.0
-_TERM_S = 1.0
 
 
 class Ros2Source(LiveSource):
@@ -117,9 +116,6 @@ class Ros2Source(LiveSource):
             return
         child.end_input()
         self._thread.join(_HAND_OVER_S)
-        if self._thread.is_alive():
-            child.terminate()
-            self._thread.join(_TERM_S)
         if self._thread.is_alive():
             child.kill()
         self._thread.join()

@@ -20,7 +20,7 @@ from hybridlog.live.sources.ros2.child.definitions import Definitions, share_fol
 from hybridlog.live.sources.ros2.child.middleware import Middleware
 from hybridlog.live.sources.ros2.child.outbox import Outbox
 from hybridlog.live.sources.ros2.child.topics import Topics
-from hybridlog.live.sources.ros2.child.wire import MAX_BATCH, WireError, parse_object
+from hybridlog.live.sources.ros2.child.wire import MAX_EVENT, WireError, parse_object
 
 _LOOK_S = 0.5
 _FIRST_LOOKS_S = 0.1
@@ -143,7 +143,7 @@ def run(number: int) -> int:
     peer.set_inheritable(False)
     # The recorder sends no command before the greeting.
     with peer.makefile("rb") as file:
-        settings = parse_object(file.readline(MAX_BATCH))
+        settings = parse_object(file.readline(MAX_EVENT))
     outbox = Outbox(peer)
     try:
         middleware = Middleware()

@@ -13,13 +13,10 @@ from itertools import islice
 from typing import TYPE_CHECKING
 
 from hybridlog.live.sources.ros2.child.wire import (
-    COUNT,
     ENTRY,
     HEADER,
-    LARGE,
     MAX_PAYLOAD,
     MESSAGE,
-    MESSAGES,
     event_frame,
 )
 
@@ -30,6 +27,7 @@ BUDGET = 256 << 20
 """Maximum number of queued bytes."""
 
 _BATCH = 1 << 20
+_LARGE = 32 << 10
 _MAX_BUFFERS = 64
 _MAX_REPORTS = 10_000  # different ones
 
@@ -62,9 +60,8 @@ class Outbox:
         self._peer = peer
         self._budget = budget
         self._buffers: deque[bytes | memoryview] = deque()
-        self._entries: list[bytes] = []
-        self._payloads: list[bytes] = []
-        self._small = 0
+        self._batch: list[bytes] = []  # small messages
+        self._small = 0  # their bytes
         self.waiting = 0
         self.refused: dict[int, Refusal] = {}
         self._channels: list[str] = []
@@ -80,15 +77,15 @@ class Outbox:
             refusal.count += 1
             refusal.last = received
             return
+        head = HEADER.pack(MESSAGE, ENTRY.size + size)
         entry = ENTRY.pack(channel, size, received, sent, number)
-        if size >= LARGE:
+        if size >= _LARGE:
             self.close_batch()
-            self._put(HEADER.pack(MESSAGE, ENTRY.size + size) + entry)
+            self._put(head + entry)
             self._put(payload)
             return
-        self._entries.append(entry)
-        self._payloads.append(payload)
-        self._small += size + ENTRY.size
+        self._batch += (head, entry, payload)
+        self._small += size
         if self._small >= _BATCH:
             self.close_batch()
 
@@ -152,16 +149,11 @@ class Outbox:
             self.event("say", text=text)
 
     def close_batch(self) -> None:
-        """Packs the small messages so far into a frame."""
-        if not self._entries:
-            return
-        length = COUNT.size + self._small
-        count = COUNT.pack(len(self._entries))
-        head = HEADER.pack(MESSAGES, length)
-        self._put(b"".join((head, count, *self._entries, *self._payloads)))
-        self._entries.clear()
-        self._payloads.clear()
-        self._small = 0
+        """Queues the small messages so far."""
+        if self._batch:
+            self._put(b"".join(self._batch))
+            self._batch.clear()
+            self._small = 0
 
     def _put(self, data: bytes) -> None:
         self._buffers.append(data)

@@ -1,10 +1,8 @@
 """Protocol between the child in the ROS environment and the recorder.
 
 Both ends come from one installation and share one socket. The child sends frames: kind and
-length, then the body. Small messages are packed by the hundred. Large ones have their own
-frame, so that the reader can receive a payload without a copy. Everything else is a JSON
-object. The recorder sends lines of JSON. At the end of its input the child passes on its
-remaining messages and ends.
+length, then the body: a message, or a JSON object. The recorder sends lines of JSON. At the
+end of its input the child passes on its remaining messages and ends.
 """
 
 from __future__ import annotations
@@ -16,16 +14,11 @@ from typing import Any
 EVENT = 1
 """Body: a JSON object; its `event` names the kind of event."""
 
-MESSAGES = 2
-"""Body: number of messages (uint32), an `ENTRY` for each, then their payloads."""
-
-MESSAGE = 3
+MESSAGE = 2
 """Body: one `ENTRY`, then the payload."""
 
 HEADER = struct.Struct("<II")
 """Kind of the frame, and length of its body in bytes."""
-
-COUNT = struct.Struct("<I")
 
 ENTRY = struct.Struct("<IIqqq")
 """Channel, payload bytes, receive and send time (ns since the epoch), sequence number.
@@ -36,11 +29,8 @@ The send time is 0 and the number -1 if the middleware does not know them.
 MAX_PAYLOAD = 1 << 30
 """Bytes of the largest payload."""
 
-MAX_BATCH = 16 << 20
-"""Bytes of the largest body of a frame with several messages or an event."""
-
-LARGE = 32 << 10
-"""Payloads from this size on have their own frame, bytes."""
+MAX_EVENT = 16 << 20
+"""Bytes of the largest event."""
 
 
 class WireError(Exception):
@@ -75,9 +65,7 @@ def check_frame(kind: int, length: int) -> None:
         WireError: The kind is unknown, or the length is impossible.
     """
     if kind == EVENT:
-        low, high = 2, MAX_BATCH
-    elif kind == MESSAGES:
-        low, high = COUNT.size, MAX_BATCH
+        low, high = 2, MAX_EVENT
     elif kind == MESSAGE:
         low, high = ENTRY.size, ENTRY.size + MAX_PAYLOAD
     else:

@@ -10,7 +10,7 @@ import threading
 from typing import TYPE_CHECKING, Final, NamedTuple
 from urllib.parse import urlsplit
 
-from hybridlog.live.sources.base import one_line
+from hybridlog.live.sources.base import PeerError, one_line
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -21,10 +21,6 @@ PATIENCE_S: Final = 5.0
 """Time limit for a look-up, a connection or an answer."""
 
 _MAX_ADDRESSES = 8
-
-
-class PeerError(Exception):
-    """A peer is unreachable or violates the protocol; the message names the problem."""
 
 
 class UnreachedError(PeerError):
