@@ -163,11 +163,7 @@ def _print(
 
 
 def _check(report: CopyReport) -> None:
-    """Fail if something was not copied, or did not expire.
-
-    Raises:
-        StoreError: It was not.
-    """
+    """Fail if something was not copied, or did not expire."""
     left = [*report.refused.values(), *report.problems]
     if left:
         sys.stdout.flush()

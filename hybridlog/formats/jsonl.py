@@ -85,11 +85,7 @@ def json_rows(records: pa.StructArray) -> Iterator[Line]:
 
 
 def object_line(row: Mapping[str, object]) -> Line:
-    """An object as one line of JSON, without its end; in pieces if it has a long list.
-
-    Raises:
-        UsageError: A value that has no JSON form.
-    """
+    """An object as one line of JSON, without its end; in pieces if it has a long list."""
     if any(isinstance(value, list) and len(value) > _ROWS for value in row.values()):
         return _pieces(row)
     return json_line(row)
@@ -109,11 +105,7 @@ def _pieces(row: Mapping[str, object]) -> Iterator[str]:
 
 
 def json_line(row: object) -> str:
-    """A plain value, as of `Decoded.plain`, as one line of JSON, without its end.
-
-    Raises:
-        UsageError: It is nested too deep.
-    """
+    """A plain value, as of `Decoded.plain`, as one line of JSON, without its end."""
     try:
         try:
             return json.dumps(row, ensure_ascii=False, allow_nan=False, default=_base64)

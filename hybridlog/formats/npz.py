@@ -53,12 +53,7 @@ Arrays: TypeAlias = "Iterator[tuple[str, np.dtype[Any], tuple[int, ...], Iterato
 
 
 def write_npz(answer: Answer, target: Target) -> None:
-    """Write one .npz file.
-
-    Raises:
-        UsageError: A column changes its type, or has a type without a numpy form.
-        DiskFullError: No space left.
-    """
+    """Write one .npz file."""
     directory = scratch_directory()
     try:
         with Sink(target) as sink, failures(sink.name):
@@ -136,11 +131,7 @@ def _add(
 
 
 def _arrays(name: str, kind: pa.DataType, pieces: Pieces) -> Arrays:
-    """The arrays of a column.
-
-    Raises:
-        UsageError: Numpy has no such type.
-    """
+    """The arrays of a column."""
     rows = sum(map(len, pieces()))
     if is_numeric(kind):
         yield name, numpy_type(kind), (rows,), map(_numbers, pieces())
