@@ -118,24 +118,15 @@ def _print_report(report: LerobotReport, fps: int | None) -> None:
     resumed = f", {report.resumed} of them from before" if report.resumed else ""
     about = (
         f"{report.path}: {counted(report.episodes, 'episode')}{resumed}, "
-        f"{counted(report.frames, 'frame')}, {output.size(report.bytes)}"
-    )
-    held, dropped, missing = (
-        counted(number, "frame") for number in (report.held, report.dropped, report.missing)
+        f"{counted(report.frames, 'frame')} at {fps or _FPS} Hz, {output.size(report.bytes)}"
     )
     output.remarks([about])
-    output.remarks([f"Without --fps there are {_FPS} frames a second."] if fps is None else [])
-    notes = [
-        (report.held, f"Values that are older than usual were kept for {held}."),
-        (report.dropped, f"{dropped} left out, because a topic has a gap there."),
-        (
-            report.missing,
-            f"{missing} show an earlier picture: their own cannot be shown, or has no payload.",
-        ),
-        (
-            report.lost,
-            f"{counted(report.lost, 'message')} of these topics are lost in the episodes; "
-            "meta/hybridlog.json says in which.",
-        ),
-    ]
-    output.notes(text for applies, text in notes if applies)
+    said = {
+        "with a value older than usual": report.held,
+        "left out, where a topic has a gap": report.dropped,
+        "with an earlier picture, since its own cannot be shown": report.missing,
+    }
+    output.notes(f"{counted(number, 'frame')} {what}." for what, number in said.items() if number)
+    if report.lost:
+        lost = f"{counted(report.lost, 'message')} of these topics are lost in the episodes"
+        output.note(f"{lost}; meta/hybridlog.json says in which.")
