@@ -74,14 +74,9 @@ class StoredAttachment:
             DiskFullError: No space.
         """
         pieces = self.pieces()
-        sink = Sink(path)
-        try:
+        with Sink(path) as sink:
             for piece in pieces:
                 sink.write(piece)
-            sink.commit()
-        except BaseException:
-            sink.abort()
-            raise
         return Path(path)
 
 

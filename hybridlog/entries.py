@@ -203,12 +203,7 @@ class Inventory:
 
 
 def state_now(directory: StoreDirectory, recording: str) -> str:
-    """The state of a recording's files, as of `Inventory`.
-
-    Raises:
-        RecordingGoneError: It is being removed.
-        StoreError: Directory or manifest cannot be read.
-    """
+    """The state of a recording's files, as of `Inventory`."""
     return state_of(directory.listing(recording), directory.manifests.find(recording))
 
 
@@ -218,12 +213,7 @@ def state_of(listing: Listing, manifest: Manifest | None) -> str:
 
 
 def take_inventory(directory: StoreDirectory, recording: str) -> Inventory:
-    """Compare the sealed segments of a recording with its manifest.
-
-    Raises:
-        RecordingGoneError: It is being removed.
-        StoreError: Directory or manifest cannot be read, or all files are of another recording.
-    """
+    """Compare the sealed segments of a recording with its manifest."""
     listing = directory.listing(recording)
     return inventory_of(directory, recording, listing, directory.manifests.find(recording))
 
@@ -340,13 +330,7 @@ def with_marks(entry: RecordingEntry) -> RecordingEntry:
 
 
 def describe(catalog: Catalog, inventory: Inventory, *, is_open: bool = False) -> Described:
-    """Make the complete entry of a recording.
-
-    Args:
-        catalog: Has the decoding results of its segments, and its unreadable chunks.
-        inventory: Content of its directory.
-        is_open: Whether a process is writing it.
-    """
+    """Make the complete entry of a recording."""
     from hybridlog.schema.codecs import codec_for
 
     if inventory.manifest is None:
@@ -453,10 +437,6 @@ def summary_by(
 ) -> tuple[RecordingSummary, frozenset[TopicType]] | None:
     """The summary and the topics of a whole recording by its manifest.
 
-    Args:
-        manifest: Its manifest; all files are there.
-        look: State of its directory, read before.
-
     Returns:
         As of `summary_of` and `topic_types`; None if only its files say what is left.
     """
@@ -523,12 +503,7 @@ def _marks_type() -> TopicType:
 
 
 def summary_of(entry: RecordingEntry, look: str = "") -> RecordingSummary:
-    """The summary of a recording.
-
-    Args:
-        entry: Its entry.
-        look: State of its directory; empty if that does not matter.
-    """
+    """The summary of a recording."""
     losses, gone = entry.end.get("losses", ()), expired_messages(entry)
     return RecordingSummary(
         id=entry.id,
@@ -769,11 +744,7 @@ def _file_of(sealed: Sealed) -> File:
 
 
 def ended(end: Mapping[str, Any]) -> Callable[[Manifest], Manifest]:
-    """The change that ends a recording.
-
-    Args:
-        end: Its `status`, `losses`, `cut_bytes` and `damage`, as segments have them.
-    """
+    """The change that ends a recording."""
     status = cast("Literal['complete', 'damaged', 'recovered']", end.get("status", "complete"))
     losses = tuple(loss_of(row) for row in end.get("losses", ()))
 
@@ -796,12 +767,7 @@ def unlisted(inventory: Inventory) -> Callable[[Manifest], Manifest] | None:
 
 
 def made_again(inventory: Inventory, old: Manifest | None) -> Manifest:
-    """The manifest of a recording that has lost it.
-
-    Args:
-        inventory: What is there.
-        old: The one before the last change, if it can be read.
-    """
+    """The manifest of a recording that has lost it."""
     made = old or described(inventory)
     numbers = [
         number

@@ -26,18 +26,7 @@ _LIST_EVERY_S = 1.0  # between two comparisons of ids: tools that copy may write
 
 
 class OpenStore(Shared):
-    """An open store. Thread safe for reading.
-
-    Args:
-        directory: The store's directory.
-        mongo: URI of the MongoDB that holds the index, `embedded`, or `none`; None for the one
-            in the store's settings.
-        progress: Called while an index is brought up to date.
-        cache_mb: Size of the embedded MongoDB's cache in MiB; None for the one in the store's
-            settings.
-        recover: False to leave what a crash has cut, and what the index lacks of it, to another
-            opening.
-    """
+    """An open store. Thread safe for reading."""
 
     index: IndexAccess
 
@@ -113,10 +102,6 @@ class OpenStore(Shared):
         """See which recordings came or went, and how some others are now.
 
         All else that was read stays, so this costs little in a store of thousands.
-
-        Args:
-            recordings: Their ids.
-            mends: Recover those of them that a crash has cut short.
         """
         with self.following:
             if self._latest is None:
@@ -165,14 +150,7 @@ class OpenStore(Shared):
     # Repairs.
 
     def mend(self, seconds: float = math.inf) -> None:
-        """Repair what questions met: recordings after a crash, missing and damaged tables.
-
-        Args:
-            seconds: For recordings that take longer, tables stay in `repairs.noted_tables`.
-
-        Raises:
-            DiskFullError: There is no room.
-        """
+        """Repair what questions met: recordings after a crash, missing and damaged tables."""
         self.check_process()
         if self.directory.is_writable:
             with self._mending:

@@ -43,9 +43,6 @@ _MAX_OPEN_SEGMENTS = 256
 class Shared(ABC):
     """What all questions to one open store share. Thread safe for reading.
 
-    Args:
-        directory: The store's directory.
-
     Attributes:
         directory: The store's directory.
         index: The index in MongoDB, an `IndexAccess`.

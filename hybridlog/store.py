@@ -92,7 +92,7 @@ _MENDING_S: Final = 2.0
 """Longest time that a command repairs what it met, after its answer."""
 Names: TypeAlias = "Iterable[str | RecordingEntry]"
 """Recordings by name or id, or their entries."""
-_ELSEWHERE: Final = re.compile(r"(?P<host>[^/:]+):(?P<path>.*)")
+_ELSEWHERE: Final = re.compile(r"[^/:]+:(.*)")
 """A URL, or a place on a server as scp has it."""
 
 
@@ -229,16 +229,11 @@ def _local(to: str | Path) -> Path:
         UsageError: It is written like a place elsewhere.
     """
     found = _ELSEWHERE.fullmatch(str(to))
-    if found is not None and (found["path"].startswith("/") or not os.path.lexists(to)):
-        host, path = found["host"], found["path"]
-        if host == "ssh":
-            cure = f"Write ssh://{path.lstrip('/')}"
-        elif path.startswith("//") or (path.startswith("/") and host == "file"):
-            cure = "Give a directory, ssh://user@host/path, s3://, gs:// or az://"
-        else:
-            rest = path if path.startswith("/") else f"/~/{path.removeprefix('~/')}"
-            cure = f"Write ssh://{host}{rest} for a server, or ./{to} for a directory"
-        raise UsageError(f"{to} is no place to copy to. {cure}.")
+    if found is not None and (found[1].startswith("/") or not os.path.lexists(to)):
+        raise UsageError(
+            f"{to} is no place to copy to. Write ssh://user@host/path for a server, s3://, gs:// "
+            "or az:// for a bucket, and ./ in front of a directory with a colon in its name."
+        )
     try:
         return Path(to).expanduser()
     except RuntimeError as error:

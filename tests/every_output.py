@@ -68,10 +68,10 @@ def compare_exact(query: Query, raw: list[bytes], folder: Path) -> None:
     found = list(make_reader(mcap).iter_messages())
     assert [message.data for _, _, message in found] == raw
     if found[0][1].message_encoding == "ros1":
-        write_answer(query, "bag", folder / "out.bag", quiet=True)
+        write_answer(query, "bag", folder / "out.bag")
         with Reader(folder / "out.bag") as reader:
             assert [bytes(data) for _, _, data in reader.messages()] == raw
-    write_answer(query, "raw", folder / "raw", quiet=True)
+    write_answer(query, "raw", folder / "raw")
     lines = map(json.loads, (folder / "raw" / "index.jsonl").read_text().splitlines())
     assert [(folder / "raw" / line["file"]).read_bytes() for line in lines] == raw
 
@@ -79,7 +79,7 @@ def compare_exact(query: Query, raw: list[bytes], folder: Path) -> None:
 def written(query: Query, form: str) -> bytes:
     """What an output writes."""
     stream = io.BytesIO()
-    write_answer(query, form, stream, quiet=True)
+    write_answer(query, form, stream)
     return stream.getvalue()
 
 

@@ -18,7 +18,7 @@ from hybridlog.cli.completion import (
     complete_topic,
 )
 from hybridlog.cli.options import Asking, in_frame, parse_fields, query_of
-from hybridlog.cli.output import notes
+from hybridlog.cli.output import remarks
 from hybridlog.query.choice import Choice
 from hybridlog_storage.errors import TopicError, UsageError
 
@@ -104,8 +104,8 @@ def align_command(given: _Given) -> None:
         # That there is a transform shows only at the end.
         completeness = rows.completeness if given.strict else None
         answer_tables(rows.to_tables(to.shown), to, rows.schema, completeness)
-        print_end(given, rows.counters, started)
-        notes([] if given.quiet else rows.remarks())
+        print_end(rows.counters, started, verbose=given.verbose)
+        remarks(rows.remarks())
 
 
 def _resampled(store: Store, given: _Given) -> Aligned:

@@ -6,9 +6,8 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Sized
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
-from functools import partial
 from itertools import chain, groupby, islice
 from operator import itemgetter
 from pathlib import Path
@@ -64,7 +63,6 @@ class Destination:
     path: Path | None
     force: bool
     limit: int | None = None
-    quiet: bool = False
     settings: Mapping[str, Any] = field(default_factory=dict)
 
     @property
@@ -72,14 +70,10 @@ class Destination:
         """Maximum number of rows of a table that are printed or written; None for all."""
         return SCREEN_ROWS if self.limit is None and self.form == SCREEN else self.limit
 
-    @contextmanager
-    def opened(self) -> Iterator[Target]:
-        """The target for a writer, which leaves what was there if it fails."""
-        if self.path is None:
-            yield sys.stdout.buffer
-            return
-        with if_stopped(partial(not_written, self.path)):
-            yield self.path
+    @property
+    def target(self) -> Target:
+        """What a writer takes."""
+        return self.path or sys.stdout.buffer
 
     def check(self) -> None:
         """Refuse what cannot be written, before a store is opened."""
@@ -147,7 +141,6 @@ class Tabular(Forced, AsJson):
             path=self.output,
             force=self.force,
             limit=self.limit,
-            quiet=getattr(self, "quiet", False),
         )
 
 
@@ -204,9 +197,8 @@ def answering(given: Topics) -> Iterator[Answering]:
     with given.opened(snapshot=True) as store:
         asked = Answering(store, given.query(store))
         yield asked
-        print_end(given, asked.query.counters, started, count=True)
-        if not given.quiet:
-            output.notes(asked.query.remarks(is_empty=asked.is_empty))
+        print_end(asked.query.counters, started, verbose=given.verbose, count=True)
+        output.remarks(asked.query.remarks(is_empty=asked.is_empty))
 
 
 def answer_query(query: Query, to: Destination, *, front: Front, strict: bool = False) -> Query:
@@ -215,17 +207,7 @@ def answer_query(query: Query, to: Destination, *, front: Front, strict: bool = 
     Strict: nothing is written if a pose has no transform, which shows only at the end.
     """
     if to.form != SCREEN:
-        quiet = to.quiet or to.path is None
-        with to.opened() as target:
-            write_answer(
-                query,
-                to.form,
-                target,
-                front=front,
-                quiet=quiet,
-                strict=strict,
-                settings=to.settings,
-            )
+        write_answer(query, to.form, to.target, front=front, strict=strict, settings=to.settings)
         return query
     from hybridlog.record.marks import MARKS
 
@@ -260,12 +242,11 @@ def answer_tables(
     if to.form == SCREEN:
         _print_rows(limited, to.limit, "row")
         return
-    quiet = to.quiet or to.path is None
-    with to.opened() as target, Bar(to.form, None, quiet=quiet) as bar:
+    with writing(to.path), Bar(to.form, None, quiet=to.path is None) as bar:
         answer = _rows(_with_progress(limited, bar))
         if OUTPUTS[to.form].content == "table":
             answer.schema = schema()
-        OUTPUTS[to.form].write(answer, target)
+        OUTPUTS[to.form].write(answer, to.target)
 
 
 def write_answer(
@@ -275,7 +256,6 @@ def write_answer(
     *,
     front: Front | None = None,
     extras: Extras | None = None,
-    quiet: bool = False,
     strict: bool = False,
     settings: Mapping[str, Any] | None = None,
 ) -> int:
@@ -300,7 +280,9 @@ def write_answer(
 
     for name in ("lines", "tables", "batches", "points", "messages"):
         setattr(answer, name, _checked(told(getattr(answer, name)), completeness))
-    with Bar(form, 0 if quiet else payload_bytes(query), quiet=quiet) as bar:
+    path = target if isinstance(target, Path) else None
+    size = 0 if path is None else payload_bytes(query)
+    with writing(path), Bar(form, size, quiet=path is None) as bar:
         OUTPUTS[form].write(answer, target, **settings or {})
     notes = answer.notes
     if left_out := len(answer.unreadable):
@@ -498,15 +480,13 @@ def _print_rows(
     return min(read, most)
 
 
-def print_end(given: Topics, counters: Counters, started: float, *, count: bool = False) -> None:
+def print_end(counters: Counters, started: float, *, verbose: bool, count: bool = False) -> None:
     """Print what an answer cost, with `--verbose`; without, the messages in front."""
     sys.stdout.flush()
-    if given.quiet:
-        return
     front = latched(counters)
-    if not given.verbose:
+    if not verbose:
         if front and not count:
-            output.note(front.removeprefix(" and "))
+            output.remarks([front.removeprefix(" and ")])
         return
     used = [
         (not count, f"{output.counted(counters.messages - counters.reduced, 'message')}{front}"),
@@ -516,7 +496,7 @@ def print_end(given: Topics, counters: Counters, started: float, *, count: bool 
         (counters.documents_read, output.counted(counters.documents_read, "index document")),
         (True, f"{time.monotonic() - started:.3f} s"),
     ]
-    output.note(", ".join(text for applies, text in used if applies))
+    output.remarks([", ".join(text for applies, text in used if applies)])
 
 
 def latched(counters: Counters) -> str:
@@ -534,7 +514,7 @@ def write_bytes(target: Target, content: bytes) -> None:
     """Write a file, all of it or nothing, or into a stream."""
     from hybridlog.formats.writing import Sink
 
-    with Sink(target) as sink:
+    with writing(target if isinstance(target, Path) else None), Sink(target) as sink:
         sink.write(content)
 
 
@@ -552,6 +532,8 @@ def check_room(path: Path, *, force: bool, is_directory: bool = False) -> None:
         raise UsageError(f"{path} exists; --force overwrites it.")
 
 
-def not_written(path: Path) -> str:
-    """The sentence about an output file after a stopped command; empty if the file is complete."""
-    return "" if is_published(path) else f"{path} is not written."
+def writing(path: Path | None) -> AbstractContextManager[None]:
+    """A block that writes a file, or into a stream; a signal that stops it leaves no part."""
+    if path is None:
+        return nullcontext()
+    return if_stopped(lambda: "" if is_published(path) else f"{path} is not written.")

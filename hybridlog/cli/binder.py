@@ -18,6 +18,7 @@ from typing import Any, Final, TypeVar
 import click
 from click.core import ParameterSource
 
+from hybridlog.cli import output
 from hybridlog.wording import parse_size
 from hybridlog_storage.errors import HybridlogError, UsageError
 
@@ -220,7 +221,9 @@ def command(
         @wraps(function)
         def call(**values: Any) -> Any:
             check(kind, click.get_current_context())
-            return function(kind(**values))
+            given = kind(**values)
+            output.begin(given)
+            return function(given)
 
         call.__click_params__ = parameters_of(kind)[::-1]  # type: ignore[attr-defined]
         make: Any = click.command(name, **{"cls": Command, **settings})

@@ -90,8 +90,7 @@ def check_command(given: _Given) -> None:
             ),
         ]
         given.answer(map(asdict, found), columns)
-        if not found and not given.quiet:
-            output.note("No topic.")
+        output.remarks([] if found else ["No topic."])
 
 
 def _duration(ns: float | None) -> str:
@@ -116,8 +115,7 @@ def _show_verdict(results: Sequence[Result], recordings: int, given: _Given) -> 
     names = ("recording", "topic", "rule", "wanted", "found")
     given.answer(map(asdict, results if given.as_json else bad), [*map(Column, names)])
     sys.stdout.flush()
-    if not given.quiet:
-        output.note(verdict(results, f" in {output.counted(recordings, 'recording')}"))
+    output.remarks([verdict(results, f" in {output.counted(recordings, 'recording')}")])
     if bad:
         raise click.exceptions.Exit(DIFFERENT)
 

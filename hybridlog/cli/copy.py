@@ -80,7 +80,7 @@ def copy_command(given: _Copy) -> None:
             from hybridlog.cli.watching import watch
 
             look = partial(_look, store, given, how, set[str]())
-            watch(store.directory.place, look, quiet=given.quiet)
+            watch(store.directory.place, look)
             return
         report = _copied(store, given, given.choice, how)
     _check(report)
@@ -111,15 +111,15 @@ def _copied(
     from hybridlog.maintenance.copying import CopyReport
 
     assert given.to is not None
-    report = CopyReport()
+    report, there = CopyReport(), "there" if given.source is None else "here"
     try:
-        with Bar("copy", quiet=given.quiet or given.as_json) as bar:
+        with Bar("copy") as bar:
             store.copy(given.to, chosen, how, bar.part, report)
     except BaseException:
         if report != CopyReport():
-            _print(report, given, is_short=is_short)
+            _print(report, there, is_short=is_short)
         raise
-    _print(report, given, is_short=is_short)
+    _print(report, there, is_short=is_short)
     return report
 
 
@@ -141,33 +141,20 @@ def _look(store: Store, given: _Copy, how: CopyOptions, done: set[str]) -> Itera
     yield from map(StoreError, problems)
 
 
-def _print(
-    report: CopyReport,
-    given: _Copy,
-    *,
-    is_short: bool = False,
-) -> None:
+def _print(report: CopyReport, there: str, *, is_short: bool) -> None:
     """Print what was copied."""
-    there = "there" if given.source is None else "here"
-    if given.as_json:
-        (output.print_json_line if is_short else output.print_json)(asdict(report))
-    elif not given.quiet:
-        for name in report.copied:
-            output.say(f"copied {name}")
-        for name in () if is_short else report.known:
-            lacks = name in report.lacking
-            more = f"; payloads that were deleted {there} were not copied" if lacks else ""
-            output.say(f"{name} is {there} already{more}")
-        if report.freed_bytes > 0:  # of a few messages, fields may take more than payloads
-            output.say(f"{output.size(report.freed_bytes)} freed")
+    lines = [f"copied {name}" for name in report.copied]
+    for name in () if is_short else report.known:
+        lacks = name in report.lacking
+        more = f"; payloads that were deleted {there} were not copied" if lacks else ""
+        lines.append(f"{name} is {there} already{more}")
+    if report.freed_bytes > 0:  # of a few messages, fields may take more than payloads
+        lines.append(f"{output.size(report.freed_bytes)} freed")
+    output.tell(asdict(report), lines, at_once=is_short)
 
 
 def _check(report: CopyReport) -> None:
-    """Fail if something was not copied, or did not expire.
-
-    Raises:
-        StoreError: It was not.
-    """
+    """Fail if something was not copied, or did not expire."""
     left = [*report.refused.values(), *report.problems]
     if left:
         sys.stdout.flush()

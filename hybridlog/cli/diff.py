@@ -62,11 +62,10 @@ def diff_command(given: _Given) -> None:
     columns = [Column("topic"), Column("what"), Column("a", _side("a")), Column("b", _side("b"))]
     given.answer(map(asdict, found), columns, titles=2)
     sys.stdout.flush()
-    if not (given.quiet or given.as_json):
-        output.notes(verdicts)
+    if not given.as_json:
         total = f"{output.counted(len(found), 'difference')}." if found else "No difference."
         is_cut = given.limit is not None and given.limit < len(found)
-        output.note(f"The first {given.limit} of {total}" if is_cut else total)
+        output.remarks([*verdicts, f"The first {given.limit} of {total}" if is_cut else total])
     if found:
         raise click.exceptions.Exit(DIFFERENT)
 

@@ -28,5 +28,4 @@ def edit_command(given: _Given) -> None:
     with given.opened() as store:
         (entry,) = store.select([given.recording])
         entry = store.edit(entry.id, name=given.name, note=given.note)
-    if given.name is not None and not given.quiet:
-        output.say(f"renamed to {entry.name}")
+    output.tell(None, [] if given.name is None else [f"renamed to {entry.name}"])

@@ -16,13 +16,11 @@ from hybridlog.cli.answers import (
     check_room,
     form_of,
     latched,
-    not_written,
     write_answer,
 )
 from hybridlog.cli.binder import argument, command, option
 from hybridlog.cli.lerobot import LEROBOT, Training, export_set
 from hybridlog.cli.options import Slices, Topics, parse_fields
-from hybridlog.cli.signals import if_stopped
 from hybridlog.formats import OUTPUTS, formats_of, is_directory, suffixes_of
 from hybridlog_storage.disk.unfinished import undone
 from hybridlog_storage.errors import (
@@ -82,7 +80,7 @@ def export_command(given: _Given) -> None:
         if form == LEROBOT:
             if split is not None:
                 raise UsageError("lerobot has --episodes-by in place of --split-by.")
-            export_set(store, query, target, given, force=force, quiet=given.quiet)
+            export_set(store, query, target, given, force=force)
             return
         parts: Iterable[tuple[Path, Query]] = [(target, query)]
         if split is not None:
@@ -93,8 +91,7 @@ def export_command(given: _Given) -> None:
                 _write_log(one, form, path, given, settings)
             else:
                 _write_tables(one, form, path, given)
-            if not given.quiet:
-                output.notes(one.remarks(is_empty=None if is_log else False))
+            output.remarks(one.remarks(is_empty=None if is_log else False))
 
 
 def _write_log(
@@ -105,20 +102,11 @@ def _write_log(
     extras = extras_of(query.session, query.question)
     if given.no_attachments:
         extras = extras._replace(attachments=[], left_out=0)
-    with if_stopped(partial(not_written, path)):
-        write_answer(
-            query,
-            form,
-            path,
-            front=given.front,
-            extras=extras,
-            quiet=given.quiet,
-            settings=settings,
-        )
+    write_answer(query, form, path, front=given.front, extras=extras, settings=settings)
     has_extras = form == "mcap" or settings.get("storage") == "mcap"
     counts = (len(extras.attachments), "attachment"), (len(extras.metadata), "metadata record")
     beside = "".join(f", {output.counted(count, what)}" for count, what in counts if count)
-    print_written(path, query, beside=beside if has_extras else "", quiet=given.quiet)
+    print_written(path, query, beside=beside if has_extras else "")
     if beside and not has_extras:
         output.note(f"A bag cannot hold {beside[2:]} of the log; an MCAP file can.")
     if extras.left_out and has_extras:
@@ -148,14 +136,13 @@ def _write_tables(query: Query, form: str, directory: Path, given: _Given) -> No
         for topic, path in paths.items():
             one = narrowed(query, topic)
             try:
-                with if_stopped(lambda: f"The files named above are whole. {not_written(path)}"):  # noqa: B023 - of this round
-                    missing = write_answer(one, form, path, front=given.front, quiet=given.quiet)
+                missing = write_answer(one, form, path, front=given.front)
             except (DefinitionError, PayloadError, TimeError, UsageError) as error:
                 is_named = isinstance(error, DefinitionError) or topic in str(error)
                 output.note(f"{'' if is_named else f'{topic}: '}{error}")
                 left_out.append(error)
                 continue
-            print_written(path, one, missing, quiet=given.quiet)
+            print_written(path, one, missing)
             query.counters.add(one.counters)
         if len(left_out) == len(paths):
             raise left_out[0]
@@ -177,12 +164,10 @@ def _image_topics(query: Query) -> list[str]:
     return [topic for topic in query.topics if topic in found]
 
 
-def print_written(
-    path: Path, query: Query, missing: int = 0, beside: str = "", *, quiet: bool
-) -> None:
+def print_written(path: Path, query: Query, missing: int = 0, beside: str = "") -> None:
     """Print a line about a file; --quiet leaves it out, unless messages are missing."""
     left_out = f" (left out: {output.unfit(missing)})" if missing else ""
-    if missing or not quiet:
+    if missing or not output.is_quiet():
         written = query.counters.messages - query.counters.reduced - missing
         files = path.iterdir() if path.is_dir() else [path]
         output.note(

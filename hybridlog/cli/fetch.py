@@ -109,8 +109,7 @@ def fetch_command(choices: _Choices) -> None:
             try:
                 query = query.at_time(choices.at)
             except TopicError:
-                if not choices.quiet:
-                    output.notes(query.between("start", choices.at).remarks(is_empty=False))
+                output.remarks(query.between("start", choices.at).remarks(is_empty=False))
                 raise
         if choices.strict:
             query.completeness().check(payloads=not choices.count)
@@ -121,8 +120,8 @@ def fetch_command(choices: _Choices) -> None:
             output.say(str(count))
             _print_end(query, choices, started)
             lost = query.completeness()
-            if lost.has_losses and not choices.quiet:
-                output.note(lost.describe(count, query.question.limit))
+            if lost.has_losses:
+                output.remarks([lost.describe(count, query.question.limit)])
         else:
             front = choices.front
             if choices.at is not None and to.form != "mp4":  # the answer is one message
@@ -139,9 +138,8 @@ def _print_end(query: Query, choices: _Choices, started: float) -> None:
     cost = query.counters.copy()
     for condition in query.conditions:
         cost.add(condition.counters)
-    print_end(choices, cost, started, count=choices.count)
-    if not choices.quiet:
-        output.notes(query.remarks())
+    print_end(cost, started, verbose=choices.verbose, count=choices.count)
+    output.remarks(query.remarks())
 
 
 def _write_pieces(query: Query, choices: _Choices, to: Destination, front: Front) -> None:
@@ -153,9 +151,8 @@ def _write_pieces(query: Query, choices: _Choices, to: Destination, front: Front
     how = choices.split or ""
     for path, one in pieces(query, how, to.path, force=to.force, is_directory=folder):
         answer_query(one, replace(to, path=path), front=front, strict=choices.strict)
-        print_written(path, one, quiet=to.quiet)
-        if not to.quiet:
-            output.notes(one.completeness().sentences)
+        print_written(path, one)
+        output.remarks(one.completeness().sentences)
 
 
 def _follow(query: Query, choices: _Choices, form: str) -> None:
@@ -168,7 +165,7 @@ def _follow(query: Query, choices: _Choices, form: str) -> None:
             write_following(following, form)
     except Stopped as error:
         stopped = error
-    print_end(choices, query.counters, started)
+    print_end(query.counters, started, verbose=choices.verbose)
     if not choices.quiet:
         from hybridlog.cli.ls import status_text
         from hybridlog.query.query import Query

@@ -120,7 +120,7 @@ def rebuild(given: _Rebuild) -> None:
     index makes the rest.
     """
     started = time.monotonic()
-    with given.opened(require_database=True, cache_mb=given.cache_size, quiet=given.quiet) as store:
+    with given.opened(require_database=True, cache_mb=given.cache_size) as store:
         chosen = given.recordings_in(store)
         total = sum(entry.stored_bytes for entry in chosen.summaries)
         with (
@@ -128,7 +128,7 @@ def rebuild(given: _Rebuild) -> None:
                 "Finished recordings stay indexed; the next command that needs the index makes "
                 "the rest."
             ),
-            Bar("index rebuild", total, quiet=given.quiet) as bar,
+            Bar("index rebuild", total) as bar,
         ):
             done = store.index.rebuild(None if given.choice.is_everything else chosen, bar.part)
     made = {entry.id for entry in done}
@@ -149,7 +149,7 @@ def rebuild(given: _Rebuild) -> None:
         f"{output.counted(len(done), 'recording')}, {output.counted(messages, 'message')} indexed "
         f"in {elapsed:.2f} s{output.without_documents(without)}"
     )
-    given.tell(about, [line])
+    output.tell(about, [line])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -171,9 +171,9 @@ def arrays(given: _Arrays) -> None:
     anew at once. Segments stay as they are, so this costs room. MongoDB is not needed.
     """
     with (
-        given.opened(quiet=given.quiet) as store,
+        given.opened() as store,
         if_stopped("The setting is made; run it again for the tables that are left."),
-        Bar("index arrays", 0, quiet=given.quiet) as bar,
+        Bar("index arrays") as bar,
     ):
         found = store.index.arrays(*given.topic, off=given.off, progress=bar.part)
     arrays = "without arrays" if given.off else "with arrays"
@@ -209,9 +209,9 @@ def watch_command(given: _Watch) -> None:
     """
     from hybridlog.cli.watching import watch
 
-    with given.opened(require_database=True, quiet=given.quiet, is_lasting=True) as store:
+    with given.opened(require_database=True, is_lasting=True) as store:
         look = partial(_look, store, given)
-        watch(store.directory.path, look, pause_s=given.every, quiet=given.quiet)
+        watch(store.directory.path, look, pause_s=given.every)
 
 
 def _look(store: Store, given: _Shared) -> Iterator[StoreError]:
@@ -226,9 +226,7 @@ def _look(store: Store, given: _Shared) -> Iterator[StoreError]:
             chunks = repairs.indexed.pop(name)
             if not chunks:  # another process was faster
                 continue
-            if given.as_json:
-                output.print_json_line({"recording": name, "chunks": chunks})
-            elif not given.quiet:
-                output.say(f"{name}  {output.counted(chunks, 'chunk')}")
+            line = f"{name}  {output.counted(chunks, 'chunk')}"
+            output.tell({"recording": name, "chunks": chunks}, [line], at_once=True)
     for recording, problem in sorted(repairs.unreadable.items()):
         yield StoreError(f"Recording {recording} cannot be read: {problem}")

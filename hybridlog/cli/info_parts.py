@@ -6,15 +6,13 @@ import sys
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict
 from fnmatch import fnmatchcase
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hybridlog.cli import output
-from hybridlog.cli.answers import check_room, not_written
+from hybridlog.cli.answers import check_room, writing
 from hybridlog.cli.options import AsJson
 from hybridlog.cli.render import Column, bytes_of, print_table
-from hybridlog.cli.signals import if_stopped
 from hybridlog.record.losses import losses_of
 from hybridlog.wording import listed
 from hybridlog_storage.errors import TopicError, UsageError
@@ -233,7 +231,7 @@ def _write(found: list[StoredAttachment], target: Path, *, is_one: bool, force: 
         except OSError as error:
             raise UsageError(f"{target} cannot be made: {error.strerror}.") from error
     for attachment, path in zip(found, paths, strict=True):
-        with if_stopped(partial(not_written, path)):
+        with writing(path):
             attachment.save(path)
         output.note(f"{path}: {output.size(attachment.size)}")
 

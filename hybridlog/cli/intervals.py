@@ -77,8 +77,7 @@ def intervals_command(given: _Given) -> None:
             output.say(str(len(found)))
         else:
             _show(given, found, asked)
-            if asked.is_empty and not given.quiet:
-                output.note(f"No {noun}.")
+            output.remarks([f"No {noun}."] if asked.is_empty else [])
 
 
 def _intervals(given: _Given, query: Query) -> Intervals:

@@ -85,7 +85,7 @@ def keep_command(given: _Given) -> None:
     with given.opened() as store:
         if given.pin:
             found = _pin(store, given)
-            given.tell(found, [f"{output.counted(len(found), 'pin')}: {listed(found)}"])
+            output.tell(found, [f"{output.counted(len(found), 'pin')}: {listed(found)}"])
         elif given.unpin:
             store.unpin(*given.unpin)
         elif given.pins:
@@ -214,7 +214,7 @@ def _keep(store: Store, rules: dict[str, Any], given: _Given) -> None:
     dry_run = given.dry_run
     with (
         if_stopped("What was not deleted is as it was; run it again."),
-        Bar("keep", 0, quiet=given.quiet or given.as_json) as bar,
+        Bar("keep") as bar,
     ):
         found = store.keep(wanted, dry_run=dry_run, progress=bar.part)
     plan = found.plan
@@ -228,7 +228,7 @@ def _keep(store: Store, rules: dict[str, Any], given: _Given) -> None:
         *([] if plan.free_bytes is None else [f"{size(plan.free_bytes)} free"]),
     ]
     told = f"{', '.join(parts)}: {size(freed)} {'would become free' if dry_run else 'freed'}"
-    given.tell({**asdict(found), "dry_run": dry_run}, [told])
+    output.tell({**asdict(found), "dry_run": dry_run}, [told])
     topics = store.topics()
     useless = (
         f"No topic matches {rule.pattern}, so its rule deletes nothing."

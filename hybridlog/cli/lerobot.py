@@ -59,12 +59,10 @@ class Training:
     )
 
 
-def export_set(
-    store: Store, query: Query, target: Path, given: Training, *, force: bool, quiet: bool
-) -> None:
+def export_set(store: Store, query: Query, target: Path, given: Training, *, force: bool) -> None:
     """Write a training set, or propose a map for one."""
     if given.propose_map:
-        _write_map(_proposed(query), target, force=force, quiet=quiet)
+        _write_map(_proposed(query), target, force=force)
         return
     if given.features is None:
         raise UsageError(
@@ -75,7 +73,7 @@ def export_set(
         shutil.rmtree(target)
     done = 0
     again = "The same command goes on with the episodes that are not finished."
-    with if_stopped(lambda: again), Bar(target.name, None, quiet=quiet) as bar:
+    with if_stopped(lambda: again), Bar(target.name, None) as bar:
 
         def tell(name: str, frames: int) -> None:
             nonlocal done
@@ -94,7 +92,7 @@ def export_set(
             on_gap=given.on_gap or "refuse",
             progress=tell,
         )
-    _print_report(report, given.fps, quiet=quiet)
+    _print_report(report, given.fps)
 
 
 def _proposed(query: Query) -> str:
@@ -109,36 +107,26 @@ def _proposed(query: Query) -> str:
     )
 
 
-def _write_map(text: str, target: Path, *, force: bool, quiet: bool) -> None:
+def _write_map(text: str, target: Path, *, force: bool) -> None:
     check_room(target, force=force)
     write_bytes(target, text.encode())
-    if not quiet:
-        output.note(f"{target}: look at it, then add --map {target}.")
+    output.remarks([f"{target}: look at it, then add --map {target}."])
 
 
-def _print_report(report: LerobotReport, fps: int | None, *, quiet: bool) -> None:
+def _print_report(report: LerobotReport, fps: int | None) -> None:
     counted = output.counted
     resumed = f", {report.resumed} of them from before" if report.resumed else ""
     about = (
         f"{report.path}: {counted(report.episodes, 'episode')}{resumed}, "
-        f"{counted(report.frames, 'frame')}, {output.size(report.bytes)}"
+        f"{counted(report.frames, 'frame')} at {fps or _FPS} Hz, {output.size(report.bytes)}"
     )
-    held, dropped, missing = (
-        counted(number, "frame") for number in (report.held, report.dropped, report.missing)
-    )
-    notes = [
-        (not quiet, about),
-        (not quiet and fps is None, f"Without --fps there are {_FPS} frames a second."),
-        (report.held, f"Values that are older than usual were kept for {held}."),
-        (report.dropped, f"{dropped} left out, because a topic has a gap there."),
-        (
-            report.missing,
-            f"{missing} show an earlier picture: their own cannot be shown, or has no payload.",
-        ),
-        (
-            report.lost,
-            f"{counted(report.lost, 'message')} of these topics are lost in the episodes; "
-            "meta/hybridlog.json says in which.",
-        ),
-    ]
-    output.notes(text for applies, text in notes if applies)
+    output.remarks([about])
+    said = {
+        "with a value older than usual": report.held,
+        "left out, where a topic has a gap": report.dropped,
+        "with an earlier picture, since its own cannot be shown": report.missing,
+    }
+    output.notes(f"{counted(number, 'frame')} {what}." for what, number in said.items() if number)
+    if report.lost:
+        lost = f"{counted(report.lost, 'message')} of these topics are lost in the episodes"
+        output.note(f"{lost}; meta/hybridlog.json says in which.")

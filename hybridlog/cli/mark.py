@@ -62,8 +62,7 @@ def mark_command(given: _Given) -> None:
         with given.opened() as store:
             marked = iter([store.mark(recording, at, given.text, tags, until=given.until).name])
     for name in marked:
-        if not given.quiet:
-            output.note(f"Marked in {name}.")
+        output.remarks([f"Marked in {name}."])
 
 
 def _mark_running(

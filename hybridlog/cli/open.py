@@ -6,17 +6,16 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import click
 
 from hybridlog.cli import output
-from hybridlog.cli.answers import check_room, not_written, write_answer
+from hybridlog.cli.answers import check_room, write_answer
 from hybridlog.cli.binder import argument, command, option
 from hybridlog.cli.options import Filtered, Forced, Served
-from hybridlog.cli.signals import ended_by_signal, if_stopped
+from hybridlog.cli.signals import ended_by_signal
 from hybridlog.wording import listed
 from hybridlog_storage.errors import HybridlogError, MissingDependencyError
 
@@ -92,9 +91,8 @@ def open_command(given: _Given) -> None:
     with given.opened(snapshot=True) as store:
         query = given.query(store)
         path = _written(store, query, given)
-        if not given.quiet:
-            output.notes(query.remarks(is_empty=False))
-            output.note(f"{path}: {output.size(path.stat().st_size)}, opened with {program}")
+        opened = f"{path}: {output.size(path.stat().st_size)}, opened with {program}"
+        output.remarks([*query.remarks(is_empty=False), opened])
     ended = subprocess.run(  # noqa: S603
         [program, *_VIEWERS[given.viewer][1], path.absolute()], check=False
     )
@@ -108,16 +106,13 @@ def _written(store: Store, query: Query, given: _Given) -> Path:
     from hybridlog.formats.slices import cached_slice
 
     def write(query: Query, path: Path) -> None:
-        write_answer(
-            query, "mcap", path, extras=extras_of(query.session, query.question), quiet=given.quiet
-        )
+        write_answer(query, "mcap", path, extras=extras_of(query.session, query.question))
 
     if given.path is None:
         ids = query.recordings
         name = store.entry(ids[0]).name if len(ids) == 1 else "slice"
         return cached_slice(query, name, write)
-    with if_stopped(partial(not_written, given.path)):
-        write(query, given.path)
+    write(query, given.path)
     return given.path
 
 
@@ -160,31 +155,31 @@ def _play(given: _Given) -> None:
         log = PlayedLog(query)
         name = " ".join(["hybridlog", *given.choice.name])
         server = PlaybackServer(log, name, options, output.note)
-        if not given.quiet:
-            output.notes(query.remarks(is_empty=False))
-            print_unplayed(query)
-        asyncio.run(_until_signal(server, quiet=given.quiet))
+        output.remarks([*query.remarks(is_empty=False), *unplayed(query)])
+        asyncio.run(_until_signal(server))
 
 
-async def _until_signal(server: PlaybackServer, *, quiet: bool) -> None:
+async def _until_signal(server: PlaybackServer) -> None:
     """Serve until a signal comes."""
     import asyncio
 
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
     with ended_by_signal(lambda: loop.call_soon_threadsafe(stop.set)):
-        await server.run(stop, lambda port: _print_address(port, quiet=quiet))
+        await server.run(stop, _print_address)
 
 
-def _print_address(port: int, *, quiet: bool) -> None:
+def _print_address(port: int) -> None:
     address = f"ws://127.0.0.1:{port}"
     output.say(address)
     sys.stdout.flush()
-    if not quiet:
-        url = foxglove("foxglove-websocket", address)
-        output.note(f"In Foxglove or Lichtblick: Open connection, Foxglove WebSocket, {address}")
-        output.note(f"In a browser: {url}")
-        output.note("Ctrl-C ends it.")
+    output.remarks(
+        [
+            f"In Foxglove or Lichtblick: Open connection, Foxglove WebSocket, {address}",
+            f"In a browser: {foxglove('foxglove-websocket', address)}",
+            "Ctrl-C ends it.",
+        ]
+    )
 
 
 def foxglove(source: str, url: str) -> str:
@@ -194,11 +189,11 @@ def foxglove(source: str, url: str) -> str:
     return f"https://app.foxglove.dev/?ds={source}&ds.url={quote(url, safe='')}"
 
 
-def print_unplayed(query: Query) -> None:
-    """Print the topics with messages that are left out, since their payload is gone."""
+def unplayed(query: Query) -> list[str]:
+    """The topics with messages that are left out, since their payload is gone, in a sentence."""
     from hybridlog.query.asked import channels_of
 
     topics = {each.channel.topic for each in channels_of(query) if each.is_reduced}
-    if topics:
-        found = listed(sorted(topics), _MAX_SHOWN)
-        output.note(f"Messages without their payload are not played; there are some of {found}.")
+    found = listed(sorted(topics), _MAX_SHOWN)
+    said = f"Messages without their payload are not played; there are some of {found}."
+    return [said] if topics else []

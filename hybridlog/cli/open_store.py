@@ -44,7 +44,7 @@ def opened_store(
     Args:
         path: Its directory; without, `HYBRIDLOG_STORE` or `./hybridlog-store`.
         mongo: URI of the MongoDB that holds the index.
-        quiet: No progress while the index is brought up to date.
+        quiet: No bar while the index is brought up to date.
         is_lasting: What the command meets is repaired while it goes on.
         snapshot: All that the command asks is of one moment.
         records: The command records, also while MongoDB is unavailable.

@@ -60,7 +60,6 @@ class InStore(Place):
 
     def opened(self, **how: Any) -> AbstractContextManager[Store]:
         """The open store; see `opened_store`."""
-        how.setdefault("quiet", getattr(self, "quiet", False) or getattr(self, "as_json", False))
         from hybridlog.cli.open_store import opened_store
 
         return opened_store(self.store, self.mongo, **how)
@@ -83,20 +82,12 @@ class AsJson:
         """Print rows as a table or as JSON (`plain` gives that of a row)."""
         if self.as_json:
             output.print_json([plain(row) for row in rows])
-        elif getattr(self, "quiet", False):
+        elif output.is_quiet():
             return
         elif rows:
             print_table(columns, rows, **how)
         elif without:
             output.note(without)
-
-    def tell(self, value: object, lines: Iterable[str]) -> None:
-        """Print a result as JSON, or in lines unless `--quiet` is given."""
-        if self.as_json:
-            output.print_json(value)
-        elif not getattr(self, "quiet", False):
-            for line in lines:
-                output.say_folded(line)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,11 +19,28 @@ if TYPE_CHECKING:
     from hybridlog.record.recorder import RecordReport
     from hybridlog_storage.catalog import ChannelEntry
 
+_manner = {"quiet": False, "as_json": False}
+
 counted = wording.counted
 unfit = wording.unfit
 size = wording.size
 
 _MAX_LINE = 100  # characters of a note, an attachment and the like
+
+
+def begin(given: object) -> None:
+    """Print from now on as the options of a command say: `--quiet`, `--json`."""
+    _manner.update({name: getattr(given, name, False) for name in _manner})
+
+
+def is_quiet() -> bool:
+    """Whether the command prints errors only."""
+    return _manner["quiet"]
+
+
+def has_bars() -> bool:
+    """Whether the command shows its progress where there is a terminal."""
+    return not any(_manner.values())
 
 
 def console(*, error: bool = False) -> Console:
@@ -85,6 +102,21 @@ def print_json_line(value: object) -> None:
 def note(text: str) -> None:
     """A line for the person, on standard error."""
     print(folded(text), file=sys.stderr)  # noqa: T201
+
+
+def remarks(lines: Iterable[str]) -> None:
+    """Notes that --quiet leaves out."""
+    if not is_quiet():
+        notes(lines)
+
+
+def tell(value: object, lines: Iterable[str], *, at_once: bool = False) -> None:
+    """Print a result as JSON, with `at_once` on a line; or in lines, which --quiet leaves out."""
+    if _manner["as_json"]:
+        (print_json_line if at_once else print_json)(value)
+    elif not is_quiet():
+        for line in lines:
+            say_folded(line)
 
 
 def say_folded(text: str) -> None:

@@ -5,19 +5,17 @@ from __future__ import annotations
 import re
 import sys
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 import click
 
 from hybridlog.cli import output
-from hybridlog.cli.answers import answering, check_room, form_of, not_written, write_bytes
+from hybridlog.cli.answers import answering, check_room, form_of, write_bytes
 from hybridlog.cli.binder import command, option
 from hybridlog.cli.completion import complete_path
 from hybridlog.cli.options import Asking, Forced, parse_fields
 from hybridlog.cli.render import Column, print_table
-from hybridlog.cli.signals import if_stopped
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
@@ -78,9 +76,11 @@ def plot_command(given: _Given) -> None:
         if not form:
             _print(found)
         else:
+            from hybridlog.drawing.figure import figure
+
             height = _HEIGHT * max(1, len({line.topic for line in found}))
-            with if_stopped(partial(not_written, path) if path else ""):
-                _write(found, form, shape or (width, height), path)
+            size = shape or (width, height)
+            write_bytes(path or sys.stdout.buffer, figure(found, size=size, form=form))
         asked.is_empty = not found or not asked.query.counters.messages
 
 
@@ -98,12 +98,6 @@ def _size(text: str) -> tuple[int, int]:
     if match is None:
         raise UsageError(f"A size is 1200x400, from 10 to 9999 pixels, not {text!r}.")
     return int(match[1]), int(match[2])
-
-
-def _write(found: Sequence[Line], form: str, size: tuple[int, int], path: Path | None) -> None:
-    from hybridlog.drawing.figure import figure
-
-    write_bytes(path or sys.stdout.buffer, figure(found, size=size, form=form))
 
 
 def _print(found: Sequence[Line]) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from typing import TYPE_CHECKING, Self
 
-from hybridlog.cli.output import console, printable
+from hybridlog.cli.output import console, has_bars, printable
 from hybridlog_storage.stopping import safe_point
 
 if TYPE_CHECKING:
@@ -20,13 +20,13 @@ class Bar:
     Args:
         label: Name of the work.
         total: Approximate number of bytes; None if unknown, 0 if each part tells its own.
-        quiet: No bar.
+        quiet: No bar, as for --quiet and --json.
     """
 
-    def __init__(self, label: str, total: int | None = 0, *, quiet: bool) -> None:
+    def __init__(self, label: str, total: int | None = 0, *, quiet: bool = False) -> None:
         self._label = _short(label)
         self._total = total
-        self._quiet = quiet or not sys.stderr.isatty()
+        self._quiet = quiet or not has_bars() or not sys.stderr.isatty()
         self._bar: Progress | None = None
         self._before = self._last = 0
         self._part: tuple[str, int] | None = None

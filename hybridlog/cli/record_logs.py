@@ -78,7 +78,7 @@ def record_watched(choices: RecordChoices) -> None:
     with recorder.opened() as store:
         look = partial(_look, recorder, store, watches, set[Path]())
         places = ", ".join(map(str, choices.paths))
-        watch(places, look, quiet=choices.quiet, report=partial(recorder.fail, None))
+        watch(places, look, report=partial(recorder.fail, None))
         left = [path for one in watches for path in one.unfinished()]
         for path in left[:_MAX_UNFINISHED]:
             output.note(f"{path} is not complete; `hybridlog record {path}` records what it has.")

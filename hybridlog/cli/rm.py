@@ -50,8 +50,7 @@ def rm_command(given: _Given) -> None:
                 "store removes the rest of it."
             ):
                 store.remove(one.id)
-            if not given.quiet:
-                output.say(f"deleted {one.name}")
+            output.tell(None, [f"deleted {one.name}"])
 
 
 def _confirm(chosen: Sequence[RecordingSummary], pins: Sequence[str]) -> None:

@@ -16,11 +16,7 @@ _PLAIN = "_.-:=+*#"
 
 
 def sparkline(values: NDArray[np.float64]) -> str:
-    """A letter for each number, from the least to the greatest; a space for NaN.
-
-    Args:
-        values: float64[n]; infinite ones count as NaN.
-    """
+    """A letter for each number, from the least to the greatest; a space for NaN."""
     letters = np.array(list(_letters()))
     is_known = np.isfinite(values)
     found = np.full(len(values), " ")

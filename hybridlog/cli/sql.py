@@ -4,16 +4,12 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from hybridlog.cli.answers import Tabular, answer_tables
 from hybridlog.cli.binder import SECONDS, SIZE, argument, command, option
 from hybridlog.cli.options import Ranged, Strict
-from hybridlog.cli.output import notes
+from hybridlog.cli.output import remarks
 from hybridlog.cli.signals import if_stopped
-
-if TYPE_CHECKING:
-    pass
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,8 +55,7 @@ def sql_command(given: _Given) -> None:
 
                     answer_tables((Table.from_batches([one]) for one in answer.to_batches()), to)
             sys.stdout.flush()
-            if not given.quiet:
-                notes(answer.sentences())
+            remarks(answer.sentences())
 
         if is_prompt:
             from hybridlog.cli.sql_prompt import run_prompt

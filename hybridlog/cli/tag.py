@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from hybridlog.cli import options
+from hybridlog.cli import options, output
 from hybridlog.cli.binder import argument, command, option
 from hybridlog.cli.completion import complete_recording
 from hybridlog.cli.options import AsJson, Choosing, InStore, Quiet, recordings_of
@@ -45,4 +45,4 @@ def tag_command(given: _Given) -> None:
         for name, own in found.items()
         for key, value in sorted(own.items())
     )
-    given.tell(found, lines)
+    output.tell(found, lines)

@@ -10,7 +10,7 @@ from hybridlog.cli.answers import SCREEN, Destination, Tabular, answer_tables
 from hybridlog.cli.binder import argument, command, option
 from hybridlog.cli.completion import complete_frame
 from hybridlog.cli.options import Strict, Topics, Verbose, topics
-from hybridlog.cli.output import notes, short_duration
+from hybridlog.cli.output import remarks, short_duration
 from hybridlog.cli.render import Column, numbers, print_table
 from hybridlog.wording import counted, listed
 from hybridlog_storage.errors import IncompleteError, UsageError
@@ -73,7 +73,7 @@ def tf_command(given: _Given) -> None:
         if given.strict and tree.remarks:
             raise IncompleteError(" ".join(tree.remarks))
         if target is None:
-            _show_tree(tree, to, quiet=given.quiet)
+            _show_tree(tree, to)
             return
         if not topic:
             stamps = _times(tree, given, between)
@@ -91,12 +91,11 @@ def tf_command(given: _Given) -> None:
             tree.transform(target, source, int(stamps[0]), extrapolate=given.extrapolate)
         answer_tables([found.to_arrow()], to)
         sys.stdout.flush()
-        if not given.quiet:
-            notes(
-                f"{counted(number, 'time')} without a transform: {why}."
-                for why, number in found.missing.items()
-            )
-            notes(tree.remarks)
+        remarks(
+            f"{counted(number, 'time')} without a transform: {why}."
+            for why, number in found.missing.items()
+        )
+        remarks(tree.remarks)
 
 
 def _times(
@@ -122,7 +121,7 @@ def _times(
     return np.array([tree.latest(target, given.source or target)], np.int64)
 
 
-def _show_tree(tree: FrameTree, to: Destination, *, quiet: bool) -> None:
+def _show_tree(tree: FrameTree, to: Destination) -> None:
     if to.form != SCREEN:
         answer_tables([tree.to_arrow()], to)
         return
@@ -138,5 +137,4 @@ def _show_tree(tree: FrameTree, to: Destination, *, quiet: bool) -> None:
                 row["from"] = f"{(gap[0] - tree.span[0]) / 1e9:+.3f}s"
         rows.append(row)
     print_table([Column("frame", side="whole"), *numbers(*names)], rows)
-    if not quiet:
-        notes([*tree.problems(), *tree.remarks])
+    remarks([*tree.problems(), *tree.remarks])

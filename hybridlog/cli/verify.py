@@ -50,21 +50,21 @@ def verify_command(given: _Given) -> None:
         _repair(given)
         return
     started = time.monotonic()
-    with given.opened(quiet=given.quiet, verifies=True) as store:
+    with given.opened(verifies=True) as store:
         chosen, unreadable = _chosen(given, store)
         total = sum(entry.stored_bytes for entry in chosen)
         names = None if given.choice.is_everything else [*(one.id for one in chosen), *unreadable]
-        with Bar("verify", total, quiet=given.quiet) as bar:
+        with Bar("verify", total) as bar:
             result = store.verify(names, bar.part)
         why = store.shared.index.unavailable
     elapsed = time.monotonic() - started
     if given.as_json:
         output.print_json({**asdict(result), "seconds": round(elapsed, 3)})
     else:
-        _print(result, elapsed, quiet=given.quiet)
-        running = [one.name for one in chosen if one.status == "open"]
-        if running and not given.quiet:
-            output.note(f"Still being recorded, and checked as far as sealed: {listed(running)}.")
+        _print(result, elapsed)
+        if running := [one.name for one in chosen if one.status == "open"]:
+            said = f"Still being recorded, and checked as far as sealed: {listed(running)}."
+            output.remarks([said])
     is_wanted = not isinstance(why, WithoutMongoError)
     if not result.index and is_wanted and (result.findings or why is None):
         output.note(f"The index was not compared: {why}")
@@ -89,21 +89,20 @@ def _chosen(given: _Given, store: Store) -> tuple[Sequence[RecordingSummary], li
         return [], unreadable
 
 
-def _print(result: Verification, elapsed: float, *, quiet: bool) -> None:
+def _print(result: Verification, elapsed: float) -> None:
     for finding in result.findings:
         _say(finding, f"{finding.problem.removesuffix('.')}; {finding.cure}")
-    if quiet:
-        return
     verdict = "all is well" if result.index else "all is well in the files"
     if result.findings:
         verdict = output.counted(len(result.findings), "problem")
-    output.say(
+    told = (
         f"{output.counted(result.recordings, 'recording')}, "
         f"{output.counted(result.chunks, 'chunk')}, "
         f"{output.counted(result.messages, 'message')}, "
         f"{output.size(result.bytes_read)} read in {elapsed:.2f} s: {verdict}"
         f"{output.without_documents(result.without_documents)}"
     )
+    output.tell(None, [told])
 
 
 def _repair(given: _Given) -> None:
@@ -114,21 +113,20 @@ def _repair(given: _Given) -> None:
 
         become_another(store_path(given.store), given.mongo)
         output.note("The store has a new id now.")
-    with given.opened(quiet=given.quiet, verifies=True) as store:
+    with given.opened(verifies=True) as store:
         if given.moved:
             store.shared.index.take_over()
             output.note("The index belongs to the store at this place now.")
         chosen, unreadable = _chosen(given, store)
         names = None if given.choice.is_everything else [*(one.id for one in chosen), *unreadable]
-        with Bar("repair", 0, quiet=given.quiet) as bar:
+        with Bar("repair") as bar:
             done = store.verify(names, bar.part, repair=True)
     if given.as_json:
         output.print_json([asdict(one) for one in done])
     else:
         for one in done:
             _say(one, f"{'mended' if one.is_cured else 'left'}: {one.done}")
-        if not (done or given.moved or given.new_id or given.quiet):
-            output.say("nothing to mend")
+        output.tell(None, [] if done or given.moved or given.new_id else ["nothing to mend"])
     if not all(one.is_cured for one in done):
         raise click.exceptions.Exit(1)
 

@@ -29,7 +29,6 @@ def watch(
     look: Callable[[], Iterable[HybridlogError]],
     *,
     pause_s: float = 2.0,
-    quiet: bool,
     report: Callable[[HybridlogError], None] = lambda error: output.note(str(error)),
 ) -> None:
     """Look at a store or directories again and again; a signal ends this normally.
@@ -39,7 +38,6 @@ def watch(
         look: Acts on what has changed since its last call and prints that; yields problems. If
             it fails because a place or a database is away, it is called again, later.
         pause_s: Seconds between two looks.
-        quiet: Problems only.
         report: Called once with a problem, as long as it lasts.
     """
     if isinstance(sys.stdout, io.TextIOWrapper):  # a file and a pipe show each line at once
@@ -47,8 +45,7 @@ def watch(
     told: set[str] = set()
     try:
         with at_safe_points():
-            if not quiet:
-                output.note(f"Watching {place}. Ctrl-C ends it.")
+            output.remarks([f"Watching {place}. Ctrl-C ends it."])
             while True:
                 is_away = _look(look, told, report, _LONGER * pause_s)
                 pause(_LONGER * pause_s if is_away else pause_s)

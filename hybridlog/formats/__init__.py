@@ -47,11 +47,7 @@ class LogFormat:
     has_end: bool = False
 
     def open(self, path: Path) -> Source:
-        """Open an uncompressed file.
-
-        Raises:
-            SourceError: Nothing of it can be read.
-        """
+        """Open an uncompressed file."""
         source: Source = resolve_name(self.reader)(path)
         return source
 
@@ -111,12 +107,7 @@ class OutputFormat:
     is_of_places: bool = False
 
     def write(self, answer: Answer, target: Target, **settings: Any) -> None:
-        """Write an answer, all of it or nothing.
-
-        Raises:
-            DiskFullError: No space left.
-            UsageError: The target cannot be written, or the format cannot hold the answer.
-        """
+        """Write an answer, all of it or nothing."""
         resolve_name(self.writer)(answer, target, **settings)
 
 

@@ -28,9 +28,6 @@ def sniff(path: Path) -> tuple[LogFormat, bool]:
 
     Returns:
         The format, and whether the file is compressed with zstd.
-
-    Raises:
-        SourceError: It cannot be read.
     """
     try:
         with path.open("rb") as file:
@@ -69,11 +66,7 @@ class LogFile:
             return cls(path, messages=messages)
 
     def open(self, unpacked: Path | None = None) -> Source:
-        """Open the file, or what it has been unpacked to.
-
-        Raises:
-            SourceError: Nothing of it can be read.
-        """
+        """Open the file, or what it has been unpacked to."""
         if self.format is not UNKNOWN:
             return self.format.open(unpacked or self.path)
         _, is_packed = sniff(self.path)

@@ -56,9 +56,6 @@ def find_logs(top: Path) -> Found:
     A ROS 2 bag is one log, and so are the parts of a split one, whose numbers begin with 0.
     Symlinks are followed, but no directory is searched twice. Hidden files, stores, and
     databases that are not called `.db3` are left out.
-
-    Raises:
-        SourceError: The directory cannot be read.
     """
     found = Found()
     for folder, files in _folders(top, found):
@@ -82,10 +79,6 @@ class Watch:
     the same log exists or `metadata.yaml` lists it. Databases and compressed files are complete,
     too, when they have not changed for some time. Each file is a log of its own, but for ROS 2
     bags that are complete when they are met.
-
-    Args:
-        top: The directory.
-        settle_s: That time, seconds.
     """
 
     def __init__(self, top: Path, settle_s: float = SETTLE_S) -> None:
@@ -99,9 +92,6 @@ class Watch:
         """The logs that have become complete since the last look.
 
         It lists the directories, and reads the beginnings and ends of files that have changed.
-
-        Raises:
-            SourceError: The directory cannot be read.
         """
         found = Found()
         seen: set[_File] = set()

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from itertools import chain, repeat
 from typing import TYPE_CHECKING
 
@@ -84,36 +84,8 @@ def json_rows(records: pa.StructArray) -> Iterator[Line]:
             yield from json_column(part).to_pylist()
 
 
-def object_line(row: Mapping[str, object]) -> Line:
-    """An object as one line of JSON, without its end; in pieces if it has a long list.
-
-    Raises:
-        UsageError: A value that has no JSON form.
-    """
-    if any(isinstance(value, list) and len(value) > _ROWS for value in row.values()):
-        return _pieces(row)
-    return json_line(row)
-
-
-def _pieces(row: Mapping[str, object]) -> Iterator[str]:
-    for number, (name, value) in enumerate(row.items()):
-        yield f"{', ' if number else '{'}{json_line(name)}: "
-        if not isinstance(value, list):
-            yield json_line(value)
-            continue
-        for begin in range(0, max(len(value), 1), _ROWS):
-            yield ", " if begin else "["
-            yield json_line(value[begin : begin + _ROWS])[1:-1]
-        yield "]"
-    yield "}"
-
-
 def json_line(row: object) -> str:
-    """A plain value, as of `Decoded.plain`, as one line of JSON, without its end.
-
-    Raises:
-        UsageError: It is nested too deep.
-    """
+    """A plain value, as of `Decoded.plain`, as one line of JSON, without its end."""
     try:
         try:
             return json.dumps(row, ensure_ascii=False, allow_nan=False, default=_base64)

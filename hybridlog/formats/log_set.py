@@ -38,11 +38,7 @@ _CDR = frozenset({"cdr", ""})  # encodings of ROS 2 messages
 
 
 def open_source(path: Path) -> Source:
-    """Open a log: a file, or the directory of a ROS 2 bag or of a split log.
-
-    Raises:
-        SourceError: As `LogSet.open`.
-    """
+    """Open a log: a file, or the directory of a ROS 2 bag or of a split log."""
     return LogSet.at(path).open()
 
 
@@ -90,12 +86,7 @@ class LogSet:
 
     @classmethod
     def of(cls, parts: Sequence[LogFile], metadata: BagMetadata | Damage | None) -> LogSet:
-        """A file, or the parts of a split log in their order.
-
-        Args:
-            parts: The files.
-            metadata: The metadata beside them.
-        """
+        """A file, or the parts of a split log in their order."""
         first = parts[0]
         if len(parts) == 1 and isinstance(metadata, BagMetadata) and first.format.rosbag2:
             files, _ = locate(first.path.parent, metadata)
@@ -120,13 +111,7 @@ class LogSet:
         return self.path.name.rpartition("_")[0] or None if is_split else None
 
     def open(self) -> Source:
-        """Open its files as one source.
-
-        Raises:
-            SourceError: Nothing can be read: the path is missing, not readable, empty, of an
-                unknown kind, encrypted or of an old version, or a directory without a log. The
-                message names the cause and the cure.
-        """
+        """Open its files as one source."""
         if self.problem is not None:
             raise self.problem
         if all(part.format is UNKNOWN for part in self.parts):
@@ -155,11 +140,7 @@ class LogSet:
 
 
 def _in_folder(folder: Path) -> LogSet:
-    """The log in a directory; its metadata need not list all parts, nor right names.
-
-    Raises:
-        SourceError: There is none, or more than one.
-    """
+    """The log in a directory; its metadata need not list all parts, nor right names."""
     metadata = read_metadata(folder)
     bag = metadata if isinstance(metadata, BagMetadata) else None
     damage = [metadata] if isinstance(metadata, Damage) else []
@@ -228,9 +209,6 @@ class _JoinedSource(Source):
 
     Equal channels of all files become one channel. An unreadable file counts as damage,
     unless all are unreadable.
-
-    Args:
-        log: The files, one of which at least has a known format.
     """
 
     def __init__(self, log: LogSet) -> None:
@@ -338,14 +316,7 @@ class _JoinedSource(Source):
         self._check_count(path / NAME, total, self._got, 0)
 
     def _check_count(self, path: Path, total: int | None, got: int, found_before: int) -> None:
-        """Compare with a number of messages in the metadata.
-
-        Args:
-            path: The file that they are missing from.
-            total: The number, None if unknown.
-            got: Messages that were read.
-            found_before: Damage found before them.
-        """
+        """Compare with a number of messages in the metadata."""
         if total is None or got >= total:
             return
         found = self.damage[found_before:]

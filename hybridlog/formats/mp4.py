@@ -48,14 +48,7 @@ _BT601: Final = 6
 
 
 def write_mp4(answer: Answer, target: Target) -> None:
-    """Write a video; messages that are unreadable are left out.
-
-    Raises:
-        UsageError: The target is a stream, or cannot be written; or a picture is of another
-            topic, recording, or size than those before, or earlier.
-        MissingDependencyError: PyAV is not installed.
-        DiskFullError: No space left.
-    """
+    """Write a video; messages that are unreadable are left out."""
     with _Video(path_of(target, "mp4", "a file")) as video:
         for message in answer.messages:
             try:

@@ -11,14 +11,13 @@
 | structures | `name.field` |
 
 If a column has nulls, `name.valid` marks the rows with a value; the others are NaN, NaT,
-zero or empty. Rows wait in a temporary Arrow file, from which columns are read one by one.
+zero or empty. All rows are in memory, as they are for who reads the file.
 """
 
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Callable, Iterator
-from functools import partial
+from collections.abc import Iterator
 from typing import IO, TYPE_CHECKING, Any, TypeAlias, cast
 
 import numpy as np
@@ -27,9 +26,8 @@ import pyarrow.compute as pc
 
 from hybridlog.formats.answer import Answer
 from hybridlog.formats.tables import groups
-from hybridlog.formats.writing import Sink, Target, failures
+from hybridlog.formats.writing import Sink, Target
 from hybridlog.schema.arrow_types import (
-    bounds_of,
     is_bytes,
     is_list,
     is_numeric,
@@ -37,7 +35,6 @@ from hybridlog.schema.arrow_types import (
     is_time,
     numpy_type,
 )
-from hybridlog_storage.disk.unfinished import scratch_directory
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
@@ -46,201 +43,103 @@ if TYPE_CHECKING:
 _LONGEST_STRING = 256
 _STRINGS_AT_ONCE = 1 << 14
 
-Pieces: TypeAlias = "Callable[[], Iterator[pa.Array]]"
-"""Reads a column, piece by piece, from its beginning."""
-Arrays: TypeAlias = "Iterator[tuple[str, np.dtype[Any], tuple[int, ...], Iterator[NDArray[Any]]]]"
-"""Name, type, shape and content, piece by piece, of arrays."""
+Arrays: TypeAlias = "Iterator[tuple[str, NDArray[Any]]]"
+"""Arrays by name."""
 
 
 def write_npz(answer: Answer, target: Target) -> None:
-    """Write one .npz file.
-
-    Raises:
-        UsageError: A column changes its type, or has a type without a numpy form.
-        DiskFullError: No space left.
-    """
-    directory = scratch_directory()
-    try:
-        with Sink(target) as sink, failures(sink.name):
-            path = str(directory.path / "rows.arrow")
-            schema = _spool(groups(answer, "npz"), path)
-            with zipfile.ZipFile(cast("IO[bytes]", sink), "w", zipfile.ZIP_STORED) as archive:
-                try:
-                    for index, field in enumerate(schema):
-                        if not pa.types.is_null(field.type):
-                            pieces = partial(_column, path, index)
-                            for array in _arrays(_array_name(field.name), field.type, pieces):
-                                _add(archive, *array)
-                except BaseException:
-                    # Otherwise the archive would be finished, and a stream would look complete.
-                    sink.abort()
-                    raise
-    finally:
-        directory.remove()
+    """Write one .npz file."""
+    table = pa.concat_tables(groups(answer, "npz"))
+    with Sink(target) as sink, zipfile.ZipFile(cast("IO[bytes]", sink), "w") as archive:
+        try:
+            for field, column in zip(table.schema, table.columns, strict=True):
+                for name, array in _arrays(_array_name(field.name), column):
+                    _add(archive, name, array)
+        except BaseException:
+            # Otherwise the archive would be finished, and a stream would look complete.
+            sink.abort()
+            raise
 
 
-def _spool(tables: Iterator[pa.Table], path: str) -> pa.Schema:
-    """Write tables of the same columns into an Arrow file; returns the columns of that."""
-    table = _plain(next(tables))
-    for field in table.schema:
-        for _ in _arrays(field.name, field.type, lambda: iter(())):
-            pass  # a type that numpy does not have is refused here
-    with pa.ipc.new_file(path, table.schema) as file:
-        file.write_table(table)
-        for more in tables:
-            file.write_table(_plain(more))
-    return table.schema
-
-
-def _plain(table: pa.Table) -> pa.Table:
-    """The rows without dictionaries, with JSON as text, in one piece."""
-    columns = []
-    for column in table.combine_chunks().columns:
-        kind = column.type
-        if isinstance(kind, pa.BaseExtensionType):
-            arrays = [one.storage for one in column.chunks]
-            columns.append(pa.chunked_array(arrays, kind.storage_type))
-        else:
-            is_coded = pa.types.is_dictionary(kind)
-            columns.append(column.cast(kind.value_type) if is_coded else column)
-    return pa.Table.from_arrays(columns, table.column_names)
-
-
-def _column(path: str, index: int) -> Iterator[pa.Array]:
-    with pa.memory_map(path) as mapped:
-        file = pa.ipc.open_file(mapped)
-        for number in range(file.num_record_batches):
-            yield file.get_batch(number).column(index)
-
-
-def _add(
-    archive: zipfile.ZipFile,
-    name: str,
-    dtype: np.dtype[Any],
-    shape: tuple[int, ...],
-    pieces: Iterator[NDArray[Any]],
-) -> None:
+def _add(archive: zipfile.ZipFile, name: str, array: NDArray[Any]) -> None:
     while f"{name}.npy" in archive.NameToInfo:
         name += "_"
     # With a fixed date, equal content makes equal files.
     entry = zipfile.ZipInfo(f"{name}.npy", (1980, 1, 1, 0, 0, 0))
-    about = {
-        "descr": np.lib.format.dtype_to_descr(dtype),
-        "fortran_order": False,
-        "shape": shape,
-    }
     with archive.open(entry, "w", force_zip64=True) as file:
-        np.lib.format.write_array_header_1_0(file, about)
-        for piece in pieces:
-            file.write(np.ascontiguousarray(piece, dtype).tobytes())
+        np.lib.format.write_array(file, np.ascontiguousarray(array), allow_pickle=False)
 
 
-def _arrays(name: str, kind: pa.DataType, pieces: Pieces) -> Arrays:
-    """The arrays of a column.
-
-    Raises:
-        UsageError: Numpy has no such type.
-    """
-    rows = sum(map(len, pieces()))
+def _arrays(name: str, column: pa.ChunkedArray) -> Arrays:
+    """The arrays of a column."""
+    kind = column.type
+    if isinstance(kind, pa.BaseExtensionType):
+        chunks = [one.storage for one in column.chunks]
+        yield from _arrays(name, pa.chunked_array(chunks, kind.storage_type))
+        return
+    if pa.types.is_dictionary(kind):
+        yield from _arrays(name, column.cast(kind.value_type))
+        return
     if is_numeric(kind):
-        yield name, numpy_type(kind), (rows,), map(_numbers, pieces())
+        yield name, _numbers(column)
     elif is_time(kind):
         is_stamp = pa.types.is_timestamp(kind)
-        unit = pa.timestamp("ns") if is_stamp else pa.duration("ns")
-        dtype = np.dtype("datetime64[ns]" if is_stamp else "timedelta64[ns]")
-        yield name, dtype, (rows,), (_ticks(one.cast(unit)).view(dtype) for one in pieces())
+        ticks = column.cast(pa.timestamp("ns") if is_stamp else pa.duration("ns")).cast(pa.int64())
+        values = ticks.fill_null(int(np.iinfo(np.int64).min)).to_numpy().astype(np.int64)
+        yield name, values.view("datetime64[ns]" if is_stamp else "timedelta64[ns]")
     elif is_text(kind) or is_bytes(kind):
-        yield from _texts(name, kind, rows, pieces)
+        yield from _texts(name, column)
     elif pa.types.is_fixed_size_list(kind) and is_numeric(kind.value_type):
-        shape = (rows, kind.list_size)
-        yield name, numpy_type(kind.value_type), shape, map(_matrix, pieces())
+        # A null row has as many elements, which are null.
+        rows = [pc.list_flatten(one.fill_null([None] * kind.list_size)) for one in column.chunks]
+        items = _numbers(pa.chunked_array(rows, kind.value_type))
+        yield name, items.reshape(len(column), kind.list_size)
     elif is_list(kind):
-        elements = partial(_each, pieces, lambda one: one.flatten())
-        yield from _arrays(f"{name}.values", kind.value_type, elements)
-        yield f"{name}.offsets", np.dtype(np.int64), (rows + 1,), _offsets(pieces())
+        yield from _arrays(f"{name}.values", pc.list_flatten(column))
+        yield f"{name}.offsets", _offsets(pc.list_value_length(column))
     elif pa.types.is_struct(kind):
-        for n, field in enumerate(kind):
-            member = partial(_each, pieces, partial(_member, n))
-            yield from _arrays(f"{name}.{_array_name(field.name)}", field.type, member)
-    elif pa.types.is_dictionary(kind):
-        decoded = partial(_each, pieces, lambda one: one.dictionary_decode())
-        yield from _arrays(name, kind.value_type, decoded)
+        for field, member in zip(kind, column.flatten(), strict=True):
+            yield from _arrays(f"{name}.{_array_name(field.name)}", member)
     elif not pa.types.is_null(kind):  # elements of lists that are all empty
         raise UsageError(
             f"column {name!r} is {kind}, which numpy does not have; leave it out with --fields"
         )
-    if not pa.types.is_dictionary(kind) and any(one.null_count for one in pieces()):
-        valid = (one.is_valid().to_numpy(zero_copy_only=False) for one in pieces())
-        yield f"{name}.valid", np.dtype(bool), (rows,), valid
+    if column.null_count and not pa.types.is_null(kind):
+        yield f"{name}.valid", column.is_valid().to_numpy()
 
 
-def _each(pieces: Pieces, how: Callable[[pa.Array], pa.Array]) -> Iterator[pa.Array]:
-    return map(how, pieces())
-
-
-def _member(n: int, structs: pa.StructArray) -> pa.Array:
-    return structs.flatten()[n]  # null where the structure is
-
-
-def _texts(name: str, kind: pa.DataType, rows: int, pieces: Pieces) -> Arrays:
+def _texts(name: str, column: pa.ChunkedArray) -> Arrays:
     """Strings of a fixed width; or bytes and their ends."""
-    is_short = is_text(kind)
-    longest = 1
-    for one in pieces() if is_short else ():
-        longest = max(longest, pc.max(pc.utf8_length(one)).as_py() or 0)
-        has_nul = pc.any(pc.match_substring(one, "\0")).as_py()
-        is_short = is_short and not has_nul and longest <= _LONGEST_STRING
-    if is_short:
-        dtype = np.dtype(f"<U{longest}")
-        parts = (
-            one.slice(at, _STRINGS_AT_ONCE)
-            for one in pieces()
-            for at in range(0, len(one), _STRINGS_AT_ONCE)
-        )
-        words = (np.array(part.fill_null("").to_pylist(), dtype) for part in parts)
-        yield name, dtype, (rows,), words
-        return
-    binary = partial(_each, pieces, lambda one: one.cast(pa.large_binary()))
-    size = sum(int(bounds_of(one)[-1]) for one in binary())
-    joined = (np.frombuffer(b"".join(one.fill_null(b"").to_pylist()), np.uint8) for one in binary())
-    yield f"{name}.values", np.dtype(np.uint8), (size,), joined
-    yield f"{name}.offsets", np.dtype(np.int64), (rows + 1,), _offsets(binary())
+    if is_text(column.type):
+        longest = max(pc.max(pc.utf8_length(column)).as_py() or 0, 1)
+        has_nul = pc.any(pc.match_substring(column, "\0")).as_py()
+        if longest <= _LONGEST_STRING and not has_nul:
+            words = np.empty(len(column), f"<U{longest}")
+            for at in range(0, len(column), _STRINGS_AT_ONCE):
+                part = column.slice(at, _STRINGS_AT_ONCE).fill_null("").to_pylist()
+                words[at : at + len(part)] = part
+            yield name, words
+            return
+    chunks = column.cast(pa.large_binary()).fill_null(b"").chunks
+    data = b"".join(cell for chunk in chunks for cell in chunk.to_pylist())
+    yield f"{name}.values", np.frombuffer(data, np.uint8)
+    yield f"{name}.offsets", _offsets(pc.binary_length(column))
 
 
-def _offsets(pieces: Iterator[pa.Array]) -> Iterator[NDArray[np.int64]]:
-    """Ends of rows, behind a 0."""
-    end = 0
-    yield np.zeros(1, np.int64)
-    for one in pieces:
-        bounds = bounds_of(one)
-        yield bounds[1:] + end
-        end += int(bounds[-1])
+def _offsets(lengths: pa.ChunkedArray) -> NDArray[np.int64]:
+    """Where rows begin, and the last one ends."""
+    ends = np.zeros(len(lengths) + 1, np.int64)
+    np.cumsum(lengths.fill_null(0).to_numpy(), out=ends[1:])
+    return ends
 
 
-def _numbers(array: pa.Array) -> NDArray[Any]:
+def _numbers(column: pa.ChunkedArray) -> NDArray[Any]:
     """NaN, False or 0 for null."""
-    kind = array.type
+    kind = column.type
     empty = float("nan") if pa.types.is_floating(kind) else 0
     filler = pa.scalar(False if pa.types.is_boolean(kind) else empty, kind)
-    found: NDArray[Any] = array.fill_null(filler).to_numpy(zero_copy_only=False)
+    found: NDArray[Any] = column.fill_null(filler).to_numpy().astype(numpy_type(kind), copy=False)
     return found
-
-
-def _ticks(array: pa.Array) -> NDArray[np.int64]:
-    """Nanoseconds, with NaT for null."""
-    plain = array.cast(pa.int64()).fill_null(int(np.iinfo(np.int64).min))
-    found: NDArray[np.int64] = plain.to_numpy(zero_copy_only=False)
-    return found
-
-
-def _matrix(array: pa.Array) -> NDArray[Any]:
-    """The elements of lists of one size, one behind the other; those of null rows are null."""
-    size = array.type.list_size
-    items = array.values.slice(array.offset * size, len(array) * size)
-    if array.null_count:
-        hidden = np.repeat(array.is_null().to_numpy(zero_copy_only=False), size)
-        items = pc.if_else(pa.array(hidden), pa.scalar(None, items.type), items)
-    return _numbers(items)
 
 
 def _array_name(name: str) -> str:

@@ -21,17 +21,7 @@ _Form = Literal["png", "jpg"]
 
 
 def _write(form: _Form, answer: Answer, target: Target) -> None:
-    """Write one image to a stream or a name with the suffix of one; else a directory.
-
-    Args:
-        form: Format of images that are no file yet.
-        answer: The messages; those that are unreadable are left out.
-        target: Directory; path, whose suffix must be that of the image; or a binary stream.
-
-    Raises:
-        UsageError: It cannot be written, or there are several images for a file.
-        DiskFullError: No space left.
-    """
+    """Write one image to a stream or a name with the suffix of one; else a directory."""
     suffix = suffix_of(target) if isinstance(target, str | os.PathLike) else None
     if suffix is None and isinstance(target, str | os.PathLike):
         with Directory(target) as folder:

@@ -66,11 +66,7 @@ def write_geojson(answer: Answer, target: Target) -> None:
 def _places(
     answer: Answer, choose: Callable[[Sequence[str]], list[str]]
 ) -> Iterator[tuple[pa.Table, list[str]]]:
-    """The tables that have rows, and the columns that are written.
-
-    Raises:
-        UsageError: The columns hold no such places, or those of several topics.
-    """
+    """The tables that have rows, and the columns that are written."""
     if answer.schema is not None:
         choose(answer.schema.names)
     topics: set[str] = set()

@@ -39,14 +39,7 @@ _NO_WORD: Final = re.compile(r"\W", re.ASCII)
 
 
 def write_ply(answer: Answer, target: Target) -> None:
-    """Write a directory with a PLY file a message.
-
-    Raises:
-        UsageError: The target is a stream, not empty, or cannot be written; or a message has no
-            points.
-        PayloadError: A message is damaged.
-        DiskFullError: No space left.
-    """
+    """Write a directory with a PLY file a message."""
     with Directory(path_of(target, "ply", "a directory")) as folder:
         for points, topic, kind, time in chain(answer.points, _points(answer)):
             about = {"topic": topic, "type": kind, "log_time_ns": time, "points": points.size}

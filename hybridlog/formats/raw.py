@@ -52,14 +52,7 @@ def write_raw(answer: Answer, target: Target) -> None:
 
 
 class Directory(Whole):
-    """A directory with a file a message.
-
-    Args:
-        target: The directory; it must be missing or empty.
-
-    Raises:
-        UsageError: It is not empty, or cannot be written.
-    """
+    """A directory with a file a message."""
 
     def __init__(self, target: str | os.PathLike[str]) -> None:
         self._name = os.fspath(target)

@@ -153,11 +153,7 @@ class Source(ABC):
 
 
 def size_of(file: Path) -> int:
-    """Size of a file in bytes.
-
-    Raises:
-        SourceError: The file is missing or not accessible.
-    """
+    """Size of a file in bytes."""
     try:
         return file.stat().st_size
     except OSError as error:

@@ -44,12 +44,7 @@ IN_FORCE: Final = Front()
 
 
 def batches_of(query: Query, front: Front) -> Iterator[tuple[Batch, Sequence[Channel]]]:
-    """The messages of a slice in the order of the file, many at once.
-
-    Args:
-        query: The query; its counters count the messages, those in front as `latched`.
-        front: The latched messages in front of the answer.
-    """
+    """The messages of a slice in the order of the file, many at once."""
     before = copy(query)
     if front.latched:
         for batch, channels in before.latched(original_times=front.original_times):
@@ -92,13 +87,7 @@ def profile_of(query: Query) -> str:
 
 
 def log_of(query: Query, front: Front = IN_FORCE, extras: Extras | None = None) -> Answer:
-    """A slice as a log.
-
-    Args:
-        query: The slice.
-        front: The latched messages in front of the answer.
-        extras: What it has beside messages.
-    """
+    """A slice as a log."""
     from hybridlog.formats.answer import Answer
 
     return Answer(batches=batches_of(query, front), extras=extras, profile=profile_of(query))

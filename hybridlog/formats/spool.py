@@ -48,11 +48,7 @@ class Spooled:
 
 
 def peek(path: Path, count: int) -> bytes:
-    """The first unpacked bytes of a zstd file, fewer if it is damaged.
-
-    Raises:
-        SourceError: The file cannot be read.
-    """
+    """The first unpacked bytes of a zstd file, fewer if it is damaged."""
     try:
         with path.open("rb") as file:
             data = file.read(1 << 17)
@@ -67,11 +63,7 @@ def peek(path: Path, count: int) -> bytes:
 
 
 def spool(path: Path) -> Spooled:
-    """Unpack the intact part of a zstd file to a temporary file.
-
-    Raises:
-        SourceError: It cannot be read, or there is no room for it.
-    """
+    """Unpack the intact part of a zstd file to a temporary file."""
     try:
         with path.open("rb") as source:
             size = zstandard.frame_content_size(source.read(32))
@@ -82,11 +74,7 @@ def spool(path: Path) -> Spooled:
 
 
 def copy_start(path: Path, count: int) -> Spooled:
-    """Copy the first `count` bytes of a file to a temporary file.
-
-    Raises:
-        SourceError: It cannot be read, or there is no room for it.
-    """
+    """Copy the first `count` bytes of a file to a temporary file."""
     try:
         with path.open("rb") as source:
             return _to_temporary(path, count, partial(_copy, source, count))
@@ -95,13 +83,7 @@ def copy_start(path: Path, count: int) -> Spooled:
 
 
 def _to_temporary(path: Path, size: int, fill: Callable[[IO[bytes], int], str | None]) -> Spooled:
-    """Create and fill a temporary file.
-
-    Args:
-        path: The source file.
-        size: Least number of bytes that it takes.
-        fill: Writes at most the given number of bytes to it, and returns a problem or None.
-    """
+    """Create and fill a temporary file."""
     folder = Path(tempfile.gettempdir())
     room = shutil.disk_usage(folder).free - _MIN_FREE_BYTES
     if size > room:

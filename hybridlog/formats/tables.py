@@ -86,15 +86,7 @@ def _write(
     open_file: Callable[[Sink, pa.Table], _ArrowFile],
     prepared: Callable[[pa.Table], pa.Table] = lambda table: table,
 ) -> None:
-    """Write tables.
-
-    Args:
-        answer: The tables.
-        target: Path or binary stream.
-        form: The format.
-        open_file: Opens a file for a table and those after it.
-        prepared: Converts a table to columns that the format supports.
-    """
+    """Write tables."""
     with Sink(target) as sink:
         try:
             file: _ArrowFile | None = None
@@ -113,16 +105,7 @@ def _write(
 
 
 def groups(answer: Answer, form: str) -> Iterator[pa.Table]:
-    """The rows in tables of the same columns, each of many rows; at least one, possibly empty.
-
-    Args:
-        answer: The tables.
-        form: The format, for messages.
-
-    Raises:
-        UsageError: A column appears too late, twice, or with values that do not fit the type
-            it had.
-    """
+    """The rows in tables of the same columns, each of many rows; at least one, possibly empty."""
     schema, written, rows, size = answer.schema, 0, 0, 0
     pieces: list[pa.Table] = []
 

@@ -61,12 +61,7 @@ class Whole:
             self.abort()
 
     def commit(self) -> None:
-        """Complete the output; it then stands under its name.
-
-        Raises:
-            DiskFullError: No space; no file remains.
-            UsageError: The target cannot be written.
-        """
+        """Complete the output; it then stands under its name."""
         raise NotImplementedError
 
     def abort(self) -> None:
@@ -79,12 +74,6 @@ class Sink(Whole):
 
     It has the methods that pyarrow, zipfile and the mcap writer need of a file without seek.
     Others write to its `path`, where it is one.
-
-    Args:
-        target: Path or stream.
-
-    Raises:
-        UsageError: The target is a directory, does not exist or cannot be written.
     """
 
     def __init__(self, target: Target) -> None:
@@ -115,9 +104,6 @@ class Sink(Whole):
         """Append bytes; returns how many.
 
         After `abort` they are dropped: libraries write their trailers when they are closed.
-
-        Raises:
-            DiskFullError: No space left.
         """
         if self._over:
             return memoryview(data).nbytes
@@ -179,16 +165,7 @@ class Sink(Whole):
 
 
 def path_of(target: Target, form: str, name: str) -> str | os.PathLike[str]:
-    """The path of a format that is no stream.
-
-    Args:
-        target: As given.
-        form: The format.
-        name: What is to be named.
-
-    Raises:
-        UsageError: It is a stream.
-    """
+    """The path of a format that is no stream."""
     if isinstance(target, str | os.PathLike):
         return target
     raise UsageError(f"{form} is no stream: name {name} with -o.")
@@ -198,9 +175,6 @@ def destination(target: str | os.PathLike[str]) -> tuple[Path, bool]:
     """The path to write, with links resolved, and whether a rename can replace it.
 
     Devices and pipes cannot be replaced.
-
-    Raises:
-        UsageError: It is a directory, or its directory does not exist.
     """
     if "\0" in os.fspath(target):
         raise UsageError("the output's name has a NUL character")
@@ -214,27 +188,14 @@ def destination(target: str | os.PathLike[str]) -> tuple[Path, bool]:
 
 
 def _check_outside(path: Path) -> None:
-    """Raise if a path is within a store, whose files are not to be replaced.
-
-    Raises:
-        UsageError: It is.
-    """
+    """Raise if a path is within a store, whose files are not to be replaced."""
     for folder in path.parents:
         if (folder / SETTINGS).is_file():
             raise UsageError(f"{path} is within the store {folder}; write it elsewhere")
 
 
 def new_directory(target: str | os.PathLike[str], content: str) -> tuple[Path, Unfinished]:
-    """A directory to write, with links resolved, and the unfinished one that will replace it.
-
-    Args:
-        target: The directory; it must be missing or empty.
-        content: What it is to hold, for messages.
-
-    Raises:
-        UsageError: It is a file, or not empty.
-        OSError: It cannot be made.
-    """
+    """A directory to write, with links resolved, and the unfinished one that will replace it."""
     path = Path(os.path.realpath(target))
     _check_outside(path)
     if path.exists() and not path.is_dir():

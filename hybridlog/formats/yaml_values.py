@@ -30,15 +30,7 @@ class YamlError(ValueError):
 
 
 def read_yaml(path: str | Path, what: str) -> bytes:
-    """Read a small file of a user that is to be parsed.
-
-    Args:
-        path: The file.
-        what: What it should be, for messages.
-
-    Raises:
-        UsageError: It cannot be read, or is larger than `MAX_BYTES`.
-    """
+    """Read a small file of a user that is to be parsed."""
     try:
         with Path(path).open("rb") as file:
             text = file.read(MAX_BYTES + 1)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import pyarrow as pa
 
 from hybridlog.formats.answer import Line
-from hybridlog.formats.jsonl import json_rows, object_line
+from hybridlog.formats.jsonl import json_line, json_rows
 from hybridlog.frames.answer import Decoder
 from hybridlog.frames.builder import Block
 from hybridlog.frames.columns import flat, summary_array, with_summaries
@@ -117,7 +117,7 @@ def _of_objects(
             _summarise(leaves, fields)
         for path in _by_fields(leaves, fields):
             row[free_name(path, row)] = leaves[path]
-        yield object_line(row)
+        yield json_line(row)
 
 
 def _flat(message: Mapping[str, Any]) -> dict[str, Any]:

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import subprocess
 from pathlib import Path
-from types import SimpleNamespace
-from typing import cast
 
 import pytest
 
 from hybridlog.cli.answers import print_end
-from hybridlog.cli.options import Topics
 from hybridlog.query.counters import Counters
 from tests.independent import Seen, read_bag, read_mcap
 
@@ -185,8 +182,7 @@ def test_messages_that_do_not_fit_are_counted(store: Path, tmp_path: Path) -> No
 
 
 def test_the_closing_line_counts_what_is_given(capsys: pytest.CaptureFixture[str]) -> None:
-    given = SimpleNamespace(quiet=False, verbose=True)
-    print_end(cast("Topics", given), Counters(messages=251, reduced=12), 0.1)
+    print_end(Counters(messages=251, reduced=12), 0.1, verbose=True)
     assert capsys.readouterr().err.startswith("239 messages, ")
 
 

@@ -40,11 +40,10 @@ def test_copies_to_a_directory(
         "ssh://": "Write ssh://user@host/path",
         "ssh://-oProxyCommand=x/y": "Write ssh://user@host/path",
         "ssh://a:b@c/d": "has no password",
-        "ssh:/lab/data": "Write ssh://lab/data.",
-        "me@lab:/data": "Write ssh://me@lab/data for a server",
-        "lab:data": "Write ssh://lab/~/data for a server, or ./lab:data for a directory",
-        "ftp://x/y": "Give a directory, ssh://user@host/path, s3://, gs:// or az://.",
-        "file:///data": "Give a directory, ssh://user@host/path, s3://, gs:// or az://.",
+        **dict.fromkeys(
+            ("ssh:/lab/data", "me@lab:/data", "lab:data", "ftp://x/y", "file:///data"),
+            "Write ssh://user@host/path for a server, s3://, gs:// or az:// for a bucket, and ./",
+        ),
         "~nosuchuser/x": "no such home directory",
         str(robots / "inside"): "lies inside the store",
     }.items():

@@ -66,7 +66,7 @@ def read(path: Path) -> tuple[str, list[int], list[NDArray[Any]]]:
 
 
 def to_mp4(query: Query, path: Path) -> None:
-    write_answer(query, "mp4", path, quiet=True)
+    write_answer(query, "mp4", path)
 
 
 def reordered(form: str) -> list[bytes]:

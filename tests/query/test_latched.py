@@ -181,7 +181,7 @@ def store(tmp_path_factory: pytest.TempPathFactory, log: Path) -> Iterator[hl.St
 def written(query: Query, front: Front | None = None) -> list[tuple[int, int, str]]:
     """Log time, publish time and text of the messages of a slice, as they stand in the file."""
     target = io.BytesIO()
-    write_answer(query, "mcap", target, front=front or Front(), quiet=True)
+    write_answer(query, "mcap", target, front=front or Front())
     reader = make_reader(io.BytesIO(target.getvalue()))
     return [
         (message.log_time, message.publish_time, message.data.decode())

@@ -528,5 +528,5 @@ def test_nearly_empty_topics_are_not_proposed(tmp_path: Path) -> None:
     assert text_of_map.endswith("# left out: /seldom has 1 message\n")
     words = ("export", str(tmp_path / "set"), "-F", "lerobot", "--map", str(tmp_path / "map.yaml"))
     done = answer(*words, "--task", "x", store=tmp_path / "store")
-    assert "Without --fps there are 30 frames a second." in done.err
+    assert " at 30 Hz, " in done.err
     assert json.loads((tmp_path / "set/meta/info.json").read_text())["fps"] == 30

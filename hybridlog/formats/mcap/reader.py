@@ -50,9 +50,6 @@ class McapSource(Source):
     damaged chunk. A channel id that is redefined with other content is another channel from
     there on. Messages on a channel with an undefined schema are read without a schema, and
     `damage` notes it.
-
-    Raises:
-        SourceError: It cannot be opened, or is not an MCAP file.
     """
 
     def __init__(self, path: Path) -> None:

@@ -48,12 +48,7 @@ def write_mcap(answer: Answer, target: Target) -> None:
 
 
 class McapWriter(LogWriter):
-    """Writes one MCAP file with a complete summary.
-
-    Args:
-        target: Path or binary stream.
-        profile: MCAP profile: `ros1`, `ros2` or empty.
-    """
+    """Writes one MCAP file with a complete summary."""
 
     def __init__(self, target: Target, *, profile: str = "") -> None:
         self._sink = Sink(target)
@@ -72,11 +67,7 @@ class McapWriter(LogWriter):
             raise
 
     def write(self, batch: Batch, channels: Sequence[Channel]) -> None:
-        """Append messages in the order of the rows.
-
-        Raises:
-            DiskFullError: No space left.
-        """
+        """Append messages in the order of the rows."""
         view = memoryview(batch.buffer)
         add = self._writer.add_message
         ids = {number: self._channel(channels[number]) for number in set(batch.channel.tolist())}
@@ -103,12 +94,7 @@ class McapWriter(LogWriter):
         self._writer.add_metadata(name, dict(values))
 
     def add_attachment(self, attachment: Attachment) -> None:
-        """Add an attachment, piece by piece.
-
-        Raises:
-            SegmentError: Its file is shorter than before.
-            DiskFullError: No space left.
-        """
+        """Add an attachment, piece by piece."""
         offset = self._sink.tell()
         for piece in attachment.record():
             self._sink.write(piece)

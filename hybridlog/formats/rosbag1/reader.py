@@ -135,9 +135,6 @@ class _Walk(NamedTuple):
     def without_wrong(self, data: bytes) -> int:
         """Leave out the last message if its length is wrong, as a record begins in it.
 
-        Args:
-            data: The bytes, which are damaged behind it.
-
         Returns:
             The end of what is sound.
         """
@@ -150,12 +147,7 @@ class _Walk(NamedTuple):
 
 
 def walk(data: bytes, most: int) -> _Walk:
-    """Read the whole message and connection records at the beginning of some bytes.
-
-    Args:
-        data: The bytes.
-        most: Messages that are read at most.
-    """
+    """Read the whole message and connection records at the beginning of some bytes."""
     rows: list[tuple[int, int, int, int]] = []
     connections: list[tuple[int, _Record]] = []
     pos, size, u32, usual = 0, len(data), _u32, _USUAL.match
@@ -227,9 +219,6 @@ class Rosbag1Source(Source):
     """A ROS 1 bag.
 
     Each connection with messages becomes a channel of its own.
-
-    Raises:
-        SourceError: It does not exist, is not a bag of version 2.0, or is encrypted.
     """
 
     def __init__(self, path: Path) -> None:
@@ -519,9 +508,6 @@ class Rosbag1Source(Source):
 
         Returns:
             The content, and the number of its compressed bytes.
-
-        Raises:
-            ValueError: The chunk is damaged or too large; or another error of its format.
         """
         size, length = record.number(b"size"), record.end - record.start
         most = min(max(size, _UNSTATED), MAX_PAYLOAD)

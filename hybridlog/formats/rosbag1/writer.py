@@ -41,10 +41,6 @@ class BagWriter(LogWriter):
     """Writes one ROS 1 bag, version 2.0, with its index.
 
     Only channels of ROS 1 messages (`message_encoding` is `ros1`) fit into a bag.
-
-    Args:
-        target: Path or binary stream. A bag's header is written last, so for a stream the bag
-            is written to a temporary file first.
     """
 
     def __init__(self, target: Target) -> None:
@@ -73,13 +69,7 @@ class BagWriter(LogWriter):
                 raise
 
     def write(self, batch: Batch, channels: Sequence[Channel]) -> None:
-        """Append messages in the order of the rows.
-
-        Raises:
-            UsageError: A channel has another encoding than ROS 1, or a time is outside the range
-                of a bag (1970 to 2106).
-            DiskFullError: No space left.
-        """
+        """Append messages in the order of the rows."""
         if len(batch) == 0:
             return
         if int(batch.log_time.max()) >= _TIME_LIMIT or int(batch.log_time.min()) < 0:

@@ -45,9 +45,6 @@ def locate(folder: Path, metadata: BagMetadata) -> tuple[dict[Path, int | None],
     Returns:
         The existing files, in order, with their number of messages as listed; and the damage
         for missing ones.
-
-    Raises:
-        SourceError: The folder cannot be read.
     """
     files: dict[Path, int | None] = {}
     missing: list[Damage] = []
@@ -112,11 +109,7 @@ class BagMetadata:
 
 
 def parse_metadata(text: str) -> BagMetadata:
-    """Parse the metadata of a bag.
-
-    Raises:
-        YamlError: It is not YAML or not that of a bag, or too large.
-    """
+    """Parse the metadata of a bag."""
     if len(text) > MAX_BYTES:
         raise YamlError(f"it has more than {MAX_BYTES >> 20} MiB")
     bag = _mapping(parse_yaml(text, _WANTED))

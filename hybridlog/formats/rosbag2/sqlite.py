@@ -41,11 +41,7 @@ _Row = tuple[int, int, int, int, bytes]
 
 
 class SqliteSource(Source):
-    """A `.db3` file of rosbag2.
-
-    Raises:
-        SourceError: It does not exist, is not a ROS 2 bag, or has no readable messages.
-    """
+    """A `.db3` file of rosbag2."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path, kind="ROS 2 bag (sqlite3)", profile="ros2", files=[path])

@@ -91,16 +91,7 @@ def write_rosbag2(answer: Answer, target: Target, **settings: Any) -> None:
 
 
 class Rosbag2Writer(LogWriter):
-    """Writes a bag.
-
-    Args:
-        target: Its directory, which must be missing or empty.
-        storage: A name of `STORAGES`.
-        max_file: Bytes of payload at which a file ends.
-
-    Raises:
-        UsageError: The target is a stream, not empty, or cannot be written.
-    """
+    """Writes a bag."""
 
     def __init__(self, target: Target, *, storage: str = "mcap", max_file: int = MAX_FILE) -> None:
         self._storage = storage
@@ -117,12 +108,7 @@ class Rosbag2Writer(LogWriter):
         self._size = 0
 
     def write(self, batch: Batch, channels: Sequence[Channel]) -> None:
-        """Append messages in the order of the rows.
-
-        Raises:
-            UsageError: A channel has another encoding than CDR, or a time is before 1970.
-            DiskFullError: No space left.
-        """
+        """Append messages in the order of the rows."""
         if not len(batch):
             return
         topics = {number: self.topic(channels[number]) for number in set(batch.channel.tolist())}
@@ -168,11 +154,7 @@ class Rosbag2Writer(LogWriter):
             self._log = _SqliteFile(path, self)
 
     def topic(self, channel: Channel) -> _Topic:
-        """The topic of a channel.
-
-        Raises:
-            UsageError: It has another encoding than CDR.
-        """
+        """The topic of a channel."""
         if channel not in self._known:
             if channel.message_encoding != "cdr" or channel.schema is None:
                 cure = "write --format mcap"
