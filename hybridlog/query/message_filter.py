@@ -82,7 +82,7 @@ class MessageFilter:
         else:
             mask = mask_of(self._predicate, self._types, decoded.arrow(), channel, *times)
         if mask is None:
-            plain = decoded.plain(self._fields, whole=False)
+            plain = decoded.plain(whole=False)
             if self._asks_meta:
                 meta = meta_array(structs({}, len(rows)), channel, *times).to_pylist()
                 plain = [{**one, **own} for one, own in zip(plain, meta, strict=True)]
