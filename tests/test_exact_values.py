@@ -83,7 +83,7 @@ def payloads(name: str, topic: str) -> list[bytes]:
 
 def written(query: Any, form: str) -> bytes:
     stream = io.BytesIO()
-    write_answer(query, form, stream, quiet=True)
+    write_answer(query, form, stream)
     return stream.getvalue()
 
 
