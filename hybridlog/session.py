@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import (
     Callable,
     Collection,
@@ -23,7 +24,7 @@ from hybridlog.query.topics import resolve
 from hybridlog.record.marks import MARKS
 from hybridlog.snapshot import UNFINISHED
 from hybridlog.wording import counted, listed
-from hybridlog_storage.catalog import ChannelStats, file_of
+from hybridlog_storage.catalog import file_of
 from hybridlog_storage.disk.directory import gone
 from hybridlog_storage.errors import (
     CatalogError,
@@ -279,33 +280,28 @@ class Session:
         """Names of all topics, sorted; includes those whose messages are all lost."""
         return self.look().topics
 
-    def channels(self, recording: RecordingEntry) -> list[RecordedChannel]:
-        """The channels of a recording, with their codecs.
+    def channels_of(
+        self, recording: RecordingEntry, topics: Collection[str]
+    ) -> list[RecordedChannel]:
+        """The channels of some topics in a recording, with their codecs.
 
         Where a topic has messages, its channels without any are left out: they must not change
         the columns of an answer.
         """
-        return _in_order(self._channels_by_topic(recording).values())
-
-    def channels_of(
-        self, recording: RecordingEntry, topics: Collection[str]
-    ) -> list[RecordedChannel]:
-        """The channels of some topics in a recording, as of `channels`."""
         by_topic = self._channels_by_topic(recording)
-        return _in_order(by_topic[topic] for topic in topics if topic in by_topic)
+        found = [channel for topic in topics for channel in by_topic.get(topic, ())]
+        return sorted(found, key=lambda channel: channel.channel_id)
 
     def _channels_by_topic(self, recording: RecordingEntry) -> dict[str, list[RecordedChannel]]:
         known = self.shared.channels.get(recording.id)
         if known is not None and known[0] is recording:
             return known[1]
-        stats = {c.id: (c.stats, c.reason) for c in recording.channels}
-        counts = recording.messages_by_topic()
-        found: dict[str, list[RecordedChannel]] = {}
-        for number, channel in self.definitions(recording).items():
-            if not counts[channel.topic] or (number in stats and stats[number][0].messages):
-                own = stats.get(number, (ChannelStats(), None))
-                one = RecordedChannel(recording, number, channel, *own)
-                found.setdefault(channel.topic, []).append(one)
+        counts, definitions = recording.messages_by_topic(), self.definitions(recording)
+        found: dict[str, list[RecordedChannel]] = defaultdict(list)
+        for own in recording.channels:
+            if not counts[own.topic] or own.stats.messages:
+                one = RecordedChannel(recording, own.id, definitions[own.id], own.stats, own.reason)
+                found[own.topic].append(one)
         self.shared.channels[recording.id] = recording, found
         return found
 
@@ -674,11 +670,6 @@ def _file_in(entry: RecordingEntry, number: int) -> tuple[object, ...]:
     """What tells a segment of a recording from a later file of its number."""
     key = str(number)
     return entry.digests.get(key), entry.files.get(key), number in entry.flushed
-
-
-def _in_order(by_topic: Iterable[Sequence[RecordedChannel]]) -> list[RecordedChannel]:
-    found = (channel for own in by_topic for channel in own)
-    return sorted(found, key=lambda channel: channel.channel_id)
 
 
 def _changed(recording: RecordingEntry) -> ChangedError:

@@ -12,7 +12,7 @@ from collections import defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from copy import copy
 from fnmatch import fnmatchcase
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -34,18 +34,14 @@ def _order(one: RecordingSummary) -> tuple[bool, tuple[int, int], str, str]:
     return one.span is None, one.span or (0, 0), one.name, one.id
 
 
-def _columns_of(
-    summaries: Sequence[RecordingSummary], topics: Iterable[str]
-) -> dict[str, NDArray[Any]]:
-    """Columns of a snapshot, a row for each recording, by name."""
+_COLUMNS = np.dtype([("begin", "i8"), ("end", "i8"), ("is_open", "?"), ("set", np.intp)])
+
+
+def _columns_of(summaries: Sequence[RecordingSummary], topics: Iterable[str]) -> NDArray[np.void]:
+    """Columns of a snapshot, a row for each recording; `set` is the number of its topics."""
     numbers = {digest: number for number, digest in enumerate(topics)}
-    bounds = np.array([one.extent for one in summaries], np.int64).reshape(-1, 2)
-    return {
-        "begin": bounds[:, 0].copy(),
-        "end": bounds[:, 1].copy(),
-        "is_open": np.array([one.status in UNFINISHED for one in summaries], np.bool_),
-        "set": np.array([numbers[one.topics] for one in summaries], np.intp),
-    }
+    rows = [(*one.extent, one.status in UNFINISHED, numbers[one.topics]) for one in summaries]
+    return np.array(rows, _COLUMNS)
 
 
 class Snapshot:
@@ -72,7 +68,7 @@ class Snapshot:
         return len(self.summaries)
 
     @lazy
-    def _columns(self) -> dict[str, NDArray[Any]]:
+    def _columns(self) -> NDArray[np.void]:
         """The columns, which a list of recordings does without."""
         return _columns_of(self.summaries, self._topics)
 
@@ -126,9 +122,8 @@ class Snapshot:
             found.summaries.insert(place, one)
         new = {digest: sorted(of) for digest, of in topics.items() if digest not in self._topics}
         known = {**self._topics, **new}
-        columns = _columns_of(changed, known)
-        for name, values in columns.items():
-            columns[name] = np.insert(np.delete(self._columns[name], places), before, values)
+        new_rows = _columns_of(changed, known)
+        columns = np.insert(np.delete(self._columns, places), before, new_rows)
         used = np.unique(columns["set"])
         if len(used) < len(known):
             held = [*known.items()]

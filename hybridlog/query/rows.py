@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from hybridlog.frames.names import is_summary
 from hybridlog.query.chunk_scan import ChunkKey, ChunkScan, RecordingScan, ScanPlan
 from hybridlog.query.predicate.tree import is_meta
 from hybridlog.record.losses import lost_spans
@@ -34,9 +35,8 @@ if TYPE_CHECKING:
     from hybridlog.query.counters import Counters
     from hybridlog.query.message_filter import MessageFilter
     from hybridlog.query.question import Part, RecordedChannel
-    from hybridlog.schema.codec import Decoded
+    from hybridlog.schema.left import LeftFields
     from hybridlog.session import Session
-    from hybridlog_storage.messages import Batch
 
 _WHOLE = 32  # elements; longer arrays are summaries in tables
 _IN_FULL = SINGLE - {"uint8", "byte", "char"}  # elements of arrays in tables with arrays
@@ -247,23 +247,59 @@ class Rows:
 
     def values(self, part: Part, fields: Collection[str] | None) -> Iterator[Values]:
         """Fields of the matching messages."""
-        found = self._answering(part, fields)
-        left: Part | None = part
-        if found is not None:
-            from hybridlog.schema.arrow_types import narrowed
+        for found, _ in self._values(part, self._answering(part, fields), fields):
+            yield found
 
+    def columns(self, part: Part, fields: Collection[str] | None) -> Iterator[Values]:
+        """The same by dotted path, as tables have them; also summaries of arrays."""
+        from hybridlog.frames.columns import flat, with_summaries
+        from hybridlog.schema.arrow_columns import structs
+
+        summaries = summaries_in(fields, part.field_types)
+        found = self._answering(part, None if fields is None else {*fields} - summaries)
+        if found is not None and not all(map(found.table.has, summaries)):
+            found = None
+        for (times, seq, records), left in self._values(part, found, fields, summaries):
+            made: dict[str, pa.Array[Any]] = {}
+            for path in summaries if left is not None else ():
+                array, _, what = path.rpartition(".")
+                known = None if left is None else left.statistic(array, what)
+                made |= {} if known is None else {path: known}
+            leaves = with_summaries(flat(records), fields, made)
+            yield Values(times, seq, structs(leaves, len(times)))
+
+    def _values(
+        self,
+        part: Part,
+        found: Tabled | None,
+        fields: Collection[str] | None,
+        summaries: Collection[str] = (),
+    ) -> Iterator[tuple[Values, LeftFields | None]]:
+        """Fields of the matching messages, of a table or decoded, and what is left of them."""
+        from hybridlog.schema.arrow_types import narrowed
+        from hybridlog.schema.left import LeftFields, without_lacking
+
+        rest: Part | None = part
+        if found is not None:
             kind = None if fields is None else found.table.fields(fields)
             for rows, holds in self._in_table(found, fields):
                 chosen = rows if holds.all() else rows.take(np.flatnonzero(holds))
                 if len(chosen):
                     # Without the columns that only the predicate needs.
                     records = chosen.records if kind is None else narrowed(chosen.records, kind)
-                    yield Values(chosen.t, chosen.seq, records)
-            left = found.rest
-        for channel, run in self._by_channel(self.plan([left])) if left is not None else ():
-            decoded = self._decoded(channel, run.batch, fields)
+                    yield Values(chosen.t, chosen.seq, records), None
+            rest = found.rest
+        arrays = {path.rpartition(".")[0] for path in summaries}
+        wanted = None if fields is None else {*fields} - {*summaries} | arrays
+        for channel, run in self._by_channel(self.plan([rest])) if rest is not None else ():
+            decoded = columns_of(channel.codec, run.batch, wanted)
+            self._counters.unreadable += len(run.batch) - len(decoded.rows)
+            decoded, lacking = without_lacking(decoded, arrays.difference(fields or ()))
+            if lacking:
+                self._counters.leave_out(lacking, channel.state)
             good = decoded.rows
-            yield Values(run.batch.log_time[good], run.seq[good], decoded.arrow())
+            left = decoded.records if isinstance(decoded.records, LeftFields) else None
+            yield Values(run.batch.log_time[good], run.seq[good], decoded.arrow()), left
 
     # Tables.
 
@@ -445,19 +481,6 @@ class Rows:
                 self._counters.without_arrays += found.expired
             yield MatchColumns(run.batch.log_time, run.seq, holds)
 
-    def _decoded(
-        self, channel: RecordedChannel, batch: Batch, fields: Collection[str] | None = None
-    ) -> Decoded:
-        """The fields of messages; those that cannot be read, or lack some, are counted."""
-        found = columns_of(channel.codec, batch, fields)
-        self._counters.unreadable += len(batch) - len(found.rows)
-        if channel.is_reduced:
-            from hybridlog.schema.left import without_lacking
-
-            found, lacking = without_lacking(found)
-            self._counters.leave_out(lacking, channel.state)
-        return found
-
     def _by_channel(self, plan: ScanPlan) -> Iterator[tuple[RecordedChannel, MessageRun]]:
         """The messages of a plan with fields in order, those of one channel at a time."""
         for run in ChunkScan(plan, self.session).runs():
@@ -528,6 +551,11 @@ def _within(
         for channel in part.channels
     )
     return replace(part, recording=recording, channels=channels)
+
+
+def summaries_in(fields: Collection[str] | None, types: Mapping[str, str] | None) -> set[str]:
+    """The paths among some fields that are summaries of arrays."""
+    return {path for path in fields or () if is_summary(path, types or {})}
 
 
 def filter_of(part: Part) -> MessageFilter | None:

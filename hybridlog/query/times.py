@@ -27,7 +27,6 @@ the start of the recording.
 
 from __future__ import annotations
 
-import calendar
 import math
 import re
 import time
@@ -390,13 +389,11 @@ def _timedelta(delta: timedelta) -> int:
 def _from_date(moment: date) -> int:
     if not isinstance(moment.year, int):  # pandas.NaT is a datetime whose year is nan
         raise TimeError(f"{moment} is not a time: {ACCEPTED}")
-    seconds = calendar.timegm(moment.timetuple())
     if not isinstance(moment, datetime):
-        return seconds * _SECOND
-    offset = moment.utcoffset() or timedelta(0)
-    # pandas.Timestamp has one attribute more than datetime.
-    below = moment.microsecond * 1_000 + int(getattr(moment, "nanosecond", 0))
-    return seconds * _SECOND + below - _timedelta(offset)
+        moment = datetime(moment.year, moment.month, moment.day)
+    if moment.utcoffset() is None:
+        moment = moment.replace(tzinfo=UTC)
+    return _timedelta(moment - _EPOCH)
 
 
 def _from_datetime64(moment: object) -> int:

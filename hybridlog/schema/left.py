@@ -222,12 +222,12 @@ def missing_payload(state: State, size: int, digest: bytes) -> PayloadError:
     )
 
 
-def without_lacking(decoded: Decoded) -> tuple[Decoded, int]:
+def without_lacking(decoded: Decoded, but: Collection[str] = ()) -> tuple[Decoded, int]:
     """Decoded messages but for those that lack a wanted value, and how many these are."""
     records = decoded.records
     if not isinstance(records, LeftFields):
         return decoded, 0
-    is_complete = ~records.lacking()
+    is_complete = ~records.lacking(but)
     left = Decoded(
         decoded.rows[is_complete],
         records.take(is_complete),

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections import defaultdict
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
-from itertools import chain
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hybridlog.query.counters import Counters
 from hybridlog.query.planner import Planner
-from hybridlog.query.ranges import RangeResolver
+from hybridlog.query.question import field_types
+from hybridlog.query.rows import summaries_in
 from hybridlog.schema.kinds import NUMBERS
 from hybridlog.schema.summary import Totals
 from hybridlog_storage.errors import DefinitionError, UsageError
@@ -21,7 +19,8 @@ from hybridlog_storage.errors import DefinitionError, UsageError
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from hybridlog.query.question import Part, Question
+    from hybridlog.query.counters import Counters
+    from hybridlog.query.question import Question, RecordedChannel
     from hybridlog.session import Session
 
 
@@ -63,8 +62,8 @@ class _Running:
         self._mean = 0.0
         self._squares, self._exponent = 0.0, -1074  # squares of numbers divided by 2**exponent
 
-    def add(self, column: pa.ChunkedArray[Any]) -> None:
-        values = column.drop_null().to_numpy()
+    def add(self, column: pa.Array[Any]) -> None:
+        values = column.drop_null().to_numpy(zero_copy_only=False)
         if values.dtype.kind == "f":
             is_finite = np.isfinite(values)
             nan = int(np.isnan(values).sum())
@@ -121,91 +120,61 @@ def statistics(session: Session, question: Question, counters: Counters) -> list
     """Statistics of numeric fields; see `Query.stats`."""
     if not question.returns_all or question.reverse:
         raise UsageError("Statistics are of all messages: leave out limit, every and reverse.")
-    counted = Counters()
-    planner = Planner(session, question, counted)
-    in_tables = _of_tables(planner)
-    counters.add(counted)
-    recordings = [row.summary.id for row in RangeResolver(session, question).resolve()]
-    found = []
-    for topic in question.topics:
-        if topic in in_tables:
-            found += [values.result(topic, name) for name, values in in_tables[topic].items()]
-            continue
-        one = replace(question, topics=(topic,))
-        known = session.field_types((topic,), question.recordings)
-        if question.fields is None and known is not None:
-            numeric = tuple(_single_numbers(known))
-            if not numeric:
-                continue
-            one = replace(one, fields=numeric)
-        snapshot = session.look(one.recordings)
-        having = {snapshot.summaries[place].id for place in session.chosen(one).tolist()}
-        running: dict[str, _Running] = {}
+    planner = Planner(session, question, counters)
+    found: dict[str, dict[str, _Running]] = {topic: {} for topic in question.topics}
+    blind: DefinitionError | None = None
+    for channel in planner.examples:
         try:
-            for recording in filter(having.__contains__, recordings):
-                part = replace(one, recordings=(recording,))
-                for name, column in _columns(session, part, counters):
-                    running.setdefault(name, _Running()).add(column)
-        except DefinitionError:
-            if question.fields is not None or len(question.topics) == 1:
-                raise  # otherwise, those of the topics that have fields
-        found += [values.result(topic, name) for name, values in running.items()]
-    if question.fields is not None and not found:
+            _add(found[channel.channel.topic], question, _columns_of(channel, question))
+        except DefinitionError as error:
+            blind = error
+    if blind is not None and (question.fields is not None or len(question.topics) == 1):
+        raise blind  # otherwise, those of the topics that have fields
+    for part in planner.decided(planner.parts()):
+        if not all(channel.codec.indexed for channel in part.channels):
+            continue
+        fields = _numbers(part.field_types) if question.fields is None else question.fields
+        for times, _, records in planner.columns(part, fields) if fields != [] else ():
+            counters.messages += len(times)
+            _add(found[part.topic], question, records)
+    if question.fields is not None and not any(found.values()):
         raise UsageError(f"{', '.join(question.fields)}: no field with numbers.")
-    return found
+    return [
+        values.result(topic, name)
+        for topic, running in found.items()
+        for name, values in running.items()
+    ]
 
 
-def _single_numbers(types: Mapping[str, str]) -> list[str]:
+def _numbers(types: Mapping[str, str] | None) -> list[str] | None:
     """The fields of which each message has one number: none in lists of messages."""
+    if types is None:
+        return None
     return [path for path, kind in types.items() if kind in NUMBERS and "[" not in path]
 
 
-def _of_tables(planner: Planner) -> dict[str, dict[str, _Running]]:
-    """Statistics of the topics whose fields stand in tables, planned together."""
+def _columns_of(channel: RecordedChannel, question: Question) -> pa.StructArray:
+    """The columns of a channel, without rows."""
     import pyarrow as pa
+
+    from hybridlog.frames.columns import flat, with_summaries
+    from hybridlog.schema.arrow_columns import structs
+
+    types = field_types((channel,))
+    fields = _numbers(types) if question.fields is None else question.fields
+    arrays = {path.rpartition(".")[0] for path in summaries_in(fields, types)}
+    empty = pa.array([], channel.arrow_type(None if fields is None else {*fields, *arrays}))
+    return structs(with_summaries(flat(empty), fields), 0)
+
+
+def _add(running: dict[str, _Running], question: Question, records: pa.StructArray) -> None:
+    """Add numeric columns; elements of arrays that are named."""
     import pyarrow.compute as pc
 
-    by_topic: dict[str, list[Part]] = defaultdict(list)
-    for part in planner.parts():
-        by_topic[part.topic].append(part)
-    found: dict[str, dict[str, _Running]] = {}
-    for topic, parts in by_topic.items():
-        types = parts[0].field_types or {}
-        numbers = _single_numbers(types)
-        fields = numbers if planner.question.fields is None else [*planner.question.fields]
-        if (
-            not fields
-            or not {*fields} <= {*numbers}
-            or not all(part.field_types == types for part in parts)
-        ):
-            continue
-        read = planner.values_of_tables(parts, fields)
-        if read is None:
-            continue
-        found[topic] = {path: _Running() for path in fields}
-        for values in chain.from_iterable(read):
-            planner.counters.messages += len(values.log_time)
-            for path, running in found[topic].items():
-                column = pc.struct_field(values.records, path.split("."))
-                running.add(pa.chunked_array([column]))
-    return found
-
-
-def _columns(
-    session: Session, question: Question, counters: Counters
-) -> Iterator[tuple[str, pa.ChunkedArray[Any]]]:
-    """The numeric columns of an answer, a block at a time; elements of arrays that are named."""
-    import pyarrow.compute as pc
-
-    from hybridlog.frames.answer import stream
     from hybridlog.schema.arrow_types import is_list, is_number
 
-    counted = Counters()
-    for table in stream(Planner(session, question, counted)):
-        for field in table.schema:
-            column = table[field.name]
-            if question.fields is not None and is_list(field.type):
-                column = pc.list_flatten(column)
-            if is_number(column.type):
-                yield field.name, column
-    counters.add(counted)
+    for field, column in zip(records.type, records.flatten(), strict=True):
+        if question.fields is not None and is_list(field.type):
+            column = pc.list_flatten(column)  # noqa: PLW2901
+        if is_number(column.type):
+            running.setdefault(field.name, _Running()).add(column)

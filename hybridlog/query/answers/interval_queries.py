@@ -198,29 +198,15 @@ class IntervalQueries:
         self, part: Part, span: Span, paths: Collection[str], tolerance: float
     ) -> NDArray[np.int64]:
         """Log times of the messages in a span that differ from the one before."""
-        ask = partial(self._rows, paths=paths)
+        ask = partial(self._planner.columns, fields=paths)
         before = self._last_before(part, span, ask)
-        carried = None if before is None else before[1][-1:]
+        carried = None if before is None else before.records[-1:]
         found = [_NONE]
-        for times, rows in ask(_bounded(part, span)):
+        for times, _, rows in ask(_bounded(part, span)):
             if len(rows):
                 differs, carried = _steps(carried, rows, tolerance)
                 found.append(times[differs])
         return np.concatenate(found)
-
-    def _rows(
-        self, part: Part, paths: Collection[str]
-    ) -> Iterator[tuple[NDArray[np.int64], pa.StructArray]]:
-        """Fields of the matching messages, as tables have them; summaries of arrays as fields."""
-        from hybridlog.frames.columns import flat, with_summaries
-        from hybridlog.frames.names import is_summary
-        from hybridlog.schema.arrow_columns import structs
-
-        known = part.field_types or {}
-        summaries = {path for path in paths if is_summary(path, known)}
-        read = {path.rpartition(".")[0] if path in summaries else path for path in paths}
-        for times, _, records in self._planner.values(part, read):
-            yield times, structs(with_summaries(flat(records), paths), len(times))
 
     def _check(self, subject: str) -> None:
         question = self._question

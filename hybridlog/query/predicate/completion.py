@@ -8,22 +8,17 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 from hybridlog.frames.names import is_summary
-from hybridlog.query.predicate.tokens import MAX_TEXT, TOPIC
+from hybridlog.query.predicate.tokens import Token, tokenize
 from hybridlog.query.predicate.types import STATS
+from hybridlog_storage.errors import WhereError
 
 Kind = Literal["field", "topic", "word"]
 
 _WORD: Final = re.compile(r"""[^\s()!&|<>=~,"'{}]*\Z""")
-_COMPARISON: Final = re.compile(r"[<>=~]\Z")
+_COMPARISONS: Final = frozenset({"==", "=", "!=", "<", "<=", ">", ">=", "~", "=~", "!~"})
 _BEHIND: Final = ("and", "or", "between", "exists", "in", "missing", "not in")
 _VALUES: Final = ("false", "inf", "nan", "null", "true")
 _BEGINS: Final = frozenset({"and", "&&", "or", "||", "not", "!", "("})
-_TOKEN: Final = re.compile(
-    rf"""(?:"(?:\\.|[^"\\])*"|'(?:\\.|[^'\\])*'|`[^`]*`)"""
-    rf"""|(?P<topic>{TOPIC})|(?P<word>[^\W\d][\w.]*|&&|\|\||!(?![=~])|[()]|["'])|\S""",
-    re.DOTALL,
-)
-"""A part of a predicate, whether that can be parsed or not; a quote that is not closed is one."""
 _PLAIN: Final = re.compile(r"[^\W\d]\w*")
 _META: Final = ("_meta.t", "_meta.pub", "_meta.seq", "_meta.rec", "_meta.topic")
 
@@ -74,28 +69,33 @@ def complete(
     before = text[:place]
     found = _WORD.search(before)
     begin = place if found is None else found.start()
-    if len(text) > MAX_TEXT or _is_in_string(before):
+    try:
+        known = tokenize(before[:begin])[:-1]
+    except WhereError:  # in a string, for example
         return Completion(place, ())
-    word, earlier = before[begin:], before[:begin]
-    known = [*_TOKEN.finditer(earlier)]
-    offered = [*_offered(earlier, known, topics, fields)]
-    folded = word.casefold()
+    offered = [*_offered(known, topics, fields)]
+    folded = before[begin:].casefold()
     fitting = [one for one in offered if folded in one.text.casefold()]
     fitting.sort(key=lambda one: not one.text.casefold().startswith(folded))
     return Completion(begin, tuple(fitting[:most]))
 
 
-def _offered(
-    earlier: str, known: list[re.Match[str]], topics: Collection[str], fields: Fields
-) -> Iterator[Candidate]:
-    if _COMPARISON.search(earlier.rstrip()):
+def _offered(known: list[Token], topics: Collection[str], fields: Fields) -> Iterator[Candidate]:
+    last = known[-1] if known else None
+    word = _word(last) if last is not None else "("
+    if word in _COMPARISONS:
         yield from (Candidate(word, "word") for word in _VALUES)
-    elif not known or known[-1]["topic"] or (known[-1]["word"] or "").lower() in _BEGINS:
+    elif word in _BEGINS or (last is not None and last.kind == "topic"):
         yield from _fields_of(fields(_topic_at(known)))
         yield Candidate("not", "word")
         yield from (Candidate(f"{topic}: ", "topic") for topic in sorted(topics))
     else:
         yield from (Candidate(word, "word") for word in _BEHIND)
+
+
+def _word(token: Token) -> str:
+    """An operator, or a word that may be a keyword; empty for others."""
+    return token.text if token.kind == "operator" else token.keyword
 
 
 def _fields_of(types: Mapping[str, str] | None) -> Iterator[Candidate]:
@@ -120,20 +120,15 @@ def _quoted(part: str) -> str:
     return part if _PLAIN.fullmatch(name) else f"`{name}`{bracket}{rest}"
 
 
-def _topic_at(known: list[re.Match[str]]) -> str | None:
+def _topic_at(known: list[Token]) -> str | None:
     """The topic that a predicate behind some tokens is about; None for the message itself."""
     outer: list[str | None] = []
     topic: str | None = None
     for token in known:
-        if token["word"] == "(":
+        if token.kind == "topic":
+            topic = token.text.removesuffix(":")
+        elif _word(token) == "(":
             outer.append(topic)
-        elif token["word"] == ")" and outer:
+        elif _word(token) == ")" and outer:
             topic = outer.pop()
-        elif token["topic"]:
-            topic = token["topic"].removesuffix(":")
     return topic
-
-
-def _is_in_string(before: str) -> bool:
-    """True behind a quote that is not closed."""
-    return any(token["word"] in {'"', "'"} for token in _TOKEN.finditer(before))

@@ -9,9 +9,9 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import reduce
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -64,8 +64,6 @@ if TYPE_CHECKING:
     Mask = NDArray[np.bool_]
     Rows = NDArray[np.intp]
 
-Records: TypeAlias = "pa.StructArray | pa.Table | pa.RecordBatch"
-
 _ORDERS: dict[str, np.ufunc] = {
     "==": np.equal,
     "<": np.less,
@@ -73,39 +71,24 @@ _ORDERS: dict[str, np.ufunc] = {
     ">": np.greater,
     ">=": np.greater_equal,
 }
-_TEXT_ORDERS: dict[str, Callable[..., Any]] = {
-    "==": pc.equal,
-    "<": pc.less,
-    "<=": pc.less_equal,
-    ">": pc.greater,
-    ">=": pc.greater_equal,
-}
 _SUMMARIES = (set(STATS), {"n"})
 
 
 def to_mask(
-    node: Predicate | Node,
-    types: FieldTypes | Mapping[str, str] | None,
-    records: Records,
+    node: Predicate | Node, types: FieldTypes | Mapping[str, str] | None, records: pa.StructArray
 ) -> Mask | None:
-    """Mask of the rows for which a predicate holds.
+    """Mask of the rows for which a predicate holds: bool[rows]; None if columns cannot decide.
 
     Args:
         node: The predicate.
         types: Types of the fields; None if each message decides.
         records: Decoded messages with at least the fields of the predicate. Arrays are
             complete, or structs of `n`, `min`, `max` and `mean`.
-
-    Returns:
-        bool[rows]; None if these columns cannot decide.
     """
-    compiled = FieldTypes.of(types)
-    root = root_of(node)
-    found = [_mask(root, compiled, part) for part in _parts(records)]
-    masks = [mask for mask in found if mask is not None]
-    if len(masks) < len(found):
-        return None
-    return np.concatenate(masks) if masks else np.zeros(0, np.bool_)
+    try:
+        return _Columns(FieldTypes.of(types), records).node(root_of(node))
+    except (_UnfitError, pa.ArrowNotImplementedError):
+        return None  # Arrow has no functions for lists of JSON text either
 
 
 def mask_of_objects(
@@ -118,23 +101,6 @@ def mask_of_objects(
     For conditions on its numbers, an array may be `{n, min, max, mean}`.
     """
     return _Objects(FieldTypes.of(types), messages).node(root_of(node))
-
-
-def _parts(records: Records) -> Iterator[pa.StructArray]:
-    """The records in pieces."""
-    if isinstance(records, pa.Table):
-        yield from (batch.to_struct_array() for batch in records.to_batches())
-    elif isinstance(records, pa.RecordBatch):
-        yield records.to_struct_array()
-    else:
-        yield records
-
-
-def _mask(root: Node, types: FieldTypes, records: pa.StructArray) -> Mask | None:
-    try:
-        return _Columns(types, records).node(root)
-    except (_UnfitError, pa.ArrowNotImplementedError):
-        return None  # Arrow has no functions for lists of JSON text either
 
 
 class _UnfitError(Exception):
@@ -532,19 +498,6 @@ def _computed(leaves: _Leaves, stat: Stat) -> _Leaves:
     return _Leaves(found, rows, is_element=True)
 
 
-def _as_integers(values: pa.Array) -> pa.Array:
-    """Times and durations as nanoseconds; other values unchanged.
-
-    Raises:
-        _UnfitError: they have another unit.
-    """
-    if not is_time(values.type):
-        return values
-    if values.type.unit != "ns":
-        raise _UnfitError
-    return values.cast(pa.int64())
-
-
 # Conditions on values.
 
 
@@ -600,7 +553,8 @@ def _of_large(node: Compare | Member | Match, values: NDArray[Any]) -> Mask:
 
 
 def _equal_to(leaves: _Leaves, values: Sequence[Value]) -> Mask:
-    if len(values) > 1 and pa.types.is_int64(leaves.values.type) and _are_int64(values):
+    are_int64 = all(type(value) is int and LOW <= value <= HIGH for value in values)
+    if len(values) > 1 and pa.types.is_int64(leaves.values.type) and are_int64:
         return _numpy(pc.is_in(leaves.values, pa.array(values, pa.int64())))
     found = np.zeros(len(leaves.values), np.bool_)
     for value in values:
@@ -611,10 +565,6 @@ def _equal_to(leaves: _Leaves, values: Sequence[Value]) -> Mask:
             raise _UnfitError  # null, or missing
         return ~found
     return found
-
-
-def _are_int64(values: Sequence[Value]) -> bool:
-    return all(type(value) is int and LOW <= value <= HIGH for value in values)
 
 
 def _matching(values: pa.Array, pattern: str) -> Mask:
@@ -644,7 +594,10 @@ def _compared(values: pa.Array, order: str, value: Value) -> Mask:
         return none
     if pa.types.is_decimal(kind):
         raise _UnfitError
-    values = _as_integers(values)
+    if is_time(kind):
+        if kind.unit != "ns":
+            raise _UnfitError
+        values = values.cast(pa.int64())
     kind = values.type
     if not (pa.types.is_integer(kind) or pa.types.is_floating(kind)):
         return none
@@ -660,7 +613,7 @@ def _texts_compared(values: pa.Array, order: str, value: str) -> Mask:
         wanted = pa.scalar(value, values.type)
     except (pa.ArrowInvalid, UnicodeEncodeError):
         raise _UnfitError from None
-    return _filled(_TEXT_ORDERS[order](values, wanted))
+    return _filled(getattr(pc, _ORDERS[order].__name__)(values, wanted))
 
 
 def _integers_compared(numbers: NDArray[Any], order: str, value: float) -> Any:

@@ -31,12 +31,11 @@ _NUMBER_WORD = re.compile(r"\.?[0-9](?:[eE][+-](?=[0-9])|[0-9A-Za-z_.µμ])*")
 _HEX = re.compile(r"0[xX][0-9a-fA-F]+")
 _INTEGER = re.compile(r"[0-9]+")
 _FLOAT = re.compile(r"(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
-TOPIC = (
+_TOPIC = re.compile(
     r"""(?<![^\s(!])(?:re:\S*[^\s:]"""
     r"""|(?!\S*\[[^\s\]]*:|[0-9]+:)[^\s()"'`:!&|][^\s()"'`:]*):(?=\s|$)"""
 )
 """The name of another topic with its colon."""
-_TOPIC = re.compile(TOPIC)
 _OPERATOR = re.compile(r"==|!=|<=|>=|&&|\|\||!~|=~|[<>=~!()\[\],+-]")
 _HINTS = {
     "&": "; write and",

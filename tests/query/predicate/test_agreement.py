@@ -69,8 +69,7 @@ def in_columns(
         return
     if not pa.types.is_struct(records.type) or not records.type.num_fields:
         return
-    batches = [pa.RecordBatch.from_struct_array(part) for part in (records[:2], records[2:])]
-    tables: list[object] = [records, pa.Table.from_batches(batches)]
+    tables = [records]
     if types is not None:
         tables.append(pa.array([summarised(message) for message in messages], SUMMARIES))
     for table in tables:

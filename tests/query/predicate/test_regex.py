@@ -34,7 +34,7 @@ def test_long_lines_are_matched_to_their_end(pattern: str, found: list[bool]) ->
         predicate = parse(f's {operator} "{pattern}"')
         objects = [{"s": line} for line in lines]
         assert mask_of_objects(predicate, None, objects).tolist() == expected
-        mask = to_mask(predicate, None, pa.table({"s": lines}))
+        mask = to_mask(predicate, None, pa.StructArray.from_arrays([pa.array(lines)], ["s"]))
         assert mask is not None
         assert mask.tolist() == expected
 

@@ -53,8 +53,10 @@ def test_numbers_are_compared_by_value(name: str, order: str) -> None:
         assert mask_of_objects(asked, {"x": name}, objects).tolist() == expected
 
 
-def mask_of(text: str, records: object, types: dict[str, str] | None = None) -> list[bool] | None:
-    mask = to_mask(parse(text), types, records)  # type: ignore[arg-type]
+def mask_of(
+    text: str, records: pa.RecordBatch, types: dict[str, str] | None = None
+) -> list[bool] | None:
+    mask = to_mask(parse(text), types, records.to_struct_array())
     return None if mask is None else mask.tolist()
 
 
@@ -77,13 +79,13 @@ def mask_of(text: str, records: object, types: dict[str, str] | None = None) -> 
     ],
 )
 def test_nulls(text: str, expected: list[bool] | None) -> None:
-    table = pa.table({"x": [1, None], "y": [2, 2]})
+    table = pa.record_batch({"x": [1, None], "y": [2, 2]})
     assert mask_of(text, table) == expected
     assert mask_of(text, table, {"x": "int64", "y": "int64", "z": "int64"}) == expected
 
 
 def test_times_are_nanoseconds() -> None:
-    table = pa.table(
+    table = pa.record_batch(
         {
             "t": pa.array([5, 10**18 + 1], pa.timestamp("ns", "UTC")),
             "d": pa.array([5, -6], pa.duration("ns")),
@@ -121,7 +123,7 @@ def test_summaries(text: str, expected: list[bool] | None) -> None:
         {"n": 40, "min": 1.0, "max": 9.0, "mean": 5.0},
         {"n": 40, "min": None, "max": None, "mean": None},
     ]
-    table = pa.table({"a": pa.array(summaries, SUMMARY)})
+    table = pa.record_batch({"a": pa.array(summaries, SUMMARY)})
     assert mask_of(text, table, {"a": "float64[]"}) == expected
     if "exists" not in text and ".max" not in text:
         assert mask_of("a < 2", table) is None, "it may be a message"
@@ -129,12 +131,12 @@ def test_summaries(text: str, expected: list[bool] | None) -> None:
 
 def test_what_columns_cannot_tell() -> None:
     text = pa.array(['{"a": 1}'], pa.json_())
-    assert mask_of("x == 1", pa.table({"x": text})) is None
-    assert mask_of("x.a == 1", pa.table({"x": text})) is None
-    table = pa.table({"x": [1]})
-    assert to_mask(mongo_filter({"x": 1}, None), None, table) is None
+    assert mask_of("x == 1", pa.record_batch({"x": text})) is None
+    assert mask_of("x.a == 1", pa.record_batch({"x": text})) is None
+    table = pa.record_batch({"x": [1]})
+    assert to_mask(mongo_filter({"x": 1}, None), None, table.to_struct_array()) is None
     assert mask_of("_meta.seq > 1", table) is None
-    mask = to_mask(mongo_filter({}, None), None, table)
+    mask = to_mask(mongo_filter({}, None), None, table.to_struct_array())
     assert mask is not None
     assert mask.tolist() == [True]
     assert mask_of("x == 1", table.slice(0, 0)) == []
