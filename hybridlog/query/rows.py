@@ -250,14 +250,15 @@ class Rows:
         found = self._answering(part, fields)
         left: Part | None = part
         if found is not None:
-            from hybridlog.schema.arrow_types import narrowed
+            from hybridlog.schema.arrow_types import converted
 
             kind = None if fields is None else found.table.fields(fields)
             for rows, holds in self._in_table(found, fields):
                 chosen = rows if holds.all() else rows.take(np.flatnonzero(holds))
                 if len(chosen):
                     # Without the columns that only the predicate needs.
-                    records = chosen.records if kind is None else narrowed(chosen.records, kind)
+                    records = chosen.records
+                    records = records if kind is None else converted(records, kind, drops=True)
                     yield Values(chosen.t, chosen.seq, records)
             left = found.rest
         for channel, run in self._by_channel(self.plan([left])) if left is not None else ():
