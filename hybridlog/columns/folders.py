@@ -16,7 +16,7 @@ import re
 import time
 from bisect import bisect_right
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from stat import S_ISDIR
@@ -99,7 +99,7 @@ class TableFolders:
         self._keeps_bytes = not prefixes  # tables that are made anew leave no holes
         with suppress(FileExistsError):
             files.make_folder(self._root / TABLES)
-        with locked(self._root):
+        with files.locked_folder(self._root / TABLES):
             others = [name for name in _folders(self._root) if name.startswith(tuple(prefixes))]
             for name in dict.fromkeys([*additions, *others]):
                 if name in additions:
@@ -121,10 +121,10 @@ class TableFolders:
         Raises:
             OSError: one cannot be removed.
         """
-        with suppress(FileNotFoundError), locked(self._root):
+        with suppress(FileNotFoundError), files.locked_folder(self._root / TABLES):
             for name in _folders(self._root):
                 if name.startswith(tuple(prefixes)):
-                    self._change(name, Addition(), _all)
+                    self._change(name, Addition(), lambda _: True)
 
     def _change(self, folder: str, addition: Addition, goes: Callable[[str], bool] | None) -> None:
         """Remove and add tables in a folder; an empty one is removed.
@@ -282,17 +282,6 @@ class TableFolders:
             files.remove_tree(place / name)
 
 
-@contextmanager
-def locked(root: Path) -> Iterator[None]:
-    """Lock the tables of a store for changes.
-
-    Raises:
-        FileNotFoundError: there are none.
-    """
-    with files.locked_folder(root / TABLES):
-        yield
-
-
 def _folders(root: Path) -> list[str]:
     """Names of the folders of tables."""
     found = files.names(root / TABLES).items()
@@ -383,7 +372,3 @@ def _reader(path: Path) -> ColumnFile | None:
         _log.info("%s", error)
         files.remove_tree(path)
         return None
-
-
-def _all(_: str) -> bool:
-    return True

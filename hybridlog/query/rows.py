@@ -276,7 +276,7 @@ class Rows:
         summaries: Collection[str] = (),
     ) -> Iterator[tuple[Values, LeftFields | None]]:
         """Fields of the matching messages, of a table or decoded, and what is left of them."""
-        from hybridlog.schema.arrow_types import narrowed
+        from hybridlog.schema.arrow_types import converted
         from hybridlog.schema.left import LeftFields, without_lacking
 
         rest: Part | None = part
@@ -286,7 +286,8 @@ class Rows:
                 chosen = rows if holds.all() else rows.take(np.flatnonzero(holds))
                 if len(chosen):
                     # Without the columns that only the predicate needs.
-                    records = chosen.records if kind is None else narrowed(chosen.records, kind)
+                    records = chosen.records
+                    records = records if kind is None else converted(records, kind, drops=True)
                     yield Values(chosen.t, chosen.seq, records), None
             rest = found.rest
         arrays = {path.rpartition(".")[0] for path in summaries}

@@ -77,17 +77,6 @@ def map_key(key: object) -> str:
     return str(key).lower() if isinstance(key, bool) else str(key)
 
 
-_ARROW = {
-    "string": pa.string(),
-    "bytes": pa.binary(),
-    "bool": pa.bool_(),
-    **{f"float{bits}": pa.type_for_alias(f"float{bits}") for bits in (32, 64)},
-    **{
-        f"{sign}int{bits}": pa.type_for_alias(f"{sign}int{bits}")
-        for sign in ("", "u")
-        for bits in (32, 64)
-    },
-}
 _MAX_UNSET = 10_000
 """Maximum number of fields that no row has and that still get a type."""
 
@@ -180,7 +169,8 @@ class _Builder:
     ) -> pa.Array[Any]:
         """One value for each row."""
         if not is_message(field):
-            return pa.array(values, _ARROW[TYPES[field.type]])
+            name = TYPES[field.type].replace("bytes", "binary")
+            return pa.array(values, pa.type_for_alias(name))
         kind = TIMES.get(field.message_type.full_name)
         if kind is None:
             return self.messages(field.message_type, values, wanted, above)

@@ -330,11 +330,16 @@ def _example(array: Array) -> Array:
 # Conversion.
 
 
-def converted(array: Array, kind: pa.DataType) -> Array:
+def converted(array: Array, kind: pa.DataType, *, drops: bool = False) -> Array:
     """The values of an array in another type that represents them.
 
     Arrays become summaries where the type is that of summaries, and bytes become lists of
     numbers.
+
+    Args:
+        array: The array.
+        kind: The type.
+        drops: True to leave out fields of structs that the type lacks.
 
     Raises:
         pa.ArrowInvalid: the type does not represent them exactly.
@@ -346,29 +351,15 @@ def converted(array: Array, kind: pa.DataType) -> Array:
     if kind == pa.json_():
         return json_array(plain_values(array))
     if _types.is_struct(kind):
-        return _converted_struct(array, kind)
+        return _converted_struct(array, kind, drops=drops)
     if is_list(kind) and _types.is_binary(array.type):
         array = _numbers_of(array)
     if is_list(kind) and is_list(array.type):
-        made = with_values(array, converted(array.flatten(), kind.value_type))
+        made = with_values(array, converted(array.flatten(), kind.value_type, drops=drops))
         return made if made.type == kind else made.cast(kind)
     if any(same(kind) and same(array.type) for same in (_is_countable, is_text, is_bytes)):
         return array.cast(kind)
     raise pa.ArrowInvalid(f"{array.type} is not {kind}")
-
-
-def narrowed(array: Array, kind: pa.DataType) -> Array:
-    """The same of structs that have more fields.
-
-    Raises:
-        pa.ArrowInvalid: As `converted`.
-    """
-    if _types.is_struct(kind) and _types.is_struct(array.type):
-        return _with_fields(array, kind, narrowed)
-    if is_list(kind) and is_list(array.type) and kind != array.type:
-        values = narrowed(array.flatten(), kind.value_type)
-        return converted(with_values(array, values), kind)
-    return converted(array, kind)
 
 
 def _numbers_of(array: Array) -> Array:
@@ -384,23 +375,16 @@ def _is_countable(kind: pa.DataType) -> bool:
     return is_number(kind) or is_time(kind)
 
 
-def _converted_struct(array: Array, kind: pa.DataType) -> Array:
+def _converted_struct(array: Array, kind: pa.DataType, *, drops: bool) -> Array:
     if is_summary(kind) and is_array(array.type):
         array = summary(array)
     if not _types.is_struct(array.type):
         raise pa.ArrowInvalid(f"{array.type} is not {kind}")
-    if not {field.name for field in kind} >= {field.name for field in array.type}:
-        raise pa.ArrowInvalid(f"{array.type} has fields that {kind} lacks")
-    return _with_fields(array, kind, converted)
-
-
-def _with_fields(
-    array: Array, kind: pa.DataType, convert: Callable[[Array, pa.DataType], Array]
-) -> Array:
-    """Structs with converted fields, and nulls in those that they lack."""
     have = dict(zip([field.name for field in array.type], array.flatten(), strict=True))
+    if not drops and not {field.name for field in kind} >= have.keys():
+        raise pa.ArrowInvalid(f"{array.type} has fields that {kind} lacks")
     children = {
-        field.name: convert(have[field.name], field.type)
+        field.name: converted(have[field.name], field.type, drops=drops)
         if field.name in have
         else pa.nulls(len(array), field.type)
         for field in kind

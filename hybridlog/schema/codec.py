@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, Protocol
 
 import numpy as np
 
-from hybridlog.schema.column import STAMP, Records, row_of, top_level_names
+from hybridlog.schema.column import STAMP, Records
 from hybridlog_storage.errors import DefinitionError, PayloadError
 
 if TYPE_CHECKING:
@@ -90,10 +90,9 @@ class Decoded:
         """
         if not isinstance(self.records, Records):
             return self.records.plain(whole=whole)
-        columns = self.records.fields
-        named = [*zip(top_level_names(columns), columns.values(), strict=True)]
-        rows = range(self.records.rows)
-        return [{name: row_of(column, row) for name, column in named} for row in rows]
+        from hybridlog.schema.arrow_types import plain_values
+
+        return plain_values(self.arrow())
 
 
 class Codec(Protocol):

@@ -46,15 +46,9 @@ def codec_for(channel: Channel) -> Codec:
 @lru_cache(maxsize=1024)
 def _codec(encoding: str, schema: Schema | None) -> Codec:
     try:
-        return _made(encoding, schema)
+        return JsonCodec() if encoding == "json" else _defined(encoding, schema)
     except DefinitionError as error:
         return OpaqueCodec(str(error))
-
-
-def _made(encoding: str, schema: Schema | None) -> Codec:
-    if encoding == "json":
-        return JsonCodec()
-    return _defined(encoding, schema)
 
 
 def _defined(encoding: str, schema: Schema | None) -> Codec:

@@ -164,40 +164,6 @@ STAMP: Final = "header.stamp"
 """Path of the header stamp in messages that have one."""
 
 
-def flatten(records: Records) -> dict[str, Column]:
-    """The leaves of records by dotted path, in the order of the definition.
-
-    A path that exists already (only names with dots in them can do that) gets trailing
-    underscores. Messages without fields have no leaf.
-    """
-    found: dict[str, Column] = {}
-    pending: list[tuple[str, Column]] = list(reversed(records.fields.items()))
-    while pending:
-        path, column = pending.pop()
-        if isinstance(column, Records):
-            inner = [(f"{path}.{name}", value) for name, value in column.fields.items()]
-            pending.extend(reversed(inner))
-            continue
-        while path in found:
-            path += "_"
-        found[path] = column
-    return found
-
-
-def row_of(column: Column, row: int) -> object:
-    """One row as plain values; times and durations are integer nanoseconds."""
-    if isinstance(column, Scalars):
-        return column.values[row].item()
-    if isinstance(column, Records):
-        return {name: row_of(inner, row) for name, inner in column.fields.items()}
-    begin, end = int(column.offset[row]), int(column.offset[row + 1])
-    if isinstance(column, Strings):
-        return column.data[begin:end].tobytes().decode("utf-8", "replace")
-    if isinstance(column.values, Scalars):
-        return column.values.values[begin:end].tolist()
-    return [row_of(column.values, place) for place in range(begin, end)]
-
-
 def header_stamps(records: Records) -> NDArray[np.int64] | None:
     """The header stamps of decoded messages, ns; None without a header."""
     header = records.fields.get("header")

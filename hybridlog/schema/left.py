@@ -111,10 +111,10 @@ class LeftFields(Objects):
         """Values of each part, or None, as one array of a type."""
         import pyarrow as pa
 
-        from hybridlog.schema.arrow_types import narrowed
+        from hybridlog.schema.arrow_types import converted
 
         arrays = [
-            pa.nulls(len(part), kind) if one is None else narrowed(one, kind)
+            pa.nulls(len(part), kind) if one is None else converted(one, kind, drops=True)
             for one, part in zip(parts, self._parts, strict=True)
         ]
         return pa.concat_arrays([pa.nulls(0, kind), *arrays]).take(pa.array(self._order))

@@ -19,9 +19,11 @@ from hybridlog.arrays.message_arrays import attributes, plain_type
 from hybridlog.arrays.point_arrays import POINT_MAKERS, point_columns, positions
 from hybridlog.formats.places import POSITIONS, poses_among
 from hybridlog.frames import answer
+from hybridlog.frames.columns import flat
 from hybridlog.message import messages_in
 from hybridlog.query.planner import Planner
 from hybridlog.query.times import decoded_time
+from hybridlog.schema.arrow_types import with_values
 from hybridlog.tf.reader import frame_tree
 from hybridlog.tf.transform import Transform, placed
 from hybridlog_storage.errors import DefinitionError, PayloadError, TopicError, UsageError
@@ -274,12 +276,12 @@ def _tables_of_poses(planner: Planner) -> Iterator[pa.Table]:
         frames = [str(name or "") for name in table[frame].to_pylist()]
         times = table[stamp].cast(pa.int64()).fill_null(0).to_numpy()
         moved = looked.transforms(recordings, frames, times)
-        columns = dict(zip(table.column_names, table.columns, strict=True))
+        columns = {name: table[name].combine_chunks() for name in table.column_names}
         for pose in found.poses:
             columns |= _pose_in_frame(columns, pose, moved)
         for name, inside in found.lists.items():
             lookup = _Elements(looked, recordings, frames, times, moved)
-            columns[name] = _list_in_frame(columns[name].combine_chunks(), inside, lookup)
+            columns[name] = _list_in_frame(columns[name], inside, lookup)
         columns[frame] = pa.array([question.frame] * table.num_rows, pa.string())
         yield pa.table({name: column for name, column in columns.items() if name not in hidden})
 
@@ -300,7 +302,7 @@ def _pose_in_frame(
     for axis, values in zip("xyz", place.T, strict=True):
         made[f"{pose.position}.{axis}"] = pa.array(values, mask=lost)
     if pose.covariance in columns:
-        found = columns[pose.covariance].combine_chunks()
+        found = columns[pose.covariance]
         turn = np.zeros((len(lost), 6, 6))
         turn[:, :3, :3] = turn[:, 3:, 3:] = moved.matrix()[:, :3, :3]
         turned = np.full_like(turn, np.nan)
@@ -341,10 +343,7 @@ class _Elements(NamedTuple):
 def _list_in_frame(column: Any, poses: Sequence[_Pose], lookup: _Elements) -> Any:
     """A list of structures with poses, at the times of their messages."""
     values, rows = column.flatten(), pc.list_parent_indices(column).to_numpy()
-    flat = pa.Table.from_struct_array(values)
-    while any(pa.types.is_struct(one.type) for one in flat.schema):
-        flat = flat.flatten()
-    columns: dict[str, Any] = dict(zip(flat.column_names, flat.columns, strict=True))
+    columns = flat(values)
     frame = next((name for name in _FRAMES if name in columns), None)
     own = columns[frame].to_pylist() if frame else [None] * len(rows)
     moved = lookup.transforms(rows.astype(np.int64), own)
@@ -352,26 +351,21 @@ def _list_in_frame(column: Any, poses: Sequence[_Pose], lookup: _Elements) -> An
         columns |= _pose_in_frame(columns, pose, moved)
     if frame:
         columns[frame] = pa.array([lookup.looked.target] * len(rows), pa.string())
-    ends = np.cumsum(pc.fill_null(pc.list_value_length(column), 0).to_numpy())
-    offsets = pa.array(np.concatenate([[0], ends]), pa.int32())
-    nested = _nested("", values.type, columns)
-    return pa.ListArray.from_arrays(offsets, nested, mask=column.is_null())
+    return with_values(column, _nested("", values.type, columns))
 
 
 def _nested(path: str, kind: Any, columns: Mapping[str, Any]) -> Any:
     """The array of a structure from the columns of its fields."""
     if not pa.types.is_struct(kind):
-        found = columns[path]
-        return found.combine_chunks() if isinstance(found, pa.ChunkedArray) else found
-    names = [one.name for one in kind]
+        return columns[path]
     stem = f"{path}." if path else ""
     arrays = [_nested(f"{stem}{one.name}", one.type, columns) for one in kind]
-    return pa.StructArray.from_arrays(arrays, names)
+    return pa.StructArray.from_arrays(arrays, [one.name for one in kind])
 
 
 def _numbers(columns: Mapping[str, Any], path: str, axes: str) -> NDArray[np.float64]:
-    found = [columns[f"{path}.{axis}"].cast(pa.float64()).to_numpy() for axis in axes]
-    return np.stack(found, axis=1)
+    found = (columns[f"{path}.{axis}"].cast(pa.float64()) for axis in axes)
+    return np.stack([one.to_numpy(zero_copy_only=False) for one in found], axis=1)
 
 
 def _poses_among(paths: Mapping[str, str]) -> Iterator[_Pose]:

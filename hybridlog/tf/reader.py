@@ -59,12 +59,15 @@ def frame_tree(session: Session, recording: RecordingSummary, topics: Sequence[s
             "No topic has transforms: they are messages of tf2_msgs/TFMessage or "
             "foxglove.FrameTransform."
         )
-    builder = _Builder()
-    for topic in names:
-        for table in stream(Planner(session, replace(question, topics=(topic,)), Counters())):
-            builder.add(table, is_static=topic.endswith(_STATIC))
+    found = [
+        _transforms_of(table, is_static=topic.endswith(_STATIC))
+        for topic in names
+        for table in stream(Planner(session, replace(question, topics=(topic,)), Counters()))
+    ]
     lacks = completeness_of(session, replace(question, topics=tuple(names))).sentences
-    return FrameTree(builder.frames(), recording.extent, dict(builder.invalid), [*lacks])
+    invalid = Counter[str]()
+    frames = _frames(pa.concat_tables(found), invalid) if found else {}
+    return FrameTree(frames, recording.extent, dict(invalid), [*lacks])
 
 
 def frames_and_stamps(
@@ -85,100 +88,36 @@ def frames_and_stamps(
     return frames, table["header.stamp"].cast(pa.int64()).to_numpy()
 
 
-class _Builder:
-    """Collects transforms by their child frame."""
-
-    def __init__(self) -> None:
-        self.invalid: Counter[str] = Counter()
-        self._parts: list[tuple[pa.Table, bool]] = []
-
-    def add(self, table: pa.Table, *, is_static: bool) -> None:
-        """Add the messages of a table."""
-        rows = _transforms_of(table)
-        if rows.num_rows:
-            self._parts.append((rows, is_static))
-
-    def frames(self) -> dict[str, Frame]:
-        """All frames with a parent."""
-        if not self._parts:
-            return {}
-        rows = pa.concat_tables([rows for rows, _ in self._parts])
-        static = np.repeat(
-            [is_static for _, is_static in self._parts],
-            [part.num_rows for part, _ in self._parts],
-        )
-        order = np.argsort(rows["log_time"].to_numpy(), kind="stable")
-        rows, static = rows.take(pa.array(order)), static[order]
-        pose = Transform(
-            np.stack([rows[name].to_numpy() for name in ("tx", "ty", "tz")], axis=1),
-            np.stack([rows[name].to_numpy() for name in ("rx", "ry", "rz", "rw")], axis=1),
-        )
-        names = pc.utf8_ltrim(rows["child"], "/").combine_chunks().dictionary_encode()
-        parents = pc.utf8_ltrim(rows["parent"], "/").combine_chunks().dictionary_encode()
-        child, parent = names.indices.to_numpy(), parents.indices.to_numpy()
-        known, above = names.dictionary.to_pylist(), parents.dictionary.to_pylist()
-        good = self._valid(
-            np.asarray(known, object)[child], np.asarray(above, object)[parent], pose
-        )
-        stamps = rows["stamp"].to_numpy()
-        made: dict[str, Frame] = {}
-        by_child = np.argsort(child, kind="stable")
-        starts = np.searchsorted(child[by_child], np.arange(len(known) + 1))
-        for place, name in enumerate(known):
-            own = by_child[starts[place] : starts[place + 1]]
-            own = own[good[own]]
-            if len(own):
-                made[name] = self._frame(
-                    name,
-                    own,
-                    stamps=stamps,
-                    parent=parent,
-                    above=above,
-                    pose=pose,
-                    static=static,
-                )
-        return made
-
-    def _valid(
-        self, child: NDArray[np.object_], parent: NDArray[np.object_], pose: Transform
-    ) -> NDArray[np.bool_]:
-        """Mask of the valid transforms; each of the others is counted by its first reason."""
-        with np.errstate(all="ignore"):
-            norm = np.linalg.norm(pose.rotation, axis=1)
-            finite = np.isfinite(pose.translation).all(axis=1) & np.isfinite(norm)
-            reasons = {
-                "a frame without a name": (child == "") | (parent == ""),
-                "a frame that is its own parent": child == parent,
-                "numbers that are not finite": ~finite,
-                "a rotation that is no unit quaternion": np.abs(norm - 1) > _MAX_NORM_ERROR,
-            }
-        good = np.ones(len(child), np.bool_)
-        for why, bad in reasons.items():
-            if number := int((good & bad).sum()):
-                self.invalid[why] += number
-            good &= ~bad
-        with np.errstate(all="ignore"):
-            pose.rotation[:] /= norm[:, None]
-        return good
-
-    def _frame(
-        self,
-        name: str,
-        own: NDArray[np.intp],
-        *,
-        stamps: NDArray[np.int64],
-        parent: NDArray[np.int32],
-        above: list[str],
-        pose: Transform,
-        static: NDArray[np.bool_],
-    ) -> Frame:
+def _frames(rows: pa.Table, invalid: Counter[str]) -> dict[str, Frame]:
+    """The frames with a parent, by name; counts transforms that are left out, by reason."""
+    rows = rows.take(pa.array(np.argsort(rows["log_time"].to_numpy(), kind="stable")))
+    pose = Transform(
+        np.stack([rows[name].to_numpy() for name in ("tx", "ty", "tz")], axis=1),
+        np.stack([rows[name].to_numpy() for name in ("rx", "ry", "rz", "rw")], axis=1),
+    )
+    columns = (pc.utf8_ltrim(rows[name], "/").combine_chunks() for name in ("child", "parent"))
+    (child, known), (parent, above) = (
+        (one.indices.to_numpy(), one.dictionary.to_pylist())
+        for one in (column.dictionary_encode() for column in columns)
+    )
+    good = _valid(
+        np.asarray(known, object)[child], np.asarray(above, object)[parent], pose, invalid
+    )
+    stamps, static = rows["stamp"].to_numpy(), rows["is_static"].to_numpy()
+    made: dict[str, Frame] = {}
+    by_child = np.argsort(child, kind="stable")
+    starts = np.searchsorted(child[by_child], np.arange(len(known) + 1))
+    for place, name in enumerate(known):
+        own = by_child[starts[place] : starts[place + 1]]
+        own = own[good[own]]
+        if not len(own):
+            continue
         # As in tf2, the first transform decides whether a frame is static.
-        is_static = bool(static[own[0]])
+        is_static, repeated = bool(static[own[0]]), 0
         if other := int((static[own] != is_static).sum()):
             here, there = ("static", "moving") if is_static else ("moving", "static")
-            self.invalid[f"{there}, while {name} is {here}"] += other
+            invalid[f"{there}, while {name} is {here}"] += other
             own = own[static[own] == is_static]
-        repeated = 0
         if is_static:
             own = own[-1:]
         else:
@@ -188,7 +127,7 @@ class _Builder:
             own = own[is_first]
         codes = list(dict.fromkeys(parent[own][::-1].tolist()))[::-1]
         place_of = {code: place for place, code in enumerate(codes)}
-        return Frame(
+        made[name] = Frame(
             name,
             tuple(above[code] for code in codes),
             is_static,
@@ -197,10 +136,33 @@ class _Builder:
             Transform(pose.translation[own], pose.rotation[own]),
             repeated,
         )
+    return made
 
 
-def _transforms_of(table: pa.Table) -> pa.Table:
-    """The transforms of messages as rows: log_time, stamp, parent, child and seven numbers."""
+def _valid(
+    child: NDArray[np.object_], parent: NDArray[np.object_], pose: Transform, invalid: Counter[str]
+) -> NDArray[np.bool_]:
+    """Mask of the valid transforms; each of the others is counted by its first reason."""
+    with np.errstate(all="ignore"):
+        norm = np.linalg.norm(pose.rotation, axis=1)
+        finite = np.isfinite(pose.translation).all(axis=1) & np.isfinite(norm)
+        reasons = {
+            "a frame without a name": (child == "") | (parent == ""),
+            "a frame that is its own parent": child == parent,
+            "numbers that are not finite": ~finite,
+            "a rotation that is no unit quaternion": np.abs(norm - 1) > _MAX_NORM_ERROR,
+        }
+        pose.rotation[:] /= norm[:, None]
+    good = np.ones(len(child), np.bool_)
+    for why, bad in reasons.items():
+        if number := int((good & bad).sum()):
+            invalid[why] += number
+        good &= ~bad
+    return good
+
+
+def _transforms_of(table: pa.Table, *, is_static: bool) -> pa.Table:
+    """The transforms of messages as rows: times, names, seven numbers, and whether they hold."""
     times = table["log_time"].combine_chunks().cast(pa.int64())
     columns = {name: table[name].combine_chunks() for name in table.column_names}
     if "transforms" in columns:
@@ -224,6 +186,7 @@ def _transforms_of(table: pa.Table) -> pa.Table:
     for own, name in names.items():
         kind = pa.string() if own in {"parent", "child"} else pa.float64()
         found[own] = columns[name].cast(kind)
+    found["is_static"] = pa.repeat(pa.scalar(is_static), len(times))
     return pa.table(found).drop_null()
 
 
