@@ -26,9 +26,9 @@ def file_name(text: str) -> str:
     return re.sub(r"[^A-Za-z0-9._-]+", "-", text).strip("-.")[:80] or "recording"
 
 
-def counted(number: int, what: str, plural: str | None = None) -> str:
+def counted(number: int, what: str) -> str:
     """`1 message`, `2 messages`."""
-    return f"{number} {what if number == 1 else plural or what + 's'}"
+    return f"{number} {what if number == 1 else what + 's'}"
 
 
 def unfit(messages: int) -> str:

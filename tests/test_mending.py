@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import fcntl
 import os
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 import hybridlog as hl
-from hybridlog.cli.open_store import _print_left, mended_meanwhile
+from hybridlog.cli.open_store import _print_left
 from hybridlog_storage.catalog import CATALOG
 from tests.running.methods import LABEL, rows, sent
 from tests.running.running import NO_MONGODB, Running, begun
@@ -80,16 +79,6 @@ def test_a_question_about_a_recorder_that_died_writes_nothing(died: hl.Store, kn
     check(died, known)
     died.mend()
     check(died, known)
-
-
-def test_a_store_that_stays_open_is_repaired_meanwhile(died: hl.Store, known: Known) -> None:
-    with mended_meanwhile(died, 0.05):
-        deadline = time.monotonic() + 60
-        while died.entry(LABEL).status != "recovered":
-            assert time.monotonic() < deadline
-            check(died, known)
-        check(died, known)
-    assert not any(name.endswith(".mcap.open") for name in files_in(died))
 
 
 def test_one_moment_outlasts_the_repair(died: hl.Store, known: Known) -> None:

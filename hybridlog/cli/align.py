@@ -121,11 +121,11 @@ def _aligned(store: Store, given: _Given) -> Aligned:
     base = given.base or ""
     queries = _queries(store, [base, *given.topics], given.choice, given.beside)
     for text in given.where:
-        places, predicate = _named(store, queries, text, "--where wants TOPIC: PREDICATE")
+        places, predicate = _named(queries, text, "--where wants TOPIC: PREDICATE")
         for place in places:
             queries[place] = queries[place].where(predicate)
     for text in given.fields:
-        places, names = _named(store, queries, text, "--fields wants TOPIC: A,B.C")
+        places, names = _named(queries, text, "--fields wants TOPIC: A,B.C")
         for place in places:
             queries[place] = queries[place].fields(*parse_fields(names))
     if given.frame is not None:
@@ -164,7 +164,7 @@ def _queries(
     return [base, *(narrowed(q, topic) for q in found for topic in q.topics)]
 
 
-def _named(store: Store, queries: list[Query], text: str, form: str) -> tuple[list[int], str]:
+def _named(queries: list[Query], text: str, form: str) -> tuple[list[int], str]:
     """The queries about a topic before a colon, and what follows it."""
     from hybridlog.query.topics import resolve, split_topic
 

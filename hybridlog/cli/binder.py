@@ -143,8 +143,6 @@ def option(
 def argument(
     help: str,  # noqa: A002 - the word of click
     metavar: str,
-    *,
-    excludes: Sequence[str] = (),
     **settings: Any,
 ) -> Any:
     """A field that is an argument; its type says how: a tuple takes any number of words."""
@@ -158,7 +156,7 @@ def argument(
         settings.setdefault("required", None if of == annotation else False)
         return click.Argument([field], help=help, metavar=metavar, **settings)
 
-    return field(metadata={_MAKE: make, _EXCLUDES: excludes})
+    return field(metadata={_MAKE: make})
 
 
 def parameters_of(kind: type) -> list[click.Parameter]:

@@ -73,7 +73,7 @@ def copy_command(given: _Copy) -> None:
         given.only_fields, given.then_expire, given.limit_rate, given.ssh, given.check
     )
     with (
-        given.opened(is_lasting=given.watch) as store,
+        given.opened() as store,
         if_stopped("What arrived stays there: run the command again."),
     ):
         if given.watch:
@@ -125,6 +125,7 @@ def _copied(
 
 def _look(store: Store, given: _Copy, how: CopyOptions, done: set[str]) -> Iterator[StoreError]:
     """Copy what has ended and is not `done`; yields why something was not copied."""
+    store.mend()
     store.summaries()  # as they are now
     chosen = store.choose(given.choice).summaries
     new = [one.id for one in chosen if one.id not in done and one.status not in _RUNNING]

@@ -100,7 +100,7 @@ def fetch_command(choices: _Choices) -> None:
     """
     to = _destination(choices)
     started = time.monotonic()
-    with choices.opened(is_lasting=choices.follow, snapshot=not choices.follow) as store:
+    with choices.opened(snapshot=not choices.follow) as store:
         query = _query(store, choices)
         if choices.follow:
             _follow(query, choices, to.form)

@@ -209,13 +209,14 @@ def watch_command(given: _Watch) -> None:
     """
     from hybridlog.cli.watching import watch
 
-    with given.opened(require_database=True, is_lasting=True) as store:
-        look = partial(_look, store, given)
+    with given.opened(require_database=True) as store:
+        look = partial(_look, store)
         watch(store.directory.path, look, pause_s=given.every)
 
 
-def _look(store: Store, given: _Shared) -> Iterator[StoreError]:
+def _look(store: Store) -> Iterator[StoreError]:
     """Index what has come since the last look, and print it; yields what cannot be read."""
+    store.mend()
     if store.session.snapshot().is_open.any() or store.shared.has_changed():
         store.refresh()
     repairs = store.repairs

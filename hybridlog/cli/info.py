@@ -240,7 +240,7 @@ def _print_recording(
         source += f", {output.size(entry.source['bytes'])}"
     if entry.source["path"]:
         source = f"{entry.source['path']} ({source})"
-    first, last = about["start_ns"], about["last_ns"]
+    first, last = about["first_ns"], about["last_ns"]
     print_fields(
         [
             ("recording", entry.name),

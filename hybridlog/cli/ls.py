@@ -81,7 +81,7 @@ def recording_dict(recording: RecordingSummary) -> dict[str, Any]:
         "name": recording.name,
         "tags": recording.tags,
         "status": recording.status,
-        "start_ns": span[0] if span else None,
+        "first_ns": span[0] if span else None,
         "last_ns": span[1] if span else None,
         "topics": recording.topic_count,
         "messages": recording.messages,

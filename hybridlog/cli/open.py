@@ -150,7 +150,7 @@ def _play(given: _Given) -> None:
         is_paused=given.paused,
         origins=given.origins,
     )
-    with given.opened(is_lasting=True) as store:
+    with given.opened() as store:
         query = given.query(store)
         log = PlayedLog(query)
         name = " ".join(["hybridlog", *given.choice.name])

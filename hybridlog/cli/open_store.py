@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from itertools import chain, islice
 from pathlib import Path
 from shlex import quote
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
 _MAX_LISTED = 3  # names of recordings or stores
 _MAX_FOLDERS = 1000
-_EVERY_S: Final = 2.0  # between repairs while a command lasts
 _READING: Final = ("Look", "Ask", "Export")
 """Groups of commands that take the only store that is near; others name it."""
 
@@ -33,7 +32,6 @@ def opened_store(
     mongo: str | None,
     *,
     quiet: bool = False,
-    is_lasting: bool = False,
     snapshot: bool = False,
     records: bool = False,
     verifies: bool = False,
@@ -45,7 +43,6 @@ def opened_store(
         path: Its directory; without, `HYBRIDLOG_STORE` or `./hybridlog-store`.
         mongo: URI of the MongoDB that holds the index.
         quiet: No bar while the index is brought up to date.
-        is_lasting: What the command meets is repaired while it goes on.
         snapshot: All that the command asks is of one moment.
         records: The command records, also while MongoDB is unavailable.
         verifies: The command says itself what `hybridlog verify --repair` cures.
@@ -69,8 +66,7 @@ def opened_store(
             named = " or ".join(f"--store {quote(str(one))}" for one in near[:_MAX_LISTED])
             error.add_note(f"Below this folder: {named}.")
         raise
-    during = mended_meanwhile(store) if is_lasting and recover else nullcontext()
-    with store, during:
+    with store:
         doing = "so the files answer"
         if records:
             target = store.shared.index.index_to_record("Recording")
@@ -160,24 +156,3 @@ def _print_left(store: Store) -> None:
     left = len(store.repairs.noted_tables)
     if left and store.directory.is_writable:
         note(f"Left to repair: {counted(left, 'table')}. `hybridlog verify --repair` does it.")
-
-
-@contextmanager
-def mended_meanwhile(store: Store, every: float = _EVERY_S) -> Iterator[None]:
-    """A block during which another thread calls `Store.mend` again and again, every so many s."""
-    import math
-    import threading
-
-    ended = threading.Event()
-
-    def mend() -> None:
-        while not ended.wait(every):
-            store.mend(math.inf)
-
-    thread = threading.Thread(target=mend, name="hybridlog-mend", daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        ended.set()
-        thread.join()

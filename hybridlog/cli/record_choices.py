@@ -242,7 +242,6 @@ def opened_to_record(
         create=True,
         cache_mb=choices.cache_size,
         quiet=choices.quiet,
-        is_lasting=True,
         records=True,
         recover=recover,
     )

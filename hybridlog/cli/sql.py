@@ -41,7 +41,7 @@ def sql_command(given: _Given) -> None:
     is_prompt = query is None and sys.stdin.isatty()
     if query is None and not is_prompt:
         query = sys.stdin.read()
-    with given.opened(is_lasting=is_prompt, snapshot=not is_prompt) as store:
+    with given.opened(snapshot=not is_prompt) as store:
         ids = None if given.choice.is_everything else given.recordings_in(store).ids
         connection = store.sql_engine.connect(given.memory, scope=Question((), ids, given.span))
 

@@ -65,7 +65,7 @@ def top_command(given: _Given) -> None:
     with _ended_by_ctrl_c(), at_safe_points(), ExitStack() as held:
         opened = None
         if fields:
-            opened = held.enter_context(given.opened(is_lasting=True, quiet=False))
+            opened = held.enter_context(given.opened())
         table = held.enter_context(LiveTable(error=False)) if on_screen else None
         for state in states(directory, recorder, _EVERY_S):
             if state is None:

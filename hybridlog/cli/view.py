@@ -41,7 +41,7 @@ def view_command(given: _Given) -> None:
         raise MissingDependencyError(
             "The view needs starlette and uvicorn: pip install 'hybridlog[view]'"
         ) from error
-    with given.opened(is_lasting=True) as store:
+    with given.opened() as store:
         server = ViewServer(store, given.port or 0, viewers=given.mcap, origins=given.origins)
         url = server.url
         name = ""

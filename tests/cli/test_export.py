@@ -21,7 +21,7 @@ def test_what_is_no_table_is_said_and_left_out(store: Path, tmp_path: Path) -> N
 
 def test_a_topic_beside_the_range_is_said_and_left_out(store: Path, tmp_path: Path) -> None:
     odd = next(r for r in run("ls", "--json", store=store).json if r["name"] == "odd")
-    between = ("--between", f"{odd['start_ns']}ns", f"{odd['last_ns'] + 1}ns")
+    between = ("--between", f"{odd['first_ns']}ns", f"{odd['last_ns'] + 1}ns")
     topics = ("-t", "/json", "-t", "/base/scan")
     done = run("export", tmp_path / "x", "-F", "csv", *topics, *between, store=store)
     assert [path.name for path in (tmp_path / "x").iterdir()] == ["json.csv"]

@@ -141,7 +141,7 @@ def _page(_: Answer, out: Path) -> Any:
 
 def _info(answer: Answer, _: Path) -> Any:
     (one,) = answer.json
-    names = ("status", "messages", "start_ns", "last_ns", "topics")
+    names = ("status", "messages", "first_ns", "last_ns", "topics")
     counts = {t["topic"]: t["messages"] for t in one["channels"] if t["messages"]}
     return [one[n] for n in names], counts, [loss["count"] for loss in one["losses"]]
 
@@ -174,7 +174,7 @@ COMMANDS: dict[str, list[Asked]] = {
     "ls": [
         asked(
             "ls --json",
-            listed("name", "status", "messages", "start_ns", "last_ns", "topics"),
+            listed("name", "status", "messages", "first_ns", "last_ns", "topics"),
             lambda k: [(LABEL, "open", len(k.of()), *k.span, len(_there(k)))],
         ),
         asked(

@@ -327,7 +327,7 @@ def listed(store: Path) -> dict[str, Row]:
 
 def listed_by_command(store: Path) -> dict[str, Row]:
     """The same of ended recordings, as `hybridlog ls --json` prints them."""
-    keys = ("id", "tags", "status", "created_ns", "start_ns", "last_ns", "messages")
+    keys = ("id", "tags", "status", "created_ns", "first_ns", "last_ns", "messages")
     keys += ("topics", "segments", "stored_bytes")
     return {
         one["name"]: tuple(one[key] // 1000 if key == "created_ns" else one[key] for key in keys)
