@@ -127,12 +127,10 @@ class RecordingWriter:
             never waits for the disk, and the caller watches `stored_bytes`: when more than a
             few chunks wait, only those that shrink to a fifth or less are compressed. Without
             it `append` waits for a slow disk.
-        no_index: Returns whether the messages of a topic get no documents in MongoDB; None
-            for no topic. The segments keep that.
-        is_named: Returns whether a rule names a topic, which then has segments of its own; None
-            for no topic.
-        is_latched: Returns whether the messages of a channel stay in the first segments; None
-            for no channel.
+        no_index: Returns whether the messages of a topic get no documents in MongoDB. The
+            segments keep that.
+        is_named: Returns whether a rule names a topic, which then has segments of its own.
+        is_latched: Returns whether the messages of a channel stay in the first segments.
         latched_apart: Whether they have a segment of their own in each group instead.
         on_sealing: Called when a group is complete and, unless `sync` is never, on the disk,
             before its segments get their final names. Called on a writer thread or by
@@ -148,11 +146,11 @@ class RecordingWriter:
         settings: SegmentSettings | None = None,
         *,
         on_written: Callable[[], None] | None = None,
-        no_index: Callable[[str], bool] | None = None,
-        is_named: Callable[[str], bool] | None = None,
-        is_latched: Callable[[Channel], bool] | None = None,
+        no_index: Callable[[str], bool] = lambda _: False,
+        is_named: Callable[[str], bool] = lambda _: False,
+        is_latched: Callable[[Channel], bool] = lambda _: False,
         latched_apart: bool = False,
-        on_sealing: Callable[[Sequence[Sealed]], None] | None = None,
+        on_sealing: Callable[[Sequence[Sealed]], None] = lambda _: None,
         make_room: Callable[[], bool] = lambda: False,
     ) -> None:
         self.settings = settings or SegmentSettings()
@@ -178,13 +176,13 @@ class RecordingWriter:
         self._pool = Threads(packers, "hybridlog-pack")
         self._disk = Threads(1, "hybridlog-disk")
         self._on_written = on_written
-        self._no_index = no_index or (lambda _: False)
+        self._no_index = no_index
         self._latched_apart = latched_apart
-        self._is_latched = is_latched or (lambda _: False)
-        self._on_sealing: Callable[[Sequence[Sealed]], None] = on_sealing or (lambda _: None)
+        self._is_latched = is_latched
+        self._on_sealing = on_sealing
         self._make_room = make_room
         large, own = self.settings.large_payload, self.settings.own_payload
-        self._division = Division(own, large, is_named or (lambda _: False))
+        self._division = Division(own, large, is_named)
         self._packed: deque[Future[PackedChunk]] = deque()  # in file order
         self._storing: deque[Future[None]] = deque()
         self._extras: list[Metadata | Attachment] = []  # not in a segment yet
