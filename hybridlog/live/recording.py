@@ -46,7 +46,6 @@ _TICK_S = 0.1  # interval of the writing thread when little comes
 _FLUSH_AT = 0.95  # share of the flush interval after which chunks are closed
 _INDEX_INTERVALS = 4  # flush intervals between two passes of the index
 _INDEXING_S = 2.0  # time to pack, write, convert and send the documents of a chunk
-_BEHIND_BYTES = 64 << 20  # unwritten bytes; above it only chunks that shrink a lot are packed
 _MAX_NS = 1 << 63
 _SOURCE = {"path": "", "kind": "live", "profile": "", "bytes": 0}
 LIVE_SETTINGS = SegmentSettings(segment_size=1 << 30, segment_span_s=600.0)
@@ -172,7 +171,6 @@ class LiveRecording:
             no_index=options.no_index,
             is_ring=options.is_ring,
             make_room=self._when_full,
-            skip_compression=self._is_behind,
             on_written=self._notify,
             index_interval_s=_index_interval_s(options.flush_interval_s),
         )
@@ -428,10 +426,6 @@ class LiveRecording:
     def _unwritten(self) -> int:
         """Bytes that were taken and are not in a file."""
         return self._received - self._capture.writer.stored_bytes
-
-    def _is_behind(self) -> bool:
-        most = min(self._options.budget_bytes // 4, _BEHIND_BYTES)
-        return self._unwritten > most and not self._ended
 
     def _notify(self) -> None:
         """There is room for another message."""

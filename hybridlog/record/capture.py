@@ -70,8 +70,6 @@ class Capture:
         tags: Tags of the recording.
         source: Origin of its messages, for the catalog.
         settings: Rotation, chunks and compression of segments.
-        skip_compression: Returns whether writing is behind. Then only chunks that shrink to a
-            fifth are compressed.
         on_written: Called on another thread when less content waits for the disk; for a caller
             that cannot wait for it.
         index_interval_s: Longest time between two passes of the index, seconds.
@@ -100,7 +98,6 @@ class Capture:
         tags: Mapping[str, str],
         source: Mapping[str, Any],
         settings: SegmentSettings,
-        skip_compression: Callable[[], bool] | None = None,
         on_written: Callable[[], None] | None = None,
         index_interval_s: float = INTERVAL_S,
         no_index: Callable[[str], bool] | None = None,
@@ -165,7 +162,6 @@ class Capture:
             latched_apart=is_ring,
             on_sealing=self._announce,
             make_room=make_room,
-            skip_compression=skip_compression,
             on_written=on_written,
         )
 

@@ -201,7 +201,7 @@ def test_chunks_are_as_large_as_their_bound_however_messages_come(
 
 @pytest.mark.parametrize("noise", [0.3, 0.1])
 def test_chunks_that_wait_are_stored_as_they_are_once_there_is_a_hurry(
-    tmp_path: Path, noise: float
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, noise: float
 ) -> None:
     """Also those that were closed before: topics of one rate close theirs at one time.
 
@@ -210,13 +210,13 @@ def test_chunks_that_wait_are_stored_as_they_are_once_there_is_a_hurry(
     chunks: list[StoredChunk] = []
     hurried, go_on = False, threading.Event()
 
-    def is_hurried() -> bool:
+    def is_behind(_: object) -> bool:
         go_on.wait(60)
         return hurried
 
     size = 1 << 20
-    setup = SegmentSettings(chunk_size=size)
-    writer = recorder(tmp_path, chunks, setup, skip_compression=is_hurried, on_written=done)
+    monkeypatch.setattr(RecordingWriter, "_is_behind", is_behind)
+    writer = recorder(tmp_path, chunks, SegmentSettings(chunk_size=size), on_written=done)
     payloads = [
         b"".join(os.urandom(int(noise * 1024)).ljust(1024, bytes([n])) for _ in range(size >> 10))
         for n in range(8)

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     _Done = TypeVar("_Done")
-from hybridlog_storage.threads import Threads
+from hybridlog_storage.threads import Threads, processors
 
 _PACKERS = 2
 AT_WORK = 8
@@ -123,17 +123,14 @@ class RecordingWriter:
         recording: Catalog entry stored in every segment.
         on_chunk: Called on a writer thread, in file order, with every chunk in the file.
         settings: How to divide and compress.
-        skip_compression: Returns whether to compress only chunks that shrink to a fifth or
-            less; None for never.
         on_written: Called on a writer thread when less content is waiting. With it `append`
-            never waits for the disk, and the caller watches `stored_bytes`. Without it `append`
-            waits for a slow disk.
-        no_index: Returns whether the messages of a topic get no documents in MongoDB; None
-            for no topic. The segments keep that.
-        is_named: Returns whether a rule names a topic, which then has segments of its own; None
-            for no topic.
-        is_latched: Returns whether the messages of a channel stay in the first segments; None
-            for no channel.
+            never waits for the disk, and the caller watches `stored_bytes`: when more than a
+            few chunks wait, only those that shrink to a fifth or less are compressed. Without
+            it `append` waits for a slow disk.
+        no_index: Returns whether the messages of a topic get no documents in MongoDB. The
+            segments keep that.
+        is_named: Returns whether a rule names a topic, which then has segments of its own.
+        is_latched: Returns whether the messages of a channel stay in the first segments.
         latched_apart: Whether they have a segment of their own in each group instead.
         on_sealing: Called when a group is complete and, unless `sync` is never, on the disk,
             before its segments get their final names. Called on a writer thread or by
@@ -148,13 +145,12 @@ class RecordingWriter:
         on_chunk: Callable[[StoredChunk, Mapping[int, Channel]], None],
         settings: SegmentSettings | None = None,
         *,
-        skip_compression: Callable[[], bool] | None = None,
         on_written: Callable[[], None] | None = None,
-        no_index: Callable[[str], bool] | None = None,
-        is_named: Callable[[str], bool] | None = None,
-        is_latched: Callable[[Channel], bool] | None = None,
+        no_index: Callable[[str], bool] = lambda _: False,
+        is_named: Callable[[str], bool] = lambda _: False,
+        is_latched: Callable[[Channel], bool] = lambda _: False,
         latched_apart: bool = False,
-        on_sealing: Callable[[Sequence[Sealed]], None] | None = None,
+        on_sealing: Callable[[Sequence[Sealed]], None] = lambda _: None,
         make_room: Callable[[], bool] = lambda: False,
     ) -> None:
         self.settings = settings or SegmentSettings()
@@ -164,6 +160,7 @@ class RecordingWriter:
         """Number of messages in the files, by channel id."""
         self.stored_bytes = 0
         """Bytes of content in the files, before compression."""
+        self._closed_bytes = 0  # of content in closed chunks, those in the files included
         self._last_times: dict[int, int] = {}  # in the files, by channel id
         self._directory = directory
         self._recording = recording
@@ -174,17 +171,18 @@ class RecordingWriter:
         self._latched: set[int] = set()  # ids of channels whose messages lie apart
         self._movable: set[int] = set()  # ids of channels that need not be in the first segment
         self._compressor = Compressor(self.settings.compression, self.settings.level)
-        self._pool = Threads(_PACKERS, "hybridlog-pack")
+        # One processor is left to who brings messages that cannot wait.
+        packers = _PACKERS if on_written is None else min(_PACKERS, max(processors() - 1, 1))
+        self._pool = Threads(packers, "hybridlog-pack")
         self._disk = Threads(1, "hybridlog-disk")
-        self._skip_compression = skip_compression or (lambda: False)
         self._on_written = on_written
-        self._no_index = no_index or (lambda _: False)
+        self._no_index = no_index
         self._latched_apart = latched_apart
-        self._is_latched = is_latched or (lambda _: False)
-        self._on_sealing: Callable[[Sequence[Sealed]], None] = on_sealing or (lambda _: None)
+        self._is_latched = is_latched
+        self._on_sealing = on_sealing
         self._make_room = make_room
         large, own = self.settings.large_payload, self.settings.own_payload
-        self._division = Division(own, large, is_named or (lambda _: False))
+        self._division = Division(own, large, is_named)
         self._packed: deque[Future[PackedChunk]] = deque()  # in file order
         self._storing: deque[Future[None]] = deque()
         self._extras: list[Metadata | Attachment] = []  # not in a segment yet
@@ -380,7 +378,9 @@ class RecordingWriter:
         return start + int(far.argmax()) if far.any() else len(batch)
 
     def _close_chunk(self, key: int) -> None:
-        packed = self._pool.submit(self._pack, self._clusters.pop(key))
+        chunk = self._clusters.pop(key)
+        self._closed_bytes += chunk.size
+        packed = self._pool.submit(self._pack, chunk)
         self._packed.append(packed)
         self._storing.append(self._disk.submit(self._store, packed))
         self._limit_queue(limit=AT_WORK)
@@ -400,7 +400,12 @@ class RecordingWriter:
     def _pack(self, chunk: OpenChunk) -> PackedChunk:
         batch, seq = chunk.laid_out()
         # Asked now: topics of equal rate close their chunks at the same time.
-        return pack(self._compressor, batch, seq, hurried=self._skip_compression())
+        return pack(self._compressor, batch, seq, hurried=self._is_behind())
+
+    def _is_behind(self) -> bool:
+        """True if too much waits for a live recording's disk."""
+        waiting = self._closed_bytes - self.stored_bytes
+        return self._on_written is not None and waiting > AT_WORK * self.settings.chunk_size
 
     # The methods below run on the writing thread only.
 

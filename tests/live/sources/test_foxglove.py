@@ -487,18 +487,6 @@ def test_nonsense_is_told_in_a_line_and_the_rest_goes_on(sent: bytes, words: str
     assert source.was_reached
 
 
-def test_who_gives_reason_to_complain_for_ever_is_not_listened_to_for_ever() -> None:
-    def script(peer: Peer) -> None:
-        number = peer.offer(channel())[1]
-        for at in range(300):
-            peer.send(text({"op": "status", "message": str(at)}))
-        peer.send(message(number, 0, b"after"))
-        peer.wait()
-
-    heard = hear(lambda h: h.taken, script)
-    assert len(heard.said) == 101
-
-
 def test_channels_without_end_are_bounded(limit: Limit) -> None:
     limit(foxglove_channels=10)
 

@@ -22,9 +22,9 @@ from picows import (
     ws_connect,
 )
 
-from hybridlog.live.sources.base import Cause, Loss, PeerError, Sink
+from hybridlog.live.sources.base import Cause, Loss, PeerError, Sink, one_line
 from hybridlog.live.sources.foxglove.protocol import Address
-from hybridlog.live.sources.foxglove.session import Notifier, Session
+from hybridlog.live.sources.foxglove.session import Session
 from hybridlog.live.sources.network import Endpoint, Network, reason_of
 
 _TICK_S: Final = 0.25  # interval at which a silent connection checks whether to stop
@@ -33,7 +33,7 @@ _CLOSE_S: Final = 1.0
 _PING_S: Final = 10.0  # silence after which a ping is sent, and then until the end
 _PAUSES_S: Final = (0.5, 1.0, 2.0, 4.0, 8.0, 15.0)
 _STABLE_S: Final = 10.0  # after a connection of this length the pauses are short again
-_SILENT: Final = logging.Logger("picows", logging.CRITICAL + 1)  # the user is told by `Notifier`
+_SILENT: Final = logging.Logger("picows", logging.CRITICAL + 1)  # the user is told by us
 
 
 class Client:
@@ -47,7 +47,6 @@ class Client:
         reached: Callable[[], None],
     ) -> None:
         self._sink = sink
-        self._notifier = Notifier(sink, address.shown)
         self._address = address
         self._stop = stop
         self._reached = reached
@@ -72,7 +71,7 @@ class Client:
                 reason = str(error)
             if self._stop.is_set():
                 return
-            self._notifier.say(f"{reason}; trying again")
+            self._sink.say(f"{self._address.shown}: {one_line(reason)}; trying again")
             if time.monotonic() - began > _STABLE_S:
                 failures = 0
             self._stop.wait(_PAUSES_S[min(failures, len(_PAUSES_S) - 1)])
@@ -84,7 +83,7 @@ class Client:
         Returns:
             The reason of the end, for the user.
         """
-        session = Session(self._sink, self._notifier, self._missed)
+        session = Session(self._sink, self._address.shown, self._missed)
         opening = asyncio.ensure_future(self._open(session))
         if not await self._has_ended(opening, _OPEN_S):
             opening.cancel()

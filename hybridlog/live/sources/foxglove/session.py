@@ -36,7 +36,6 @@ from hybridlog_storage.messages import Channel
 _MAX_CHANNELS: Final = 1 << 16
 _MAX_RETIRED: Final = 1 << 12
 _MAX_NS: Final = 1 << 63
-_MAX_COMPLAINTS: Final = 100
 _NO_CHANNEL = re.compile(
     r"(?i)unknown channel\D{0,20}(\d{1,20})\b|channel\D{0,20}(\d{1,20}) is not available"
 )
@@ -49,27 +48,6 @@ _HEAD: Final = Struct("<xIQ")
 _TIME: Final = Struct("<xQ")
 _CONTENT: Final = attrgetter("topic", "message_encoding", "schema", "metadata")
 _BINARY: Final = WSMsgType.BINARY
-
-
-class Notifier:
-    """Reports problems of one server to the user, one line each."""
-
-    def __init__(self, sink: Sink, name: str) -> None:
-        self._sink = sink
-        self._name = name
-        self._complaints = 0
-
-    def say(self, text: str) -> None:
-        """Report a problem; the text may quote the server."""
-        self._sink.say(f"{self._name}: {one_line(text)}")
-
-    def complain(self, text: str) -> None:
-        """Report a problem that the server can cause any number of times, up to a limit."""
-        self._complaints += 1
-        if self._complaints <= _MAX_COMPLAINTS:
-            self.say(text)
-        elif self._complaints == _MAX_COMPLAINTS + 1:
-            self.say(f"has caused {_MAX_COMPLAINTS} complaints; further ones are not shown")
 
 
 @dataclass(slots=True)
@@ -86,19 +64,18 @@ class Session(WSListener):
 
     Args:
         sink: Takes the messages.
-        notifier: Reports problems.
+        name: The server, for the user.
         missed: Topics of an earlier connection, with the time of its end, ns since the
             epoch. Topics that are available again are removed.
-
     """
 
     max_bytes: Final = 1 << 30  # of a message
 
-    def __init__(self, sink: Sink, notifier: Notifier, missed: dict[str, int]) -> None:
+    def __init__(self, sink: Sink, name: str, missed: dict[str, int]) -> None:
         self.problem: Exception | None = None  # why the session ended the connection
         self._sink = sink
         self._take = sink.take
-        self._notifier = notifier
+        self._name = name
         self._missed = missed
         self._next = 0
         self._routes: dict[int, tuple[Channel, SequenceGapDetector | None]] = {}
@@ -110,6 +87,10 @@ class Session(WSListener):
         self._loop = asyncio.get_running_loop()
         self._transport: WSTransport
         self._overdue: asyncio.TimerHandle
+
+    def _say(self, text: str) -> None:
+        """Report a problem; the text may quote the server."""
+        self._sink.say(f"{self._name}: {one_line(text)}")
 
     # The connection.
 
@@ -205,7 +186,7 @@ class Session(WSListener):
         channel, gaps = route
         received = time.time_ns()
         if log_time >= _MAX_NS:
-            self._notifier.complain(
+            self._say(
                 f"gives {channel.topic!r} a time after the year 2262; it is replaced by the "
                 "receive time"
             )
@@ -231,7 +212,7 @@ class Session(WSListener):
         now = time.time_ns()
         self._sink.lost(Loss("", Cause.UNREADABLE, 1, now, now, detail))
         are = "they are" if what.startswith("messages") else "it is"
-        self._notifier.complain(f"sends {what}; {are} ignored")
+        self._say(f"sends {what}; {are} ignored")
 
     # JSON messages.
 
@@ -240,7 +221,7 @@ class Session(WSListener):
         try:
             message = parse_text(data)
         except PeerError as error:
-            self._notifier.complain(str(error))
+            self._say(str(error))
             return
         match message["op"]:
             case "advertise":
@@ -252,14 +233,14 @@ class Session(WSListener):
 
     def _advertise(self, channels: object) -> None:
         if not isinstance(channels, list):
-            self._notifier.complain("advertises something else than a list of channels")
+            self._say("advertises something else than a list of channels")
             return
         wanted: list[_Subscription] = []
         for entry in channels:
             try:
                 offer = parse_channel(entry)
             except PeerError as error:
-                self._notifier.complain(str(error))
+                self._say(str(error))
                 continue
             subscription = self._offered(offer)
             if subscription is not None:
@@ -279,10 +260,10 @@ class Session(WSListener):
         if not self._sink.wants(topic, offer.type_name):
             return None
         if len(self._subscriptions) >= _MAX_CHANNELS:
-            self._notifier.say(f"has more than {_MAX_CHANNELS} channels; the rest is ignored")
+            self._say(f"has more than {_MAX_CHANNELS} channels; the rest is ignored")
             return None
         if offer.problem:
-            self._notifier.complain(
+            self._say(
                 f"the definition of {topic!r} {offer.problem}; its messages are recorded, but "
                 "their fields cannot be searched"
             )
@@ -302,7 +283,7 @@ class Session(WSListener):
 
     def _unadvertise(self, channels: object) -> None:
         if not isinstance(channels, list):
-            self._notifier.complain("unadvertises something else than a list of channels")
+            self._say("unadvertises something else than a list of channels")
             return
         for number in channels:
             if type(number) is int and number in self._subscriptions:
@@ -330,12 +311,12 @@ class Session(WSListener):
         found = _NO_CHANNEL.search(text)
         refused = self._subscriptions.get(int(found[found.lastindex or 1])) if found else None
         if refused is None:
-            self._notifier.complain(f"says: {text}")
+            self._say(f"says: {text}")
             return
         refused.refusals += 1
         if refused.refusals > _MAX_REFUSALS:
             topic = refused.offer.channel.topic
-            self._notifier.complain(f"offers {topic!r}, but does not send it ({text})")
+            self._say(f"offers {topic!r}, but does not send it ({text})")
             return
         self._loop.call_later(_RETRY_S * (refused.refusals - 1), self._retry, refused)
 
