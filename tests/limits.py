@@ -57,8 +57,6 @@ PLACES = {
     "sampled_periods": "hybridlog.query.periods._SAMPLED",
     "planner_group_growth": "hybridlog.query.planner._GROUP_GROWTH",
     "document_slab_bytes": "hybridlog.schema.document._SLAB",
-    "sql_tree_size": "hybridlog.sql.engine._MAX_TREE",
-    "sql_trees": "hybridlog.sql.engine._MAX_TREES",
     "clients_wait_s": "hybridlog.index.of_store._CLIENTS_WAIT_S",
     "playback_sent": "hybridlog.view.playback.server._MAX_SENT",
     "sql_seconds": "hybridlog.view.routes.ask.SQL_SECONDS",

@@ -8,7 +8,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from difflib import get_close_matches
-from functools import partial
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from hybridlog.query.question import Question
@@ -18,7 +18,6 @@ from hybridlog.sql.content import StoreContent
 from hybridlog.sql.duck import MEMORY, Worker, explained, open_duckdb, shortage_of
 from hybridlog.sql.names import TABLES
 from hybridlog.sql.pieces import DamagedTableError
-from hybridlog.sql.source import source_of
 from hybridlog.sql.store_tables import store_schema, store_table
 from hybridlog.sql.topic_view import Reading
 from hybridlog.sql.usage import EVERYTHING, Usage, usage_of
@@ -49,7 +48,6 @@ _NAMES: Final = (
     "union select view_name from duckdb_views() where not internal order by name"
 )
 _MAX_TREES: Final = 64  # syntax trees that are kept
-_MAX_TREE: Final = 1 << 20  # characters of one of them
 _NO_TABLE: Final = re.compile(r"Catalog Error: Table with name (.+?) does not exist")
 _MAX_TRIES: Final = 10  # tables that may be damaged in one query
 _T = TypeVar("_T")
@@ -62,7 +60,7 @@ class SqlEngine:
         self._source = source
         self._bases: dict[int, Any] = {}
         self._content: StoreContent | None = None
-        self._trees: dict[str, str] = {}
+        self.tree = lru_cache(_MAX_TREES)(self._tree)
         self._lock = threading.RLock()
 
     def connect(
@@ -104,17 +102,12 @@ class SqlEngine:
                 known = self._content = StoreContent(session, scope)
             return known
 
-    def tree(self, cursor: Any, text: str) -> str:
-        """The syntax tree of a query as JSON; those of the last queries are kept."""
+    def _tree(self, text: str) -> str:
+        """The syntax tree of a query as JSON; `tree` keeps those of the last queries."""
         with self._lock:
-            found = self._trees.get(text)
-            if found is None:
-                ((found,),) = cursor.execute(_TREE, [text]).fetchall()
-                if len(found) <= _MAX_TREE:
-                    self._trees[text] = found
-                if len(self._trees) > _MAX_TREES:
-                    del self._trees[next(iter(self._trees))]
-            return found
+            base = next(iter(self._bases.values()))
+            ((found,),) = base.cursor().execute(_TREE, [text]).fetchall()
+        return str(found)
 
     def reject(self, damaged: DamagedTableError) -> None:
         """Drop a damaged table; the next query makes it again."""
@@ -251,11 +244,13 @@ class SqlConnection:
 
     def register(self, content: StoreContent) -> None:
         """Register the views that were named so far, if they are not those of this content."""
+        from hybridlog.sql.source import TopicDataset
+
         known = set() if content is not self._content else self._registered
         for name in self._names - known:
             topic = content.names.topic(name)
             if topic is not None:
-                source: Any = source_of(content.view(topic), lambda: self.reading)
+                source: Any = TopicDataset(content.view(topic), lambda: self.reading)
             elif name in TABLES:
                 source = store_table(name, content)
             else:
@@ -267,8 +262,7 @@ class SqlConnection:
         if self._has_own:
             return EVERYTHING
         text = statement.query.strip().rstrip(";")
-        tree = self.engine.tree(self.cursor, text)
-        return usage_of(tree, {name.casefold() for name in self._names})
+        return usage_of(self.engine.tree(text), {name.casefold() for name in self._names})
 
     def close(self) -> None:
         """Close the connection."""

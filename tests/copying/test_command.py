@@ -88,7 +88,7 @@ def test_payloads_that_were_not_copied_yet_were_not_deleted(
         with pytest.raises(PayloadError, match=f"its payload was {re.escape(why)}"):
             _ = first.raw
         assert told in str(query.completeness())
-        assert why in recordings(Context(store), None).text
+        assert why in recordings(Context(store)).text
         found = store.sql("select distinct state from cloud where state <> 'whole'")
         assert found.to_arrow()["state"].to_pylist() == [state]
     arrays = answer("sql", "select sum(len(data)) from cloud", store=lab)
