@@ -62,7 +62,7 @@ PLACES = {
     "sql_seconds": "hybridlog.view.routes.ask.SQL_SECONDS",
     "export_piece_bytes": "hybridlog.view.routes.export.PIECE",
     "catalog_busy_s": "hybridlog_storage.catalog._BUSY_S",
-    "matches": "hybridlog.drawing.matches.MAX_MATCHES",
+    "matches": "hybridlog.drawing.times.MAX_MATCHES",
     "direct_flag": "hybridlog_storage.disk.append_file.DIRECT",
     "copy_wait_s": "hybridlog_storage.copy_places.LOCK_WAIT_S",
     "server_copy_wait_s": "hybridlog_storage.sftp.LOCK_WAIT_S",

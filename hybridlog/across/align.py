@@ -11,13 +11,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pyarrow as pa
 
-from hybridlog.across.bins import AGGREGATES, Bins, RegularTimes
+from hybridlog.across.bins import AGGREGATES, Bins, RegularTimes, with_numbers
 from hybridlog.across.match import HOWS, UNKNOWN, How, interpolated, match
 from hybridlog.across.topic_reader import (
     RECORDING,
     TIME,
     Block,
-    Stream,
     TopicReader,
     concatenated,
 )
@@ -86,7 +85,7 @@ class Aligned:
         self,
         session: Session,
         base: TopicReader | RegularTimes,
-        others: Sequence[Stream],
+        others: Sequence[TopicReader],
         *,
         how: str,
         tolerance: DurationLike | None,
@@ -108,24 +107,22 @@ class Aligned:
         self._empty: Counter[tuple[str, str]] = Counter()
 
     @property
-    def _streams(self) -> list[Stream]:
+    def _readers(self) -> list[TopicReader]:
         """The topics that are read."""
-        own = [self._base.stream] if isinstance(self._base, TopicReader) else []
+        own = [self._base] if isinstance(self._base, TopicReader) else []
         return [*own, *self._others]
 
-    def _partner(self, stream: Stream) -> _Partner | Bins:
-        session, how = self._session, self._how
-        if isinstance(self._base, RegularTimes) and how in AGGREGATES:
-            return Bins(session, stream, self._base, how)
-        reader = TopicReader(session, stream, self._clock)
-        return _Partner(reader, how, self._tolerance)  # type: ignore[arg-type]
+    def _partner(self, reader: TopicReader) -> _Partner | Bins:
+        if isinstance(self._base, RegularTimes) and self._how in AGGREGATES:
+            return Bins(reader, self._base, self._how)
+        return _Partner(reader, self._how, self._tolerance)  # type: ignore[arg-type]
 
     @property
     def counters(self) -> Counters:
         """The cost of the last answer."""
         found = Counters()
-        for stream in self._streams:
-            found.add(stream.counters)
+        for reader in self._readers:
+            found.add(reader.counters)
         return found
 
     @property
@@ -141,8 +138,8 @@ class Aligned:
 
     def remarks(self) -> list[str]:
         """Sentences about the last answer, those of `Query.remarks` about each topic."""
-        streams = self._streams
-        topics = tuple(topic for stream in streams for topic in stream.question.topics)
+        questions = [reader.asked for reader in self._readers]
+        topics = tuple(topic for question in questions for topic in question.topics)
         rows = counted(self.rows, "row")
         lines = [
             f"{name}: {number} of {rows} {'is' if number == 1 else 'are'} empty: {reason}."
@@ -154,19 +151,18 @@ class Aligned:
             found.append(
                 f"{counted(len(lines) - _MAX_NAMES, 'more column')} are empty in some rows."
             )
-        for stream in streams:
-            question = stream.question
+        for question in questions:
             others = tuple(topic for topic in question.namesakes if topic not in topics)
             found += remarks(self._session, replace(question, namesakes=others), is_empty=False)
         return [*dict.fromkeys([*found, *self.completeness().sentences])]
 
     def completeness(self) -> Completeness:
         """Return what the rows lack, as `Query.completeness` does, after they were read."""
-        answered = [(stream.question, stream.counters) for stream in self._streams]
+        answered = [(reader.asked, reader.counters) for reader in self._readers]
         return completeness_of(self._session, *answered[0], *answered[1:])
 
     def __repr__(self) -> str:
-        names = [name for stream in self._others for name in stream.question.topics]
+        names = [name for reader in self._others for name in reader.question.topics]
         return f"<Aligned {', '.join(names)}; {self._how}>"
 
     def to_tables(self, told: int | None = None) -> Iterator[pa.Table]:
@@ -177,8 +173,8 @@ class Aligned:
         Args:
             told: `rows`, `empty` and `remarks` are about so many first rows; None for all.
         """
-        for stream in self._streams:
-            stream.counters.reset()
+        for reader in self._readers:
+            reader.counters.reset()
         self.rows = 0
         self._empty.clear()
         base, partners = self._base, [self._partner(other) for other in self._others]
@@ -357,7 +353,7 @@ class _Partner:
             self._advance()
         table = concatenated([one for one, _ in parts])
         distance = pa.chunked_array([one for _, one in parts])
-        columns[free_name(self._reader.stream.prefix + _DISTANCE, columns)] = distance
+        columns[free_name(self._reader.prefix + _DISTANCE, columns)] = distance
         none = distance.null_count
         if none:
             (topic,) = self._reader.question.topics
@@ -436,11 +432,13 @@ def side_by_side(
             f"{listed(base.topics)}."
         )
     chosen: Clock = clock  # type: ignore[assignment]
-    first, *beside = _streams([base, *others])
-    if across_recordings:
-        beside = [replace(stream, is_apart=True) for stream in beside]
-    rows = TopicReader(session, first, chosen)
-    return Aligned(session, rows, beside, how=how, tolerance=tolerance, clock=chosen)
+    (prefix, first), *beside = _named([base, *others])
+    rows = TopicReader(session, first, chosen, prefix=prefix)
+    readers = [
+        TopicReader(session, one, chosen, prefix=prefix, is_apart=across_recordings)
+        for prefix, one in beside
+    ]
+    return Aligned(session, rows, readers, how=how, tolerance=tolerance, clock=chosen)
 
 
 def resampled(
@@ -452,19 +450,23 @@ def resampled(
 ) -> Aligned:
     """An alignment of topics to regular times; see `Query.resample`."""
     times = RegularTimes(session, replace(question, predicate=None), parse_duration(step))
-    streams = _streams([question])
-    if len(streams) == 1:
-        streams = [replace(streams[0], prefix="")]
-    return Aligned(session, times, streams, how=how, tolerance=tolerance, clock="log")
+    found = _named([question])
+    readers = [
+        TopicReader(
+            session, with_numbers(session, one, how), prefix=prefix if len(found) > 1 else ""
+        )
+        for prefix, one in found
+    ]
+    return Aligned(session, times, readers, how=how, tolerance=tolerance, clock="log")
 
 
-def _streams(questions: Sequence[Question]) -> list[Stream]:
-    """The topics of questions, with names for their columns: `imu/data.`, `imu/data_2.`."""
-    found: dict[str, Stream] = {}
+def _named(questions: Sequence[Question]) -> list[tuple[str, Question]]:
+    """Each topic of questions, and the beginning of its columns: `imu/data.`, `imu/data_2.`."""
+    found: dict[str, Question] = {}
     for question in questions:
         for topic in question.topics:
             name = topic.removeprefix("/")
             more = (f"{name}_{number}." for number in count(2))
             prefix = next(one for one in chain([f"{name}."], more) if one not in found)
-            found[prefix] = Stream(replace(question, topics=(topic,)), prefix)
-    return list(found.values())
+            found[prefix] = replace(question, topics=(topic,))
+    return [*found.items()]

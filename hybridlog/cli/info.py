@@ -293,7 +293,7 @@ def _coverage(entry: RecordingEntry, words: str) -> list[tuple[str, str]]:
 def _sparklines(store: Store, entry: RecordingEntry) -> dict[str, str]:
     """Messages of each topic over time; none without any, or if they cannot be read."""
     from hybridlog.cli.sparkline import densities
-    from hybridlog.drawing.density import density, evenly
+    from hybridlog.drawing.times import density, evenly
     from hybridlog.record.losses import extent_of
 
     begin, end = extent_of(entry)

@@ -1,30 +1,37 @@
-"""Fields over time, with no more points than a picture has pixels."""
+"""Fields that can be drawn over time, with no more points than a picture has pixels."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeAlias
+from itertools import islice
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
-from hybridlog.frames.names import FIELD
+from hybridlog.frames.names import FIELD, is_summary
+from hybridlog.query.answers.infer_fields import infer_fields
 from hybridlog.query.asked import field_types, spans_of
 from hybridlog.query.intervals import Intervals
 from hybridlog.query.periods import GAP_PERIODS, Steps
 from hybridlog.query.times import TIME_LIMIT
 from hybridlog.schema.arrow_types import is_list, is_number, is_time, lengths_of
-from hybridlog.schema.kinds import NUMERIC, element_of
+from hybridlog.schema.kinds import NUMERIC, element_of, width_of
 from hybridlog.wording import listed
-from hybridlog_storage.errors import TopicError, UsageError
+from hybridlog_storage.errors import SegmentError, TopicError, UsageError
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     import pyarrow as pa
     from numpy.typing import NDArray
 
+    from hybridlog.message import Message
     from hybridlog.query.query import Query
     from hybridlog.query.question import Span
+
 
 Numbers: TypeAlias = "NDArray[np.floating[Any]]"
 _Part: TypeAlias = "tuple[NDArray[np.int64], Mapping[str, Numbers]]"
@@ -432,3 +439,69 @@ class ShownRows:
             least, greatest = (np.insert(end, places, np.nan) for end in ends)
             found.append(Series(path, shown, least, greatest, self.exact))
         return found
+
+
+MAX_FIELDS: Final = 5000
+"""Most fields of a topic that are listed."""
+MAX_ELEMENTS: Final = 36
+"""Most elements of an array that are listed one by one: those of a covariance."""
+
+_SUMMARIES: Final = ("min", "max", "mean", "n")
+_IN_JSON: Final = ("bool", "integer", "number")
+
+
+class Field(NamedTuple):
+    """A field, as `series` takes it, and its type."""
+
+    path: str
+    type: str
+
+
+def fields_of(known: Mapping[str, str] | None, messages: Iterator[Message]) -> list[Field]:
+    """Numbers, elements of short arrays and summaries of arrays, in the order of the definition.
+
+    Args:
+        known: Types of all fields by path; None where no definition fixes them, and those of
+            the first messages count.
+        messages: The messages; only the first ones are read.
+    """
+    found = _observed(messages) if known is None else _defined(known, messages)
+    return list(islice(found, MAX_FIELDS))
+
+
+def _defined(known: Mapping[str, str], messages: Iterator[Message]) -> Iterator[Field]:
+    first = None
+    with suppress(SegmentError):  # damage hides how long arrays are, and no field
+        first = next(messages, None)
+    values = {} if first is None else first.fields
+    for path, kind in known.items():
+        if "[" in path:
+            continue  # within the elements of an array
+        if kind in NUMERIC:
+            yield Field(path, kind)
+            continue
+        summaries = (f"{path}.{name}" for name in _SUMMARIES)
+        yield from (Field(name, "summary") for name in summaries if is_summary(name, known))
+        element = element_of(kind)
+        if element in NUMERIC:
+            width = _width(kind, path, values)
+            yield from (Field(f"{path}[{n}]", element) for n in range(width))
+
+
+def _width(kind: str, path: str, values: Mapping[str, Any]) -> int:
+    """Number of elements that are listed: of a fixed array, or of the first message."""
+    width = width_of(kind)
+    if width is None:
+        value: Any = values
+        for name in path.split("."):
+            value = value.get(name) if isinstance(value, Mapping) else None
+        width = len(value) if isinstance(value, list) else 0
+    return width if width <= MAX_ELEMENTS else 0
+
+
+def _observed(messages: Iterator[Message]) -> Iterator[Field]:
+    for found in infer_fields(messages):
+        path, kinds = str(found["path"]), str(found["type"]).split("|")
+        # A name within backquotes may have dots, which a path cannot tell from its own.
+        if not found["array"] and "`" not in path and any(kind in _IN_JSON for kind in kinds):
+            yield Field(path, "|".join(kinds))

@@ -154,4 +154,6 @@ def _values(table: pa.Table, name: str, fits: Callable[[pa.DataType], bool]) -> 
     if place < 0 or not fits(table.schema.field(place).type):
         return []
     column = table.column(place)
-    return (column.cast(pa.int64()) if pa.types.is_timestamp(column.type) else column).to_pylist()
+    if pa.types.is_timestamp(column.type):
+        column = column.cast(pa.int64())
+    return list(column.to_pylist())

@@ -14,11 +14,10 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 from hybridlog.query.question import Question
 from hybridlog.query.topics import namesakes
 from hybridlog.schema.states import without_fields
-from hybridlog.sql.content import StoreContent
+from hybridlog.sql.content import StoreContent, store_schema, store_table
 from hybridlog.sql.duck import MEMORY, Worker, explained, open_duckdb, shortage_of
 from hybridlog.sql.names import TABLES
 from hybridlog.sql.pieces import DamagedTableError
-from hybridlog.sql.store_tables import store_schema, store_table
 from hybridlog.sql.topic_view import Reading
 from hybridlog.sql.usage import EVERYTHING, Usage, usage_of
 from hybridlog.wording import listed

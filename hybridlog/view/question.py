@@ -18,8 +18,7 @@ if TYPE_CHECKING:
     from hybridlog.query.query import Query
     from hybridlog.query.question import Span
     from hybridlog.store import Store
-    from hybridlog.view.context import Context
-    from hybridlog.view.params import RequestParams
+    from hybridlog.view.context import Context, RequestParams
     from hybridlog_storage.catalog import RecordingEntry
 
 _EVERY_TOPIC: Final = "**"

@@ -252,8 +252,7 @@ def plot(
     end: Time | None = None,
 ) -> Answer:
     """Draw fields of a topic over time as a picture."""
-    from hybridlog.drawing.figure import figure
-    from hybridlog.drawing.lines import lines
+    from hybridlog.drawing.figure import figure, lines
 
     query = _query(context, topic, recording, (begin, end))
     found = lines(query, fields, pixels=_PLOT[0])

@@ -18,9 +18,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import hybridlog as hl
-from hybridlog.drawing.density import gaps as silent
-from hybridlog.drawing.density import periods as periods_of
 from hybridlog.drawing.series import series
+from hybridlog.drawing.times import gaps as silent
+from hybridlog.drawing.times import periods as periods_of
 from hybridlog.query import periods
 from hybridlog.query.answers.field_statistics import _Running
 from hybridlog_storage.errors import TimeError, TopicError, UsageError

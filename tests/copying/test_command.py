@@ -12,7 +12,7 @@ import pytest
 import hybridlog as hl
 from hybridlog.cli import watching
 from hybridlog.cli.signals import Stopped
-from hybridlog.drawing.density import density, evenly
+from hybridlog.drawing.times import density, evenly
 from hybridlog.schema.states import CAUSES, State, without_payload
 from hybridlog.view.context import Context
 from hybridlog.view.tools import recordings

@@ -15,7 +15,7 @@ from mcap.writer import Writer
 from numpy.typing import NDArray
 
 import hybridlog as hl
-from hybridlog.drawing.density import aligned, density, evenly, periods
+from hybridlog.drawing.times import aligned, density, evenly, periods
 from hybridlog.query.planner import Planner
 from hybridlog_storage.catalog import RecordingEntry
 from hybridlog_storage.errors import TopicError

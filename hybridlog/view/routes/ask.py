@@ -8,7 +8,7 @@ from contextlib import closing, suppress
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any, Final
 
-from hybridlog.drawing.matches import Match, Matches
+from hybridlog.drawing.times import Match, Matches
 from hybridlog.query.answers.infer_fields import infer_fields
 from hybridlog.query.asked import field_types
 from hybridlog.query.predicate.completion import complete
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from hybridlog.sql.topic_view import Remarks
-    from hybridlog.view.params import RequestParams
+    from hybridlog.view.context import RequestParams
     from hybridlog.view.question import PageQuestion
 
 MAX_LISTED: Final = 200

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from starlette.responses import Response
 
     from hybridlog.query.query import Query
-    from hybridlog.view.params import RequestParams
+    from hybridlog.view.context import RequestParams
 
 MAX_TOPICS: Final = 200
 """Greatest number of topics that are named; without any, all are meant."""

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     from hybridlog.query.query import Query
     from hybridlog.query.question import RecordedChannel
-    from hybridlog.view.params import RequestParams
+    from hybridlog.view.context import RequestParams
     from hybridlog_storage.messages import Schema
 
 MAX_RECORDINGS: Final = 100

@@ -14,7 +14,7 @@ from hybridlog.schema.states import encoding_of, shown_channels
 from hybridlog.view.context import Context, extent, route, start_of
 
 if TYPE_CHECKING:
-    from hybridlog.view.params import RequestParams
+    from hybridlog.view.context import RequestParams
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.summary import RecordingSummary
 

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from hybridlog.drawing.density import aligned, density, gaps, periods
-from hybridlog.drawing.fields import fields_of
+from hybridlog.drawing.series import fields_of
 from hybridlog.drawing.series import series as read_series
+from hybridlog.drawing.times import aligned, density, gaps, periods
 from hybridlog.query.answers.infer_fields import SAMPLE
 from hybridlog.query.answers.marks import mark_topics
 from hybridlog.query.answers.marks import marks as marks_of
@@ -23,8 +23,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from starlette.responses import Response
 
-    from hybridlog.view.context import Context
-    from hybridlog.view.params import RequestParams
+    from hybridlog.view.context import Context, RequestParams
 
 
 MAX_LANES: Final = 64
