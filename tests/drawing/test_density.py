@@ -101,25 +101,18 @@ def test_pixels_have_what_queries_count(
             assert pixel == store.topic(topic).between(begin, end).count()
 
 
-@given(st.lists(st.tuples(SPANS, st.sampled_from([1, 9, 250, 2000])), min_size=1, max_size=6))
+@given(span=SPANS, pixels=st.sampled_from([1, 9, 250, 2000]))
 @settings(max_examples=40)
-def test_zooming_and_panning_change_nothing(
-    store: hl.Store, views: list[tuple[tuple[int, int], int]]
-) -> None:
-    for span, pixels in views:
-        found = density(
-            store.session, store.entry("a"), aligned(span, pixels), ["/late", "/steady"]
-        )
-        widths = np.diff(found.edges)
-        assert found.edges[0] <= span[0] < found.edges[1]
-        assert found.edges[-2] < span[1] <= found.edges[-1]
-        assert len(widths) <= pixels + 1
-        assert widths[0] == 1 or (span[1] - span[0]) / widths[0] > pixels / 2
-        assert (widths == widths[0]).all()
-        assert widths[0] & (widths[0] - 1) == 0
-        assert found.edges[0] % widths[0] == 0
-        for row, topic in enumerate(("/late", "/steady")):
-            assert (found.counts[row] == _truth(topic, found.edges)).all()
+def test_zooming_and_panning_change_nothing(span: tuple[int, int], pixels: int) -> None:
+    edges = aligned(span, pixels)
+    widths = np.diff(edges)
+    assert edges[0] <= span[0] < edges[1]
+    assert edges[-2] < span[1] <= edges[-1]
+    assert len(widths) <= pixels + 1
+    assert widths[0] == 1 or (span[1] - span[0]) / widths[0] > pixels / 2
+    assert (widths == widths[0]).all()
+    assert widths[0] & (widths[0] - 1) == 0
+    assert edges[0] % widths[0] == 0
 
 
 def test_a_picture_reads_its_topics_once_and_no_payload(store: hl.Store, calls: Calls) -> None:

@@ -210,7 +210,7 @@ def test_pictures_at_the_ends_of_time(clocks: TestClient, label: str) -> None:
         for where in ("v > 9", "a[1] < -9"):
             found = clocks.get("matches", params={**rest, "where": where})
             assert sum(found.json()["counts"]) == SENT - 10
-        found = clocks.get("export-command", params={**span, "recording": label})
+        found = clocks.get("ask", params={**span, "recording": label})
         assert found.json()["count"] == SENT
 
 

@@ -1,4 +1,4 @@
-"""Questions: predicates and SQL, their matches over time, and completion."""
+"""Matches of predicates over time, SQL, and completion."""
 
 from __future__ import annotations
 
@@ -38,14 +38,9 @@ _MAX_CANDIDATES: Final = 50
 _MICROSECOND: Final = 1000  # ns
 
 
-def ask(context: Context, params: RequestParams) -> dict[str, Any]:
-    """The number of messages that satisfy a predicate, with losses and remarks."""
-    return question_of(context, params).told()
-
-
 def matches(context: Context, params: RequestParams) -> dict[str, Any]:
     """The matches in a range by pixel, and the bands in which the predicate holds."""
-    question = question_of(context, params)
+    question = _question(context, params)
     start = start_of(question.recording)
     span, pixels = params.span(start), params.pixels()
     matching = _matches(context, question)
@@ -62,7 +57,7 @@ def matches(context: Context, params: RequestParams) -> dict[str, Any]:
 
 def match_list(context: Context, params: RequestParams) -> dict[str, Any]:
     """Some matches behind or in front of a place, and how many are in front of them."""
-    question = question_of(context, params)
+    question = _question(context, params)
     start = start_of(question.recording)
     place = Match(params.moment(start), params.integer("seq", -1, END, -1))
     count = params.integer("count", 1, MAX_LISTED, MAX_LISTED)
@@ -73,6 +68,12 @@ def match_list(context: Context, params: RequestParams) -> dict[str, Any]:
         "rows": [[str(one.time - start), one.seq] for one in found],
         "before": matching.count_before(found[0]) if found else None,
     }
+
+
+def _question(context: Context, params: RequestParams) -> PageQuestion:
+    """A question about one topic."""
+    params.text("topic")
+    return question_of(context, params)
 
 
 def _matches(context: Context, question: PageQuestion) -> Matches:
@@ -172,7 +173,6 @@ def _moments(
 
 
 routes = [
-    route("/ask", ask),
     route("/matches", matches),
     route("/match-list", match_list),
     route("/complete", completion),

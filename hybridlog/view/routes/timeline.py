@@ -11,10 +11,7 @@ from hybridlog.drawing.series import fields_of
 from hybridlog.drawing.series import series as read_series
 from hybridlog.drawing.times import aligned, density, gaps, periods
 from hybridlog.query.answers.infer_fields import SAMPLE
-from hybridlog.query.answers.marks import mark_topics
-from hybridlog.query.answers.marks import marks as marks_of
 from hybridlog.query.asked import field_types
-from hybridlog.query.counters import Counters
 from hybridlog.view.context import Context, extent, packed_response, route, start_of
 from hybridlog_storage.errors import UsageError
 
@@ -30,9 +27,6 @@ MAX_LANES: Final = 64
 """Topics of one picture."""
 MAX_BINS: Final = 1 << 17
 """Topics times pixels of one picture."""
-MAX_MARKS: Final = 500
-"""Marks of one answer."""
-
 MAX_FIELDS: Final = 16
 """Most fields of one plot."""
 _GREATEST_EXACT: Final = 1 << 53
@@ -73,27 +67,6 @@ def timeline(context: Context, params: RequestParams) -> Response:
         "lanes": lanes,
     }
     return packed_response(head, arrays)
-
-
-def marks(context: Context, params: RequestParams) -> dict[str, Any]:
-    """The first marks in a range, and how many more there are."""
-    recording = context.recording(params)
-    start = start_of(recording)
-    known = {channel.topic for channel in recording.channels}
-    topics = [one for one in mark_topics(context.store.session, [recording.id]) if one in known]
-    if not topics:
-        return {"marks": [], "more": 0}
-    begin, end = params.span(start)
-    first, last = recording.span or (start, start)
-    if begin > last or end <= first:
-        return {"marks": [], "more": 0}  # a query refuses such a range
-    query = context.query(recording, *topics).between(begin, end)
-    some = query.limit(MAX_MARKS)
-    found = [
-        {"at": one.begin - start, "end": (one.end or one.begin) - start, "text": one.text}
-        for one in marks_of(some.session, some.question, Counters())
-    ]
-    return {"marks": found, "more": max(query.count() - MAX_MARKS, 0)}
 
 
 def _within(
@@ -148,7 +121,6 @@ def _value(number: float) -> float | str:
 
 routes = [
     route("/timeline", timeline),
-    route("/marks", marks),
     route("/fields", fields),
     route("/series", series),
 ]
