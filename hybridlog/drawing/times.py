@@ -5,7 +5,7 @@ The times of a topic are read once, and kept in the cache while there is room. N
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -31,26 +31,31 @@ if TYPE_CHECKING:
 
 
 MAX_TIMES: Final = 20_000_000
-"""As of `density`, of a timeline."""
+"""As of `lane_of`, of a timeline."""
 _SAMPLED: Final = 100_000  # steps that tell the usual one
 _LATEST: Final = np.iinfo(np.int64).max
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Density:
-    """Messages of some topics by pixel.
+class Lane:
+    """The messages of a topic in a recording over time.
 
     Attributes:
-        topics: Full names, n.
-        edges: int64[p + 1], ns; a pixel has the messages with `edges[i] <= time < edges[i + 1]`.
-        counts: int64[n, p].
-        exact: bool[n], False where counts are estimates.
+        times: int64[n], log times, ns, sorted.
+        exact: False where they are estimates.
     """
 
-    topics: tuple[str, ...]
-    edges: NDArray[np.int64]
-    counts: NDArray[np.int64]
-    exact: NDArray[np.bool_]
+    times: NDArray[np.int64]
+    exact: bool
+
+    def counts(self, edges: NDArray[np.int64]) -> NDArray[np.int64]:
+        """int64[p], messages with `edges[i] <= time < edges[i + 1]` of int64[p + 1], ns."""
+        return np.diff(np.searchsorted(self.times, edges))
+
+    def period(self) -> float:
+        """Usual time from one message to the next, ns; 0 where it is unknown."""
+        rows = np.arange(0, len(self.times) - 1, 1 + len(self.times) // _SAMPLED)
+        return usual_period(self.times[rows + 1] - self.times[rows])
 
 
 def evenly(span: tuple[int, int], pixels: int) -> NDArray[np.int64]:
@@ -71,71 +76,40 @@ def aligned(span: tuple[int, int], pixels: int) -> NDArray[np.int64]:
     return np.array([min(number << level, _LATEST) for number in numbers], np.int64)
 
 
-def density(
-    session: Session,
-    recording: RecordingEntry,
-    edges: NDArray[np.int64],
-    topics: Sequence[str] | None = None,
-    *,
-    max_times: int = MAX_TIMES,
-) -> Density:
-    """Counts of messages by pixel.
+def lane_of(
+    session: Session, recording: RecordingEntry, topic: str, max_times: int = MAX_TIMES
+) -> Lane:
+    """The messages of a topic.
 
     Args:
         session: The open store.
         recording: The recording.
-        edges: int64[p + 1], ns, as of `Density`.
-        topics: Full names; None for all topics of the recording.
-        max_times: Messages of a topic whose times are read; of more, those of a chunk are
-            spread evenly.
+        topic: Full name.
+        max_times: Messages whose times are read; of more, those of a chunk are spread evenly.
 
     Raises:
         TopicError: The recording has no such topic.
     """
-    known = {channel.topic for channel in recording.channels}
-    chosen = sorted(known) if topics is None else topics
-    if unknown := {*chosen} - known:
-        raise TopicError(f"{recording.name} has no topic {min(unknown)!r}.")
-    counts = np.zeros((len(chosen), len(edges) - 1), np.int64)
-    exact = np.ones(len(chosen), np.bool_)
-    for row, topic in enumerate(chosen):
-        times, exact[row] = _times(session, recording, topic, max_times)
-        counts[row] = np.diff(np.searchsorted(times, edges))
-    return Density(tuple(chosen), edges, counts, exact)
-
-
-def periods(session: Session, recording: RecordingEntry, topics: Sequence[str]) -> list[float]:
-    """Usual time from one message of each topic to the next, ns; 0 where it is unknown."""
-    found = []
-    for topic in topics:
-        times, _ = _times(session, recording, topic)
-        rows = np.arange(0, len(times) - 1, 1 + len(times) // _SAMPLED)
-        found.append(usual_period(times[rows + 1] - times[rows]))
-    return found
-
-
-def _times(
-    session: Session, recording: RecordingEntry, topic: str, max_times: int = MAX_TIMES
-) -> tuple[NDArray[np.int64], bool]:
-    """Log times of a topic, sorted, and whether they are all, as they are."""
-    messages = recording.messages_by_topic()[topic]
+    if topic not in (known := recording.messages_by_topic()):
+        raise TopicError(f"{recording.name} has no topic {topic!r}.")
+    messages = known[topic]
     is_read = messages <= max_times
 
-    def read() -> tuple[NDArray[np.int64], bool]:
+    def read() -> Lane:
         if is_read:
             question = Question((topic,), (recording.id,))
             with suppress(SegmentError):
                 found = match_times(session, question, Counters())
-                return _sorted(one.log_time for one in found), True
+                return Lane(_sorted(one.log_time for one in found), exact=True)
         ids = [channel.id for channel in recording.channels if channel.topic == topic]
         parts = session.parts(recording, ids, (BEGIN, END))
         rows = zip(parts["first"], parts["last"], parts["messages"], strict=True)
-        return _sorted(np.linspace(*row).astype(np.int64) for row in rows), False
+        return Lane(_sorted(np.linspace(*row).astype(np.int64) for row in rows), exact=False)
 
     tails = ((n, one.table.chunks[-1:].tobytes()) for n, one in recording.flushed.items())
     state = recording.status, messages, frozenset((*recording.digests.items(), *tails))
     key = recording.id, topic, state, is_read
-    return session.cache.made("times", *key, make=read, size_of=lambda one: one[0].nbytes)
+    return session.cache.made("times", *key, make=read, size_of=lambda one: one.times.nbytes)
 
 
 def _sorted(parts: Iterable[NDArray[np.int64]]) -> NDArray[np.int64]:

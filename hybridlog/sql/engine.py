@@ -399,11 +399,13 @@ class SqlAnswer:
 
     def _batches(self, size: int, limit: int | None) -> Iterator[pa.RecordBatch]:
         """The answer in batches of so many rows, up to a limit."""
+        import pyarrow as pa
+
         worker = self._worker()
         try:
             reader, batch = self._tried(lambda: worker.run(partial(self._stream, size, limit)))
             if batch is None:
-                yield _empty(reader.schema)
+                yield pa.RecordBatch.from_pylist([], schema=reader.schema)
             while batch is not None:
                 yield batch
                 with self._explained():
@@ -509,10 +511,3 @@ def _kind(statement: Any) -> str:
         return str(statement.type.name)
     except ValueError:
         return ""
-
-
-def _empty(schema: pa.Schema) -> pa.RecordBatch:
-    import pyarrow as pa
-
-    arrays = [pa.nulls(0, field.type) for field in schema]
-    return pa.RecordBatch.from_arrays(arrays, schema=schema)

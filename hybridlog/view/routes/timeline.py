@@ -9,7 +9,7 @@ import numpy as np
 
 from hybridlog.drawing.series import fields_of
 from hybridlog.drawing.series import series as read_series
-from hybridlog.drawing.times import aligned, density, gaps, periods
+from hybridlog.drawing.times import aligned, gaps, lane_of
 from hybridlog.query.answers.infer_fields import SAMPLE
 from hybridlog.query.asked import field_types
 from hybridlog.view.context import Context, extent, packed_response, route, start_of
@@ -50,20 +50,18 @@ def timeline(context: Context, params: RequestParams) -> Response:
         raise UsageError(f"At most {MAX_BINS // max(len(topics), 1)} pixels for as many topics.")
     start = start_of(recording)
     span = params.span(start)
-    session = context.store.session
-    found = density(session, recording, aligned(span, pixels), topics)
-    usual = periods(session, recording, topics)
-    lanes = []
+    edges, lanes = aligned(span, pixels), []
     arrays: dict[str, NDArray[Any]] = {}
-    lanes_of = zip(found.counts, found.exact.tolist(), usual, strict=True)
-    for number, (counts, exact, period) in enumerate(lanes_of):
-        silent = gaps(*_within(counts, found.edges, extent(recording)), period)
-        lanes.append({"exact": exact, "period": period})
+    for number, topic in enumerate(topics):
+        lane = lane_of(context.store.session, recording, topic)
+        counts, period = lane.counts(edges), lane.period()
+        silent = gaps(*_within(counts, edges, extent(recording)), period)
+        lanes.append({"exact": lane.exact, "period": period})
         arrays |= {f"counts {number}": _small(counts), f"gaps {number}": silent.astype(np.uint32)}
     head = {
         "start": str(start),
-        "begin": int(found.edges[0]) - start,
-        "width": int(found.edges[1] - found.edges[0]),
+        "begin": int(edges[0]) - start,
+        "width": int(edges[1] - edges[0]),
         "lanes": lanes,
     }
     return packed_response(head, arrays)
