@@ -187,9 +187,11 @@ class Aligned:
             for times, table in base.tables(resolved.summary.id):
                 given, begin = True, 0
                 while begin < len(times):
+                    rest = times[begin:]
+                    known = min([len(rest), *(partner.decided(rest) for partner in partners)])
                     # Small pieces where many rows have the same large message.
-                    row = sum(partner.row_bytes(times[begin:]) for partner in partners)
-                    end = min(begin + max(_PIECE_BYTES // max(row, 1), 1), len(times))
+                    row = sum(partner.row_bytes() for partner in partners)
+                    end = begin + min(max(_PIECE_BYTES // max(row, 1), 1), known)
                     left = end if told is None else begin + told - self.rows
                     end = left if begin < left < end else end
                     piece = times[begin:end], table.slice(begin, end - begin)
@@ -300,8 +302,11 @@ class _Partner:
         found[found] = self._lost[place[found], 0] <= high[found]
         return found
 
-    def row_bytes(self, times: NDArray[np.int64]) -> int:
-        """Mean bytes of the messages that are read next, for times as of `add`."""
+    def decided(self, times: NDArray[np.int64]) -> int:
+        """Number of times, at least one, that the messages which are read now decide.
+
+        By the log clock times ascend, and are not before those of the last call of `add`.
+        """
         if self._blocks is None:
             if self._reader.is_by_log_time:
                 self._blocks = self._reader.tables(self._recording, self._span(int(times[0])))
@@ -309,8 +314,16 @@ class _Partner:
             else:
                 self._blocks, self._is_last = iter(()), True
                 self._times, self._table = self._reader.by_clock(self._recording)
-        size = int(self._table.nbytes)
-        return size // max(len(self._times), 1)
+        while not self._is_last:
+            # What belongs to times before the last one of the block is known.
+            if end := int(np.searchsorted(times, self._times[-1])):
+                return end
+            self._advance()
+        return len(times)
+
+    def row_bytes(self) -> int:
+        """Mean bytes of these messages."""
+        return int(self._table.nbytes) // max(len(self._times), 1)
 
     def _span(self, first: int) -> tuple[int, int] | None:
         """Log time that can hold the messages of all rows; None for all of it."""
@@ -330,35 +343,35 @@ class _Partner:
     def add(
         self, columns: dict[str, Any], times: NDArray[np.int64], empty: Counter[tuple[str, str]]
     ) -> None:
-        """Add the columns of the messages that belong to some times, with their distance.
+        """Add the columns of the messages that belong to decided times, with their distance.
 
         Args:
             columns: Those of the rows, by name.
-            times: int64[n], ns; by the log clock ascending, not before those of the last call.
+            times: int64[n], ns.
             empty: Numbers of rows without a message or a value, by name and reason.
         """
-        if len(times):
-            self.row_bytes(times)
-        parts, rest = [], times
-        while True:
-            end = len(rest)
-            if not self._is_last:
-                # What belongs to times before the last one of the block is known.
-                end = int(np.searchsorted(rest, self._times[-1])) if len(self._times) else 0
-            if end or not len(times):
-                parts.append(self._found(rest[:end]))
-                rest = rest[end:]
-            if not len(rest):
-                break
-            self._advance()
-        table = concatenated([one for one, _ in parts])
-        distance = pa.chunked_array([one for _, one in parts])
+        known = self._times if len(self._times) else times
+        found = match(times, self._times, self._how, self._tolerance)
+        table = _taken(self._table, found.before)
+        if self._how == "interpolate":
+            low, high = known[np.maximum(found.before, 0)], known[np.maximum(found.after, 0)]
+            length = (high - low).astype(np.float64)
+            weight = (times - low) / np.where(length > 0, length, 1)
+            weight[length <= 0] = 0
+            after = _taken(self._table, found.after)
+            table = interpolated(table, after, weight, self._reader.quaternions)
+        missing = found.before < 0
+        distance = (
+            pa.array(found.distance, DURATION, mask=missing)
+            if missing.any()
+            else numbers(found.distance, "duration")
+        )
         columns[free_name(self._reader.prefix + _DISTANCE, columns)] = distance
         none = distance.null_count
         if none:
             (topic,) = self._reader.question.topics
             is_unknown = times == UNKNOWN
-            is_lost = distance.is_null().to_numpy() & ~is_unknown & self._is_lost(times)
+            is_lost = missing & ~is_unknown & self._is_lost(times)
             lost, unknown = int(is_lost.sum()), int(is_unknown.sum())
             empty[topic, _NO_TIME] += unknown
             empty[topic, _LOST] += lost
@@ -376,27 +389,6 @@ class _Partner:
             self._table = concatenated([last, found[1]])
         else:
             self._times, self._table = found
-
-    def _found(self, times: NDArray[np.int64]) -> tuple[pa.Table, pa.Array[Any]]:
-        """The messages of times that the block decides, and their distance."""
-        known = self._times
-        found = match(times, known, self._how, self._tolerance)
-        rows = _taken(self._table, found.before)
-        if self._how == "interpolate":
-            known = known if len(known) else times
-            low, high = known[np.maximum(found.before, 0)], known[np.maximum(found.after, 0)]
-            length = (high - low).astype(np.float64)
-            weight = (times - low) / np.where(length > 0, length, 1)
-            weight[length <= 0] = 0
-            after = _taken(self._table, found.after)
-            rows = interpolated(rows, after, weight, self._reader.quaternions)
-        missing = found.before < 0
-        distance = (
-            pa.array(found.distance, DURATION, mask=missing)
-            if missing.any()
-            else numbers(found.distance, "duration")
-        )
-        return rows, distance
 
 
 def _taken(table: pa.Table, rows: NDArray[np.int64]) -> pa.Table:
