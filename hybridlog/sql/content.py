@@ -5,21 +5,27 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import pyarrow as pa
 
+from hybridlog.columns.layout import POINTS
 from hybridlog.columns.recordings_file import RECORDINGS, TAGS, TIME, recordings_table, times
 from hybridlog.query.answers.marks import marks_in
 from hybridlog.query.counters import Counters
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.snapshot import UNFINISHED
-from hybridlog.sql.columns import merged
+from hybridlog.sql.columns import OWN, ViewColumn, merged, sql_type, view_columns
 from hybridlog.sql.names import ViewNames
 from hybridlog.sql.pieces import TopicOfRecording
-from hybridlog.sql.topic_view import TopicView
+from hybridlog.sql.plan import (
+    Chooser,
+    Plan,
+    RecordingChooser,
+    in_window,
+    within_source,
+)
 from hybridlog_storage.catalog import ChannelStats
 
 if TYPE_CHECKING:
@@ -27,6 +33,7 @@ if TYPE_CHECKING:
 
     from hybridlog.query.question import Question, Span
     from hybridlog.session import Session
+    from hybridlog.sql.plan import Reading
     from hybridlog_storage.summary import RecordingSummary
 
 
@@ -100,59 +107,98 @@ class StoreContent:
         """The view of a topic."""
         with self._lock:
             if topic not in self._views:
-                self._views[topic] = self._view(topic)
+                self._views[topic] = TopicView(self, topic)
             return self._views[topic]
 
-    def _view(self, topic: str) -> TopicView:
-        found = self.summaries_of(topic)
-        kinds = self._kinds(topic, found)
-        found = [one for one in found if self._windows is None or one.id in self._windows]
-        return TopicView(
-            topic,
-            recordings=[partial(self.topic_of, summary, topic) for summary in found],
-            names=[summary.name for summary in found],
-            spans=[self._span(summary) for summary in found],
-            windows=[self.window(summary.id) for summary in found],
-            kinds=kinds,
-            points=self._points(topic, found),
-            size=self._size(topic, found),
+    def differing(self, topic: str) -> list[RecordingSummary]:
+        """Recordings of which each one with a topic has the definition of one of these."""
+        return self.snapshot.differing(self._having(topic))
+
+
+class TopicView:
+    """The view of a topic: its columns, and the rows that a query reads.
+
+    Attributes:
+        topic: Full name.
+        schema: All columns.
+        size: Number of rows, nearly.
+    """
+
+    def __init__(self, content: StoreContent, topic: str) -> None:
+        self.topic = topic
+        self._content = content
+        self._known: dict[str, TopicOfRecording] = {}
+        self._choosers: dict[str, Chooser] = {}
+        having = {*content.having([topic])}
+        known = content.summaries_of(topic)
+        self._summaries = [one for one in known if one.id in having]
+        kinds = self._kinds(known)
+        columns = view_columns(merged(kinds) if kinds else pa.struct([]))
+        self._columns = {column.name: column for column in columns}
+        points = self._points()
+        if points is not None and POINTS not in self._columns:
+            own = ViewColumn(POINTS, (POINTS,), points, sql_type(points), is_points=True)
+            self._columns[POINTS] = own
+        fields = [pa.field(column.name, column.type) for column in self._columns.values()]
+        self.schema = pa.schema([*OWN, *fields])
+        some = [self._of(one) for one in self._summaries[:_SAMPLED]]
+        messages = sum(c.stats.messages for one in some for c in one.channels.values())
+        self.size = messages * len(self._summaries) // max(len(some), 1)
+        # The end of a recording is one more than its last time: for messages at the end of time.
+        spans = (one.extent for one in self._summaries)
+        self._chooser = RecordingChooser(
+            self.schema,
+            [one.name for one in self._summaries],
+            [(first, end) if first < end else None for first, end in spans],
         )
 
-    def _size(self, topic: str, found: Sequence[RecordingSummary]) -> int:
-        """Number of messages, estimated from some recordings."""
-        some = found[:_SAMPLED]
-        messages = [
-            sum(c.stats.messages for c in self.topic_of(one, topic).channels.values())
-            for one in some
-        ]
-        return sum(messages) * len(found) // max(len(some), 1)
+    def _of(self, summary: RecordingSummary) -> TopicOfRecording:
+        if summary.id not in self._known:
+            self._known[summary.id] = self._content.topic_of(summary, self.topic)
+        return self._known[summary.id]
 
-    def _kinds(self, topic: str, found: Sequence[RecordingSummary]) -> list[Any]:
+    def _kinds(self, known: Sequence[RecordingSummary]) -> list[Any]:
         """Types of the messages; recordings with equal definitions have equal ones."""
-        differing = self.snapshot.differing(self._having(topic))
-        some = [self.topic_of(one, topic) for one in differing]
+        some = [self._of(one) for one in self._content.differing(self.topic)]
         if not all(one.is_fixed for one in some):
-            some = [self.topic_of(one, topic) for one in found]
+            some = [self._of(one) for one in known]
         return [kind for one in some for kind in one.kinds]
 
-    def _points(self, topic: str, found: Sequence[RecordingSummary]) -> Any:
+    def _points(self) -> Any:
         """Type of the points of clouds of a topic whose tables have them; None without."""
-        if topic not in self.session.directory.settings.arrays:
+        if self.topic not in self._content.session.directory.settings.arrays:
             return None
-        clouds = [self.topic_of(one, topic) for one in found]
-        tables = (one.table for one in clouds)
-        kinds = [table.points for table in tables if table is not None]
-        kinds = [kind for kind in kinds if kind is not None]
+        clouds = [self._of(one) for one in self._summaries]
+        of_tables = (one.table.points for one in clouds if one.table is not None)
+        kinds = [kind for kind in of_tables if kind is not None]
         if not kinds:  # no table is there yet, or payloads have expired
-            first = (one.first_points() for one in clouds[:_SAMPLED])
-            kinds = [kind for kind in first if kind is not None]
+            of_messages = (one.first_points() for one in clouds[:_SAMPLED])
+            kinds = [kind for kind in of_messages if kind is not None]
         return merged(kinds) if kinds else None
 
-    def _span(self, summary: RecordingSummary) -> tuple[int, int] | None:
-        first, end = summary.extent
-        if first >= end:
-            return None
-        return first, end  # one more, for messages at the end of time
+    def rows(
+        self, columns: Sequence[str], where: Any, reading: Reading
+    ) -> Iterator[pa.RecordBatch]:
+        """Rows for a query.
+
+        Args:
+            columns: Names of the columns.
+            where: Expression that holds for all of them; None for all rows.
+            reading: Collects what is read.
+        """
+        plans: dict[Span | None, Plan] = {}
+        for number in self._chooser.chosen(where):
+            summary = self._summaries[number]
+            recording, window = self._of(summary), self._content.window(summary.id)
+            if window not in plans:
+                holds = in_window(where, window)
+                plans[window] = Plan(self.schema, self._columns, columns, holds, reading)
+            if summary.id not in self._choosers:
+                spans = [within_source(source) for source in recording.sources]
+                self._choosers[summary.id] = Chooser(self.schema, spans)
+            reading.remarks.add(recording)
+            for place in self._choosers[summary.id].chosen(plans[window].where):
+                yield from plans[window].read(recording, recording.sources[place])
 
 
 _TOPICS: Final = pa.schema(

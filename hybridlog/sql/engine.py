@@ -18,7 +18,7 @@ from hybridlog.sql.content import StoreContent, store_schema, store_table
 from hybridlog.sql.duck import MEMORY, Worker, explained, open_duckdb, shortage_of
 from hybridlog.sql.names import TABLES
 from hybridlog.sql.pieces import DamagedTableError
-from hybridlog.sql.topic_view import Reading
+from hybridlog.sql.plan import Reading
 from hybridlog.sql.usage import EVERYTHING, Usage, usage_of
 from hybridlog.wording import listed
 from hybridlog_storage.errors import ChangedError, HybridlogError, TopicError, UsageError
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from hybridlog.query.answers.completeness import Completeness
     from hybridlog.session import Asked
     from hybridlog.sql.pieces import ScanCounts
-    from hybridlog.sql.topic_view import Remarks
+    from hybridlog.sql.plan import Remarks
 
 Params = Sequence[Any] | Mapping[str, Any] | None
 EVERYWHERE: Final = Question(())

@@ -12,7 +12,8 @@ from duckdb._sources.nodes import Untranslatable
 from duckdb._sources.pyarrow import PyArrowDatasetSource
 from duckdb._sources.to_arrow import to_arrow
 
-from hybridlog.sql.topic_view import Reading, TopicView
+from hybridlog.sql.content import TopicView
+from hybridlog.sql.plan import Reading
 
 
 class TopicDataset(ds.Dataset, PyArrowDatasetSource):  # type: ignore[misc] # without types

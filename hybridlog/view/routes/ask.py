@@ -23,7 +23,7 @@ from hybridlog_storage.times import END
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from hybridlog.sql.topic_view import Remarks
+    from hybridlog.sql.plan import Remarks
     from hybridlog.view.context import RequestParams
     from hybridlog.view.question import PageQuestion
 
