@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import threading
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
 from difflib import get_close_matches
 from functools import lru_cache, partial
@@ -401,8 +401,7 @@ class SqlAnswer:
         """The answer in batches of so many rows, up to a limit."""
         import pyarrow as pa
 
-        worker = self._worker()
-        try:
+        with closing(self._worker()) as worker:
             reader, batch = self._tried(lambda: worker.run(partial(self._stream, size, limit)))
             if batch is None:
                 yield pa.RecordBatch.from_pylist([], schema=reader.schema)
@@ -410,8 +409,6 @@ class SqlAnswer:
                 yield batch
                 with self._explained():
                     batch = worker.run(partial(next, reader, None))
-        finally:
-            worker.close()
 
     def to_pandas(self) -> pd.DataFrame:
         """The whole answer as a pandas frame.
@@ -468,11 +465,8 @@ class SqlAnswer:
             raise TopicError(f"There is no view {found[1]!r}; {hint}") from error
 
     def _computed(self, call: Callable[[], _T]) -> _T:
-        worker = self._worker()
-        try:
+        with closing(self._worker()) as worker:
             return self._tried(lambda: worker.run(call))
-        finally:
-            worker.close()
 
     def _tried(self, call: Callable[[], _T]) -> _T:
         """The result of a call; repeated when a table was damaged or files were replaced."""

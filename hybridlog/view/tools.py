@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple
 from pydantic import Field
 
 from hybridlog.arrays.message_arrays import IMAGES, plain_type
+from hybridlog.drawing.images import Picture, picture
 from hybridlog.query.answers.completeness import coverage
 from hybridlog.query.answers.infer_fields import infer_fields
 from hybridlog.query.answers.match_times import match_times
@@ -27,8 +28,6 @@ from hybridlog.view.context import SQL_MEMORY, Context
 from hybridlog_storage.errors import PayloadError, TimeError, TopicError, UsageError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from hybridlog.query.query import Query
 
 MAX_ROWS: Final = 200
@@ -40,13 +39,6 @@ MAX_BYTES: Final = 128 << 10
 MAX_PICTURE_BYTES: Final = 2 << 20
 """Bytes of one picture."""
 _PLOT: Final = (1000, 320)
-
-
-class Picture(NamedTuple):
-    """A picture of an answer: its media type and its file."""
-
-    media_type: str
-    data: bytes
 
 
 class Answer(NamedTuple):
@@ -147,8 +139,9 @@ def ask(
     count = query.count()
     values: dict[str, Any] = {"count": count, **_lacks(query, count)}
     with suppress(TimeError):  # the range is outside all recordings
-        times = match_times(query.session, query.question, Counters())
-        values["first_times"] = [format_time(one) for one in islice(_each(times), 10)]
+        parts = match_times(query.session, query.question, Counters())
+        times = chain.from_iterable(part.log_time.tolist() for part in parts)
+        values["first_times"] = [*map(format_time, islice(times, 10))]
     rows = []
     is_cut = False
     if where is not None and len(query.topics) == 1:
@@ -166,11 +159,6 @@ def ask(
             for one in islice(held, MAX_ROWS)
         ]
     return _answer({**values, "intervals": rows}, "intervals", is_cut=is_cut)
-
-
-def _each(found: Any) -> Iterator[int]:
-    for part in found:
-        yield from part.log_time.tolist()
 
 
 def sql(context: Context, *, query: Annotated[str, Field(max_length=MAX_TEXT)]) -> Answer:
@@ -234,12 +222,10 @@ def fetch(
 
 
 def _picture(message: Any) -> Picture:
-    from hybridlog.drawing.images import picture
-
     found = picture(message, raw=False, form="jpg")
     if len(found.data) > MAX_PICTURE_BYTES:
         raise PayloadError(f"a picture of {len(found.data)} bytes is too large for an answer")
-    return Picture(found.media_type, found.data)
+    return found
 
 
 def plot(
@@ -263,7 +249,7 @@ def plot(
     return _answer(
         {**lacks, "lines": [f"{one.topic} {one.series.field} in {one.recording}" for one in found]},
         "lines",
-        (Picture("image/png", drawn),),
+        (Picture("image/png", ".png", drawn),),
     )
 
 
