@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hybridlog.frames import columns as columns_module
-from hybridlog.frames.builder import Block, TableBuilder
+from hybridlog.frames.answer import Block, TableBuilder
 from hybridlog.frames.frame import frame_of
 from hybridlog.schema.arrow_columns import records_array
 from hybridlog.schema.arrow_objects import values_array

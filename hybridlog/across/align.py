@@ -11,13 +11,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pyarrow as pa
 
-from hybridlog.across.bins import AGGREGATES, Bins, RegularTimes
+from hybridlog.across.bins import AGGREGATES, Bins, RegularTimes, with_numbers
 from hybridlog.across.match import HOWS, UNKNOWN, How, interpolated, match
 from hybridlog.across.topic_reader import (
     RECORDING,
     TIME,
     Block,
-    Stream,
     TopicReader,
     concatenated,
 )
@@ -86,7 +85,7 @@ class Aligned:
         self,
         session: Session,
         base: TopicReader | RegularTimes,
-        others: Sequence[Stream],
+        others: Sequence[TopicReader],
         *,
         how: str,
         tolerance: DurationLike | None,
@@ -108,24 +107,22 @@ class Aligned:
         self._empty: Counter[tuple[str, str]] = Counter()
 
     @property
-    def _streams(self) -> list[Stream]:
+    def _readers(self) -> list[TopicReader]:
         """The topics that are read."""
-        own = [self._base.stream] if isinstance(self._base, TopicReader) else []
+        own = [self._base] if isinstance(self._base, TopicReader) else []
         return [*own, *self._others]
 
-    def _partner(self, stream: Stream) -> _Partner | Bins:
-        session, how = self._session, self._how
-        if isinstance(self._base, RegularTimes) and how in AGGREGATES:
-            return Bins(session, stream, self._base, how)
-        reader = TopicReader(session, stream, self._clock)
-        return _Partner(reader, how, self._tolerance)  # type: ignore[arg-type]
+    def _partner(self, reader: TopicReader) -> _Partner | Bins:
+        if isinstance(self._base, RegularTimes) and self._how in AGGREGATES:
+            return Bins(reader, self._base, self._how)
+        return _Partner(reader, self._how, self._tolerance)  # type: ignore[arg-type]
 
     @property
     def counters(self) -> Counters:
         """The cost of the last answer."""
         found = Counters()
-        for stream in self._streams:
-            found.add(stream.counters)
+        for reader in self._readers:
+            found.add(reader.counters)
         return found
 
     @property
@@ -141,8 +138,8 @@ class Aligned:
 
     def remarks(self) -> list[str]:
         """Sentences about the last answer, those of `Query.remarks` about each topic."""
-        streams = self._streams
-        topics = tuple(topic for stream in streams for topic in stream.question.topics)
+        questions = [reader.asked for reader in self._readers]
+        topics = tuple(topic for question in questions for topic in question.topics)
         rows = counted(self.rows, "row")
         lines = [
             f"{name}: {number} of {rows} {'is' if number == 1 else 'are'} empty: {reason}."
@@ -154,19 +151,18 @@ class Aligned:
             found.append(
                 f"{counted(len(lines) - _MAX_NAMES, 'more column')} are empty in some rows."
             )
-        for stream in streams:
-            question = stream.question
+        for question in questions:
             others = tuple(topic for topic in question.namesakes if topic not in topics)
             found += remarks(self._session, replace(question, namesakes=others), is_empty=False)
         return [*dict.fromkeys([*found, *self.completeness().sentences])]
 
     def completeness(self) -> Completeness:
         """Return what the rows lack, as `Query.completeness` does, after they were read."""
-        answered = [(stream.question, stream.counters) for stream in self._streams]
+        answered = [(reader.asked, reader.counters) for reader in self._readers]
         return completeness_of(self._session, *answered[0], *answered[1:])
 
     def __repr__(self) -> str:
-        names = [name for stream in self._others for name in stream.question.topics]
+        names = [name for reader in self._others for name in reader.question.topics]
         return f"<Aligned {', '.join(names)}; {self._how}>"
 
     def to_tables(self, told: int | None = None) -> Iterator[pa.Table]:
@@ -177,8 +173,8 @@ class Aligned:
         Args:
             told: `rows`, `empty` and `remarks` are about so many first rows; None for all.
         """
-        for stream in self._streams:
-            stream.counters.reset()
+        for reader in self._readers:
+            reader.counters.reset()
         self.rows = 0
         self._empty.clear()
         base, partners = self._base, [self._partner(other) for other in self._others]
@@ -191,9 +187,11 @@ class Aligned:
             for times, table in base.tables(resolved.summary.id):
                 given, begin = True, 0
                 while begin < len(times):
+                    rest = times[begin:]
+                    known = min([len(rest), *(partner.decided(rest) for partner in partners)])
                     # Small pieces where many rows have the same large message.
-                    row = sum(partner.row_bytes(times[begin:]) for partner in partners)
-                    end = min(begin + max(_PIECE_BYTES // max(row, 1), 1), len(times))
+                    row = sum(partner.row_bytes() for partner in partners)
+                    end = begin + min(max(_PIECE_BYTES // max(row, 1), 1), known)
                     left = end if told is None else begin + told - self.rows
                     end = left if begin < left < end else end
                     piece = times[begin:end], table.slice(begin, end - begin)
@@ -304,8 +302,11 @@ class _Partner:
         found[found] = self._lost[place[found], 0] <= high[found]
         return found
 
-    def row_bytes(self, times: NDArray[np.int64]) -> int:
-        """Mean bytes of the messages that are read next, for times as of `add`."""
+    def decided(self, times: NDArray[np.int64]) -> int:
+        """Number of times, at least one, that the messages which are read now decide.
+
+        By the log clock times ascend, and are not before those of the last call of `add`.
+        """
         if self._blocks is None:
             if self._reader.is_by_log_time:
                 self._blocks = self._reader.tables(self._recording, self._span(int(times[0])))
@@ -313,8 +314,16 @@ class _Partner:
             else:
                 self._blocks, self._is_last = iter(()), True
                 self._times, self._table = self._reader.by_clock(self._recording)
-        size = int(self._table.nbytes)
-        return size // max(len(self._times), 1)
+        while not self._is_last:
+            # What belongs to times before the last one of the block is known.
+            if end := int(np.searchsorted(times, self._times[-1])):
+                return end
+            self._advance()
+        return len(times)
+
+    def row_bytes(self) -> int:
+        """Mean bytes of these messages."""
+        return int(self._table.nbytes) // max(len(self._times), 1)
 
     def _span(self, first: int) -> tuple[int, int] | None:
         """Log time that can hold the messages of all rows; None for all of it."""
@@ -334,35 +343,35 @@ class _Partner:
     def add(
         self, columns: dict[str, Any], times: NDArray[np.int64], empty: Counter[tuple[str, str]]
     ) -> None:
-        """Add the columns of the messages that belong to some times, with their distance.
+        """Add the columns of the messages that belong to decided times, with their distance.
 
         Args:
             columns: Those of the rows, by name.
-            times: int64[n], ns; by the log clock ascending, not before those of the last call.
+            times: int64[n], ns.
             empty: Numbers of rows without a message or a value, by name and reason.
         """
-        if len(times):
-            self.row_bytes(times)
-        parts, rest = [], times
-        while True:
-            end = len(rest)
-            if not self._is_last:
-                # What belongs to times before the last one of the block is known.
-                end = int(np.searchsorted(rest, self._times[-1])) if len(self._times) else 0
-            if end or not len(times):
-                parts.append(self._found(rest[:end]))
-                rest = rest[end:]
-            if not len(rest):
-                break
-            self._advance()
-        table = concatenated([one for one, _ in parts])
-        distance = pa.chunked_array([one for _, one in parts])
-        columns[free_name(self._reader.stream.prefix + _DISTANCE, columns)] = distance
+        known = self._times if len(self._times) else times
+        found = match(times, self._times, self._how, self._tolerance)
+        table = _taken(self._table, found.before)
+        if self._how == "interpolate":
+            low, high = known[np.maximum(found.before, 0)], known[np.maximum(found.after, 0)]
+            length = (high - low).astype(np.float64)
+            weight = (times - low) / np.where(length > 0, length, 1)
+            weight[length <= 0] = 0
+            after = _taken(self._table, found.after)
+            table = interpolated(table, after, weight, self._reader.quaternions)
+        missing = found.before < 0
+        distance = (
+            pa.array(found.distance, DURATION, mask=missing)
+            if missing.any()
+            else numbers(found.distance, "duration")
+        )
+        columns[free_name(self._reader.prefix + _DISTANCE, columns)] = distance
         none = distance.null_count
         if none:
             (topic,) = self._reader.question.topics
             is_unknown = times == UNKNOWN
-            is_lost = distance.is_null().to_numpy() & ~is_unknown & self._is_lost(times)
+            is_lost = missing & ~is_unknown & self._is_lost(times)
             lost, unknown = int(is_lost.sum()), int(is_unknown.sum())
             empty[topic, _NO_TIME] += unknown
             empty[topic, _LOST] += lost
@@ -380,27 +389,6 @@ class _Partner:
             self._table = concatenated([last, found[1]])
         else:
             self._times, self._table = found
-
-    def _found(self, times: NDArray[np.int64]) -> tuple[pa.Table, pa.Array[Any]]:
-        """The messages of times that the block decides, and their distance."""
-        known = self._times
-        found = match(times, known, self._how, self._tolerance)
-        rows = _taken(self._table, found.before)
-        if self._how == "interpolate":
-            known = known if len(known) else times
-            low, high = known[np.maximum(found.before, 0)], known[np.maximum(found.after, 0)]
-            length = (high - low).astype(np.float64)
-            weight = (times - low) / np.where(length > 0, length, 1)
-            weight[length <= 0] = 0
-            after = _taken(self._table, found.after)
-            rows = interpolated(rows, after, weight, self._reader.quaternions)
-        missing = found.before < 0
-        distance = (
-            pa.array(found.distance, DURATION, mask=missing)
-            if missing.any()
-            else numbers(found.distance, "duration")
-        )
-        return rows, distance
 
 
 def _taken(table: pa.Table, rows: NDArray[np.int64]) -> pa.Table:
@@ -436,11 +424,13 @@ def side_by_side(
             f"{listed(base.topics)}."
         )
     chosen: Clock = clock  # type: ignore[assignment]
-    first, *beside = _streams([base, *others])
-    if across_recordings:
-        beside = [replace(stream, is_apart=True) for stream in beside]
-    rows = TopicReader(session, first, chosen)
-    return Aligned(session, rows, beside, how=how, tolerance=tolerance, clock=chosen)
+    (prefix, first), *beside = _named([base, *others])
+    rows = TopicReader(session, first, chosen, prefix=prefix)
+    readers = [
+        TopicReader(session, one, chosen, prefix=prefix, is_apart=across_recordings)
+        for prefix, one in beside
+    ]
+    return Aligned(session, rows, readers, how=how, tolerance=tolerance, clock=chosen)
 
 
 def resampled(
@@ -452,19 +442,23 @@ def resampled(
 ) -> Aligned:
     """An alignment of topics to regular times; see `Query.resample`."""
     times = RegularTimes(session, replace(question, predicate=None), parse_duration(step))
-    streams = _streams([question])
-    if len(streams) == 1:
-        streams = [replace(streams[0], prefix="")]
-    return Aligned(session, times, streams, how=how, tolerance=tolerance, clock="log")
+    found = _named([question])
+    readers = [
+        TopicReader(
+            session, with_numbers(session, one, how), prefix=prefix if len(found) > 1 else ""
+        )
+        for prefix, one in found
+    ]
+    return Aligned(session, times, readers, how=how, tolerance=tolerance, clock="log")
 
 
-def _streams(questions: Sequence[Question]) -> list[Stream]:
-    """The topics of questions, with names for their columns: `imu/data.`, `imu/data_2.`."""
-    found: dict[str, Stream] = {}
+def _named(questions: Sequence[Question]) -> list[tuple[str, Question]]:
+    """Each topic of questions, and the beginning of its columns: `imu/data.`, `imu/data_2.`."""
+    found: dict[str, Question] = {}
     for question in questions:
         for topic in question.topics:
             name = topic.removeprefix("/")
             more = (f"{name}_{number}." for number in count(2))
             prefix = next(one for one in chain([f"{name}."], more) if one not in found)
-            found[prefix] = Stream(replace(question, topics=(topic,)), prefix)
-    return list(found.values())
+            found[prefix] = replace(question, topics=(topic,))
+    return [*found.items()]

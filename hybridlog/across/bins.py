@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import pyarrow as pa
 
-from hybridlog.across.topic_reader import TIME, Block, Stream, TopicReader, concatenated
+from hybridlog.across.topic_reader import TIME, Block, TopicReader, concatenated
 from hybridlog.frames.names import free_name, is_summary
 from hybridlog.query.predicate.types import FieldTypes
 from hybridlog.query.ranges import RangeResolver
@@ -45,14 +45,11 @@ class Bins:
     """A topic beside regular times: gives what its messages say until the next time.
 
     Raises:
-        UsageError: a field has no single number, or the question has limit, every or reverse.
+        UsageError: a field has no single number.
     """
 
-    def __init__(self, session: Session, stream: Stream, grid: RegularTimes, how: str) -> None:
-        if how in _OF_NUMBERS:
-            fields = _numbers_of(session, stream.question, how)
-            stream = replace(stream, question=replace(stream.question, fields=fields))
-        self._reader = TopicReader(session, stream)
+    def __init__(self, reader: TopicReader, grid: RegularTimes, how: str) -> None:
+        self._reader = reader
         self._grid = grid
         self._how = how
         self._none = self._reader.empty() if how != _COUNT else pa.table({})
@@ -64,7 +61,11 @@ class Bins:
         if self._how == _COUNT:
             self._blocks = ((times, pa.table({})) for times, _ in self._reader.times(recording))
 
-    def row_bytes(self, _times: NDArray[np.int64]) -> int:
+    def decided(self, times: NDArray[np.int64]) -> int:
+        """All times are."""
+        return len(times)
+
+    def row_bytes(self) -> int:
         """Rows have a size of their own."""
         return 0
 
@@ -88,7 +89,7 @@ class Bins:
         for field in self._reader.question.fields or ():
             if made.has_no_number(field):
                 raise _no_number(field, self._reader.question.topics[0])
-        name = free_name(self._reader.stream.prefix + _COUNT, columns)
+        name = free_name(self._reader.prefix + _COUNT, columns)
         columns[name] = pa.array(made.messages)
         self._reader.add(columns, made.table(), Counter(), len(times))
 
@@ -103,17 +104,17 @@ class Bins:
                 return
 
 
-def _numbers_of(session: Session, question: Question, how: str) -> tuple[str, ...] | None:
-    """The fields of a topic, or the requested ones, that are single numbers, also times.
+def with_numbers(session: Session, question: Question, how: str) -> Question:
+    """The question for the fields, or the requested ones, that are single numbers, also times.
 
-    Times have no mean. None if no definition fixes the fields.
+    Times have no mean. The same question where all values count, or no definition fixes the fields.
 
     Raises:
         UsageError: a requested field has none.
     """
     known = session.field_types(question.topics, question.recordings)
-    if known is None:
-        return question.fields
+    if known is None or how not in _OF_NUMBERS:
+        return question
     types = FieldTypes.of(known)
     kinds = {"number", "bool"} if how == "mean" else {"number", "bool", "time"}
     single = [
@@ -122,14 +123,14 @@ def _numbers_of(session: Session, question: Question, how: str) -> tuple[str, ..
         if not (path.endswith("]") or "[" in path or "[" in kind) and types.kind(path) in kinds
     ]
     if question.fields is None:
-        return tuple(single)
+        return replace(question, fields=tuple(single))
     chosen: list[str] = []
     for field in question.fields:
         below = [path for path in single if path == field or path.startswith(f"{field}.")]
         if not below and not is_summary(field, known):
             raise _no_number(field, question.topics[0])
         chosen += below or [field]
-    return tuple(dict.fromkeys(chosen))
+    return replace(question, fields=tuple(dict.fromkeys(chosen)))
 
 
 def _no_number(field: str, topic: str) -> UsageError:

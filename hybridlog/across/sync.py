@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias, overload
 import numpy as np
 
 from hybridlog.across.match import UNKNOWN
-from hybridlog.across.topic_reader import Stream, TopicReader
+from hybridlog.across.topic_reader import TopicReader
 from hybridlog.message import messages_in
 from hybridlog.query.answers.last_message import message_at
 from hybridlog.query.answers.lost import completeness_of
@@ -201,8 +201,9 @@ def _times_of(
         TopicError: the topic does not have the clock.
     """
     own = replace(question, recordings=(recording,), fields=())
-    reader = TopicReader(session, Stream(own, counters=counters), clock)
+    reader = TopicReader(session, own, clock)
     read = [(np.empty(0, np.int64), np.empty(0, np.int64)), *reader.times(recording)]
+    counters.add(reader.counters)
     log_time, time = (np.concatenate(parts) for parts in zip(*read, strict=True))
     order = np.argsort(time, kind="stable")
     return log_time, time, order[time[order] != UNKNOWN]

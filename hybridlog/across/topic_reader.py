@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from itertools import chain
 from typing import TYPE_CHECKING, Any, Final
 
@@ -42,41 +42,42 @@ _NO_VALUE: Final = "the message has no such value"
 _MAX_NAMES: Final = 3  # recordings in a message
 
 
-@dataclass(frozen=True, slots=True)
-class Stream:
-    """One topic of an alignment.
+class TopicReader:
+    """One topic of an alignment: its messages with their times on a clock.
 
-    Attributes:
-        question: The question about the topic.
+    Args:
+        session: The open store.
+        question: The question about the topic, kept as `asked`.
+        clock: The clock.
         prefix: Beginning of its columns' names; empty for none.
         is_apart: Its messages may be of other recordings than the rows.
-        counters: What reading it costs.
     """
 
-    question: Question
-    prefix: str = ""
-    is_apart: bool = False
-    counters: Counters = field(default_factory=Counters, compare=False)
-
-
-class TopicReader:
-    """Reads one topic with its times on a clock."""
-
-    def __init__(self, session: Session, stream: Stream, clock: Clock = "log") -> None:
-        question = stream.question
+    def __init__(
+        self,
+        session: Session,
+        question: Question,
+        clock: Clock = "log",
+        *,
+        prefix: str = "",
+        is_apart: bool = False,
+    ) -> None:
         if not question.returns_all or question.reverse:
             raise UsageError(
                 "An alignment uses all messages; it cannot be combined with limit, every or "
                 "reverse."
             )
-        self.stream = stream
+        self.asked = question
+        self.prefix = prefix
+        self.is_apart = is_apart
+        self.counters = Counters()
         self.is_by_log_time = clock == "log"
         self._session = session
         known = session.field_types(question.topics, question.recordings)
         self.quaternions = quaternion_paths(known)
         self._time = {"log": TIME, "publish": "publish_time", "header": STAMP}[clock]
-        self._hidden = {TIME} if stream.is_apart else {TIME, RECORDING}
-        if stream.is_apart:
+        self._hidden = {TIME} if is_apart else {TIME, RECORDING}
+        if is_apart:
             question = replace(question, names_recording=True)
         if clock != "log":
             # Refused where the topic does not have the clock.
@@ -109,7 +110,7 @@ class TopicReader:
             with suppress(TimeError):
                 yield Planner(self._session, question, counters)
         finally:
-            self.stream.counters.add(counters)
+            self.counters.add(counters)
 
     def empty(self) -> pa.Table:
         """No rows, with the columns of all recordings."""
@@ -162,7 +163,7 @@ class TopicReader:
         """Why no message can be beside the rows of a recording; None if there may be some."""
         snapshot = self._session.snapshot()
         place, places = snapshot.by_id[recording], self._session.chosen(self.question)
-        if self.stream.is_apart or place in places:
+        if self.is_apart or place in places:
             return None
         is_near = (snapshot.begin[places] < snapshot.end[place]) & (
             snapshot.begin[place] < snapshot.end[places]
@@ -188,7 +189,7 @@ class TopicReader:
 
     def _beside(self, recording: str) -> Question:
         """The question about the messages that may be beside the rows of a recording."""
-        if self.stream.is_apart:
+        if self.is_apart:
             return self.question
         return replace(self.question, recordings=(recording,))
 
@@ -196,7 +197,7 @@ class TopicReader:
         """Log time of the last message beside a recording by a time, ns; that without any."""
         if moment >= END:
             return moment
-        found = message_at(self._session, self._beside(recording), self.stream.counters, moment)
+        found = message_at(self._session, self._beside(recording), self.counters, moment)
         return moment if found is None else found.log_time_ns
 
     def following(self, recording: str, moment: int) -> int:
@@ -220,7 +221,7 @@ class TopicReader:
         """
         for name, column in zip(table.column_names, table.columns, strict=True):
             if name not in self._hidden:
-                free = free_name(self.stream.prefix + name, columns)
+                free = free_name(self.prefix + name, columns)
                 columns[free] = column
                 if column.null_count > known:
                     blank[free, _NO_VALUE] += column.null_count - known

@@ -293,7 +293,7 @@ def _coverage(entry: RecordingEntry, words: str) -> list[tuple[str, str]]:
 def _sparklines(store: Store, entry: RecordingEntry) -> dict[str, str]:
     """Messages of each topic over time; none without any, or if they cannot be read."""
     from hybridlog.cli.sparkline import densities
-    from hybridlog.drawing.density import density, evenly
+    from hybridlog.drawing.times import evenly, lane_of
     from hybridlog.record.losses import extent_of
 
     begin, end = extent_of(entry)
@@ -301,11 +301,13 @@ def _sparklines(store: Store, entry: RecordingEntry) -> dict[str, str]:
         return {}
     edges = evenly((begin, end), _DRAWN)
     try:
-        found = density(store.session, entry, edges, max_times=_DRAWN_TIMES)
+        return {
+            topic: densities(lane_of(store.session, entry, topic, _DRAWN_TIMES).counts(edges))
+            for topic in sorted({channel.topic for channel in entry.channels})
+        }
     except SegmentError as error:
         output.note(f"{entry.name}: {error}")
         return {}
-    return dict(zip(found.topics, map(densities, found.counts), strict=True))
 
 
 def _content(attachment: Mapping[str, Any]) -> str:

@@ -21,7 +21,7 @@ from hybridlog_storage.errors import UsageError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from hybridlog.drawing.lines import Line
+    from hybridlog.drawing.figure import Line
     from hybridlog.drawing.series import Series
 
 _FORMATS = ("png", "svg", "pdf")
@@ -68,7 +68,7 @@ def plot_command(given: _Given) -> None:
     if path is not None:
         check_room(path, force=given.force)
     with answering(given) as asked:
-        from hybridlog.drawing.lines import lines
+        from hybridlog.drawing.figure import lines
 
         names = [] if given.fields is None else parse_fields(given.fields)
         width = _WIDTH if shape is None else shape[0]

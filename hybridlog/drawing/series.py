@@ -1,35 +1,43 @@
-"""Fields over time, with no more points than a picture has pixels."""
+"""Fields that can be drawn over time, with no more points than a picture has pixels."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeAlias
+from itertools import islice
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
-from hybridlog.frames.names import FIELD
+from hybridlog.frames.names import FIELD, is_summary
+from hybridlog.query.answers.infer_fields import infer_fields
 from hybridlog.query.asked import field_types, spans_of
 from hybridlog.query.intervals import Intervals
-from hybridlog.query.periods import GAP_PERIODS, Steps, usual_period
+from hybridlog.query.periods import GAP_PERIODS, Steps
 from hybridlog.query.times import TIME_LIMIT
 from hybridlog.schema.arrow_types import is_list, is_number, is_time, lengths_of
-from hybridlog.schema.kinds import NUMERIC, element_of
+from hybridlog.schema.kinds import NUMERIC, element_of, width_of
 from hybridlog.wording import listed
-from hybridlog_storage.errors import TopicError, UsageError
-from hybridlog_storage.ordering import run_starts
+from hybridlog_storage.errors import SegmentError, TopicError, UsageError
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     import pyarrow as pa
     from numpy.typing import NDArray
 
+    from hybridlog.message import Message
     from hybridlog.query.query import Query
     from hybridlog.query.question import Span
 
+
 Numbers: TypeAlias = "NDArray[np.floating[Any]]"
+_Part: TypeAlias = "tuple[NDArray[np.int64], Mapping[str, Numbers]]"
 _ACCESS = re.compile(r"\[(\d{1,9})\]|\.([^.\[\]]+)")
 _MAX_NAMES = 8  # names of fields in a message
+_EXTREMES = (np.fmin, np.fmax)
 
 
 @dataclass(frozen=True)
@@ -115,7 +123,7 @@ def series(
     """
     if pixels < 1:
         raise UsageError(f"A picture is at least one pixel wide, not {pixels}.")
-    wanted = [_Wanted.of(text) for text in fields]
+    wanted = [Wanted.of(text) for text in fields]
     if not wanted:
         raise UsageError(f"Name a field, such as {listed(numbers_of(query), _MAX_NAMES)}.")
     narrowed, (begin, end) = over_time(query, [one.path for one in wanted], span)
@@ -124,7 +132,8 @@ def series(
         none = np.empty(0)
         return [Series(one.text, none.astype(np.int64), none, none, True) for one in wanted]
     with query.counters.timed():
-        found = _read(narrowed.to_tables(), wanted, _Grid.over(span or (begin, end), pixels))
+        rows = ShownRows(span or (begin, end), pixels, most=2 * pixels)
+        found = _read(narrowed.to_tables(), wanted, rows)
         query.counters.add(narrowed.counters)
     return found
 
@@ -165,7 +174,7 @@ def numbers_of(query: Query) -> list[str]:
     return [p for p, kind in known.items() if kind in NUMERIC and "[" not in p]
 
 
-def _check(wanted: Sequence[_Wanted], known: Mapping[str, str]) -> None:
+def _check(wanted: Sequence[Wanted], known: Mapping[str, str]) -> None:
     """Refuse fields that are known to be no numbers, before anything is read.
 
     Raises:
@@ -190,7 +199,7 @@ def _no_number(text: str, kind: str) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class _Wanted:
+class Wanted:
     """A field as it was asked for.
 
     Attributes:
@@ -204,7 +213,12 @@ class _Wanted:
     access: tuple[int | str, ...]
 
     @classmethod
-    def of(cls, text: str) -> _Wanted:
+    def of(cls, text: str) -> Wanted:
+        """The field of a path.
+
+        Raises:
+            UsageError: it is none.
+        """
         path, bracket, rest = text.partition("[")
         rest = bracket + rest
         found = list(_ACCESS.finditer(rest))
@@ -280,114 +294,214 @@ def _numbers_in_json(texts: Any) -> Any:
     return pc.if_else(is_number, texts, pa.scalar(None, texts.type))
 
 
-def _read(tables: Iterable[pa.Table], wanted: Sequence[_Wanted], grid: _Grid) -> list[Series]:
+def _read(tables: Iterable[pa.Table], wanted: Sequence[Wanted], rows: ShownRows) -> list[Series]:
     """The series from tables of messages, which are in order.
 
     Raises:
         TopicError: a field does not exist.
         UsageError: a field is no number.
     """
-    held: list[tuple[NDArray[np.int64], dict[str, Numbers]]] = []
     names: list[dict[str, bool]] = [{} for _ in wanted]  # of columns, True for numbers
-    rows = 0
     for table in tables:
-        times = table["log_time"].combine_chunks().cast("int64").to_numpy()
         columns: dict[str, Numbers] = {}
         for one, known in zip(wanted, names, strict=True):
             for path, values in one.columns(table).items():
                 known[path] = known.get(path, False) or values is not None
                 if values is not None:
                     columns[path] = values
-        rows += len(times)
-        held.append((times, columns))
-        if rows > 2 * grid.pixels:
-            for each in held:
-                grid.add(*each)
-            held.clear()
+        rows.add(log_times(table), columns)
     for one, known in zip(wanted, names, strict=True):
-        if not known and rows:
+        if not known and len(rows.times):
             raise TopicError(f"No message here has a field {one.text!r}.")
-        if not any(known.values()) and rows:
+        if not any(known.values()) and len(rows.times):
             raise UsageError(f"{one.text} is no number: only numbers can be drawn.")
-    paths = list(dict.fromkeys(p for known in names for p, is_number in known.items() if is_number))
-    if rows > 2 * grid.pixels:
-        return grid.series(paths)
-    return _exact(held, paths)
+    paths = dict.fromkeys(p for known in names for p, is_number in known.items() if is_number)
+    return rows.series(paths)
 
 
-def _exact(
-    held: Sequence[tuple[NDArray[np.int64], Mapping[str, Numbers]]],
-    paths: Sequence[str],
-) -> list[Series]:
-    times = np.concatenate([times for times, _ in held])
-    steps = np.diff(times)
-    gaps = np.flatnonzero(steps > GAP_PERIODS * usual_period(steps)) + 1
-    middles = times[gaps - 1] + steps[gaps - 1] // 2
-    found = []
-    for path in paths:
-        values = np.concatenate([c.get(path, np.full(len(t), np.nan)) for t, c in held])
-        values = np.insert(values, gaps, np.nan)
-        found.append(Series(path, np.insert(times, gaps, middles), values, values, True))
-    return found
+def log_times(table: pa.Table) -> NDArray[np.int64]:
+    """The log times of a table of messages, ns."""
+    times: NDArray[np.int64] = table["log_time"].combine_chunks().cast("int64").to_numpy()
+    return times
 
 
-class _Grid:
-    """Least and greatest values by pixel.
+class ShownRows:
+    """Messages in order of time; of very many, those that a picture shows.
+
+    Then a pixel has its first and its last message, those with the least and the greatest finite
+    value of each column, and one without, if it has any.
 
     Args:
-        begin: Log time of the first pixel, ns.
-        width: Log time of a pixel, ns.
+        span: Log time `[begin, end)` of the picture, ns.
         pixels: Number of pixels.
+        most: Messages that are not yet very many.
+
+    Attributes:
+        times: int64[n], log times, ns.
+        columns: Values by name, n each; NaN where a message has none.
+        exact: True if they are all messages.
     """
 
-    def __init__(self, begin: int, width: int, pixels: int) -> None:
-        self.pixels = pixels
-        self._begin = begin
-        self._width = width
-        self._count = np.zeros(pixels, np.int64)
-        self._first = np.zeros(pixels, np.int64)
-        self._last = np.zeros(pixels, np.int64)
-        self._steps = Steps()
-        self._extremes: dict[str, Numbers] = {}
-
-    @classmethod
-    def over(cls, span: Span, pixels: int) -> _Grid:
-        """A grid of a span of log time, ns."""
+    def __init__(self, span: Span, pixels: int, most: int) -> None:
         begin, end = max(span[0], 0), min(span[1], TIME_LIMIT)
-        return cls(begin, max(1, -(-(end - begin) // pixels)), pixels)
+        width = max(1, -(-(end - begin) // pixels))
+        inner = min(pixels - 1, (TIME_LIMIT - 1 - begin) // width)
+        self._edges = begin + width * np.arange(1, inner + 1, dtype=np.int64)
+        self._most = self._room = most
+        self._steps = Steps()
+        self._parts: list[_Part] = []
+        self._size = 0
+        self.exact = True
 
     def add(self, times: NDArray[np.int64], columns: Mapping[str, Numbers]) -> None:
-        """Add messages, which are in order of time and not before earlier ones."""
-        if not len(times):
-            return
+        """Add messages, which are not before earlier ones."""
         self._steps.add(times)
-        # Messages of a running recording may be later than its known end.
-        pixel = np.minimum((times - self._begin) // self._width, self.pixels - 1)
-        begins = run_starts(pixel)
-        ends = np.append(begins[1:], len(times))
-        used = pixel[begins]
-        new = self._count[used] == 0
-        self._first[used[new]] = times[begins[new]]
-        self._last[used] = times[ends - 1]
-        self._count[used] += ends - begins
-        for path, values in columns.items():
-            known = self._extremes.get(path, np.full((2, self.pixels), np.nan))
-            kind = np.promote_types(known.dtype, values.dtype)
-            least, greatest = self._extremes[path] = known.astype(kind, copy=False)
-            finite = np.where(np.isfinite(values), values, np.nan)
-            least[used] = np.fmin(least[used], np.fmin.reduceat(finite, begins))
-            greatest[used] = np.fmax(greatest[used], np.fmax.reduceat(finite, begins))
+        self._parts.append((times, columns))
+        self._size += len(times)
+        if self._size > self._room:
+            self._parts = [self._thinned(*part) for part in self._parts]
+            self.thin()
+            self._room = max(self._most, 4 * self._size)
 
-    def series(self, paths: Sequence[str]) -> list[Series]:
-        """An entry for each pixel with messages, and one of NaN in each gap."""
-        used = np.flatnonzero(self._count)
-        first, last = self._first[used], self._last[used]
-        pause = first[1:] - last[:-1]
-        is_gap = (np.diff(used) > 1) & (pause > GAP_PERIODS * self._steps.usual_period())
-        gaps = np.flatnonzero(is_gap) + 1
-        times = np.insert(first, gaps, last[gaps - 1] + pause[gaps - 1] // 2)
+    def thin(self) -> None:
+        """Leave out what a picture does not show."""
+        self._parts = [self._thinned(self.times, self.columns)]
+        self._size, self.exact = len(self.times), False
+
+    @property
+    def times(self) -> NDArray[np.int64]:  # noqa: D102
+        return self._joined()[0]
+
+    @property
+    def columns(self) -> Mapping[str, Numbers]:  # noqa: D102
+        return self._joined()[1]
+
+    def _joined(self) -> _Part:
+        if len(self._parts) != 1:
+            times = np.concatenate([np.empty(0, np.int64), *(times for times, _ in self._parts)])
+            columns = {
+                name: np.concatenate(
+                    [c[name] if name in c else np.full(len(t), np.nan) for t, c in self._parts]
+                )
+                for name in dict.fromkeys(name for _, columns in self._parts for name in columns)
+            }
+            self._parts = [(times, columns)]
+        return self._parts[0]
+
+    def _begins(self, times: NDArray[np.int64]) -> NDArray[np.intp]:
+        """The place of the first message of each pixel that has any."""
+        found = np.searchsorted(times, self._edges)
+        found = np.append(0, found[np.diff(found, prepend=0) > 0])
+        return found[found < len(times)]
+
+    def _thinned(self, times: NDArray[np.int64], columns: Mapping[str, Numbers]) -> _Part:
+        if not len(times):
+            return times, columns
+        begins = self._begins(times)
+        ends = np.append(begins[1:], len(times))
+        keep = np.zeros(len(times), np.bool_)
+        keep[begins] = keep[ends - 1] = True
+        for values in columns.values():
+            finite, is_finite = values, np.isfinite(values)
+            places = []
+            if not is_finite.all():
+                finite, places = np.where(is_finite, values, np.nan), [np.flatnonzero(~is_finite)]
+            for choose in _EXTREMES:
+                found = choose.reduceat(finite, begins).repeat(ends - begins)
+                places.append(np.flatnonzero(finite == found))
+            for some in places:
+                first = np.append(some, len(times))[np.searchsorted(some, begins)]
+                keep[first[first < ends]] = True
+        return times[keep], {name: values[keep] for name, values in columns.items()}
+
+    def gaps(self) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
+        """Places in front of which times without messages end, and the middles of these, ns."""
+        times = self.times
+        steps = np.diff(times)
+        is_gap = steps > GAP_PERIODS * self._steps.usual_period()
+        if not self.exact:  # one that has a pixel of its own
+            is_gap &= np.diff(np.searchsorted(self._edges, times, "right")) > 1
+        places = np.flatnonzero(is_gap)
+        return places + 1, times[places] + steps[places] // 2
+
+    def series(self, paths: Iterable[str]) -> list[Series]:
+        """Columns; with an entry for each pixel if there are very many messages."""
+        times, (gaps, middles) = self.times, self.gaps()
+        begins = np.arange(len(times)) if self.exact else self._begins(times)
+        places = np.searchsorted(begins, gaps)
+        shown = np.insert(times[begins], places, middles)
         found = []
         for path in paths:
-            least, greatest = (np.insert(side[used], gaps, np.nan) for side in self._extremes[path])
-            found.append(Series(path, times, least, greatest, False))
+            ends = [self.columns[path]] * 2
+            if not self.exact:
+                finite = np.where(np.isfinite(ends[0]), ends[0], np.nan)
+                ends = [choose.reduceat(finite, begins) for choose in _EXTREMES]
+            least, greatest = (np.insert(end, places, np.nan) for end in ends)
+            found.append(Series(path, shown, least, greatest, self.exact))
         return found
+
+
+MAX_FIELDS: Final = 5000
+"""Most fields of a topic that are listed."""
+MAX_ELEMENTS: Final = 36
+"""Most elements of an array that are listed one by one: those of a covariance."""
+
+_SUMMARIES: Final = ("min", "max", "mean", "n")
+_IN_JSON: Final = ("bool", "integer", "number")
+
+
+class Field(NamedTuple):
+    """A field, as `series` takes it, and its type."""
+
+    path: str
+    type: str
+
+
+def fields_of(known: Mapping[str, str] | None, messages: Iterator[Message]) -> list[Field]:
+    """Numbers, elements of short arrays and summaries of arrays, in the order of the definition.
+
+    Args:
+        known: Types of all fields by path; None where no definition fixes them, and those of
+            the first messages count.
+        messages: The messages; only the first ones are read.
+    """
+    found = _observed(messages) if known is None else _defined(known, messages)
+    return list(islice(found, MAX_FIELDS))
+
+
+def _defined(known: Mapping[str, str], messages: Iterator[Message]) -> Iterator[Field]:
+    first = None
+    with suppress(SegmentError):  # damage hides how long arrays are, and no field
+        first = next(messages, None)
+    values = {} if first is None else first.fields
+    for path, kind in known.items():
+        if "[" in path:
+            continue  # within the elements of an array
+        if kind in NUMERIC:
+            yield Field(path, kind)
+            continue
+        summaries = (f"{path}.{name}" for name in _SUMMARIES)
+        yield from (Field(name, "summary") for name in summaries if is_summary(name, known))
+        element = element_of(kind)
+        if element in NUMERIC:
+            width = _width(kind, path, values)
+            yield from (Field(f"{path}[{n}]", element) for n in range(width))
+
+
+def _width(kind: str, path: str, values: Mapping[str, Any]) -> int:
+    """Number of elements that are listed: of a fixed array, or of the first message."""
+    width = width_of(kind)
+    if width is None:
+        value: Any = values
+        for name in path.split("."):
+            value = value.get(name) if isinstance(value, Mapping) else None
+        width = len(value) if isinstance(value, list) else 0
+    return width if width <= MAX_ELEMENTS else 0
+
+
+def _observed(messages: Iterator[Message]) -> Iterator[Field]:
+    for found in infer_fields(messages):
+        path, kinds = str(found["path"]), str(found["type"]).split("|")
+        # A name within backquotes may have dots, which a path cannot tell from its own.
+        if not found["array"] and "`" not in path and any(kind in _IN_JSON for kind in kinds):
+            yield Field(path, "|".join(kinds))

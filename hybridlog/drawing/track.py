@@ -9,17 +9,15 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from hybridlog.drawing.series import over_time
-from hybridlog.frames.names import FIELD
+from hybridlog.drawing.series import ShownRows, Wanted, log_times, over_time
 from hybridlog.query.asked import field_types
-from hybridlog.query.periods import GAP_PERIODS, Steps
 from hybridlog_storage.errors import UsageError
-from hybridlog_storage.ordering import run_starts
 
 if TYPE_CHECKING:
     import pyarrow as pa
     from numpy.typing import NDArray
 
+    from hybridlog.drawing.series import Numbers
     from hybridlog.message import Message
     from hybridlog.query.query import Query
     from hybridlog.query.question import Span
@@ -58,9 +56,7 @@ class Grid:
         north = _RADIUS * (1 - _ECCENTRICITY) / part**1.5
         return cls(latitude, longitude, math.radians(max(east, 0.0)), math.radians(north))
 
-    def metres(
-        self, latitude: NDArray[np.float64], longitude: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    def metres(self, latitude: Numbers, longitude: Numbers) -> NDArray[np.float64]:
         """Positions in degrees as float64[n, 2], metres east and north of the origin."""
         turn = (longitude - self.longitude + 180) % 360 - 180  # the short way round
         return np.stack([turn * self.east, (latitude - self.latitude) * self.north], axis=1)
@@ -74,13 +70,14 @@ class Track:
         times: int64[n], log time, ns since the epoch.
         xy: float64[n, 2], metres: east and north of the origin of the grid, or x and y of poses
             in their frame. NaN where no line goes: for messages without a fix, and in the
-            middle of times without messages that are longer than `GAP_PERIODS` usual periods.
+            middle of times without messages that are longer than usual, as in a `Series`.
         grid: The grid, with its origin at the first fix; None without any, and for poses.
         is_geographic: False for poses.
         messages: Number of messages.
         fixes: Number of those that have a fix.
-        exact: True if each message is here. Else each pixel of time has its first fix, those
-            farthest east, north, west and south, and one without a fix if it has any.
+        exact: True if each message is here. Else each pixel of time has its first and its last
+            one, the fixes farthest east, north, west and south, and one without a fix if it has
+            any.
     """
 
     times: NDArray[np.int64]
@@ -154,132 +151,57 @@ def track(query: Query, *, pixels: int, span: Span | None = None) -> Track:
     if position.is_geographic and (known is None or _STATUS in known):
         paths.append(_STATUS)
     narrowed, (begin, end) = over_time(query, paths, span)
-    made = _Builder(begin, end, pixels, is_geographic=position.is_geographic)
+    rows = ShownRows((begin, end), pixels, most=_POSITIONS_PER_PIXEL * pixels)
+    rows.add(np.empty(0, np.int64), {"x": np.empty(0), "y": np.empty(0)})
+    grid, messages, fixes = None, 0, 0
     with query.counters.timed():
         for table in narrowed.to_tables() if begin < end else ():
-            made.add(table, paths)
+            first, second, *status = (_numbers(table, path) for path in paths)
+            if position.is_geographic:
+                has_fix = _is_position(first, second)
+            else:
+                has_fix = np.isfinite(first) & np.isfinite(second)
+            if status:
+                has_fix &= ~(status[0] < 0)
+            messages += len(has_fix)
+            fixes += int(np.count_nonzero(has_fix))
+            xy = np.where(has_fix, (first, second), np.nan)
+            if position.is_geographic and fixes:
+                at = int(np.argmax(has_fix))
+                grid = grid or Grid.at(float(first[at]), float(second[at]))
+                xy = grid.metres(*xy).T
+            rows.add(log_times(table), {"x": xy[0], "y": xy[1]})
         query.counters.add(narrowed.counters)
-    return made.track()
+    if not rows.exact:
+        rows.thin()
+    gaps, middles = rows.gaps()
+    places = np.stack([rows.columns[name] for name in "xy"], axis=1)
+    return Track(
+        times=np.insert(rows.times, gaps, middles),
+        xy=np.insert(places, gaps, np.nan, axis=0),
+        grid=grid,
+        is_geographic=position.is_geographic,
+        messages=messages,
+        fixes=fixes,
+        exact=rows.exact,
+    )
 
 
-class _Builder:
-    """Collects positions, and thins them as soon as they are many.
-
-    Args:
-        begin: Log time of the first pixel, ns.
-        end: Log time of the end of the last one.
-        pixels: Number of pixels.
-        is_geographic: Whether positions are in degrees.
-    """
-
-    def __init__(self, begin: int, end: int, pixels: int, *, is_geographic: bool) -> None:
-        self._begin = begin
-        self._width = max(1, -(-(end - begin) // pixels))
-        self._limit = _POSITIONS_PER_PIXEL * pixels
-        self._times = np.empty(0, np.int64)
-        self._xy = np.empty((0, 2))
-        self._grid: Grid | None = None
-        self._is_geographic = is_geographic
-        self._messages = 0
-        self._fixes = 0
-        self._exact = True
-        self._steps = Steps()
-
-    def add(self, table: pa.Table, paths: list[str]) -> None:
-        """Add messages, which are in order of time."""
-        first, second, *status = (_numbers(table, path) for path in paths)
-        if self._is_geographic:
-            has_fix = _is_position(first, second)
-        else:
-            has_fix = np.isfinite(first) & np.isfinite(second)
-        if status:
-            has_fix &= ~(status[0] < 0)
-        self._messages += len(has_fix)
-        self._fixes += int(np.count_nonzero(has_fix))
-        xy = np.full((len(has_fix), 2), np.nan)
-        xy[has_fix] = self._metres(first[has_fix], second[has_fix])
-        times = table["log_time"].combine_chunks().cast("int64").to_numpy()
-        self._steps.add(times)
-        self._times = np.concatenate([self._times, times])
-        self._xy = np.concatenate([self._xy, xy])
-        if len(self._times) > self._limit:
-            self._thin()
-
-    def _metres(
-        self, first: NDArray[np.float64], second: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        if not self._is_geographic or not len(first):
-            return np.stack([first, second], axis=1)
-        if self._grid is None:
-            self._grid = Grid.at(float(first[0]), float(second[0]))
-        return self._grid.metres(first, second)
-
-    def _thin(self) -> None:
-        self._exact = False
-        pixel = (self._times - self._begin) // self._width
-        has_fix = ~np.isnan(self._xy[:, 0])
-        keep = np.zeros(len(pixel), np.bool_)
-        keep[_first_of_each(pixel, np.flatnonzero(~has_fix))] = True
-        places = np.flatnonzero(has_fix)
-        keep[_first_of_each(pixel, places)] = True
-        if len(places):
-            begins = run_starts(pixel[places])
-            counts = np.diff(begins, append=len(places))
-            for values in self._xy[places].T:
-                for extreme in (np.minimum, np.maximum):
-                    found = extreme.reduceat(values, begins).repeat(counts)
-                    keep[_first_of_each(pixel, places[values == found])] = True
-        self._times, self._xy = self._times[keep], self._xy[keep]
-
-    def track(self) -> Track:
-        """The track of the messages that were added."""
-        steps = np.diff(self._times)
-        usual = self._steps.usual_period()
-        if not self._exact:
-            usual = max(usual, float(self._width))
-        gaps = np.flatnonzero(steps > GAP_PERIODS * usual) + 1
-        middles = self._times[gaps - 1] + steps[gaps - 1] // 2
-        return Track(
-            times=np.insert(self._times, gaps, middles),
-            xy=np.insert(self._xy, gaps, np.nan, axis=0),
-            grid=self._grid,
-            is_geographic=self._is_geographic,
-            messages=self._messages,
-            fixes=self._fixes,
-            exact=self._exact,
-        )
+def _is_position(latitude: Numbers, longitude: Numbers) -> NDArray[np.bool_]:
+    found: NDArray[np.bool_] = (np.abs(latitude) <= 90) & (np.abs(longitude) <= 360)
+    return found
 
 
-def _first_of_each(pixel: NDArray[np.int64], places: NDArray[np.intp]) -> NDArray[np.intp]:
-    """The first place of each pixel; places ascend."""
-    return places[run_starts(pixel[places])]
-
-
-def _is_position(
-    latitude: NDArray[np.float64], longitude: NDArray[np.float64]
-) -> NDArray[np.bool_]:
-    return (np.abs(latitude) <= 90) & (np.abs(longitude) <= 360)
-
-
-def _numbers(table: pa.Table, path: str) -> NDArray[np.float64]:
-    """A column as float64; NaN for null, and for a column that is not there.
+def _numbers(table: pa.Table, path: str) -> Numbers:
+    """A column, NaN for null, and for a column that is not there.
 
     Raises:
         UsageError: it has no numbers.
     """
-    import pyarrow as pa
-
-    from hybridlog.schema.arrow_types import is_number
-
-    for field, column in zip(table.schema, table.columns, strict=True):
-        if (field.metadata or {}).get(FIELD, field.name.encode()).decode() != path:
-            continue
-        kind = field.type
-        if not (is_number(kind) or pa.types.is_null(kind)):
-            raise UsageError(f"{path} is no number but {kind}: only numbers can be drawn.")
-        values: NDArray[np.float64] = column.cast(pa.float64(), safe=False).to_numpy()
-        return values
-    return np.full(table.num_rows, np.nan)
+    values = Wanted.of(path).columns(table).get(path, np.full(table.num_rows, np.nan))
+    if values is None:
+        raise UsageError(f"{path} is no number: only numbers can be drawn.")
+    return values
 
 
 def fix_of(message: Message, prefix: str = "") -> dict[str, Any]:

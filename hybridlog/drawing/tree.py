@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from itertools import islice
-from typing import TYPE_CHECKING, Any, Final, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
 import pyarrow as pa
@@ -59,10 +58,10 @@ def tree(
     """
     value: Any = message.content()
     for place in path:
-        items = _items(value, place, 1)
-        if items is None or not items:
+        part = _part(value)
+        if isinstance(part, _Plain) or not 0 <= place < len(part.items):
             raise UsageError("The message has no such part.")
-        value = items[0][1]
+        value = part.items[place]
     if count is not None:
         count = min(max(count, 1), MAX_SHOWN)
     return _Walk().node(value, MAX_DEPTH, max(begin, 0), count)
@@ -83,33 +82,33 @@ class _Walk:
     def node(self, value: Any, depth: int, begin: int = 0, count: int | None = None) -> Node:
         """The node of a value."""
         self.nodes -= 1
-        size = _size(value)
-        if size is None:
-            return self._plain(value, begin)
-        kind, numbers = _array_type(value), _numbers(value)
-        found: Node = {"type": kind, "n": size, "begin": min(begin, size)}
-        is_object = not kind
+        part = _part(value)
+        if isinstance(part, _Plain):
+            return self._plain(part, begin)
+        size, is_object = len(part.items), part.names is not None
+        found: Node = {"type": part.type, "n": size, "begin": min(begin, size)}
         if count is None:
-            count = MAX_SHOWN if is_object else _SHOWN[numbers is not None]
-        if numbers is not None:
-            found["texts"] = [self._cut(t) for t in _texts(numbers, begin, begin + count)]
+            count = MAX_SHOWN if is_object else _SHOWN[part.is_plain]
+        places = range(begin, min(begin + count, size))
+        if part.is_plain:
+            found["texts"] = [self._cut(_plain(part.items[place]).text) for place in places]
             return found
         if depth <= 0 or self.nodes < min(count, size):
             return found
         self.nodes -= min(count, size)
         found["items"] = []
-        for name, item in _items(value, begin, count) or ():
+        for place in places:
             self.nodes += 1  # it was set aside, so that no level below can take it
-            node = self.node(item, depth - 1)
-            found["items"].append({"name": self._cut(name), **node} if is_object else node)
+            node = self.node(part.items[place], depth - 1)
+            named = {} if part.names is None else {"name": self._cut(part.names[place])}
+            found["items"].append({**named, **node})
         return found
 
-    def _plain(self, value: Any, begin: int) -> Node:
-        kind, text = _described(value)
-        shown = self._cut(text[begin : begin + MAX_TEXT])
-        found: Node = {"type": kind, "text": shown}
-        if len(shown) < len(text):
-            found |= {"n": len(text), "begin": min(begin, len(text))}
+    def _plain(self, part: _Plain, begin: int) -> Node:
+        shown = self._cut(part.text[begin : begin + MAX_TEXT])
+        found: Node = {"type": part.type, "text": shown}
+        if len(shown) < len(part.text):
+            found |= {"n": len(part.text), "begin": min(begin, len(part.text))}
         return found
 
     def _cut(self, text: str) -> str:
@@ -119,75 +118,66 @@ class _Walk:
         return cut.encode("utf-8", "replace").decode()
 
 
-def _size(value: Any) -> int | None:
-    """Number of fields or elements; None for a plain value."""
-    if isinstance(value, Mapping | list | tuple | bytes):
-        return len(value)
-    if isinstance(value, pa.StructScalar):
-        return value.type.num_fields if value.is_valid else None
-    if isinstance(value, pa.ListScalar | pa.FixedSizeListScalar | pa.LargeListScalar):
-        return len(value.values) if value.is_valid else None
-    if isinstance(value, pa.BinaryScalar | pa.LargeBinaryScalar) and not _is_text(value):
-        return len(value.as_buffer()) if value.is_valid else None
-    return None
+class _Plain(NamedTuple):
+    """A plain value.
+
+    Attributes:
+        type: Its type.
+        text: Its text.
+    """
+
+    type: str
+    text: str
 
 
-def _items(value: Any, begin: int, count: int) -> list[tuple[str, Any]] | None:
-    """Names and values of some fields, or elements with empty names; None of a plain value."""
-    if _size(value) is None or begin < 0:
-        return None
+class _Parts(NamedTuple):
+    """An object or an array.
+
+    Attributes:
+        type: Of an array, with its length; empty for an object.
+        items: The elements, or for objects the values.
+        names: Of the fields; None for an array.
+        is_plain: An array of nothing but numbers.
+    """
+
+    type: str
+    items: Any
+    names: Sequence[str] | None = None
+    is_plain: bool = False
+
+
+def _part(value: Any) -> _Plain | _Parts:
+    """The form of a value."""
+    if isinstance(value, pa.Scalar):
+        return _of_arrow(value)
     if isinstance(value, Mapping):
-        return [(str(name), item) for name, item in islice(value.items(), begin, begin + count)]
-    if isinstance(value, pa.StructScalar):
-        places = range(begin, min(begin + count, value.type.num_fields))
-        return [(value.type.field(place).name, value[place]) for place in places]
-    numbers = _numbers(value)
-    if numbers is not None:
-        return [("", item) for item in numbers[begin : begin + count]]
-    elements = value if isinstance(value, list | tuple) else value.values
-    return [("", elements[place]) for place in range(begin, min(begin + count, len(elements)))]
-
-
-def _numbers(value: Any) -> Any:
-    """The numbers of an array of nothing else, without a copy; None for other values."""
+        return _Parts("", [*value.values()], [*map(str, value)])
     if isinstance(value, bytes):
-        return np.frombuffer(value, np.uint8)
-    if isinstance(value, pa.BinaryScalar | pa.LargeBinaryScalar) and not _is_text(value):
-        return np.frombuffer(value.as_buffer(), np.uint8)
-    if isinstance(value, list | tuple):
-        plain = bool(value) and all(_is_number(item) for item in value)
-        return value if plain else None
-    elements = getattr(value, "values", None)
-    if isinstance(elements, pa.Array) and not elements.null_count:
-        kind = elements.type
-        if is_numeric(kind):
-            return elements.to_numpy(zero_copy_only=not pa.types.is_boolean(kind))
-    return None
+        return _Parts(f"bytes[{len(value)}]", np.frombuffer(value, np.uint8), is_plain=True)
+    if not isinstance(value, list | tuple):
+        return _plain(value)
+    simple = [v for v in value[:MAX_SHOWN] if not isinstance(v, Mapping | list | tuple | bytes)]
+    kinds = {_plain(one).type for one in simple}
+    kind = kinds.pop() if len(kinds) == 1 else ""
+    numeric = all(isinstance(v, bool | int | float) and not hasattr(v, "kind") for v in value)
+    return _Parts(f"{kind}[{len(value)}]", value, is_plain=bool(value) and numeric)
 
 
-def _is_number(value: object) -> bool:
-    return isinstance(value, bool | int | float) and not hasattr(value, "kind")
-
-
-def _texts(numbers: Any, begin: int, end: int) -> list[str]:
-    return [_described(number)[1] for number in numbers[begin:end]]
-
-
-def _array_type(value: Any) -> str:
-    """Type of an array with its length; empty for an object."""
-    size = _size(value)
-    if isinstance(value, Mapping | pa.StructScalar):
-        return ""
-    if isinstance(value, bytes | pa.BinaryScalar | pa.LargeBinaryScalar):
-        return f"bytes[{size}]"
-    if isinstance(value, list | tuple):
-        kinds = {_described(item)[0] for item in value[:MAX_SHOWN] if _size(item) is None}
-        return f"{kinds.pop() if len(kinds) == 1 else ''}[{size}]"
-    return f"{_type_name(value.values.type)}[{size}]"
-
-
-def _is_text(value: Any) -> bool:
-    return isinstance(value, pa.StringScalar | pa.LargeStringScalar)
+def _of_arrow(value: pa.Scalar[Any]) -> _Plain | _Parts:
+    if not value.is_valid or isinstance(value, pa.StringScalar | pa.LargeStringScalar):
+        return _plain(value)
+    if isinstance(value, pa.StructScalar):
+        return _Parts("", value, [field.name for field in value.type])
+    if isinstance(value, pa.BinaryScalar | pa.LargeBinaryScalar):
+        data = np.frombuffer(value.as_buffer(), np.uint8)
+        return _Parts(f"bytes[{len(data)}]", data, is_plain=True)
+    if not isinstance(value, pa.ListScalar | pa.FixedSizeListScalar | pa.LargeListScalar):
+        return _plain(value)
+    items: Any = value.values
+    name, numeric = _type_name(items.type), is_numeric(items.type) and not items.null_count
+    if numeric:
+        items = items.to_numpy(zero_copy_only=not pa.types.is_boolean(items.type))
+    return _Parts(f"{name}[{len(items)}]", items, is_plain=numeric)
 
 
 def _type_name(kind: pa.DataType) -> str:
@@ -198,27 +188,21 @@ def _type_name(kind: pa.DataType) -> str:
     return {"float": "float32", "double": "float64"}.get(str(kind), str(kind).partition("[")[0])
 
 
-def _described(value: Any) -> tuple[str, str]:
-    """Type and text of a plain value."""
+def _plain(value: Any) -> _Plain:
+    """The type and the text of a plain value."""
     if isinstance(value, pa.Scalar):
-        return _of_arrow(value)
+        name = _type_name(value.type)
+        if value.is_valid and name in _INSTANTS:
+            return _Plain(name, _INSTANTS[name](value.value))
+        is_single = value.is_valid and isinstance(value, pa.FloatScalar)
+        return _Plain(name, _text(np.float32(value.as_py()) if is_single else value.as_py()))
     kind = getattr(value, "kind", "")
     if kind in _INSTANTS:
-        return kind, _INSTANTS[kind](int(value))
+        return _Plain(kind, _INSTANTS[kind](int(value)))
     if isinstance(value, np.generic):
-        return value.dtype.name, _text(value)
+        return _Plain(value.dtype.name, _text(value))
     named = ((bool, "bool"), (int, "integer"), (float, "number"), (str, "string"))
-    name = next((name for kind, name in named if isinstance(value, kind)), "")
-    return name, _text(value)
-
-
-def _of_arrow(value: pa.Scalar[Any]) -> tuple[str, str]:
-    name = _type_name(value.type)
-    if value.is_valid and name in _INSTANTS:
-        return name, _INSTANTS[name](value.value)
-    if value.is_valid and isinstance(value, pa.FloatScalar):
-        return name, _text(np.float32(value.as_py()))
-    return name, _text(value.as_py())
+    return _Plain(next((name for kind, name in named if isinstance(value, kind)), ""), _text(value))
 
 
 def _text(value: Any) -> str:

@@ -122,9 +122,9 @@ def shown(table: pa.Table, most: int) -> dict[str, Any]:
 
     Returns:
         `columns`, pairs of the name and whether it is a number; `columns_left_out`, their
-        number; `rows`, texts; `times`, the log times that each row may be of, ns since 1970
-        (timestamps have microseconds), and `recordings`, the name of its recording: both empty
-        without such columns.
+        number; `rows`, texts; `times`, the log time of each row, ns since 1970, the last one of
+        its microsecond where only a timestamp tells it, and `recordings`, the name of its
+        recording: both empty without such columns.
     """
     first = table.select(range(min(table.num_columns, most)))
     return {
@@ -135,33 +135,25 @@ def shown(table: pa.Table, most: int) -> dict[str, Any]:
         "columns_left_out": table.num_columns - first.num_columns,
         "rows": cells(first, exact=True),
         "times": _times(table),
-        "recordings": _texts(table, "recording"),
+        "recordings": _values(table, "recording", pa.types.is_string),
     }
 
 
-def _times(table: pa.Table) -> list[range | None]:
-    found: list[range | None] = []
-    for name in ("t", "log_time"):
-        place = table.schema.get_field_index(name)
-        kind = table.schema.field(place).type if place >= 0 else pa.null()
-        if name == "log_time":
-            unit = UNITS[kind.unit] if pa.types.is_timestamp(kind) else 0
-        else:
-            unit = int(pa.types.is_int64(kind))
-        if unit:
-            values = table.column(place).cast(pa.int64()).to_pylist()
-            spans = [None if v is None else range(v * unit, (v + 1) * unit) for v in values]
-            pairs = zip(found or spans, spans, strict=True)
-            found = [None if a is None or b is None else _common(a, b) for a, b in pairs]
-    return found
-
-
-def _common(one: range, other: range) -> range:
-    return range(max(one.start, other.start), min(one.stop, other.stop))
-
-
-def _texts(table: pa.Table, name: str) -> list[str | None]:
-    place = table.schema.get_field_index(name)
-    if place < 0 or not pa.types.is_string(table.schema.field(place).type):
+def _times(table: pa.Table) -> list[int | None]:
+    if found := _values(table, "t", pa.types.is_int64):
+        return found
+    if not (column := _values(table, "log_time", pa.types.is_timestamp)):
         return []
-    return list(table.column(place).to_pylist())
+    unit = UNITS[table.schema.field("log_time").type.unit]
+    return [None if value is None else value * unit + unit - 1 for value in column]
+
+
+def _values(table: pa.Table, name: str, fits: Callable[[pa.DataType], bool]) -> list[Any]:
+    """The values of a column, times as integers; none if it lacks or has another type."""
+    place = table.schema.get_field_index(name)
+    if place < 0 or not fits(table.schema.field(place).type):
+        return []
+    column = table.column(place)
+    if pa.types.is_timestamp(column.type):
+        column = column.cast(pa.int64())
+    return list(column.to_pylist())

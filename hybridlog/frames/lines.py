@@ -9,8 +9,7 @@ import pyarrow as pa
 
 from hybridlog.formats.answer import Line
 from hybridlog.formats.jsonl import json_line, json_rows
-from hybridlog.frames.answer import Decoder
-from hybridlog.frames.builder import Block
+from hybridlog.frames.answer import Block, Decoder
 from hybridlog.frames.columns import flat, summary_array, with_summaries
 from hybridlog.frames.names import arranged, free_name, summary_of
 from hybridlog.index.indexing import rows_by_channel

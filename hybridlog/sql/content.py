@@ -1,27 +1,39 @@
-"""Content of a store for SQL at one moment: names of views, recordings, flushed chunks."""
+"""Content of a store for SQL at one moment: recordings, views, and tables about the store."""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
+import pyarrow as pa
 
+from hybridlog.columns.layout import POINTS
+from hybridlog.columns.recordings_file import RECORDINGS, TAGS, TIME, recordings_table, times
+from hybridlog.query.answers.marks import marks_in
+from hybridlog.query.counters import Counters
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.snapshot import UNFINISHED
-from hybridlog.sql.columns import merged
+from hybridlog.sql.columns import OWN, ViewColumn, merged, sql_type, view_columns
 from hybridlog.sql.names import ViewNames
 from hybridlog.sql.pieces import TopicOfRecording
-from hybridlog.sql.topic_view import TopicView
+from hybridlog.sql.plan import (
+    Chooser,
+    Plan,
+    RecordingChooser,
+    in_window,
+    within_source,
+)
+from hybridlog_storage.catalog import ChannelStats
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.query.question import Question, Span
     from hybridlog.session import Session
+    from hybridlog.sql.plan import Reading
     from hybridlog_storage.summary import RecordingSummary
 
 
@@ -95,56 +107,226 @@ class StoreContent:
         """The view of a topic."""
         with self._lock:
             if topic not in self._views:
-                self._views[topic] = self._view(topic)
+                self._views[topic] = TopicView(self, topic)
             return self._views[topic]
 
-    def _view(self, topic: str) -> TopicView:
-        found = self.summaries_of(topic)
-        kinds = self._kinds(topic, found)
-        found = [one for one in found if self._windows is None or one.id in self._windows]
-        return TopicView(
-            topic,
-            recordings=[partial(self.topic_of, summary, topic) for summary in found],
-            names=[summary.name for summary in found],
-            spans=[self._span(summary) for summary in found],
-            windows=[self.window(summary.id) for summary in found],
-            kinds=kinds,
-            points=self._points(topic, found),
-            size=self._size(topic, found),
+    def differing(self, topic: str) -> list[RecordingSummary]:
+        """Recordings of which each one with a topic has the definition of one of these."""
+        return self.snapshot.differing(self._having(topic))
+
+
+class TopicView:
+    """The view of a topic: its columns, and the rows that a query reads.
+
+    Attributes:
+        topic: Full name.
+        schema: All columns.
+        size: Number of rows, nearly.
+    """
+
+    def __init__(self, content: StoreContent, topic: str) -> None:
+        self.topic = topic
+        self._content = content
+        self._known: dict[str, TopicOfRecording] = {}
+        self._choosers: dict[str, Chooser] = {}
+        having = {*content.having([topic])}
+        known = content.summaries_of(topic)
+        self._summaries = [one for one in known if one.id in having]
+        kinds = self._kinds(known)
+        columns = view_columns(merged(kinds) if kinds else pa.struct([]))
+        self._columns = {column.name: column for column in columns}
+        points = self._points()
+        if points is not None and POINTS not in self._columns:
+            own = ViewColumn(POINTS, (POINTS,), points, sql_type(points), is_points=True)
+            self._columns[POINTS] = own
+        fields = [pa.field(column.name, column.type) for column in self._columns.values()]
+        self.schema = pa.schema([*OWN, *fields])
+        some = [self._of(one) for one in self._summaries[:_SAMPLED]]
+        messages = sum(c.stats.messages for one in some for c in one.channels.values())
+        self.size = messages * len(self._summaries) // max(len(some), 1)
+        # The end of a recording is one more than its last time: for messages at the end of time.
+        spans = (one.extent for one in self._summaries)
+        self._chooser = RecordingChooser(
+            self.schema,
+            [one.name for one in self._summaries],
+            [(first, end) if first < end else None for first, end in spans],
         )
 
-    def _size(self, topic: str, found: Sequence[RecordingSummary]) -> int:
-        """Number of messages, estimated from some recordings."""
-        some = found[:_SAMPLED]
-        messages = [
-            sum(c.stats.messages for c in self.topic_of(one, topic).channels.values())
-            for one in some
-        ]
-        return sum(messages) * len(found) // max(len(some), 1)
+    def _of(self, summary: RecordingSummary) -> TopicOfRecording:
+        if summary.id not in self._known:
+            self._known[summary.id] = self._content.topic_of(summary, self.topic)
+        return self._known[summary.id]
 
-    def _kinds(self, topic: str, found: Sequence[RecordingSummary]) -> list[Any]:
+    def _kinds(self, known: Sequence[RecordingSummary]) -> list[Any]:
         """Types of the messages; recordings with equal definitions have equal ones."""
-        differing = self.snapshot.differing(self._having(topic))
-        some = [self.topic_of(one, topic) for one in differing]
+        some = [self._of(one) for one in self._content.differing(self.topic)]
         if not all(one.is_fixed for one in some):
-            some = [self.topic_of(one, topic) for one in found]
+            some = [self._of(one) for one in known]
         return [kind for one in some for kind in one.kinds]
 
-    def _points(self, topic: str, found: Sequence[RecordingSummary]) -> Any:
+    def _points(self) -> Any:
         """Type of the points of clouds of a topic whose tables have them; None without."""
-        if topic not in self.session.directory.settings.arrays:
+        if self.topic not in self._content.session.directory.settings.arrays:
             return None
-        clouds = [self.topic_of(one, topic) for one in found]
-        tables = (one.table for one in clouds)
-        kinds = [table.points for table in tables if table is not None]
-        kinds = [kind for kind in kinds if kind is not None]
+        clouds = [self._of(one) for one in self._summaries]
+        of_tables = (one.table.points for one in clouds if one.table is not None)
+        kinds = [kind for kind in of_tables if kind is not None]
         if not kinds:  # no table is there yet, or payloads have expired
-            first = (one.first_points() for one in clouds[:_SAMPLED])
-            kinds = [kind for kind in first if kind is not None]
+            of_messages = (one.first_points() for one in clouds[:_SAMPLED])
+            kinds = [kind for kind in of_messages if kind is not None]
         return merged(kinds) if kinds else None
 
-    def _span(self, summary: RecordingSummary) -> tuple[int, int] | None:
-        first, end = summary.extent
-        if first >= end:
-            return None
-        return first, end  # one more, for messages at the end of time
+    def rows(
+        self, columns: Sequence[str], where: Any, reading: Reading
+    ) -> Iterator[pa.RecordBatch]:
+        """Rows for a query.
+
+        Args:
+            columns: Names of the columns.
+            where: Expression that holds for all of them; None for all rows.
+            reading: Collects what is read.
+        """
+        plans: dict[Span | None, Plan] = {}
+        for number in self._chooser.chosen(where):
+            summary = self._summaries[number]
+            recording, window = self._of(summary), self._content.window(summary.id)
+            if window not in plans:
+                holds = in_window(where, window)
+                plans[window] = Plan(self.schema, self._columns, columns, holds, reading)
+            if summary.id not in self._choosers:
+                spans = [within_source(source) for source in recording.sources]
+                self._choosers[summary.id] = Chooser(self.schema, spans)
+            reading.remarks.add(recording)
+            for place in self._choosers[summary.id].chosen(plans[window].where):
+                yield from plans[window].read(recording, recording.sources[place])
+
+
+_TOPICS: Final = pa.schema(
+    [
+        ("topic", pa.string()),
+        ("view", pa.string()),
+        ("short", pa.string()),
+        ("recording", pa.string()),
+        ("type", pa.string()),
+        ("encoding", pa.string()),
+        ("messages", pa.int64()),
+        ("bytes", pa.int64()),
+        ("first_time", TIME),
+        ("last_time", TIME),
+        ("first_t", pa.int64()),
+        ("last_t", pa.int64()),
+        ("mean_skew", pa.float64()),
+        ("unset_stamps", pa.int64()),
+        ("problem", pa.string()),
+    ]
+)
+_LOSSES: Final = pa.schema(
+    [
+        ("recording", pa.string()),
+        ("topic", pa.string()),
+        ("cause", pa.string()),
+        ("messages", pa.int64()),
+        ("first_time", TIME),
+        ("last_time", TIME),
+        ("first_t", pa.int64()),
+        ("last_t", pa.int64()),
+        ("file", pa.string()),
+        ("reason", pa.string()),
+    ]
+)
+_MARKS: Final = pa.schema(
+    [
+        ("log_time", TIME),
+        ("t", pa.int64()),
+        ("end_time", TIME),
+        ("end_t", pa.int64()),
+        ("recording", pa.string()),
+        ("text", pa.string()),
+        ("tags", TAGS),
+    ]
+)
+
+
+def store_table(name: str, content: StoreContent) -> pa.Table:
+    """One of the tables about a store.
+
+    Args:
+        name: `recordings`, `topics`, `losses` or `marks`.
+        content: The store.
+    """
+    if name == "recordings":
+        return recordings_table(content.summaries)
+    rows, schema = _TABLES[name]
+    return pa.Table.from_pylist(list(rows(content)), schema=schema)
+
+
+def store_schema(name: str) -> pa.Schema:
+    """The columns of such a table."""
+    return RECORDINGS if name == "recordings" else _TABLES[name][1]
+
+
+def _topics(content: StoreContent) -> Iterator[Mapping[str, Any]]:
+    for topic, view in content.names.views.items():
+        for summary in content.summaries_of(topic):
+            found = content.topic_of(summary, topic)
+            channels = list(found.channels.values())
+            total = ChannelStats()
+            for channel in channels:
+                total.add(channel.stats)
+            types = dict.fromkeys(c.channel.schema.name for c in channels if c.channel.schema)
+            encodings = dict.fromkeys(c.encoding for c in channels)
+            problems = dict.fromkeys(c.codec.reason for c in channels if c.codec.reason)
+            yield {
+                "topic": topic,
+                "view": view,
+                "short": content.names.short(topic),
+                "recording": summary.name,
+                "type": ", ".join(types) or None,
+                "encoding": ", ".join(encodings) or None,
+                "messages": total.messages,
+                "bytes": total.payload_bytes,
+                **times(total.first, total.last),
+                "mean_skew": total.mean_skew,
+                "unset_stamps": total.unset if found.entry.is_decoded else None,
+                "problem": "; ".join(problems) or None,
+            }
+
+
+def _losses(content: StoreContent) -> Iterator[Mapping[str, Any]]:
+    for summary in content.summaries:
+        entry = content.session.entry_of(summary)
+        for loss in entry.end.get("losses", ()):
+            yield {
+                "recording": entry.name,
+                "topic": loss.get("topic"),
+                "cause": str(loss["cause"]),
+                "messages": loss["count"],
+                **times(loss.get("from"), loss.get("to")),
+                "file": loss.get("file") or None,
+                "reason": loss.get("reason") or None,
+            }
+
+
+def _marks(content: StoreContent) -> Iterator[Mapping[str, Any]]:
+    names = {one.id: one.name for one in content.summaries}
+    for mark in marks_in(content.session, [*names], Counters()):
+        window = content.window(mark.recording)
+        if window is not None and not window[0] <= mark.begin < window[1]:
+            continue
+        yield {
+            "log_time": mark.begin // 1000,
+            "t": mark.begin,
+            "end_time": None if mark.end is None else mark.end // 1000,
+            "end_t": mark.end,
+            "recording": names[mark.recording],
+            "text": mark.text,
+            "tags": list(mark.tags.items()),
+        }
+
+
+_Rows = Callable[["StoreContent"], Iterator[Mapping[str, Any]]]
+_TABLES: Final[Mapping[str, tuple[_Rows, Any]]] = {
+    "topics": (_topics, _TOPICS),
+    "losses": (_losses, _LOSSES),
+    "marks": (_marks, _MARKS),
+}

@@ -5,22 +5,20 @@ from __future__ import annotations
 import re
 import threading
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
 from difflib import get_close_matches
-from functools import partial
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from hybridlog.query.question import Question
 from hybridlog.query.topics import namesakes
 from hybridlog.schema.states import without_fields
-from hybridlog.sql.content import StoreContent
+from hybridlog.sql.content import StoreContent, store_schema, store_table
 from hybridlog.sql.duck import MEMORY, Worker, explained, open_duckdb, shortage_of
 from hybridlog.sql.names import TABLES
 from hybridlog.sql.pieces import DamagedTableError
-from hybridlog.sql.source import source_of
-from hybridlog.sql.store_tables import store_schema, store_table
-from hybridlog.sql.topic_view import Reading
+from hybridlog.sql.plan import Reading
 from hybridlog.sql.usage import EVERYTHING, Usage, usage_of
 from hybridlog.wording import listed
 from hybridlog_storage.errors import ChangedError, HybridlogError, TopicError, UsageError
@@ -32,7 +30,7 @@ if TYPE_CHECKING:
     from hybridlog.query.answers.completeness import Completeness
     from hybridlog.session import Asked
     from hybridlog.sql.pieces import ScanCounts
-    from hybridlog.sql.topic_view import Remarks
+    from hybridlog.sql.plan import Remarks
 
 Params = Sequence[Any] | Mapping[str, Any] | None
 EVERYWHERE: Final = Question(())
@@ -49,7 +47,6 @@ _NAMES: Final = (
     "union select view_name from duckdb_views() where not internal order by name"
 )
 _MAX_TREES: Final = 64  # syntax trees that are kept
-_MAX_TREE: Final = 1 << 20  # characters of one of them
 _NO_TABLE: Final = re.compile(r"Catalog Error: Table with name (.+?) does not exist")
 _MAX_TRIES: Final = 10  # tables that may be damaged in one query
 _T = TypeVar("_T")
@@ -62,7 +59,7 @@ class SqlEngine:
         self._source = source
         self._bases: dict[int, Any] = {}
         self._content: StoreContent | None = None
-        self._trees: dict[str, str] = {}
+        self.tree = lru_cache(_MAX_TREES)(self._tree)
         self._lock = threading.RLock()
 
     def connect(
@@ -104,17 +101,12 @@ class SqlEngine:
                 known = self._content = StoreContent(session, scope)
             return known
 
-    def tree(self, cursor: Any, text: str) -> str:
-        """The syntax tree of a query as JSON; those of the last queries are kept."""
+    def _tree(self, text: str) -> str:
+        """The syntax tree of a query as JSON; `tree` keeps those of the last queries."""
         with self._lock:
-            found = self._trees.get(text)
-            if found is None:
-                ((found,),) = cursor.execute(_TREE, [text]).fetchall()
-                if len(found) <= _MAX_TREE:
-                    self._trees[text] = found
-                if len(self._trees) > _MAX_TREES:
-                    del self._trees[next(iter(self._trees))]
-            return found
+            base = next(iter(self._bases.values()))
+            ((found,),) = base.cursor().execute(_TREE, [text]).fetchall()
+        return str(found)
 
     def reject(self, damaged: DamagedTableError) -> None:
         """Drop a damaged table; the next query makes it again."""
@@ -251,11 +243,13 @@ class SqlConnection:
 
     def register(self, content: StoreContent) -> None:
         """Register the views that were named so far, if they are not those of this content."""
+        from hybridlog.sql.source import TopicDataset
+
         known = set() if content is not self._content else self._registered
         for name in self._names - known:
             topic = content.names.topic(name)
             if topic is not None:
-                source: Any = source_of(content.view(topic), lambda: self.reading)
+                source: Any = TopicDataset(content.view(topic), lambda: self.reading)
             elif name in TABLES:
                 source = store_table(name, content)
             else:
@@ -267,8 +261,7 @@ class SqlConnection:
         if self._has_own:
             return EVERYTHING
         text = statement.query.strip().rstrip(";")
-        tree = self.engine.tree(self.cursor, text)
-        return usage_of(tree, {name.casefold() for name in self._names})
+        return usage_of(self.engine.tree(text), {name.casefold() for name in self._names})
 
     def close(self) -> None:
         """Close the connection."""
@@ -406,17 +399,16 @@ class SqlAnswer:
 
     def _batches(self, size: int, limit: int | None) -> Iterator[pa.RecordBatch]:
         """The answer in batches of so many rows, up to a limit."""
-        worker = self._worker()
-        try:
+        import pyarrow as pa
+
+        with closing(self._worker()) as worker:
             reader, batch = self._tried(lambda: worker.run(partial(self._stream, size, limit)))
             if batch is None:
-                yield _empty(reader.schema)
+                yield pa.RecordBatch.from_pylist([], schema=reader.schema)
             while batch is not None:
                 yield batch
                 with self._explained():
                     batch = worker.run(partial(next, reader, None))
-        finally:
-            worker.close()
 
     def to_pandas(self) -> pd.DataFrame:
         """The whole answer as a pandas frame.
@@ -473,11 +465,8 @@ class SqlAnswer:
             raise TopicError(f"There is no view {found[1]!r}; {hint}") from error
 
     def _computed(self, call: Callable[[], _T]) -> _T:
-        worker = self._worker()
-        try:
+        with closing(self._worker()) as worker:
             return self._tried(lambda: worker.run(call))
-        finally:
-            worker.close()
 
     def _tried(self, call: Callable[[], _T]) -> _T:
         """The result of a call; repeated when a table was damaged or files were replaced."""
@@ -516,10 +505,3 @@ def _kind(statement: Any) -> str:
         return str(statement.type.name)
     except ValueError:
         return ""
-
-
-def _empty(schema: pa.Schema) -> pa.RecordBatch:
-    import pyarrow as pa
-
-    arrays = [pa.nulls(0, field.type) for field in schema]
-    return pa.RecordBatch.from_arrays(arrays, schema=schema)

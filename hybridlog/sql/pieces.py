@@ -201,17 +201,11 @@ class TopicOfRecording:
 
     def first_points(self) -> Any:
         """Type of the points of the first clouds that can be read; None of other messages."""
-        channels = {i: one for i, one in self.channels.items() if is_cloud(one.channel)}
-        for (segment, number), place in self.places.items():
-            if place.is_expired or channels.keys().isdisjoint(place.channels):
-                continue
-            with suppress(StoreError):
-                batch = self.chunk(segment, number, ScanCounts()).batch
-                index = next(one for one in place.channels if one in channels)
-                own = batch.take(np.flatnonzero(batch.channel == index))
-                codec = channels[index].codec
-                decoded = codec.columns(own.buffer, own.offset, own.length, NEEDED)
-                return PointColumns().points(decoded.arrow()).type
+        if any(is_cloud(channel.channel) for channel in self.channels.values()):
+            for source in (one for one in self.sources if one.has_points):
+                with suppress(StoreError):
+                    for rows in source.read((), {POINTS}, ScanCounts()):
+                        return rows.own[POINTS].type
         return None
 
     def chunk_rows(self, segment: int, number: int) -> _ChunkRows:

@@ -18,10 +18,11 @@ if TYPE_CHECKING:
     from hybridlog.query.query import Query
     from hybridlog.query.question import Span
     from hybridlog.store import Store
-    from hybridlog.view.context import Context
-    from hybridlog.view.params import RequestParams
+    from hybridlog.view.context import Context, RequestParams
     from hybridlog_storage.catalog import RecordingEntry
 
+MAX_TOPICS: Final = 200
+"""Greatest number of topics that are named; without any, all are meant."""
 _EVERY_TOPIC: Final = "**"
 _NO_NAME: Final = re.compile(r"[^\w.+-]+")
 
@@ -63,7 +64,7 @@ class PageQuestion:
         return query
 
     def told(self) -> dict[str, Any]:
-        """The number of its messages, losses and remarks, its command line and its program."""
+        """The number of its messages, losses and remarks, its command line, file and program."""
         query = self.query()
         count = query.count()
         found = query.completeness()
@@ -73,6 +74,7 @@ class PageQuestion:
             "remarks": query.remarks(),
             "python": self.python(),
             "command": self.command(),
+            "name": self.file_name(),
         }
 
     def around(self, distance: str) -> PageQuestion:
@@ -153,23 +155,22 @@ def _topic_of(where: str) -> str | None:
 
 
 def question_of(context: Context, params: RequestParams) -> PageQuestion:
-    """The question of a request about one topic.
+    """The question of a request, about all times.
 
     Args:
         context: The context.
-        params: Has `recording`, `topic`, `where` and `within`.
+        params: Has `recording`, `topic`, repeated, `where` and `within`.
 
     Raises:
         TopicError: There is no such recording or topic.
         UsageError: A parameter is missing or too long.
     """
     recording = context.recording(params)
-    topic = params.text("topic")
-    context.query(recording, topic)
+    topics = tuple(dict.fromkeys(params.texts("topic", most=MAX_TOPICS)))
+    context.query(recording, *topics)
     where = params.text("where", "", longest=MAX_TEXT).strip()
-    return PageQuestion(
-        context.store, recording, (topic,), where, params.text("within", "", longest=64), None
-    )
+    within = params.text("within", "", longest=64)
+    return PageQuestion(context.store, recording, topics, where, within, None)
 
 
 def program(store: Store, body: str) -> str:

@@ -1,34 +1,34 @@
-"""Answers for programs that ask by tools: plain values and pictures, in bounds.
+"""Tools for programs that ask: answers of plain values and pictures, in bounds.
 
 They are worked out in the process for SQL, whose memory is limited. Names and texts in them
-are data of the robot.
+are data of the robot. The docstrings and types of `TOOLS` are what a program sees.
 """
 
 from __future__ import annotations
 
 import json
 from contextlib import closing, suppress
-from dataclasses import dataclass
 from itertools import chain, islice
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple
+
+from pydantic import Field
 
 from hybridlog.arrays.message_arrays import IMAGES, plain_type
+from hybridlog.drawing.images import Picture, picture
 from hybridlog.query.answers.completeness import coverage
 from hybridlog.query.answers.infer_fields import infer_fields
 from hybridlog.query.answers.match_times import match_times
 from hybridlog.query.asked import field_types
 from hybridlog.query.counters import Counters
+from hybridlog.query.predicate.tokens import MAX_TEXT
 from hybridlog.query.times import format_duration, format_time
 from hybridlog.record.losses import losses_of
 from hybridlog.schema.text import without_nan
-from hybridlog.view.context import SQL_MEMORY
+from hybridlog.view.context import SQL_MEMORY, Context
 from hybridlog_storage.errors import PayloadError, TimeError, TopicError, UsageError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from hybridlog.query.query import Query
-    from hybridlog.view.context import Context
 
 MAX_ROWS: Final = 200
 """Rows of an answer."""
@@ -41,13 +41,6 @@ MAX_PICTURE_BYTES: Final = 2 << 20
 _PLOT: Final = (1000, 320)
 
 
-class Picture(NamedTuple):
-    """A picture of an answer: its media type and its file."""
-
-    media_type: str
-    data: bytes
-
-
 class Answer(NamedTuple):
     """An answer: JSON text and pictures."""
 
@@ -55,42 +48,33 @@ class Answer(NamedTuple):
     pictures: tuple[Picture, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class ToolQuestion:
-    """The messages of a topic that are asked about.
+Name = Annotated[str, Field(max_length=500)]
+Topic = Annotated[str, Field(max_length=500, description="Full or short name, such as scan")]
+Where = Annotated[str, Field(max_length=MAX_TEXT, description="A predicate")]
+Time = Annotated[str, Field(max_length=100)]
+Fields = Annotated[list[Name], Field(max_length=50, description="Paths of fields")]
 
-    Attributes:
-        topic: Its name, full or short.
-        recording: Name or id of a recording, or a glob; None for all.
-        where: A predicate; None for all messages.
-        within: Greatest distance in time of conditions on other topics.
-        begin: First log time; None for the beginning.
-        end: Log time after the last one; None for the end.
+
+def _query(
+    context: Context,
+    topic: str,
+    recording: str | None,
+    times: tuple[str | None, str | None],
+    *,
+    where: str | None = None,
+    within: str | None = None,
+) -> Query:
+    query = context.store.recordings(recording).topic(topic)
+    if times != (None, None):
+        query = query.between(*times)
+    return query if where is None else query.where(where, within=within)
+
+
+def recordings(context: Context, *, name: Name | None = None) -> Answer:
+    """List recordings, the latest first: name, times, messages, completeness.
+
+    `name` is a name, an id or a glob such as monday*.
     """
-
-    topic: str
-    recording: str | None = None
-    where: str | None = None
-    within: str | None = None
-    begin: str | None = None
-    end: str | None = None
-
-    def query(self, context: Context) -> Query:
-        """The question.
-
-        Raises:
-            TopicError: There is no such recording or topic.
-            WhereError: The predicate cannot be parsed, or does not fit.
-            TimeError: The range is none.
-        """
-        query = context.store.recordings(self.recording).topic(self.topic)
-        if self.begin is not None or self.end is not None:
-            query = query.between(self.begin, self.end)
-        return query if self.where is None else query.where(self.where, within=self.within)
-
-
-def recordings(context: Context, name: str | None) -> Answer:
-    """The latest recordings, and how complete they are."""
     chosen = context.store.recordings(name)
     found = chosen[-MAX_ROWS:]
     rows = [
@@ -109,8 +93,10 @@ def recordings(context: Context, name: str | None) -> Answer:
     return _answer({"recordings": rows}, "recordings", is_cut=len(chosen) > len(found))
 
 
-def schema(context: Context, topic: str | None, recording: str | None) -> Answer:
-    """The topics of recordings with their types, or the fields of one topic."""
+def schema(
+    context: Context, *, topic: Topic | None = None, recording: Name | None = None
+) -> Answer:
+    """List the topics with their types, or the fields of one topic with theirs."""
     chosen = context.store.recordings(recording).check()
     if topic is None:
         found = chosen[-MAX_ROWS:]
@@ -132,17 +118,33 @@ def schema(context: Context, topic: str | None, recording: str | None) -> Answer
     return _answer({**values, "fields": fields[:MAX_ROWS]}, "fields", is_cut=len(fields) > MAX_ROWS)
 
 
-def ask(context: Context, question: ToolQuestion, at_least: str | None) -> Answer:
-    """The number of messages that satisfy a predicate, when it holds, and the first of them."""
-    query = question.query(context)
+def ask(
+    context: Context,
+    *,
+    topic: Topic,
+    where: Where | None = None,
+    within: Time | None = None,
+    at_least: Time | None = None,
+    recording: Name | None = None,
+    begin: Time | None = None,
+    end: Time | None = None,
+) -> Answer:
+    """Count the messages of a topic that satisfy a predicate, and say when it holds.
+
+    The predicate may have conditions on other topics, such as
+    `/odom: twist.twist.linear.x > 0.8`, then `within` (0.1s) is the greatest distance in
+    time. `at_least` (1s) leaves out shorter intervals.
+    """
+    query = _query(context, topic, recording, (begin, end), where=where, within=within)
     count = query.count()
     values: dict[str, Any] = {"count": count, **_lacks(query, count)}
     with suppress(TimeError):  # the range is outside all recordings
-        times = match_times(query.session, query.question, Counters())
-        values["first_times"] = [format_time(one) for one in islice(_each(times), 10)]
+        parts = match_times(query.session, query.question, Counters())
+        times = chain.from_iterable(part.log_time.tolist() for part in parts)
+        values["first_times"] = [*map(format_time, islice(times, 10))]
     rows = []
     is_cut = False
-    if question.where is not None and len(query.topics) == 1:
+    if where is not None and len(query.topics) == 1:
         held = query.intervals(at_least=at_least)
         values["interval_count"] = len(held)
         is_cut = len(held) > MAX_ROWS
@@ -159,15 +161,10 @@ def ask(context: Context, question: ToolQuestion, at_least: str | None) -> Answe
     return _answer({**values, "intervals": rows}, "intervals", is_cut=is_cut)
 
 
-def _each(found: Any) -> Iterator[int]:
-    for part in found:
-        yield from part.log_time.tolist()
-
-
-def sql(context: Context, text: str, seconds: float) -> Answer:
-    """The first rows of a query in SQL."""
+def sql(context: Context, *, query: Annotated[str, Field(max_length=MAX_TEXT)]) -> Answer:
+    """Ask in SQL (DuckDB) on views of topics; only queries, and no files."""
     with closing(context.store.sql_engine.connect(SQL_MEMORY, only_reads=True)) as connection:
-        answer = connection.query(text, timeout=seconds)
+        answer = connection.query(query)
         table, is_cut = answer.first(MAX_ROWS, MAX_BYTES)
         try:
             values = [one.to_pylist(maps_as_pydicts="strict") for one in table.columns]
@@ -181,21 +178,23 @@ def sql(context: Context, text: str, seconds: float) -> Answer:
 
 
 def fetch(
-    context: Context, question: ToolQuestion, fields: list[str], most: int, pictures: int
+    context: Context,
+    *,
+    topic: Topic,
+    where: Where | None = None,
+    within: Time | None = None,
+    recording: Name | None = None,
+    begin: Time | None = None,
+    end: Time | None = None,
+    fields: Fields | None = None,
+    limit: Annotated[int, Field(ge=1, le=MAX_MESSAGES)] = 5,
+    pictures: Annotated[int, Field(ge=0, le=MAX_PICTURES)] = 0,
 ) -> Answer:
-    """Some messages with their fields, long arrays as summaries, and pictures of images.
-
-    Args:
-        context: The store.
-        question: The messages.
-        fields: Paths of the fields wanted; all without.
-        most: Greatest number of messages.
-        pictures: Greatest number of pictures.
-    """
-    query = question.query(context)
+    """Fetch a few messages, and at most so many pictures of images and video."""
+    query = _query(context, topic, recording, (begin, end), where=where, within=within)
     if fields:
         query = query.fields(*fields)
-    limited = query.limit(min(most, MAX_MESSAGES))
+    limited = query.limit(limit)
     rows: list[Any] = []
     shown: list[Picture] = []
     problems: list[str] = []
@@ -223,20 +222,25 @@ def fetch(
 
 
 def _picture(message: Any) -> Picture:
-    from hybridlog.drawing.images import picture
-
     found = picture(message, raw=False, form="jpg")
     if len(found.data) > MAX_PICTURE_BYTES:
         raise PayloadError(f"a picture of {len(found.data)} bytes is too large for an answer")
-    return Picture(found.media_type, found.data)
+    return found
 
 
-def plot(context: Context, question: ToolQuestion, fields: list[str]) -> Answer:
-    """Fields over time as a picture."""
-    from hybridlog.drawing.figure import figure
-    from hybridlog.drawing.lines import lines
+def plot(
+    context: Context,
+    *,
+    topic: Topic,
+    fields: Fields,
+    recording: Name | None = None,
+    begin: Time | None = None,
+    end: Time | None = None,
+) -> Answer:
+    """Draw fields of a topic over time as a picture."""
+    from hybridlog.drawing.figure import figure, lines
 
-    query = question.query(context)
+    query = _query(context, topic, recording, (begin, end))
     found = lines(query, fields, pixels=_PLOT[0])
     if not found:
         raise TopicError("There is no message to draw.")
@@ -245,7 +249,7 @@ def plot(context: Context, question: ToolQuestion, fields: list[str]) -> Answer:
     return _answer(
         {**lacks, "lines": [f"{one.topic} {one.series.field} in {one.recording}" for one in found]},
         "lines",
-        (Picture("image/png", drawn),),
+        (Picture("image/png", ".png", drawn),),
     )
 
 
@@ -270,3 +274,6 @@ def _answer(
         if len(values[rows]) < 2:
             raise PayloadError("a row is too large for an answer: name fewer columns or fields")
         values[rows], is_cut = values[rows][: len(values[rows]) // 2], True
+
+
+TOOLS: Final = (recordings, schema, ask, sql, fetch, plot)

@@ -1,4 +1,4 @@
-"""How regularly topics came, against other readers, numpy and rosbag-doctor."""
+"""How regularly topics came, against other readers and numpy."""
 
 from __future__ import annotations
 
@@ -85,26 +85,6 @@ def test_topics_of_real_logs(name: str, tmp_path: Path) -> None:
                 assert not one.messages
     badness = [one.silent_periods for one in found]
     assert badness == sorted(badness, reverse=True)
-
-
-@needs_data
-@pytest.mark.parametrize("name", ["auv_ros2.mcap", "ouster.mcap"])
-def test_rosbag_doctor_finds_the_same(name: str, tmp_path: Path) -> None:
-    doctor = pytest.importorskip("rosbag_doctor.doctor", reason="NOT run: pip install -e .[dev]")
-    log = DATA / "real" / name
-    with recorded(log, tmp_path) as store:
-        ours = {
-            one.topic: (one.messages, one.rate_hz, one.late_ns, one.early_ns, one.gap_ns or None)
-            for one in store.check()
-            if one.messages
-        }
-    for other in doctor.inspect_bag(log).topics:
-        if other.count:
-            ms = (other.start_delay_ms, other.end_early_ms, other.max_gap_ms)
-            ns = [None if one is None else one * MS for one in ms]
-            wanted = (other.count, other.effective_rate_hz, *ns)
-            assert ours.pop(other.name) == pytest.approx(wanted), other.name
-    assert not ours
 
 
 def test_the_worst_topic_comes_first_and_silent_topics_before_all(tmp_path: Path) -> None:

@@ -18,9 +18,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import hybridlog as hl
-from hybridlog.drawing.density import gaps as silent
-from hybridlog.drawing.density import periods as periods_of
 from hybridlog.drawing.series import series
+from hybridlog.drawing.times import gaps as silent
+from hybridlog.drawing.times import lane_of
 from hybridlog.query import periods
 from hybridlog.query.answers.field_statistics import _Running
 from hybridlog_storage.errors import TimeError, TopicError, UsageError
@@ -161,7 +161,7 @@ def test_bursts_are_no_gaps(tmp_path: Path) -> None:
         for pixels in (20_000, 1000, 200):
             (line,) = series(query, ["v"], pixels=pixels)
             assert int(np.isnan(line.least).sum()) == 1, pixels
-        (period,) = periods_of(store.session, store.entry("a"), ["/burst"])
+        period = lane_of(store.session, store.entry("a"), "/burst").period()
         assert period == 97 * MS
         edges = np.linspace(span[0], span[1], 5000).astype(np.int64)
         counts = np.histogram(times, edges)[0]

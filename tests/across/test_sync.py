@@ -295,20 +295,6 @@ def test_a_data_loader_reads_shuffled_batches(logs: Logs, way: str) -> None:
     np.testing.assert_array_equal(collated(synced[:3]), want[:3])
 
 
-def test_a_pickled_set_outlives_the_store(logs: Logs) -> None:
-    synced = logs.store.sync(["base", "left/pose"], tolerance="30ms")
-    again: Synced = pickle.loads(pickle.dumps(synced))
-    assert (len(again), again.topics, again.recordings) == (
-        len(synced),
-        synced.topics,
-        synced.recordings,
-    )
-    np.testing.assert_array_equal(again.times, synced.times)
-    assert numbers(again, 2) == numbers(synced, 2)
-    # Sizes of what is pickled are those of the arrays.
-    assert len(pickle.dumps(synced)) < 200 * len(synced) + 5000
-
-
 def test_what_is_refused(logs: Logs) -> None:
     store = logs.store
     with pytest.raises(UsageError, match="two topics or more"):

@@ -12,7 +12,7 @@ import pytest
 import hybridlog as hl
 from hybridlog.cli import watching
 from hybridlog.cli.signals import Stopped
-from hybridlog.drawing.density import density, evenly
+from hybridlog.drawing.times import evenly, lane_of
 from hybridlog.schema.states import CAUSES, State, without_payload
 from hybridlog.view.context import Context
 from hybridlog.view.tools import recordings
@@ -88,7 +88,7 @@ def test_payloads_that_were_not_copied_yet_were_not_deleted(
         with pytest.raises(PayloadError, match=f"its payload was {re.escape(why)}"):
             _ = first.raw
         assert told in str(query.completeness())
-        assert why in recordings(Context(store), None).text
+        assert why in recordings(Context(store)).text
         found = store.sql("select distinct state from cloud where state <> 'whole'")
         assert found.to_arrow()["state"].to_pylist() == [state]
     arrays = answer("sql", "select sum(len(data)) from cloud", store=lab)
@@ -128,8 +128,8 @@ def _told(path: Path) -> Counter[State]:
         (one,) = store.summaries()
         assert one.span is not None
         span = one.span[0], one.span[1] + 1
-        drawn = density(store.session, store.entry(one.id), evenly(span, 8), ["/cloud"])
-        assert drawn.counts.sum() == found.total()
+        lane = lane_of(store.session, store.entry(one.id), "/cloud")
+        assert lane.counts(evenly(span, 8)).sum() == found.total()
         (listed,) = answer("ls", "--json", store=path).json
         assert (listed["expired"], listed["not_copied"]) == (one.expired, one.not_copied)
     raw = answer("fetch", "cloud", "-o", path.with_suffix(".mcap"), "--force", store=path).err

@@ -15,7 +15,7 @@ from mcap.writer import Writer
 from numpy.typing import NDArray
 
 import hybridlog as hl
-from hybridlog.drawing.density import aligned, density, evenly, periods
+from hybridlog.drawing.times import aligned, evenly, lane_of
 from hybridlog.query.planner import Planner
 from hybridlog_storage.catalog import RecordingEntry
 from hybridlog_storage.errors import TopicError
@@ -87,39 +87,32 @@ SPANS = st.tuples(
 def test_pixels_have_what_queries_count(
     store: hl.Store, span: tuple[int, int], pixels: int, number: int
 ) -> None:
-    found = density(store.session, store.entry("a"), evenly(span, pixels))
-    assert found.topics == tuple(sorted(TIMES))
-    assert (found.edges[0], found.edges[-1], len(found.edges)) == (*span, pixels + 1)
-    assert np.ptp(np.diff(found.edges)) <= 1
-    assert found.exact.all()
-    for topic, counts in zip(found.topics, found.counts, strict=True):
-        assert (counts == _truth(topic, found.edges)).all()
-    begin, end = found.edges[number % pixels : number % pixels + 2].tolist()
+    edges = evenly(span, pixels)
+    assert (edges[0], edges[-1], len(edges)) == (*span, pixels + 1)
+    assert np.ptp(np.diff(edges)) <= 1
+    lanes = {topic: lane_of(store.session, store.entry("a"), topic) for topic in TIMES}
+    for topic, lane in lanes.items():
+        assert lane.exact
+        assert (lane.counts(edges) == _truth(topic, edges)).all()
+    begin, end = edges[number % pixels : number % pixels + 2].tolist()
     if begin < end and begin < BASE + LENGTH and end > BASE:  # queries refuse other times
         for topic in ("/steady", "/late"):
-            pixel = found.counts[found.topics.index(topic), number % pixels]
+            pixel = lanes[topic].counts(edges)[number % pixels]
             assert pixel == store.topic(topic).between(begin, end).count()
 
 
-@given(st.lists(st.tuples(SPANS, st.sampled_from([1, 9, 250, 2000])), min_size=1, max_size=6))
+@given(span=SPANS, pixels=st.sampled_from([1, 9, 250, 2000]))
 @settings(max_examples=40)
-def test_zooming_and_panning_change_nothing(
-    store: hl.Store, views: list[tuple[tuple[int, int], int]]
-) -> None:
-    for span, pixels in views:
-        found = density(
-            store.session, store.entry("a"), aligned(span, pixels), ["/late", "/steady"]
-        )
-        widths = np.diff(found.edges)
-        assert found.edges[0] <= span[0] < found.edges[1]
-        assert found.edges[-2] < span[1] <= found.edges[-1]
-        assert len(widths) <= pixels + 1
-        assert widths[0] == 1 or (span[1] - span[0]) / widths[0] > pixels / 2
-        assert (widths == widths[0]).all()
-        assert widths[0] & (widths[0] - 1) == 0
-        assert found.edges[0] % widths[0] == 0
-        for row, topic in enumerate(("/late", "/steady")):
-            assert (found.counts[row] == _truth(topic, found.edges)).all()
+def test_zooming_and_panning_change_nothing(span: tuple[int, int], pixels: int) -> None:
+    edges = aligned(span, pixels)
+    widths = np.diff(edges)
+    assert edges[0] <= span[0] < edges[1]
+    assert edges[-2] < span[1] <= edges[-1]
+    assert len(widths) <= pixels + 1
+    assert widths[0] == 1 or (span[1] - span[0]) / widths[0] > pixels / 2
+    assert (widths == widths[0]).all()
+    assert widths[0] & (widths[0] - 1) == 0
+    assert edges[0] % widths[0] == 0
 
 
 def test_a_picture_reads_its_topics_once_and_no_payload(store: hl.Store, calls: Calls) -> None:
@@ -127,30 +120,28 @@ def test_a_picture_reads_its_topics_once_and_no_payload(store: hl.Store, calls: 
     calls.fail(SegmentReader, "read_chunk", AssertionError("a payload was read"))
     asked = calls(Planner, "parts")
     for span in ((BASE, BASE + LENGTH), (BASE + 100 * MS, BASE + 120 * MS)):
-        density(store.session, store.entry("a"), aligned(span, 100), ["/steady", "/rare"])
-        periods(store.session, store.entry("a"), ["/steady"])
+        for topic in ("/steady", "/rare"):
+            lane_of(store.session, store.entry("a"), topic).counts(aligned(span, 100))
     assert len(asked) == 2
 
 
 def test_usual_periods(store: hl.Store) -> None:
     """Of messages in chunks of many, and in chunks of their own."""
-    topics = ["/steady", "/large", "/one"]
-    steady, large, one = periods(store.session, store.entry("a"), topics)
+    entry, topics = store.entry("a"), ("/steady", "/large", "/one")
+    steady, large, one = (lane_of(store.session, entry, topic).period() for topic in topics)
     steps = np.diff(np.sort(TIMES["/steady"]))
     assert steady == pytest.approx(np.quantile(steps, 0.9), rel=0.02)
     assert (large, one) == (100 * MS, 0)
 
 
 def test_too_many_messages_are_estimated(store: hl.Store) -> None:
-    span = BASE - 10 * MS, BASE + LENGTH + 10 * MS
-    exact = density(store.session, store.entry("a"), evenly(span, 400))
-    found = density(store.session, store.entry("a"), evenly(span, 400), max_times=1999)
-    right = dict(zip(found.topics, found.exact.tolist(), strict=True))
-    assert [topic for topic, is_right in right.items() if not is_right] == ["/steady"]
-    assert (found.counts[found.exact] == exact.counts[found.exact]).all()
-    assert (found.counts.sum(axis=1) == exact.counts.sum(axis=1)).all()
-    steady = found.topics.index("/steady")
-    assert np.abs(found.counts[steady] - exact.counts[steady]).max() <= 2
+    edges = evenly((BASE - 10 * MS, BASE + LENGTH + 10 * MS), 400)
+    for topic, times in TIMES.items():
+        lane = lane_of(store.session, store.entry("a"), topic, max_times=1999)
+        assert lane.exact == (topic != "/steady")
+        found = lane.counts(edges)
+        assert found.sum() == len(times)
+        assert np.abs(found - _truth(topic, edges)).max() <= (0 if lane.exact else 2)
 
 
 def test_damaged_message_indexes(store: hl.Store, tmp_path: Path) -> None:
@@ -167,12 +158,11 @@ def test_damaged_message_indexes(store: hl.Store, tmp_path: Path) -> None:
         for place in (int(chunk["offset"]) + 60, int(chunk["offset"] + chunk["length"]) + 20):
             content[place] ^= 0xFF
         path.write_bytes(content)
-        found = density(damaged.session, entry, evenly((BASE, BASE + LENGTH), 500))
-        steady = found.topics.index("/steady")
-        assert not found.exact[steady]
-        assert found.counts[steady].sum() == len(TIMES["/steady"])
-        wrong = found.counts[steady] != _truth("/steady", found.edges)
-        begin, end = (np.searchsorted(found.edges, int(chunk[n])) for n in ("first", "last"))
+        lane, edges = lane_of(damaged.session, entry, "/steady"), evenly((BASE, BASE + LENGTH), 500)
+        assert not lane.exact
+        assert lane.counts(edges).sum() == len(TIMES["/steady"])
+        wrong = lane.counts(edges) != _truth("/steady", edges)
+        begin, end = (np.searchsorted(edges, int(chunk[n])) for n in ("first", "last"))
         assert not wrong[: begin - 1].any()
         assert not wrong[end + 1 :].any()
 
@@ -190,13 +180,14 @@ def test_a_recording_that_goes_on(tmp_path: Path) -> None:
         hl.open(tmp_path / "store") as store,
     ):
         with pytest.raises(TopicError, match="'/a'"):
-            density(store.session, store.entry("live"), aligned(span, 10), ["/a"])
+            lane_of(store.session, store.entry("live"), "/a")
 
         def live() -> RecordingEntry:
             return store.entry("live")
 
         def ask() -> NDArray[np.int64]:
-            return density(store.session, live(), aligned(span, 1000), ["/a", "/b"]).counts
+            lanes = (lane_of(store.session, live(), topic) for topic in ("/a", "/b"))
+            return np.stack([lane.counts(aligned(span, 1000)) for lane in lanes])
 
         written = 0
         for channel, messages in ((A, 100), (B, 60), (A, 1500)):
@@ -213,8 +204,6 @@ def test_a_recording_that_goes_on(tmp_path: Path) -> None:
         assert found[1][50:80].tolist() == [2] * 30
         assert live().flushed
         assert live().digests
-        plain = density(store.session, live(), evenly(span, 1000), ["/a", "/b"])
-        assert (plain.counts == found).all()
         recording.close()
         assert store.entry("live").status == "complete"
         assert (ask() == found).all()

@@ -7,7 +7,7 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from hybridlog.drawing.matches import Match, Matches
+from hybridlog.drawing.times import Match, Matches
 from hybridlog.query.answers.match_times import match_times
 from hybridlog_storage.errors import ResourceError, UsageError
 from tests.limits import Limit

@@ -11,8 +11,7 @@ import pytest
 from PIL import Image
 
 from hybridlog.cli.sparkline import bar, densities, sparkline
-from hybridlog.drawing.figure import figure
-from hybridlog.drawing.lines import MAX_LINES, Line, lines
+from hybridlog.drawing.figure import MAX_LINES, Line, figure, lines
 from hybridlog.drawing.series import Series
 from hybridlog.query.answers.lost import lost_parts
 from hybridlog.record.losses import Cause

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from hybridlog.drawing.series import _Grid, numbers_of, series
+from hybridlog.drawing.series import ShownRows, numbers_of, series
 from hybridlog_storage.errors import TopicError, UsageError
 
 from .conftest import BASE, MS, Drive
@@ -219,10 +219,10 @@ def test_questions_without_a_picture(drive: Drive) -> None:
     ],
 )
 def test_gaps_between_pixels(times: list[int], gaps: list[int]) -> None:
-    grid = _Grid(0, 10, 6)
+    rows = ShownRows((0, 60), 6, most=3)
     at = np.array(times)
-    grid.add(at, {"x": np.ones(len(at))})
-    (x,) = grid.series(["x"])
+    rows.add(at, {"x": np.ones(len(at))})
+    (x,) = rows.series(["x"])
     assert x.times[np.isnan(x.least)].tolist() == gaps
     firsts = {time // 10: time for time in reversed(times)}
     assert x.times[~np.isnan(x.least)].tolist() == sorted(firsts.values())

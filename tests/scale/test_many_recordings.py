@@ -14,7 +14,7 @@ import pytest
 from mcap.writer import Writer
 
 import hybridlog as hl
-from hybridlog.sql import topic_view
+from hybridlog.sql import plan
 from hybridlog_storage.catalog import CATALOG
 from tests.calls import Calls
 from tests.copies import bring
@@ -234,7 +234,7 @@ def test_a_question_after_a_change_keeps_what_was_read(stores: dict[int, Path]) 
 
 
 def test_sql_of_a_day_tests_groups_of_recordings(stores: dict[int, Path], calls: Calls) -> None:
-    made = calls(topic_view, "_within")
+    made = calls(plan, "_within")
     with hl.open(stores[MANY], mongo="none") as store:
         asked = f"select count(*) from pose where t >= {day(4)[0]} and t < {day(4)[1]}"
         cost = cost_of(store, lambda: store.sql(asked).rows())

@@ -32,7 +32,6 @@ from hybridlog_storage.errors import (
 )
 from hybridlog_storage.messages import Channel
 from tests import places
-from tests.limits import Limit
 from tests.sql.conftest import LARGE, SCANS, scan
 from tests.tables.logs import BASE, SECOND
 from tests.waiting import wait_for
@@ -258,25 +257,13 @@ def test_a_damaged_chunk_is_an_error(own: hl.Store) -> None:
         own.sql("select max(ranges[1]) from scan").rows()
 
 
-def test_a_query_is_parsed_once(
-    own: hl.Store, monkeypatch: pytest.MonkeyPatch, limit: Limit
-) -> None:
+def test_a_query_is_parsed_once(own: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:
     query = "select count(*) from scan where angle < 3"
     found = own.sql(query).rows()
-    trees = own.sql_engine._trees
-    assert len(trees) == 1
     monkeypatch.setattr(engine, "_TREE", "select 1 / 'no number'")
     assert own.sql(query).rows() == found
     with pytest.raises(duckdb.Error):
         own.sql(f"{query} and angle > 1")
-    monkeypatch.undo()
-    limit(sql_trees=2)
-    for most in range(5):
-        assert len(own.sql(f"select angle from scan limit {most}").rows()) == most
-    assert list(trees) == [f"select angle from scan limit {most}" for most in (3, 4)]
-    limit(sql_tree_size=10)
-    own.sql("select t from scan").rows()
-    assert len(trees) == 2
 
 
 def test_tables_with_arrays_answer_alike(own: hl.Store) -> None:

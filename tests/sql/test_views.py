@@ -184,16 +184,6 @@ def test_each_chunk_is_read_once(store: hl.Store) -> None:
     assert len(chunks) > 3
 
 
-def test_a_plain_dataset_answers_alike(
-    store: hl.Store, plain: duckdb.DuckDBPyConnection, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Without the class of DuckDB's that the package does not document."""
-    monkeypatch.setattr("hybridlog.sql.source.import_module", lambda _: None)
-    for predicate in PREDICATES.replace("\n", " | ").strip(" |").split(" | ")[::5]:
-        query = f"select t, seq from large where {predicate} order by all"
-        assert store.sql(query).rows() == plain.execute(query).fetchall(), predicate
-
-
 def test_plans_know_the_number_of_rows(store: hl.Store) -> None:
     ((_, plan),) = store.sql("explain select * from large").rows()
     assert f"~{LARGE + 40:,} row" in plan

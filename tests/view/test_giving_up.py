@@ -17,7 +17,7 @@ import hybridlog as hl
 from benchmarks.simulator.write import write_bag
 from hybridlog.view import context
 from hybridlog.view.loopback import Admission
-from hybridlog.view.routes import ask
+from hybridlog.view.routes import export
 from hybridlog.view.server import make_app
 from hybridlog_storage.cache import Kind
 from hybridlog_storage.messages import Channel
@@ -36,10 +36,9 @@ WHOLE = {"begin": 0, "end": 20 * S, "pixels": 100}
 SCAN = {"recording": "robot", "topic": "/base/scan"}
 NEAR = {**SCAN, "where": "ranges.min < 0.8"}
 QUESTIONS: dict[str, dict[str, Any]] = {
-    "ask": NEAR,
+    "ask": {**NEAR, "where": "ranges[7] < 0.8"},
     "matches": {**NEAR, **WHOLE},
     "match-list": {**NEAR, "at": 0},
-    "export-command": {**NEAR, "where": "ranges[7] < 0.8"},
     "series": {**SCAN, **WHOLE, "field": "ranges.min"},
     "track": {"recording": "robot", "topic": "/odom", "pixels": 100},
     "log": {"recording": "robot", "topic": "/rosout", "at": 0, "after": 9},
@@ -148,7 +147,7 @@ def running(tmp_path: Path) -> Iterator[hl.Store]:
 @pytest.mark.peer("browser")
 def test_updates_do_not_starve_a_question(running: hl.Store, page: Page, calls: Calls) -> None:
     """An answer that takes longer than the time from one update to the next comes, and again."""
-    calls(ask, "question_of", lambda *_: time.sleep(1.2))
+    calls(export, "question_of", lambda *_: time.sleep(1.2))
     page.set_default_timeout(60_000)
     while not running.summaries() or not running.entry("live").messages:
         time.sleep(0.1)

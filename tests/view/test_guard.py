@@ -320,7 +320,7 @@ USUAL = {
     "place": "3",
     "around": "/base/scan",
 }
-_READ = re.compile(r'asked\.[a-z]+\(\s*"(\w+)"')
+_READ = re.compile(r'params\.[a-z]+\(\s*"(\w+)"')
 
 
 def asked_by_routes() -> list[tuple[str, list[str]]]:
@@ -351,16 +351,6 @@ def test_absurd_parameters_break_nothing(door: Door, capfd: pytest.CaptureFixtur
         check(door, path, [])
         check(door, path, [(name, "1") for name in names] * 200)
     # What fails is told there.
-    assert capfd.readouterr().err == ""
-
-
-@pytest.mark.exhaustive
-def test_all_absurd_parameters_break_nothing(door: Door, capfd: pytest.CaptureFixture[str]) -> None:
-    for path, names in asked_by_routes():
-        for name in names:
-            for value in ABSURD:
-                check(door, path, list({**USUAL, name: value}.items()))
-                check(door, path, [*USUAL.items(), (name, value)])
     assert capfd.readouterr().err == ""
 
 

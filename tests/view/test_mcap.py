@@ -21,7 +21,6 @@ from hybridlog.formats.slices import cached_slice, payload_bytes, write_mcap
 from hybridlog.view.loopback import Admission
 from hybridlog.view.server import make_app
 from hybridlog_storage.errors import UsageError
-from hybridlog_storage.messages import Channel
 from tests.independent import Seen, read_bag, read_mcap
 from tests.limits import Limit
 from tests.view.conftest import PORT, TOKEN, served
@@ -155,17 +154,6 @@ def test_the_bytes_are_the_same_when_the_file_was_lost(app: TestClient, cache: P
     assert again.headers["etag"] == first.headers["etag"]
     other = app.get("slice.mcap?recording=robot&topic=/tf")
     assert other.headers["etag"] != first.headers["etag"]
-
-
-def test_more_messages_are_another_file(tmp_path: Path) -> None:
-    with hl.open(tmp_path / "store", create=True) as store:
-        files = []
-        for count in (1, 2):
-            with store.start(f"run {count}") as recording:
-                recording.write(Channel("/n", "json", None), b"{}", log_time=count)
-            files.append(cached_slice(store.topic("/n"), "run", write_mcap))
-            assert len(read_mcap(files[-1])) == count
-        assert files[0] != files[1]
 
 
 def test_a_data_loader_gets_what_the_manifest_says(

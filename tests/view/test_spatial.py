@@ -16,11 +16,10 @@ from PIL import Image
 import hybridlog as hl
 from hybridlog_storage.messages import Channel, Schema
 from tests.ros_values import ROS1
-from tests.view.conftest import Asking, opened, printed_by, served
+from tests.view.conftest import opened, printed_by, served
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
-    from starlette.testclient import TestClient
 
 S = 10**9
 BASE = 1_700_000_000 * S
@@ -81,34 +80,6 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
                 ):
                     recorder.write(channel, payload, log_time=BASE + at * S)
         yield opened
-
-
-@pytest.fixture(scope="module")
-def asked(store: hl.Store, asking: Asking) -> TestClient:
-    return asking(store)
-
-
-@pytest.mark.parametrize(
-    ("path", "change", "status"),
-    [
-        ("points", {"limit": 0}, 400),
-        ("points", {"limit": 500_001}, 400),
-        ("points", {"at": None}, 400),
-        ("points", {"topic": "/none"}, 404),
-        ("points", {"value": "x" * 1025}, 400),
-        ("track", {"begin": 0}, 400),
-        ("track", {"topic": "/scan"}, 400),
-        ("fix", {"topic": "/scan"}, 400),
-        ("fix", {"recording": "none"}, 404),
-    ],
-)
-def test_what_cannot_be_asked(
-    asked: TestClient, path: str, change: dict[str, Any], status: int
-) -> None:
-    parameters = {"recording": "yard", "topic": "/fix", "at": 0, "pixels": 10, **change}
-    response = asked.get(path, params={k: v for k, v in parameters.items() if v is not None})
-    assert response.status_code == status
-    assert response.json()["error"]
 
 
 @pytest.fixture(scope="module")

@@ -17,8 +17,6 @@ from hybridlog.query.query import Query
 from hybridlog_storage.errors import TimeError, TopicError
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from hybridlog.query.question import RecordedChannel
     from hybridlog_storage.messages import Batch, Channel
 
@@ -51,27 +49,6 @@ class Block:
     channels: Sequence[int]
 
 
-class Covered:
-    """Log time that recordings cover, also together.
-
-    Args:
-        begin: int64[n], ns.
-        end: int64[n], ns; not covered any more.
-    """
-
-    def __init__(self, begin: NDArray[np.int64], end: NDArray[np.int64]) -> None:
-        order = begin.argsort()
-        self._begin = begin[order]
-        self._end = np.maximum.accumulate(end[order])
-
-    def next(self, position: int) -> int:
-        """The next log time that is covered, ns; the same one if it is, or if no more is."""
-        row = int(np.searchsorted(self._begin, position, "right"))
-        if not row or position < self._end[row - 1] or row == len(self._begin):
-            return position
-        return int(self._begin[row])
-
-
 class PlayedLog:
     """The messages of a query, as a log that is played.
 
@@ -83,7 +60,6 @@ class PlayedLog:
             pressure are not among them.
         begin: First log time, ns.
         end: Last log time, ns.
-        covered: The log time of its recordings.
 
     Raises:
         TimeError: The range is outside of all recordings, or these have no messages.
@@ -101,7 +77,7 @@ class PlayedLog:
         params = Intervals.of((id_, times[row : row + 1]) for row, id_ in enumerate(spans))
         during = query.question.during
         self._during = params if during is None else during.common(params)
-        self.covered = Covered(times[:, 0], times[:, 1])
+        self._begin, self._end = times[:, 0], times[:, 1]
         self._ids: dict[tuple[str, int], int] = {}
         self._latching: set[str] = set()
         self.channels = self._merge(channels_of(query))
@@ -122,6 +98,12 @@ class PlayedLog:
             publishers = tuple(dict.fromkeys(name for name in names if name))
             merged.append(PlayedChannel(number, group[0].channel, publishers))
         return merged
+
+    def next_covered(self, position: int) -> int:
+        """The next log time that a recording covers, ns; the same one if it is, or no more is."""
+        is_covered = (self._begin <= position) & (position < self._end)
+        later = self._begin[self._begin > position]
+        return position if is_covered.any() or not len(later) else int(later.min())
 
     def after(self, topics: Collection[str], position: int) -> Iterator[Block]:
         """All messages of some topics behind a log time, ns, in order."""

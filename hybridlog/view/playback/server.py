@@ -430,7 +430,7 @@ class PlaybackServer:
             await self._broadcast(time_now(self._log.end))
             await self._broadcast_state()
             return
-        then = self._log.covered.next(self._sent)
+        then = self._log.next_covered(self._sent)
         if then > self._sent:
             self._sent = then - 1
             self._clock.set(then)

@@ -1,21 +1,16 @@
-"""Questions: predicates and SQL, their matches over time, and completion."""
+"""Matches of predicates over time, SQL, and completion."""
 
 from __future__ import annotations
 
 import threading
-from collections import defaultdict
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing, suppress
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any, Final, cast
+from typing import TYPE_CHECKING, Any, Final
 
-import numpy as np
-
-from hybridlog.drawing.matches import Match, Matches
+from hybridlog.drawing.times import Match, Matches
 from hybridlog.query.answers.infer_fields import infer_fields
-from hybridlog.query.answers.match_times import match_times
 from hybridlog.query.asked import field_types
-from hybridlog.query.intervals import Intervals
 from hybridlog.query.predicate.completion import complete
 from hybridlog.query.predicate.tokens import MAX_TEXT
 from hybridlog.query.topics import resolve
@@ -23,17 +18,14 @@ from hybridlog.view.context import SQL_MEMORY, Context, route, start_of
 from hybridlog.view.question import program, question_of
 from hybridlog_storage.errors import HybridlogError, TopicError
 from hybridlog_storage.stopping import held
-from hybridlog_storage.times import BEGIN, END, span_of
+from hybridlog_storage.times import END
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from numpy.typing import NDArray
-
-    from hybridlog.sql.topic_view import Remarks
-    from hybridlog.view.params import RequestParams
+    from hybridlog.sql.plan import Remarks
+    from hybridlog.view.context import RequestParams
     from hybridlog.view.question import PageQuestion
-    from hybridlog_storage.catalog import RecordingEntry
 
 MAX_LISTED: Final = 200
 """Greatest number of matches that are listed at once."""
@@ -43,16 +35,12 @@ SQL_ROWS: Final = 1000
 _SQL_BYTES: Final = 32 << 20
 SQL_COLUMNS: Final = 200
 _MAX_CANDIDATES: Final = 50
-
-
-def ask(context: Context, params: RequestParams) -> dict[str, Any]:
-    """The number of messages that satisfy a predicate, with losses and remarks."""
-    return question_of(context, params).told()
+_MICROSECOND: Final = 1000  # ns
 
 
 def matches(context: Context, params: RequestParams) -> dict[str, Any]:
     """The matches in a range by pixel, and the bands in which the predicate holds."""
-    question = question_of(context, params)
+    question = _question(context, params)
     start = start_of(question.recording)
     span, pixels = params.span(start), params.pixels()
     matching = _matches(context, question)
@@ -69,7 +57,7 @@ def matches(context: Context, params: RequestParams) -> dict[str, Any]:
 
 def match_list(context: Context, params: RequestParams) -> dict[str, Any]:
     """Some matches behind or in front of a place, and how many are in front of them."""
-    question = question_of(context, params)
+    question = _question(context, params)
     start = start_of(question.recording)
     place = Match(params.moment(start), params.integer("seq", -1, END, -1))
     count = params.integer("count", 1, MAX_LISTED, MAX_LISTED)
@@ -80,6 +68,12 @@ def match_list(context: Context, params: RequestParams) -> dict[str, Any]:
         "rows": [[str(one.time - start), one.seq] for one in found],
         "before": matching.count_before(found[0]) if found else None,
     }
+
+
+def _question(context: Context, params: RequestParams) -> PageQuestion:
+    """A question about one topic."""
+    params.text("topic")
+    return question_of(context, params)
 
 
 def _matches(context: Context, question: PageQuestion) -> Matches:
@@ -157,65 +151,28 @@ def sql_answer(context: Context, text: str, seconds: float) -> dict[str, Any]:
 
 
 def _moments(
-    context: Context,
-    times: Sequence[range | None],
-    names: Sequence[str | None],
-    remarks: Remarks,
+    context: Context, times: Sequence[int | None], names: Sequence[str | None], read: Remarks
 ) -> tuple[list[str | None], list[str | None]]:
-    """The message of each row: time since the start of its recording, ns, as text, and its name.
+    """The time since the start of its recording, ns, as text, and the recording of each row.
 
-    It is the only one of the topics that were read at a time that the row may be of. Without a
-    column `recording`, the recording is known if a single one was read.
+    Without a column `recording`, the recording is known if a single one was read. A row that
+    lies in no recording has neither.
     """
-    if not times:
-        return [], []
-    read = [entry.name for entry in remarks.recordings.values()]
-    named = names or [read[0] if len(read) == 1 else None] * len(times)
-    found: list[str | None] = [None] * len(times)
+    known = [entry.name for entry in read.recordings.values()]
+    named = names or [known[0] if len(known) == 1 else None] * len(times)
+    entries = {}
     for name in {*named} - {None}:
-        rows = [n for n, one in enumerate(named) if one == name and times[n]]
-        spans = [cast("range", times[n]) for n in rows]
         with suppress(HybridlogError):  # there is no such recording, or it is damaged
-            entry = context.store.entry(str(name))
-            known = _messages_in(context, entry, remarks.topics, spans)
-            for n, time in zip(rows, known, strict=True):
-                found[n] = None if time is None else str(time - start_of(entry))
-    return found, [name if at else None for name, at in zip(named, found, strict=False)]
-
-
-def _messages_in(
-    context: Context, entry: RecordingEntry, topics: Collection[str], spans: Sequence[range]
-) -> list[int | None]:
-    """The log time of the only message of each of some topics in a span, ns; None for none.
-
-    None also if there are several, of one topic or at several times.
-    """
-    ends = [[min(max(time, BEGIN), END) for time in (one[0], one[-1])] for one in spans]
-    bounds = np.array([(*span_of(*pair), 0) for pair in ends], np.int64).reshape(-1, 3)
-    own = {channel.topic for channel in entry.channels}
-    query = context.store.query(sorted(own & {*topics} or own), [entry.id])
-    params = query.during(Intervals.of([(entry.id, bounds)]))
-    by_topic: dict[str, list[NDArray[np.int64]]] = defaultdict(list)
-    for found in match_times(params.session, params.question, params.counters):
-        by_topic[found.topic].append(found.log_time)
-    first, last = np.array(ends, np.int64).reshape(-1, 2).T
-    least, greatest = np.full(len(spans), END), np.full(len(spans), BEGIN)
-    is_one = np.ones(len(spans), np.bool_)
-    for parts in by_topic.values():
-        known = np.sort(np.concatenate(parts))
-        low, high = np.searchsorted(known, first), np.searchsorted(known, last, "right")
-        is_one &= high - low <= 1
-        there = high > low
-        least[there] = np.minimum(least[there], known[low[there]])
-        greatest[there] = np.maximum(greatest[there], known[low[there]])
-    is_one &= least == greatest
-    return [
-        time if one else None for time, one in zip(least.tolist(), is_one.tolist(), strict=True)
-    ]
+            entries[name] = context.store.entry(str(name))
+    found: list[str | None] = []
+    for time, name in zip(times, named, strict=True):
+        first, last = (name in entries and entries[name].span) or (0, -1)
+        is_inside = time is not None and first <= time < last + _MICROSECOND
+        found.append(str(min(time or 0, last) - first) if is_inside else None)
+    return found, [name if at else None for name, at in zip(named, found, strict=True)]
 
 
 routes = [
-    route("/ask", ask),
     route("/matches", matches),
     route("/match-list", match_list),
     route("/complete", completion),

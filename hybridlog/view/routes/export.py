@@ -1,27 +1,26 @@
-"""Parts of a recording as files, and the command lines that write the same."""
+"""Questions about a recording, and their messages as files."""
 
 from __future__ import annotations
 
 import asyncio
 import io
 from collections.abc import AsyncIterator, Generator
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import StreamingResponse
 
-from hybridlog.query.predicate.tokens import MAX_TEXT
 from hybridlog.view.context import Context, route, start_of
-from hybridlog.view.question import PageQuestion
+from hybridlog.view.question import question_of
 
 if TYPE_CHECKING:
     from starlette.responses import Response
 
     from hybridlog.query.query import Query
-    from hybridlog.view.params import RequestParams
+    from hybridlog.view.context import RequestParams
+    from hybridlog.view.question import PageQuestion
 
-MAX_TOPICS: Final = 200
-"""Greatest number of topics that are named; without any, all are meant."""
 PIECE: Final = 256 << 10
 """Least size of a piece that is sent, bytes."""
 MAX_STREAMS: Final = 4
@@ -31,10 +30,9 @@ Pieces: TypeAlias = "Generator[bytes, None, None]"
 _streams = asyncio.Semaphore(MAX_STREAMS)
 
 
-def command(context: Context, params: RequestParams) -> dict[str, Any]:
-    """The command line that writes a part of a recording, and how many messages it has."""
-    question = _question(context, params)
-    return {**question.told(), "name": question.file_name()}
+def ask(context: Context, params: RequestParams) -> dict[str, Any]:
+    """The number of messages, with losses and remarks; the command line and Python for them."""
+    return _question(context, params).told()
 
 
 def file(context: Context, params: RequestParams) -> Response:
@@ -69,15 +67,9 @@ async def _sent(piece: bytes, rest: Pieces) -> AsyncIterator[bytes]:
 
 
 def _question(context: Context, params: RequestParams) -> PageQuestion:
-    recording = context.recording(params)
-    topics = tuple(dict.fromkeys(params.texts("topic", most=MAX_TOPICS)))
-    context.query(recording, *topics)
-    span = None
+    question = question_of(context, params)
     if params.has("begin") or params.has("end"):
-        span = params.span(start_of(recording))
-    where = params.text("where", "", longest=MAX_TEXT).strip()
-    within = params.text("within", "", longest=64)
-    question = PageQuestion(context.store, recording, topics, where, within, span)
+        question = replace(question, span=params.span(start_of(question.recording)))
     return question.around(params.text("around", longest=64)) if params.has("around") else question
 
 
@@ -97,4 +89,4 @@ def pieces_of(query: Query) -> Pieces:
     yield written.getvalue()
 
 
-routes = [route("/export-command", command), route("/export", file)]
+routes = [route("/ask", ask), route("/export", file)]

@@ -19,7 +19,8 @@ from hybridlog.query.predicate.tokens import MAX_TEXT
 from hybridlog.query.times import format_time
 from hybridlog.schema.completion import with_nested
 from hybridlog.view.context import Context, route
-from hybridlog.view.routes.export import MAX_TOPICS, mcap_response
+from hybridlog.view.question import MAX_TOPICS
+from hybridlog.view.routes.export import mcap_response
 from hybridlog_storage.errors import TimeError, UsageError
 
 if TYPE_CHECKING:
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
 
     from hybridlog.query.query import Query
     from hybridlog.query.question import RecordedChannel
-    from hybridlog.view.params import RequestParams
+    from hybridlog.view.context import RequestParams
     from hybridlog_storage.messages import Schema
 
 MAX_RECORDINGS: Final = 100

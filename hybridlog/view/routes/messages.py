@@ -15,8 +15,7 @@ from hybridlog_storage.errors import DefinitionError, PayloadError, UsageError
 
 if TYPE_CHECKING:
     from hybridlog.query.query import Query
-    from hybridlog.view.context import Context
-    from hybridlog.view.params import RequestParams
+    from hybridlog.view.context import Context, RequestParams
 
 
 _PATH: Final = re.compile(r"(\d{1,9}(\.\d{1,9}){0,99})?", re.ASCII)

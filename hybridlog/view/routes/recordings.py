@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from itertools import islice
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from hybridlog.query.answers.lost import lost_parts
+from hybridlog.query.answers.marks import marks_in
 from hybridlog.query.choice import Choice
+from hybridlog.query.counters import Counters
 from hybridlog.record.losses import losses_of
 from hybridlog.schema.states import encoding_of, shown_channels
 from hybridlog.view.context import Context, extent, route, start_of
 
 if TYPE_CHECKING:
-    from hybridlog.view.params import RequestParams
+    from hybridlog.view.context import RequestParams
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.summary import RecordingSummary
 
+MAX_MARKS: Final = 10_000
+"""Marks of a recording that are shown, the first of them."""
 _MAX_ROWS: Final = 200
 _MAX_CONDITIONS: Final = 16
 _MAX_PARTS: Final = 64
@@ -79,7 +84,10 @@ def recording(context: Context, params: RequestParams) -> dict[str, Any]:
         "bytes": entry.stored_bytes,
         "tags": entry.tags,
         "notes": [note["text"] for note in entry.notes],
-        "marks": [_mark(mark, start) for mark in entry.marks],
+        "marks": [
+            {"at": one.begin - start, "end": (one.end or one.begin) - start, "text": one.text}
+            for one in islice(marks_in(context.store.session, [entry.id], Counters()), MAX_MARKS)
+        ],
         "losses": [_loss(loss, start) for loss in losses_of(entry)],
         "topics": _topics(entry, start),
     }
@@ -126,11 +134,6 @@ def _lost_parts(entry: RecordingEntry, begin: int, end: int) -> list[tuple[float
     is_lost = lost_parts(entry, (begin, end), _MAX_PARTS)
     edges = np.flatnonzero(np.diff(is_lost, prepend=False, append=False)) / _MAX_PARTS
     return [(low, high) for low, high in edges.reshape(-1, 2).tolist()]
-
-
-def _mark(mark: Mapping[str, Any], start: int) -> dict[str, Any]:
-    begin, end = mark["time"], mark.get("end", mark["time"])
-    return {"at": begin - start, "end": end - start, "text": mark["text"], "tags": mark["tags"]}
 
 
 def _loss(loss: Mapping[str, Any], start: int) -> dict[str, Any]:

@@ -19,8 +19,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from starlette.responses import Response
 
-    from hybridlog.view.context import Context
-    from hybridlog.view.params import RequestParams
+    from hybridlog.view.context import Context, RequestParams
 
 
 def image(context: Context, params: RequestParams) -> Response:

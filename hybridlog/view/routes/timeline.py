@@ -7,14 +7,11 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from hybridlog.drawing.density import aligned, density, gaps, periods
-from hybridlog.drawing.fields import fields_of
+from hybridlog.drawing.series import fields_of
 from hybridlog.drawing.series import series as read_series
+from hybridlog.drawing.times import aligned, gaps, lane_of
 from hybridlog.query.answers.infer_fields import SAMPLE
-from hybridlog.query.answers.marks import mark_topics
-from hybridlog.query.answers.marks import marks as marks_of
 from hybridlog.query.asked import field_types
-from hybridlog.query.counters import Counters
 from hybridlog.view.context import Context, extent, packed_response, route, start_of
 from hybridlog_storage.errors import UsageError
 
@@ -23,17 +20,13 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from starlette.responses import Response
 
-    from hybridlog.view.context import Context
-    from hybridlog.view.params import RequestParams
+    from hybridlog.view.context import Context, RequestParams
 
 
 MAX_LANES: Final = 64
 """Topics of one picture."""
 MAX_BINS: Final = 1 << 17
 """Topics times pixels of one picture."""
-MAX_MARKS: Final = 500
-"""Marks of one answer."""
-
 MAX_FIELDS: Final = 16
 """Most fields of one plot."""
 _GREATEST_EXACT: Final = 1 << 53
@@ -57,44 +50,21 @@ def timeline(context: Context, params: RequestParams) -> Response:
         raise UsageError(f"At most {MAX_BINS // max(len(topics), 1)} pixels for as many topics.")
     start = start_of(recording)
     span = params.span(start)
-    session = context.store.session
-    found = density(session, recording, aligned(span, pixels), topics)
-    usual = periods(session, recording, topics)
-    lanes = []
+    edges, lanes = aligned(span, pixels), []
     arrays: dict[str, NDArray[Any]] = {}
-    lanes_of = zip(found.counts, found.exact.tolist(), usual, strict=True)
-    for number, (counts, exact, period) in enumerate(lanes_of):
-        silent = gaps(*_within(counts, found.edges, extent(recording)), period)
-        lanes.append({"exact": exact, "period": period})
+    for number, topic in enumerate(topics):
+        lane = lane_of(context.store.session, recording, topic)
+        counts, period = lane.counts(edges), lane.period()
+        silent = gaps(*_within(counts, edges, extent(recording)), period)
+        lanes.append({"exact": lane.exact, "period": period})
         arrays |= {f"counts {number}": _small(counts), f"gaps {number}": silent.astype(np.uint32)}
     head = {
         "start": str(start),
-        "begin": int(found.edges[0]) - start,
-        "width": int(found.edges[1] - found.edges[0]),
+        "begin": int(edges[0]) - start,
+        "width": int(edges[1] - edges[0]),
         "lanes": lanes,
     }
     return packed_response(head, arrays)
-
-
-def marks(context: Context, params: RequestParams) -> dict[str, Any]:
-    """The first marks in a range, and how many more there are."""
-    recording = context.recording(params)
-    start = start_of(recording)
-    known = {channel.topic for channel in recording.channels}
-    topics = [one for one in mark_topics(context.store.session, [recording.id]) if one in known]
-    if not topics:
-        return {"marks": [], "more": 0}
-    begin, end = params.span(start)
-    first, last = recording.span or (start, start)
-    if begin > last or end <= first:
-        return {"marks": [], "more": 0}  # a query refuses such a range
-    query = context.query(recording, *topics).between(begin, end)
-    some = query.limit(MAX_MARKS)
-    found = [
-        {"at": one.begin - start, "end": (one.end or one.begin) - start, "text": one.text}
-        for one in marks_of(some.session, some.question, Counters())
-    ]
-    return {"marks": found, "more": max(query.count() - MAX_MARKS, 0)}
 
 
 def _within(
@@ -149,7 +119,6 @@ def _value(number: float) -> float | str:
 
 routes = [
     route("/timeline", timeline),
-    route("/marks", marks),
     route("/fields", fields),
     route("/series", series),
 ]

@@ -89,7 +89,7 @@ export function exportForm(recording) {
     };
     try {
       const ask = recording.isUpdating ? "update" : "ask";
-      const found = await asking[ask]("export-command", asked);
+      const found = await asking[ask]("ask", asked);
       told.textContent = found.lost ?? counted(found.count, "message");
       command.textContent = found.command;
       python = found.python;

@@ -1,6 +1,5 @@
 /** The timeline: a lane a topic with its messages by pixel, gaps, losses, marks and matches. */
 
-import { Question } from "./api.js";
 import { labelOf, stepOf, ticksOf } from "./axis.js";
 import { element, fill } from "./dom.js";
 import { countBetween, Lanes } from "./lanes.js";
@@ -17,7 +16,6 @@ const AXIS = 30;
 const MAX_SHOWN = 12; // lanes that are seen without scrolling
 const NARROW = matchMedia("(max-width: 40rem)");
 const DARK = matchMedia("(prefers-color-scheme: dark)");
-const MARKS = ["hybridlog.Mark", "foxglove.Event", "foxglove_msgs/Event", "foxglove_msgs/msg/Event"];
 const CLICK = 4; // pixels that a click may move
 
 /** Adds the timeline of a recording to an element. Returns a function that takes it away. */
@@ -42,7 +40,6 @@ export function mountTimeline(parent, recording) {
   section.append(corner, axis, scroller, tip);
   parent.append(section);
 
-  const asking = new Question();
   const lanes = new Lanes(recording, schedule);
   const colours = new Colours(section);
   const sizes = new ResizeObserver(schedule);
@@ -79,7 +76,6 @@ export function mountTimeline(parent, recording) {
     ends.forEach((end) => end());
     sizes.disconnect();
     lanes.destroy();
-    asking.stop();
     section.remove();
   };
 
@@ -93,19 +89,8 @@ export function mountTimeline(parent, recording) {
       one.style.setProperty("height", `${Math.min(topics.length, MAX_SHOWN) * height}px`);
     }
     names.style.setProperty("height", `${topics.length * height}px`);
-    readMarks();
+    marks = recording.info.marks;
     if (isNew) lanes.want(...wanted(), true);
-    schedule();
-  }
-
-  async function readMarks() {
-    if (!recording.info.topics.some(({ type }) => MARKS.includes(type))) {
-      marks = recording.info.marks;
-      return;
-    }
-    const { begin, end } = recording.info;
-    const asked = { recording: recording.info.id, begin, end };
-    marks = await asking.update("marks", asked).then((answer) => answer.marks, () => marks);
     schedule();
   }
 

@@ -1,8 +1,12 @@
-"""The matches of a predicate over time: ticks and bands by pixel, and a few of them in order."""
+"""Messages over time, by pixel, from sorted log times: counts, gaps, matches.
+
+The times of a topic are read once, and kept in the cache while there is room. No payload is read.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -10,8 +14,11 @@ import numpy as np
 
 from hybridlog.query.answers.interval_queries import IntervalQueries
 from hybridlog.query.answers.match_times import match_times
-from hybridlog_storage.errors import ResourceError, UsageError
-from hybridlog_storage.times import placed
+from hybridlog.query.counters import Counters
+from hybridlog.query.periods import GAP_PERIODS, usual_period
+from hybridlog.query.question import Question
+from hybridlog_storage.errors import ResourceError, SegmentError, TopicError, UsageError
+from hybridlog_storage.times import BEGIN, END, placed
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -19,6 +26,117 @@ if TYPE_CHECKING:
     from hybridlog.query.answers.match_times import MatchTimes
     from hybridlog.query.query import Query
     from hybridlog.query.question import Span
+    from hybridlog.session import Session
+    from hybridlog_storage.catalog import RecordingEntry
+
+
+MAX_TIMES: Final = 20_000_000
+"""As of `lane_of`, of a timeline."""
+_SAMPLED: Final = 100_000  # steps that tell the usual one
+_LATEST: Final = np.iinfo(np.int64).max
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Lane:
+    """The messages of a topic in a recording over time.
+
+    Attributes:
+        times: int64[n], log times, ns, sorted.
+        exact: False where they are estimates.
+    """
+
+    times: NDArray[np.int64]
+    exact: bool
+
+    def counts(self, edges: NDArray[np.int64]) -> NDArray[np.int64]:
+        """int64[p], messages with `edges[i] <= time < edges[i + 1]` of int64[p + 1], ns."""
+        return np.diff(np.searchsorted(self.times, edges))
+
+    def period(self) -> float:
+        """Usual time from one message to the next, ns; 0 where it is unknown."""
+        rows = np.arange(0, len(self.times) - 1, 1 + len(self.times) // _SAMPLED)
+        return usual_period(self.times[rows + 1] - self.times[rows])
+
+
+def evenly(span: tuple[int, int], pixels: int) -> NDArray[np.int64]:
+    """Edges of parts of a span, ns; the lengths of parts differ by one nanosecond at most."""
+    whole, rest = divmod(span[1] - span[0], pixels)
+    numbers = np.arange(pixels + 1, dtype=np.int64)
+    return np.int64(span[0]) + numbers * whole + numbers * rest // pixels
+
+
+def aligned(span: tuple[int, int], pixels: int) -> NDArray[np.int64]:
+    """Edges of bins of a power of two of nanoseconds from the epoch: a moved picture has the same.
+
+    They cover the span: more than half as many as pixels, unless a bin is one nanosecond, and one
+    more than pixels at most.
+    """
+    level = max(-(-(span[1] - span[0]) // pixels) - 1, 0).bit_length()
+    numbers = range(span[0] >> level, -(-span[1] >> level) + 1)
+    return np.array([min(number << level, _LATEST) for number in numbers], np.int64)
+
+
+def lane_of(
+    session: Session, recording: RecordingEntry, topic: str, max_times: int = MAX_TIMES
+) -> Lane:
+    """The messages of a topic.
+
+    Args:
+        session: The open store.
+        recording: The recording.
+        topic: Full name.
+        max_times: Messages whose times are read; of more, those of a chunk are spread evenly.
+
+    Raises:
+        TopicError: The recording has no such topic.
+    """
+    if topic not in (known := recording.messages_by_topic()):
+        raise TopicError(f"{recording.name} has no topic {topic!r}.")
+    messages = known[topic]
+    is_read = messages <= max_times
+
+    def read() -> Lane:
+        if is_read:
+            question = Question((topic,), (recording.id,))
+            with suppress(SegmentError):
+                found = match_times(session, question, Counters())
+                return Lane(_sorted(one.log_time for one in found), exact=True)
+        ids = [channel.id for channel in recording.channels if channel.topic == topic]
+        parts = session.parts(recording, ids, (BEGIN, END))
+        rows = zip(parts["first"], parts["last"], parts["messages"], strict=True)
+        return Lane(_sorted(np.linspace(*row).astype(np.int64) for row in rows), exact=False)
+
+    tails = ((n, one.table.chunks[-1:].tobytes()) for n, one in recording.flushed.items())
+    state = recording.status, messages, frozenset((*recording.digests.items(), *tails))
+    key = recording.id, topic, state, is_read
+    return session.cache.made("times", *key, make=read, size_of=lambda one: one.times.nbytes)
+
+
+def _sorted(parts: Iterable[NDArray[np.int64]]) -> NDArray[np.int64]:
+    return placed(np.sort(np.concatenate([np.empty(0, np.int64), *parts]), kind="stable"))
+
+
+def gaps(counts: NDArray[np.int64], edges: NDArray[np.int64], period: float) -> NDArray[np.intp]:
+    """Runs of pixels without messages that last longer than is usual.
+
+    A gap that a picture shows is one of the recording, but for how exact its ends are; one
+    that is shorter than two pixels may not be shown.
+
+    Args:
+        counts: int64[p], messages of a topic by pixel.
+        edges: int64[p + 1], ns.
+        period: The usual time from one message to the next, ns; 0 if unknown.
+
+    Returns:
+        intp[n, 2], first pixel and the one behind the last.
+    """
+    if period <= 0:
+        return np.empty((0, 2), np.intp)
+    is_empty = np.concatenate([[False], counts == 0, [False]])
+    runs = np.flatnonzero(is_empty[1:] != is_empty[:-1]).reshape(-1, 2)
+    is_long = edges[runs[:, 1]] - edges[runs[:, 0]] > GAP_PERIODS * period
+    return runs[is_long]
+
 
 MAX_MATCHES: Final = 20_000_000
 """Matches, and intervals, of one question."""

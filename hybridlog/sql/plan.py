@@ -1,10 +1,10 @@
-"""The view of a topic: its columns, and the rows that a query reads."""
+"""The rows of a topic that a query needs: the parts that may have some, and their columns."""
 
 from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import isqrt
 from typing import TYPE_CHECKING, Any, Final
@@ -23,10 +23,7 @@ from hybridlog.sql.columns import (
     ViewColumn,
     fitted,
     lacks,
-    merged,
-    sql_type,
     summary_values,
-    view_columns,
 )
 from hybridlog.sql.pieces import Rows, RowSource, ScanCounts, TopicOfRecording
 from hybridlog.sql.usage import EVERYTHING, Usage
@@ -59,6 +56,14 @@ class Remarks:
     recordings: dict[str, RecordingEntry] = field(default_factory=dict)
     topics: set[str] = field(default_factory=set)
 
+    def add(self, recording: TopicOfRecording) -> None:
+        """Note a topic of a recording that is read."""
+        self.recordings[recording.entry.id] = recording.entry
+        self.topics.add(recording.topic)
+        for channel in recording.channels.values():
+            if channel.codec.reason is not None:
+                self.undefined[recording.topic] = channel.codec.reason
+
 
 @dataclass(slots=True)
 class Reading:
@@ -77,86 +82,7 @@ class Reading:
     error: Exception | None = None
 
 
-class TopicView:
-    """The rows of a topic in several recordings.
-
-    Args:
-        topic: Full name.
-        recordings: The topic in each recording, by the time of the recordings; made when a
-            query first reads it.
-        names: Name of each recording.
-        spans: First and last log time of each recording, ns; None if unknown.
-        windows: The log time `[begin, end)` of each that has rows, ns; None for all times.
-        kinds: Types of the messages.
-        points: Type of the points of clouds; None without.
-        size: Number of rows, nearly.
-    """
-
-    def __init__(
-        self,
-        topic: str,
-        *,
-        recordings: Sequence[Callable[[], TopicOfRecording]],
-        names: Sequence[str],
-        spans: Sequence[tuple[int, int] | None],
-        windows: Sequence[tuple[int, int] | None],
-        kinds: Sequence[Any],
-        points: Any,
-        size: int,
-    ) -> None:
-        self.topic = topic
-        self.size = size
-        self._recordings = recordings
-        self._windows = windows
-        self._made: dict[int, tuple[TopicOfRecording, _Chooser]] = {}
-        kind = merged(list(kinds)) if kinds else pa.struct([])
-        self._columns = {column.name: column for column in view_columns(kind)}
-        if points is not None and POINTS not in self._columns:
-            own = ViewColumn(POINTS, (POINTS,), points, sql_type(points), is_points=True)
-            self._columns[POINTS] = own
-        fields = [pa.field(column.name, column.type) for column in self._columns.values()]
-        self.schema = pa.schema([*OWN, *fields])
-        self._chooser = _RecordingChooser(self.schema, names, spans)
-
-    def rows(
-        self, columns: Sequence[str], where: Any, reading: Reading
-    ) -> Iterator[pa.RecordBatch]:
-        """Rows for a query.
-
-        Args:
-            columns: Names of the columns.
-            where: Expression that holds for all of them; None for all rows.
-            reading: Collects what is read.
-        """
-        plans: dict[tuple[int, int] | None, _Plan] = {}
-        for number in self._chooser.chosen(where):
-            window = self._windows[number]
-            plan = plans.get(window)
-            if plan is None:
-                holds = _in_window(where, window)
-                plan = plans[window] = _Plan(self.schema, self._columns, columns, holds, reading)
-            recording, chooser = self._parts_of(number)
-            self._remark(recording, reading.remarks)
-            for place in chooser.chosen(plan.where):
-                yield from plan.read(recording, recording.sources[place])
-
-    def _parts_of(self, number: int) -> tuple[TopicOfRecording, _Chooser]:
-        found = self._made.get(number)
-        if found is None:
-            recording = self._recordings[number]()
-            spans = [_within_source(source) for source in recording.sources]
-            found = self._made[number] = recording, _Chooser(self.schema, spans)
-        return found
-
-    def _remark(self, recording: TopicOfRecording, remarks: Remarks) -> None:
-        remarks.recordings[recording.entry.id] = recording.entry
-        remarks.topics.add(self.topic)
-        for channel in recording.channels.values():
-            if channel.codec.reason is not None:
-                remarks.undefined[self.topic] = channel.codec.reason
-
-
-class _Chooser:
+class Chooser:
     """Chooses parts that may have rows for which an expression holds.
 
     Args:
@@ -183,8 +109,8 @@ class _Chooser:
         return sorted(int(part.path) for part in self._parts.get_fragments(filter=where))
 
 
-class _RecordingChooser:
-    """Chooses recordings as `_Chooser` chooses parts: first groups of them, then among these.
+class RecordingChooser:
+    """Chooses recordings as `Chooser` chooses parts: first groups of them, then among these.
 
     Args:
         schema: Columns of the expression.
@@ -200,8 +126,8 @@ class _RecordingChooser:
         self._spans = spans
         count, size = len(names), max(isqrt(len(names)), 1)
         self._groups = [range(at, min(at + size, count)) for at in range(0, count, size)]
-        self._chooser = _Chooser(schema, [self._guarantee(group) for group in self._groups])
-        self._inside: dict[int, _Chooser] = {}
+        self._chooser = Chooser(schema, [self._guarantee(group) for group in self._groups])
+        self._inside: dict[int, Chooser] = {}
 
     def chosen(self, where: Any) -> Iterator[int]:
         """Numbers of the recordings, in order."""
@@ -212,7 +138,7 @@ class _RecordingChooser:
                 continue
             if number not in self._inside:
                 alone = [self._guarantee(range(one, one + 1)) for one in group]
-                self._inside[number] = _Chooser(self._schema, alone)
+                self._inside[number] = Chooser(self._schema, alone)
             yield from (group[place] for place in self._inside[number].chosen(where))
 
     def _guarantee(self, group: range) -> Any:
@@ -238,7 +164,7 @@ def _within(span: tuple[int, int] | None) -> Any:
     return (t >= first) & (t <= last) & (log_time >= low) & (log_time <= high)
 
 
-def _in_window(where: Any, window: tuple[int, int] | None) -> Any:
+def in_window(where: Any, window: tuple[int, int] | None) -> Any:
     """An expression that holds for rows of a window of log time for which another one holds."""
     if window is None:
         return where
@@ -249,12 +175,13 @@ def _in_window(where: Any, window: tuple[int, int] | None) -> Any:
     return inside if where is None else inside & where
 
 
-def _within_source(source: RowSource) -> Any:
+def within_source(source: RowSource) -> Any:
+    """An expression that holds for all rows of a source."""
     known = source.first is not None and source.last is not None
     return _within((source.first, source.last) if known else None)  # type: ignore[arg-type]
 
 
-class _Plan:
+class Plan:
     """Reads some columns of a topic.
 
     Args:
