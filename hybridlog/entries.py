@@ -10,7 +10,6 @@ changed becomes rows of the loss ledger.
 from __future__ import annotations
 
 import os
-import time
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -50,9 +49,8 @@ from hybridlog_storage.messages import EXPIRED, NOT_COPIED, REDUCED, Channel, sc
 from hybridlog_storage.segments.gone_log import GoneLog, open_log
 from hybridlog_storage.segments.segment_file import (
     Sealed,
-    SealedChannel,
     is_rows,
-    sealed_channels,
+    listed_parts,
     sealed_name,
 )
 from hybridlog_storage.segments.segment_format import group_of
@@ -296,22 +294,9 @@ def steady_inventory(directory: StoreDirectory, recording: str) -> Inventory:
 def _is_listed(summary: SegmentSummary, recording: str, number: int, log: File | None) -> bool:
     """True for a whole segment of a recording and number that is as the manifest lists it."""
     said = summary.recording.get("id"), summary.recording.get("segment")
-    as_listed = log is None or (summary.size, _parts_of(summary)) == (log.bytes, log.parts)
+    parts = listed_parts(summary.table.as_stored())
+    as_listed = log is None or (summary.size, parts) == (log.bytes, log.parts)
     return said == (recording, number) and as_listed
-
-
-def _parts_of(summary: SegmentSummary) -> dict[int, truth.Part]:
-    """What a segment has of each channel, as a manifest lists it."""
-    channels = sealed_channels(summary.table.as_stored(), summary.channels)
-    return _parts(channels)
-
-
-def _parts(channels: Iterable[SealedChannel]) -> dict[int, truth.Part]:
-    return {
-        one.id: truth.Part(one.messages, one.payload_bytes, one.first, one.last)
-        for one in channels
-        if one.messages
-    }
 
 
 def read_summary(path: Path, number: int) -> SegmentSummary:
@@ -576,20 +561,23 @@ def _source_of(source: Source) -> dict[str, Any]:
 
 def lost_in_crash(manifest: Manifest, after: Sealed) -> list[truth.Loss]:
     """Rows of the loss ledger for content of a listed segment that a crash has taken."""
-    before = manifest.logs[after.segment]
-    left = {one.id: one.messages for one in after.channels}
+    before, left = manifest.logs[after.file.number], after.file.parts
+    lost = {
+        number: part.messages - (left[number].messages if number in left else 0)
+        for number, part in before.parts.items()
+    }
     return [
         truth.Loss(
             Cause.SEGMENT.value,
             manifest.channels[number].topic,
-            part.messages - left.get(number, 0),
-            part.first,
-            part.last,
+            count,
+            before.parts[number].first,
+            before.parts[number].last,
             "a crash took what was written last",
             before.name,
         )
-        for number, part in before.parts.items()
-        if part.messages > left.get(number, 0)
+        for number, count in lost.items()
+        if count > 0
     ]
 
 
@@ -710,13 +698,9 @@ def channels_of(summaries: Iterable[SegmentSummary]) -> dict[int, Channel]:
 
 def listed(*segments: Sealed) -> Callable[[Manifest], Manifest]:
     """The change that lists segments, in the place of those of their numbers."""
-    files = tuple(map(_file_of, segments))
+    files = tuple(sealed.file for sealed in segments)
     numbers = {file.number for file in files}
-    channels = {
-        one.id: truth.Channel(one.topic, one.encoding, one.type, schema=one.schema)
-        for sealed in segments
-        for one in sealed.channels
-    }
+    channels = {n: one for sealed in segments for n, one in sealed.channels.items()}
 
     def how(now: Manifest) -> Manifest:
         others = (one for one in now.files if one.kind != "log" or one.number not in numbers)
@@ -724,23 +708,6 @@ def listed(*segments: Sealed) -> Callable[[Manifest], Manifest]:
         return truth.with_totals(truth.replace(now, files=(*others, *files), channels=known))
 
     return how
-
-
-def _file_of(sealed: Sealed) -> File:
-    times = [time for one in sealed.channels for time in (one.first, one.last) if time is not None]
-    return File(
-        sealed.segment,
-        sealed.group,
-        sealed.file,
-        "log",
-        sealed.bytes,
-        sealed.digest,
-        time.time_ns(),
-        min(times, default=None),
-        max(times, default=None),
-        _parts(sealed.channels),
-        has_losses=sealed.has_losses,
-    )
 
 
 def ended(end: Mapping[str, Any]) -> Callable[[Manifest], Manifest]:
@@ -787,9 +754,9 @@ def _listing_of(inventory: Inventory, numbers: Iterable[int]) -> Callable[[Manif
 
     def how(now: Manifest) -> Manifest:
         for sealed, log, rows in found:
-            if sealed.segment not in now.logs:
+            if sealed.file.number not in now.logs:
                 now = listed(sealed)(now)
-            line = log or truth.replace(now.logs[sealed.segment], gone=UNSET, copy="")
+            line = log or truth.replace(now.logs[sealed.file.number], gone=UNSET, copy="")
             now = truth.with_rows(now, line, rows)
         return now
 
@@ -812,10 +779,13 @@ def _rows_of(inventory: Inventory, number: int) -> tuple[File | None, Sequence[F
 def sealed_of(inventory: Inventory, number: int) -> Sealed:
     """An existing segment, as a manifest lists it."""
     summary = inventory.summaries[number]
-    channels = sealed_channels(summary.table.as_stored(), summary.channels)
-    group, digest = group_of(summary.recording, number), inventory.digest(number)
-    has_losses, name = bool(summary.losses), sealed_name(number)
-    return Sealed(number, name, summary.size, digest, channels, group, has_losses)
+    return Sealed.of(
+        (number, group_of(summary.recording, number)),
+        (summary.size, inventory.digest(number)),
+        summary.table.as_stored(),
+        summary.channels,
+        has_losses=bool(summary.losses),
+    )
 
 
 def free_name_in(others: Iterable[RecordingSummary | Manifest], name: str, but: str = "") -> str:

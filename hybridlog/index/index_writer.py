@@ -245,8 +245,8 @@ class IndexWriter:
 
     def seal(self, sealed: Sealed) -> None:
         """Note that a segment has all its chunks."""
-        self._places.setdefault(sealed.segment, [])
-        self._sealed[sealed.segment] = sealed.digest
+        self._places.setdefault(sealed.file.number, [])
+        self._sealed[sealed.file.number] = sealed.file.digest
         self._calls.put(None)
 
     def prepare(self, channel: Channel) -> None:

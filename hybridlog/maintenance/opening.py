@@ -341,8 +341,8 @@ def recover_segments(
     def announce(sealed: Sealed) -> None:
         if manifest is None:
             return
-        before = manifest.logs.get(sealed.segment)
-        if before is None or before.digest != sealed.digest:
+        before = manifest.logs.get(sealed.file.number)
+        if before is None or before.digest != sealed.file.digest:
             lost = () if before is None else lost_in_crash(manifest, sealed)
 
             def change(now: Manifest) -> Manifest:

@@ -111,8 +111,6 @@ class ChannelStats:
     skew_sum: float = 0.0
     skew_min: Int | None = None
     skew_max: Int | None = None
-    longest: Int = 0
-    """Longest span of log time of the channel's messages in one chunk."""
 
     @property
     def mean_skew(self) -> float | None:
@@ -125,7 +123,7 @@ class ChannelStats:
             setattr(self, name, getattr(self, name) + getattr(other, name))
         for name in ("first", "first_publish", "first_stamp", "skew_min"):
             setattr(self, name, _least(getattr(self, name), getattr(other, name)))
-        for name in ("last", "last_publish", "last_stamp", "skew_max", "longest"):
+        for name in ("last", "last_publish", "last_stamp", "skew_max"):
             setattr(self, name, _greatest(getattr(self, name), getattr(other, name)))
 
 
@@ -304,7 +302,6 @@ def channel_totals(
             payload_bytes=int(rows["payload_bytes"].sum()),
             first=int(rows["first"].min()),
             last=int(rows["last"].max()),
-            longest=int((rows["last"] - rows["first"]).max()),
         )
         if channel not in silent and not table.is_flushed:
             stats.first_publish = int(rows["first_publish"].min())

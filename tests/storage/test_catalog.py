@@ -75,7 +75,6 @@ def segment(rng: random.Random, chunks: int) -> tuple[ChunkTable, list[dict[int,
                 unreadable=rng.randrange(3),
                 first=times[0],
                 last=times[1],
-                longest=times[1] - times[0],
             )
             parts.append((c, found.messages, found.payload_bytes, *times, *sent))
             if c != SILENT:
@@ -172,7 +171,6 @@ def undecoded(stats: ChannelStats) -> ChannelStats:
         last=stats.last,
         first_publish=stats.first_publish,
         last_publish=stats.last_publish,
-        longest=stats.longest,
     )
 
 
@@ -284,8 +282,6 @@ def test_statistics_add_up_in_any_order(seeds: list[int], rng: random.Random) ->
             assert value == min(values, default=None)
         elif name.startswith("last") or name == "skew_max":
             assert value == max(values, default=None)
-        elif name == "longest":
-            assert value == max(values)
         else:
             assert value == sum(values)
 

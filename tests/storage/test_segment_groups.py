@@ -76,7 +76,10 @@ class Recorded:
     def topics(self) -> list[dict[int, set[str]]]:
         """The topics of each segment, by number, group by group."""
         return [
-            {sealed.segment: {one.topic for one in sealed.channels} for sealed in group}
+            {
+                sealed.file.number: {one.topic for one in sealed.channels.values()}
+                for sealed in group
+            }
             for group in self.groups
         ]
 
@@ -144,21 +147,21 @@ def test_messages_come_back_in_total_order_byte_for_byte(
                 official[channel.topic, m.data, m.log_time, m.publish_time, m.sequence] += 1
     assert official == Counter(of_rows(made.rows))
     # Groups follow one another, and each begins with its first segment.
-    numbers = [sealed.segment for group in made.groups for sealed in group]
+    numbers = [sealed.file.number for group in made.groups for sealed in group]
     assert numbers == [*range(len(paths))] == sorted(int(path.stem) for path in paths)
     for group in made.groups:
-        assert {sealed.group for sealed in group} == {group[0].segment}
+        assert {sealed.file.group for sealed in group} == {group[0].file.number}
         assert len(group) <= 32
         for sealed in group:
-            with SegmentReader(made.folder / sealed.file, sealed.segment) as reader:
+            with SegmentReader(made.folder / sealed.file.name, sealed.file.number) as reader:
                 said = reader.summary().recording
-            assert group_of(said, sealed.segment) == sealed.group
+            assert group_of(said, sealed.file.number) == sealed.file.group
         for sealed in group[1:]:
-            assert LATCHED.topic not in {one.topic for one in sealed.channels}
-        own = [s for s in group[1:] if {one.topic for one in s.channels} == {NAMED.topic}]
+            assert LATCHED.topic not in {one.topic for one in sealed.channels.values()}
+        own = [s for s in group[1:] if {one.topic for one in s.channels.values()} == {NAMED.topic}]
         assert len(own) <= 1
         assert all(
-            sealed in own or NAMED.topic not in {one.topic for one in sealed.channels}
+            sealed in own or NAMED.topic not in {one.topic for one in sealed.channels.values()}
             for sealed in group
         )
 
@@ -221,7 +224,7 @@ def test_killed_with_several_open_segments(tmp_path: Path) -> None:
         os.truncate(opened[number], chunk.offset + chunk.length + 5)
     told: list[Sealed] = []
     cut = [recover_segment(path, told.append).cut_bytes for path in opened]
-    assert {sealed.group for sealed in told} == {0}
+    assert {sealed.file.group for sealed in told} == {0}
     assert [number for number, size in enumerate(cut) if size] == [*torn]
     lost = {seq for chunk in torn.values() for seq in chunk.seq.tolist()}
     assert read_in(made.folder) == [
@@ -233,7 +236,7 @@ def test_a_group_that_cannot_be_listed_is_sealed_later(tmp_path: Path) -> None:
     tries: list[list[str]] = []
 
     def listing(group: Sequence[Sealed]) -> None:
-        tries.append([sealed.file for sealed in group])
+        tries.append([sealed.file.name for sealed in group])
         if len(tries) == 1:
             raise DiskFullError("no room for a line")
 
@@ -268,7 +271,7 @@ def test_the_end_lies_in_the_first_segment_after_a_full_disk(
     with pytest.raises(DiskFullError, match="summary"):
         made.close()
     made.writer.close_truncated([json_metadata(END_METADATA, {"status": "damaged"})])
-    assert [[sealed.segment for sealed in group] for group in made.groups] == [[0, 1, 2]]
+    assert [[sealed.file.number for sealed in group] for group in made.groups] == [[0, 1, 2]]
     with SegmentReader(made.folder / "000000.mcap", 0) as reader:
         assert reader.summary().end == {"status": "damaged", "segments": 3}
 

@@ -101,13 +101,7 @@ class ChunkPlace:
         """True if its payloads were deleted, or are to be copied later."""
         return EXPIRED_IDS <= self.channels[0] < MARKS_CHANNEL
 
-    def stored(
-        self,
-        segment: int,
-        batch: Batch,
-        seq: NDArray[np.int64],
-        compressed_size: int = 0,
-    ) -> StoredChunk:
+    def stored(self, segment: int, batch: Batch, seq: NDArray[np.int64]) -> StoredChunk:
         """The chunk of a segment with its content; see `StoredChunk`."""
         return StoredChunk(
             segment=segment,
@@ -117,7 +111,6 @@ class ChunkPlace:
             trailer=self.trailer,
             batch=batch,
             seq=seq,
-            compressed_size=compressed_size,
         )
 
 
@@ -382,7 +375,7 @@ class SegmentReader:
             seq = trailer.arrivals(len(batch))
         except SegmentError as error:
             raise self._damaged(place, error) from error
-        return place.stored(self.number, batch, seq, head.end - head.start)
+        return place.stored(self.number, batch, seq)
 
     def _damaged(self, place: ChunkPlace, error: SegmentError) -> SegmentError:
         return SegmentError(f"Chunk at byte {place.offset} of {self.path} is damaged: {error}")
