@@ -680,9 +680,9 @@ def _fill_stats(entry: RecordingEntry, inventory: Inventory, catalog: Catalog) -
     totals: dict[int, ChannelStats] = {}
     entry.is_decoded = True
     for number, summary in inventory.summaries.items():
-        found = catalog.stamps(entry, number, summary.table)
-        entry.is_decoded &= found is not None or not len(summary.table.parts)
-        for channel_id, stats in channel_totals(summary.table, found, silent).items():
+        decoded = catalog.decoded(entry, number)
+        entry.is_decoded &= decoded is not None or not len(summary.table.parts)
+        for channel_id, stats in channel_totals(summary.table, decoded, silent).items():
             totals.setdefault(channel_id, ChannelStats()).add(stats)
     for channel in entry.channels:
         channel.stats = totals.get(channel.id, ChannelStats())
