@@ -147,13 +147,9 @@ class Inventory:
         return {} if self.manifest is None else self.manifest.logs
 
     def digest(self, number: int) -> str:
-        """Digest of a valid segment; one that is not listed is read for it.
-
-        Where a segment is gone and rows are lost, it has the numbers of their channels, too.
-        """
+        """Digest of a valid segment; one that is not listed is read for it."""
         if number in self.logs:
-            lost = {channel for one in self.lost if one.number == number for channel in one.parts}
-            return "-".join([self.logs[number].digest, *map(str, sorted(lost))])
+            return self.logs[number].digest
         with open_log(self.path / self.listing.sealed[number], number) as reader:
             return reader.digest()
 
@@ -248,32 +244,28 @@ def inventory_of(
         )
     rows = {} if manifest is None else manifest.rows
     for number, file in listed.items():
-        if number not in found.summaries and number not in listing.open:
-            lost = [file] if file.is_here else rows[number]
+        own: Sequence[File] = rows.get(number, ())
+        if not file.is_here and number in found.summaries and not listing.has_all(own):
+            del found.summaries[number]
+            found.misfits += [
+                Misfit(number, row.name, f"{row.name} {problem}")
+                for row in own
+                if (problem := _problem(listing.rows.get(row.name), row.bytes))
+            ]
+            found.lost += own
+        elif number not in found.summaries and number not in listing.open:
+            lost = [file] if file.is_here else own
             found.lost += lost
             if number not in listing.sealed:
                 name = "" if file.is_here else lost[0].name
                 found.misfits.append(Misfit(number, name, f"{lost[0].name} is missing"))
-        elif not file.is_here and number in found.summaries:
-            _leave_out_lost_rows(found, number, rows[number])
     found.misfits.sort(key=lambda misfit: misfit.segment)
     return found
 
 
-def _leave_out_lost_rows(found: Inventory, number: int, rows: Sequence[File]) -> None:
-    """Leave out the topics of a segment that is gone whose files of rows are not all whole."""
-    assert found.manifest is not None
-    topics = set()
-    for file in rows:
-        size = found.listing.rows.get(file.name)
-        if size != file.bytes:
-            problem = "is missing" if size is None else "has another size"
-            found.misfits.append(Misfit(number, file.name, f"{file.name} {problem}"))
-            topics.add(topic_of(file, found.manifest))
-    found.lost += [file for file in rows if topic_of(file, found.manifest) in topics]
-    summary = found.summaries[number]
-    left = [n for n in summary.counts if summary.channels[n].topic not in topics]
-    found.summaries[number] = summary.only(left)
+def _problem(size: int | None, wanted: int) -> str:
+    """What is wrong with a file of a size, None for a missing one; empty if nothing is."""
+    return "" if size == wanted else "is missing" if size is None else "has another size"
 
 
 def steady_inventory(directory: StoreDirectory, recording: str) -> Inventory:

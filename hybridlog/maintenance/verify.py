@@ -263,7 +263,8 @@ class _Check:
         """Check every byte of the files of rows."""
         for file, problem in damaged_files(self._path, inventory):
             self.found(file.name, problem, RESTORE)
-            if inventory.manifest is not None and not inventory.logs[file.number].is_here:
+            is_counted = file.number in inventory.summaries
+            if is_counted and inventory.manifest and not inventory.logs[file.number].is_here:
                 lost = sum(part.messages for part in file.parts.values())
                 self._lost[collection_of(topic_of(file, inventory.manifest))] += lost
                 self._result.messages -= lost

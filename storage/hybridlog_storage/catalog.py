@@ -568,17 +568,15 @@ class Catalog:
         path = self._store / _RECORDINGS / entry.id / file_of(entry, number)
         try:
             with open_log(path, number) as reader:
-                is_ours = not isinstance(reader, GoneLog) or digest.startswith(reader.digest())
+                is_ours = not isinstance(reader, GoneLog) or digest == reader.digest()
                 summary = reader.summary()
         except SegmentError as error:
             raise CatalogError(str(error)) from error
         said = summary.recording.get("id"), summary.recording.get("segment")
         is_ours &= said == (entry.id, number)
-        held = entry.held.get(str(number)) if str(number) in entry.files else None
-        table = summary.table if held is None else summary.table.only(held)
-        if not is_ours or {*spans_of(number, table)} - {*entry.spans}:
+        if not is_ours or {*spans_of(number, summary.table)} - {*entry.spans}:
             raise CatalogError(f"Segment {path} has changed since the store was opened.")
-        return table
+        return summary.table
 
 
 def _summary_body(summary: RecordingSummary) -> bytes:

@@ -9,9 +9,9 @@ from __future__ import annotations
 import os
 import stat
 import struct
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -146,11 +146,6 @@ class SegmentSummary:
     def chunks(self) -> list[ChunkPlace]:
         """Position of each chunk that has messages, in file order."""
         return [place for place in places_of(self.table) if place.channels]
-
-    def only(self, channels: Collection[int]) -> SegmentSummary:
-        """The summary without the messages on other channels."""
-        table = self.table.only(channels)
-        return replace(self, table=table, counts=table.counts())
 
 
 class SegmentReader:
