@@ -533,7 +533,7 @@ class Session:
         found = [np.empty(0, PARTS)]
         for number, first, last in recording.spans_with(channels):
             if min(first, END - 1) < span[1] and last >= span[0]:
-                rows = self._chunk_columns(recording, number, channels)[0].parts
+                rows = self._chunk_columns(recording, number, channels).parts
                 found.append(rows[(placed(rows["first"]) < span[1]) & (rows["last"] >= span[0])])
         return np.concatenate(found)
 

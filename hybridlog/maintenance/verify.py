@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from hybridlog.entries import Inventory
+    from hybridlog.maintenance.repair import Repaired
     from hybridlog.maintenance.report import Progress
     from hybridlog_storage.catalog import Catalog, RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.mongo.database import Database
 
 _REPAIR = "run `hybridlog verify --repair`"
+AGAIN = f"{_REPAIR} again"
 RESTORE = "`hybridlog copy --check` from a store that has it brings it back"
 _RESTORE_LOST = f"{RESTORE}; `hybridlog info --losses` lists the lost messages"
 _KNOWN = frozenset({LOCK})
@@ -65,6 +67,7 @@ class Verification:
         findings: All problems.
         index: True if the index was compared, too; MongoDB may be unavailable.
         without_documents: Messages of topics that were recorded with `--no-index`.
+        repaired: What was repaired before.
     """
 
     recordings: int = 0
@@ -74,6 +77,7 @@ class Verification:
     findings: list[Finding] = field(default_factory=list)
     index: bool = True
     without_documents: int = 0
+    repaired: list[Repaired] = field(default_factory=list)
 
 
 def verify(
