@@ -54,7 +54,6 @@ from hybridlog_storage.segments.segment_file import (
     sealed_name,
 )
 from hybridlog_storage.segments.segment_format import group_of
-from hybridlog_storage.segments.segment_group import MOST_SEALED
 from hybridlog_storage.segments.segment_reader import SegmentSummary
 from hybridlog_storage.summary import RecordingSummary, TopicType, hash_of, topics_to_json
 from hybridlog_storage.times import span_of
@@ -155,35 +154,9 @@ class Inventory:
 
     @property
     def end(self) -> Mapping[str, Any] | None:
-        """The end of the recording: by its manifest, else by the segments that state it.
-
-        Of a group whose recorder was killed, each recovered segment says what it has lost. What
-        a power cut has taken whole, the end itself tells: it says how many segments there were.
-        """
-        if self.manifest is not None and self.manifest.is_ended:
-            return end_values(self.manifest)
-        ends: list[Mapping[str, Any]] = []
-        missing: list[int] = []
-        for number, summary in sorted(self.summaries.items()):
-            if summary.end:
-                end: dict[str, Any] = dict(summary.end)
-                segments = min(end.pop("segments", 0), number + MOST_SEALED)
-                ends.append(end)
-                missing += [n for n in range(number, segments) if not self._has(n)]
-        cut = [end for end in ends if end.get("status") == "recovered"]
-        if not missing and (len(ends) < 2 or not cut):
-            return ends[-1] if ends else None
-        damage = [text for end in cut for text in end.get("damage", ())]
-        return {
-            "status": "recovered",
-            "losses": [row for end in ends for row in end.get("losses", ())],
-            "cut_bytes": sum(end.get("cut_bytes", 0) for end in cut),
-            "damage": damage + [f"segment {number} is lost" for number in missing],
-        }
-
-    def _has(self, number: int) -> bool:
-        """True if a segment is there, or the manifest lists it, and so what it had."""
-        return number in self.summaries or number in self.logs or number in self.listing.open
+        """The end of the recording; None before it has one."""
+        is_ended = self.manifest is not None and self.manifest.is_ended
+        return end_values(self.manifest) if self.manifest is not None and is_ended else None
 
     @property
     def state(self) -> str:
@@ -703,7 +676,7 @@ def listed(*segments: Sealed) -> Callable[[Manifest], Manifest]:
 
 
 def ended(end: Mapping[str, Any]) -> Callable[[Manifest], Manifest]:
-    """The change that ends a recording."""
+    """The change that ends a recording, by its `status` and `losses`."""
     status = cast("Literal['complete', 'damaged', 'recovered']", end.get("status", "complete"))
     losses = tuple(loss_of(row) for row in end.get("losses", ()))
 
@@ -712,8 +685,6 @@ def ended(end: Mapping[str, Any]) -> Callable[[Manifest], Manifest]:
             now,
             status="unproven" if now.status == "unproven" else status,
             losses=(*now.losses, *losses),
-            cut_bytes=end.get("cut_bytes", 0),
-            damage=tuple(end.get("damage", ())),
         )
 
     return how
@@ -735,9 +706,6 @@ def made_again(inventory: Inventory, old: Manifest | None) -> Manifest:
         and (number not in made.logs or made.logs[number].is_here == is_rows(name))
     ]
     made = _listing_of(inventory, numbers)(made)
-    end = inventory.end
-    if end is not None and not made.is_ended:
-        made = ended(end)(made)
     return truth.replace(made, status="unproven", changes=made.changes + 1)
 
 

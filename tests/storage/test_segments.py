@@ -39,7 +39,6 @@ from hybridlog_storage.segments.segment_check import damage_of
 from hybridlog_storage.segments.segment_file import Sealed, SegmentFile
 from hybridlog_storage.segments.segment_format import (
     CHUNK_TABLE_OPCODE,
-    END_METADATA,
     LOSSES_METADATA,
     RECORDING_METADATA,
     arrival_record,
@@ -144,7 +143,7 @@ def write(
     writer = recorder(directory, chunks, setup)
     for rows in batches:
         writer.append(batch_of(rows), CHANNELS)
-    return writer.close(json_metadata(END_METADATA, {"status": "complete"})), chunks
+    return writer.close(), chunks
 
 
 def messages_in(path: Path) -> list[tuple[str, int, bytes]]:
@@ -386,7 +385,6 @@ def test_a_segment_cut_in_its_summary_is_what_it_was(tmp_path: Path, missing: in
     recovered = recovered_of(tmp_path, whole[: len(whole) - missing])
     assert recovered.path is not None
     assert recovered.path.read_bytes() == whole
-    assert summary_of(recovered.path, 0).end == {"status": "complete", "segments": 1}
     assert problems(recovered.path) == []
 
 
@@ -453,7 +451,7 @@ def test_a_recovered_segment_is_on_the_disk_before_it_gets_its_name(tmp_path: Pa
         log = steps.log
         with through(steps):
             recovered = recover_segment(
-                opened, lambda sealed, log=log: log.append(("list", sealed.file.name))
+                opened, lambda sealed, _, log=log: log.append(("list", sealed.file.name))
             )
         assert recovered.path == tmp_path / "000000.mcap"
         assert steps.log[-4:] == [
@@ -526,7 +524,7 @@ def sample(directory: Path) -> tuple[bytes, list[StoredChunk]]:
     writer.append(batch_of(rows[12:]), CHANNELS)
     writer.flush()
     writer.add_extra(json_metadata(LOSSES_METADATA, {"rows": [LOSS]}))
-    (path,) = writer.close(json_metadata(END_METADATA, {"status": "complete"}))
+    (path,) = writer.close()
     return path.read_bytes(), chunks
 
 
@@ -538,7 +536,7 @@ def answers(reader: SegmentReader, places: Sequence[ChunkPlace] | None = None) -
         found = None
         yield None
     else:
-        about = (found.recording, found.end, found.channels.keys(), found.counts, found.losses)
+        about = (found.recording, found.channels.keys(), found.counts, found.losses)
         topics = [(c.topic, c.schema, dict(c.metadata)) for c in found.channels.values()]
         yield (about, topics, found.size, found.chunks)
     for place in places or (found.chunks if found else []):
@@ -702,7 +700,7 @@ def test_a_complete_segment_only_gets_its_name(tmp_path: Path, zeros: int) -> No
     opened.write_bytes(whole + bytes(zeros))
     steps = Steps()
     with through(steps):
-        recovered = recover_segment(opened, told.append)
+        recovered = recover_segment(opened, lambda sealed, _: told.append(sealed))
     assert recovered.path is not None
     assert recovered.path.read_bytes() == whole
     assert (recovered.messages, recovered.cut_bytes, recovered.damage) == (50, 0, [])
@@ -745,10 +743,6 @@ def test_a_damaged_message_index_costs_no_message(tmp_path: Path) -> None:
             for place, want in zip(summary.chunks, chunks, strict=True):
                 assert content_of(reader.read_chunk(place)) == content_of(want)
                 assert sum(map(len, reader.read_times(place).values())) == len(want.batch)
-        # The recorder had ended well, but the segment is not as it was.
-        assert summary.end is not None
-        assert summary.end["status"] == "recovered"
-        assert summary.end["damage"] == recovered.damage
         assert problems(recovered.path) == []
         assert len(messages_in(recovered.path)) == recovered.messages
         data = io.BytesIO(recovered.path.read_bytes())
@@ -836,7 +830,6 @@ def test_cut_bytes_are_those_of_records_that_were_begun(tmp_path: Path) -> None:
         recovered = recovered_of(tmp_path, whole[:keep])
         assert recovered.cut_bytes == cut, keep
         assert recovered.path is not None
-        assert (summary_of(recovered.path, 0).end or {}).get("cut_bytes", 0) == cut
         recovered.path.unlink()
 
 
@@ -870,17 +863,17 @@ def test_a_full_disk_costs_nothing_that_was_told_of(
         try:
             for n in range(40):
                 writer.append(batch_of([(n % 2, os.urandom(700), n, n, n)]), CHANNELS)
-            writer.close(json_metadata(END_METADATA, {"status": "complete"}))
+            writer.close()
         except (DiskFullError, StoreError):
             try:
                 if gives_up:
-                    writer.close_truncated([json_metadata(END_METADATA, {"status": "damaged"})])
+                    writer.close_truncated([])
                 else:
                     writer.abort()
             except (DiskFullError, StoreError):
                 writer.abort()
     for opened in sorted(directory.glob("*.open")):
-        recover_segment(opened, lambda sealed: told.update({sealed.file.name: sealed}))
+        recover_segment(opened, lambda sealed, _: told.update({sealed.file.name: sealed}))
     found = []
     for path in sorted(directory.iterdir()):
         number = int(path.name.removesuffix(".mcap"))

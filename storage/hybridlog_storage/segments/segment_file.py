@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -113,10 +113,6 @@ class Sealed(NamedTuple):
         )
         known = {n: _listed(one) for n, one in sorted(channels.items()) if n < EXPIRED_IDS}
         return cls(file, known)
-
-
-OnSealing = Callable[[Sealed], None]
-"""Called when a segment is complete and on the disk, before it gets its final name."""
 
 
 def sealed_name(number: int) -> str:

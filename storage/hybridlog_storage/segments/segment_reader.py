@@ -46,7 +46,6 @@ from hybridlog_storage.segments.chunk_table import ChunkTable
 from hybridlog_storage.segments.compression import FilePart, decompress
 from hybridlog_storage.segments.segment_format import (
     CHUNK_TABLE_OPCODE,
-    END_METADATA,
     FORMAT_VERSION,
     LOSSES_METADATA,
     MAGIC,
@@ -58,7 +57,7 @@ from hybridlog_storage.segments.segment_format import (
     metadata_of,
     trailer_of,
 )
-from hybridlog_storage.segments.statements import end_of, loss_rows
+from hybridlog_storage.segments.statements import loss_rows
 from hybridlog_storage.stopping import check_wanted
 
 if TYPE_CHECKING:
@@ -120,7 +119,6 @@ class SegmentSummary:
 
     Attributes:
         recording: Catalog entry of the recording at the start of the segment.
-        end: The end of the recording; None except in its last segment.
         channels: Channels by id, and those of messages without payload, see `EXPIRED_IDS`.
         counts: Number of messages by channel id.
         losses: Rows of the loss ledger written with its messages.
@@ -132,7 +130,6 @@ class SegmentSummary:
     """
 
     recording: dict[str, object]
-    end: dict[str, object] | None
     channels: dict[int, Channel]
     counts: dict[int, int]
     losses: list[dict[str, Any]]
@@ -258,18 +255,15 @@ class SegmentReader:
         return table
 
     def _summary(self, records: Summary, body: Buffer | None, start: int) -> SegmentSummary:
-        found: dict[str, dict[str, object]] = {}
+        recording: dict[str, object] | None = None
         losses: list[dict[str, Any]] = []
         for index in records.metadata_indexes:
-            if index.name in {RECORDING_METADATA, END_METADATA}:
-                found[index.name] = json_of(self.metadata(index))
-                if index.name == RECORDING_METADATA:
-                    check_format(found[index.name], self.path)
-                else:
-                    found[index.name] = dict(end_of(found[index.name]))
+            if index.name == RECORDING_METADATA:
+                recording = json_of(self.metadata(index))
+                check_format(recording, self.path)
             elif index.name == LOSSES_METADATA:
                 losses += loss_rows(json_of(self.metadata(index)))
-        if RECORDING_METADATA not in found:
+        if recording is None:
             raise SegmentError(f"{self.path} is no segment of a hybridlog store.")
         table = self._table(body, start)
         stated = records.statistics.channel_message_counts if records.statistics else {}
@@ -281,8 +275,7 @@ class SegmentReader:
         counts = table.counts()
         channels = {i: channel_of(r, records.schemas) for i, r in records.channels.items()}
         return SegmentSummary(
-            recording=found[RECORDING_METADATA],
-            end=found.get(END_METADATA),
+            recording=recording,
             channels=with_expired(channels, counts),
             counts=counts,
             losses=losses,

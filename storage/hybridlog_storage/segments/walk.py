@@ -29,7 +29,6 @@ from hybridlog_storage.segments.chunk_table import PART, parts_of
 from hybridlog_storage.segments.segment_format import (
     ARRIVAL_OPCODE,
     DAMAGED_OPCODE,
-    END_METADATA,
     LOSSES_METADATA,
     PADDING_OPCODE,
     RECORDING_METADATA,
@@ -89,7 +88,6 @@ class Walk:
         schemas: Schemas by id, also of channels that are not defined.
         chunks: Its chunks, in file order.
         losses: Rows of the loss ledger.
-        has_end: Whether the end of the recording is there.
         attachments: Its attachments, in file order.
         metadata: All metadata records, in file order.
         damaged: What cannot be read, in file order.
@@ -106,7 +104,6 @@ class Walk:
         self.schemas: dict[int, SchemaRecord] = {}
         self.chunks: list[WalkedChunk] = []
         self.losses: list[dict[str, Any]] = []
-        self.has_end = False
         self.attachments: list[AttachmentIndex] = []
         self.metadata: list[MetadataIndex] = []
         self.damaged: list[Damage] = []
@@ -192,7 +189,6 @@ class Walk:
             self.losses += loss_rows(json_of(record))
         elif record.name == RECORDING_METADATA:
             self.recording = json_of(record)
-        self.has_end |= record.name == END_METADATA
         self.metadata.append(MetadataIndex(offset=at, length=end - at, name=record.name))
 
     # Chunks
