@@ -70,7 +70,7 @@ if TYPE_CHECKING:
     from hybridlog.live import LiveOptions, LiveRecording
     from hybridlog.maintenance.copying import CopyOptions, CopyReport, Target
     from hybridlog.maintenance.keep import KeepReport
-    from hybridlog.maintenance.repair import Repaired
+    from hybridlog.maintenance.report import Repaired
     from hybridlog.maintenance.sizes import Sizes
     from hybridlog.maintenance.verify import Finding, Verification
     from hybridlog.query.answers.regularity import TopicCheck

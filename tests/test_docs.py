@@ -614,8 +614,7 @@ def documented_classes() -> list[type]:
     from hybridlog.index.of_store import Index
     from hybridlog.live import LiveOptions, LiveRecording
     from hybridlog.maintenance.copying import CopyOptions, CopyReport
-    from hybridlog.maintenance.repair import Repaired
-    from hybridlog.maintenance.report import RepairReport
+    from hybridlog.maintenance.report import Repaired, RepairReport
     from hybridlog.maintenance.verify import Finding, Verification
     from hybridlog.query.answers.completeness import Completeness
     from hybridlog.query.answers.field_statistics import FieldStatistics

@@ -18,7 +18,7 @@ from hybridlog.wording import listed
 from hybridlog_storage.errors import DatabaseError, TopicError, WithoutMongoError
 
 if TYPE_CHECKING:
-    from hybridlog.maintenance.repair import Repaired
+    from hybridlog.maintenance.report import Repaired
     from hybridlog.maintenance.verify import Finding, Verification
     from hybridlog.store import Store
     from hybridlog_storage.summary import RecordingSummary

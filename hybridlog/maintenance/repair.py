@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from hybridlog.columns.recording_logs import RecordingRows
@@ -19,6 +18,7 @@ from hybridlog.entries import (
 from hybridlog.maintenance import tables
 from hybridlog.maintenance.index import StoreIndex
 from hybridlog.maintenance.opening import recover, recover_segments
+from hybridlog.maintenance.report import Repaired
 from hybridlog.maintenance.verify import AGAIN, Finding
 from hybridlog_storage.catalog import file_of
 from hybridlog_storage.disk.directory import LOCK_WAIT_S
@@ -34,21 +34,6 @@ if TYPE_CHECKING:
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.manifest import Manifest
     from hybridlog_storage.mongo.database import Database
-
-
-@dataclass(frozen=True, slots=True)
-class Repaired:
-    """A repair.
-
-    Attributes:
-        recording: Name of the recording.
-        place: File or other subject.
-        done: What was done.
-    """
-
-    recording: str
-    place: str
-    done: str
 
 
 def repair(

@@ -24,8 +24,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from hybridlog.entries import Inventory
-    from hybridlog.maintenance.repair import Repaired
-    from hybridlog.maintenance.report import Progress
+    from hybridlog.maintenance.report import Progress, Repaired
     from hybridlog_storage.catalog import Catalog, RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.manifest import File, Manifest
