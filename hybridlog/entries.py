@@ -10,7 +10,6 @@ changed becomes rows of the loss ledger.
 from __future__ import annotations
 
 import os
-import time
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -50,13 +49,11 @@ from hybridlog_storage.messages import EXPIRED, NOT_COPIED, REDUCED, Channel, sc
 from hybridlog_storage.segments.gone_log import GoneLog, open_log
 from hybridlog_storage.segments.segment_file import (
     Sealed,
-    SealedChannel,
     is_rows,
-    sealed_channels,
+    listed_parts,
     sealed_name,
 )
 from hybridlog_storage.segments.segment_format import group_of
-from hybridlog_storage.segments.segment_group import MOST_SEALED
 from hybridlog_storage.segments.segment_reader import SegmentSummary
 from hybridlog_storage.summary import RecordingSummary, TopicType, hash_of, topics_to_json
 from hybridlog_storage.times import span_of
@@ -149,47 +146,17 @@ class Inventory:
         return {} if self.manifest is None else self.manifest.logs
 
     def digest(self, number: int) -> str:
-        """Digest of a valid segment; one that is not listed is read for it.
-
-        Where a segment is gone and rows are lost, it has the numbers of their channels, too.
-        """
+        """Digest of a valid segment; one that is not listed is read for it."""
         if number in self.logs:
-            lost = {channel for one in self.lost if one.number == number for channel in one.parts}
-            return "-".join([self.logs[number].digest, *map(str, sorted(lost))])
+            return self.logs[number].digest
         with open_log(self.path / self.listing.sealed[number], number) as reader:
             return reader.digest()
 
     @property
     def end(self) -> Mapping[str, Any] | None:
-        """The end of the recording: by its manifest, else by the segments that state it.
-
-        Of a group whose recorder was killed, each recovered segment says what it has lost. What
-        a power cut has taken whole, the end itself tells: it says how many segments there were.
-        """
-        if self.manifest is not None and self.manifest.is_ended:
-            return end_values(self.manifest)
-        ends: list[Mapping[str, Any]] = []
-        missing: list[int] = []
-        for number, summary in sorted(self.summaries.items()):
-            if summary.end:
-                end: dict[str, Any] = dict(summary.end)
-                segments = min(end.pop("segments", 0), number + MOST_SEALED)
-                ends.append(end)
-                missing += [n for n in range(number, segments) if not self._has(n)]
-        cut = [end for end in ends if end.get("status") == "recovered"]
-        if not missing and (len(ends) < 2 or not cut):
-            return ends[-1] if ends else None
-        damage = [text for end in cut for text in end.get("damage", ())]
-        return {
-            "status": "recovered",
-            "losses": [row for end in ends for row in end.get("losses", ())],
-            "cut_bytes": sum(end.get("cut_bytes", 0) for end in cut),
-            "damage": damage + [f"segment {number} is lost" for number in missing],
-        }
-
-    def _has(self, number: int) -> bool:
-        """True if a segment is there, or the manifest lists it, and so what it had."""
-        return number in self.summaries or number in self.logs or number in self.listing.open
+        """The end of the recording; None before it has one."""
+        is_ended = self.manifest is not None and self.manifest.is_ended
+        return end_values(self.manifest) if self.manifest is not None and is_ended else None
 
     @property
     def state(self) -> str:
@@ -250,32 +217,28 @@ def inventory_of(
         )
     rows = {} if manifest is None else manifest.rows
     for number, file in listed.items():
-        if number not in found.summaries and number not in listing.open:
-            lost = [file] if file.is_here else rows[number]
+        own: Sequence[File] = rows.get(number, ())
+        if not file.is_here and number in found.summaries and not listing.has_all(own):
+            del found.summaries[number]
+            found.misfits += [
+                Misfit(number, row.name, f"{row.name} {problem}")
+                for row in own
+                if (problem := _problem(listing.rows.get(row.name), row.bytes))
+            ]
+            found.lost += own
+        elif number not in found.summaries and number not in listing.open:
+            lost = [file] if file.is_here else own
             found.lost += lost
             if number not in listing.sealed:
                 name = "" if file.is_here else lost[0].name
                 found.misfits.append(Misfit(number, name, f"{lost[0].name} is missing"))
-        elif not file.is_here and number in found.summaries:
-            _leave_out_lost_rows(found, number, rows[number])
     found.misfits.sort(key=lambda misfit: misfit.segment)
     return found
 
 
-def _leave_out_lost_rows(found: Inventory, number: int, rows: Sequence[File]) -> None:
-    """Leave out the topics of a segment that is gone whose files of rows are not all whole."""
-    assert found.manifest is not None
-    topics = set()
-    for file in rows:
-        size = found.listing.rows.get(file.name)
-        if size != file.bytes:
-            problem = "is missing" if size is None else "has another size"
-            found.misfits.append(Misfit(number, file.name, f"{file.name} {problem}"))
-            topics.add(topic_of(file, found.manifest))
-    found.lost += [file for file in rows if topic_of(file, found.manifest) in topics]
-    summary = found.summaries[number]
-    left = [n for n in summary.counts if summary.channels[n].topic not in topics]
-    found.summaries[number] = summary.only(left)
+def _problem(size: int | None, wanted: int) -> str:
+    """What is wrong with a file of a size, None for a missing one; empty if nothing is."""
+    return "" if size == wanted else "is missing" if size is None else "has another size"
 
 
 def steady_inventory(directory: StoreDirectory, recording: str) -> Inventory:
@@ -296,22 +259,9 @@ def steady_inventory(directory: StoreDirectory, recording: str) -> Inventory:
 def _is_listed(summary: SegmentSummary, recording: str, number: int, log: File | None) -> bool:
     """True for a whole segment of a recording and number that is as the manifest lists it."""
     said = summary.recording.get("id"), summary.recording.get("segment")
-    as_listed = log is None or (summary.size, _parts_of(summary)) == (log.bytes, log.parts)
+    parts = listed_parts(summary.table.as_stored())
+    as_listed = log is None or (summary.size, parts) == (log.bytes, log.parts)
     return said == (recording, number) and as_listed
-
-
-def _parts_of(summary: SegmentSummary) -> dict[int, truth.Part]:
-    """What a segment has of each channel, as a manifest lists it."""
-    channels = sealed_channels(summary.table.as_stored(), summary.channels)
-    return _parts(channels)
-
-
-def _parts(channels: Iterable[SealedChannel]) -> dict[int, truth.Part]:
-    return {
-        one.id: truth.Part(one.messages, one.payload_bytes, one.first, one.last)
-        for one in channels
-        if one.messages
-    }
 
 
 def read_summary(path: Path, number: int) -> SegmentSummary:
@@ -576,20 +526,23 @@ def _source_of(source: Source) -> dict[str, Any]:
 
 def lost_in_crash(manifest: Manifest, after: Sealed) -> list[truth.Loss]:
     """Rows of the loss ledger for content of a listed segment that a crash has taken."""
-    before = manifest.logs[after.segment]
-    left = {one.id: one.messages for one in after.channels}
+    before, left = manifest.logs[after.file.number], after.file.parts
+    lost = {
+        number: part.messages - (left[number].messages if number in left else 0)
+        for number, part in before.parts.items()
+    }
     return [
         truth.Loss(
             Cause.SEGMENT.value,
             manifest.channels[number].topic,
-            part.messages - left.get(number, 0),
-            part.first,
-            part.last,
+            count,
+            before.parts[number].first,
+            before.parts[number].last,
             "a crash took what was written last",
             before.name,
         )
-        for number, part in before.parts.items()
-        if part.messages > left.get(number, 0)
+        for number, count in lost.items()
+        if count > 0
     ]
 
 
@@ -692,9 +645,9 @@ def _fill_stats(entry: RecordingEntry, inventory: Inventory, catalog: Catalog) -
     totals: dict[int, ChannelStats] = {}
     entry.is_decoded = True
     for number, summary in inventory.summaries.items():
-        found = catalog.stamps(entry, number, summary.table)
-        entry.is_decoded &= found is not None or not len(summary.table.parts)
-        for channel_id, stats in channel_totals(summary.table, found, silent).items():
+        decoded = catalog.decoded(entry, number)
+        entry.is_decoded &= decoded is not None or not len(summary.table.parts)
+        for channel_id, stats in channel_totals(summary.table, decoded, silent).items():
             totals.setdefault(channel_id, ChannelStats()).add(stats)
     for channel in entry.channels:
         channel.stats = totals.get(channel.id, ChannelStats())
@@ -710,13 +663,9 @@ def channels_of(summaries: Iterable[SegmentSummary]) -> dict[int, Channel]:
 
 def listed(*segments: Sealed) -> Callable[[Manifest], Manifest]:
     """The change that lists segments, in the place of those of their numbers."""
-    files = tuple(map(_file_of, segments))
+    files = tuple(sealed.file for sealed in segments)
     numbers = {file.number for file in files}
-    channels = {
-        one.id: truth.Channel(one.topic, one.encoding, one.type, schema=one.schema)
-        for sealed in segments
-        for one in sealed.channels
-    }
+    channels = {n: one for sealed in segments for n, one in sealed.channels.items()}
 
     def how(now: Manifest) -> Manifest:
         others = (one for one in now.files if one.kind != "log" or one.number not in numbers)
@@ -726,25 +675,8 @@ def listed(*segments: Sealed) -> Callable[[Manifest], Manifest]:
     return how
 
 
-def _file_of(sealed: Sealed) -> File:
-    times = [time for one in sealed.channels for time in (one.first, one.last) if time is not None]
-    return File(
-        sealed.segment,
-        sealed.group,
-        sealed.file,
-        "log",
-        sealed.bytes,
-        sealed.digest,
-        time.time_ns(),
-        min(times, default=None),
-        max(times, default=None),
-        _parts(sealed.channels),
-        has_losses=sealed.has_losses,
-    )
-
-
 def ended(end: Mapping[str, Any]) -> Callable[[Manifest], Manifest]:
-    """The change that ends a recording."""
+    """The change that ends a recording, by its `status` and `losses`."""
     status = cast("Literal['complete', 'damaged', 'recovered']", end.get("status", "complete"))
     losses = tuple(loss_of(row) for row in end.get("losses", ()))
 
@@ -753,8 +685,6 @@ def ended(end: Mapping[str, Any]) -> Callable[[Manifest], Manifest]:
             now,
             status="unproven" if now.status == "unproven" else status,
             losses=(*now.losses, *losses),
-            cut_bytes=end.get("cut_bytes", 0),
-            damage=tuple(end.get("damage", ())),
         )
 
     return how
@@ -776,9 +706,6 @@ def made_again(inventory: Inventory, old: Manifest | None) -> Manifest:
         and (number not in made.logs or made.logs[number].is_here == is_rows(name))
     ]
     made = _listing_of(inventory, numbers)(made)
-    end = inventory.end
-    if end is not None and not made.is_ended:
-        made = ended(end)(made)
     return truth.replace(made, status="unproven", changes=made.changes + 1)
 
 
@@ -787,9 +714,9 @@ def _listing_of(inventory: Inventory, numbers: Iterable[int]) -> Callable[[Manif
 
     def how(now: Manifest) -> Manifest:
         for sealed, log, rows in found:
-            if sealed.segment not in now.logs:
+            if sealed.file.number not in now.logs:
                 now = listed(sealed)(now)
-            line = log or truth.replace(now.logs[sealed.segment], gone=UNSET, copy="")
+            line = log or truth.replace(now.logs[sealed.file.number], gone=UNSET, copy="")
             now = truth.with_rows(now, line, rows)
         return now
 
@@ -812,10 +739,13 @@ def _rows_of(inventory: Inventory, number: int) -> tuple[File | None, Sequence[F
 def sealed_of(inventory: Inventory, number: int) -> Sealed:
     """An existing segment, as a manifest lists it."""
     summary = inventory.summaries[number]
-    channels = sealed_channels(summary.table.as_stored(), summary.channels)
-    group, digest = group_of(summary.recording, number), inventory.digest(number)
-    has_losses, name = bool(summary.losses), sealed_name(number)
-    return Sealed(number, name, summary.size, digest, channels, group, has_losses)
+    return Sealed.of(
+        (number, group_of(summary.recording, number)),
+        (summary.size, inventory.digest(number)),
+        summary.table.as_stored(),
+        summary.channels,
+        has_losses=bool(summary.losses),
+    )
 
 
 def free_name_in(others: Iterable[RecordingSummary | Manifest], name: str, but: str = "") -> str:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Protocol, TypeVar
 import numpy as np
 
 from hybridlog.entries import channels_of, read_again, summary_of, take_inventory
-from hybridlog.query.chunk_columns import PARTS, ChunkColumns
+from hybridlog.query.chunk_columns import PARTS, ChunkColumns, log_bounds
 from hybridlog.query.question import RecordedChannel, field_types
 from hybridlog.query.topics import resolve
 from hybridlog.record.marks import MARKS
@@ -458,14 +458,17 @@ class Session:
         """Chunks that may hold messages of some channels in a time range."""
         found: list[Chunk] = []
         timed = [c.id for c in recording.channels if c.has_publish_time]
+        if clock == "header" and bounds is not None and recording.is_decoded:
+            stats = [c.stats for c in recording.channels if c.id in channels]
+            bounds, clock = log_bounds(bounds, stats), "log"
         for number, first, last in recording.spans_with(channels):
             is_beside = bounds is not None and not (
                 min(first, END - 1) < bounds[1] and last >= bounds[0]
             )
             if clock == "log" and is_beside:
                 continue
-            columns, stamps = self._chunk_columns(recording, number, channels)
-            found += columns.chunks(columns.within(bounds, clock, stamps=stamps, timed=timed))
+            columns = self._chunk_columns(recording, number, channels)
+            found += columns.chunks(columns.within(bounds, clock, timed=timed))
         return found
 
     def chunks_before(
@@ -480,22 +483,22 @@ class Session:
         spans = [span for span in spans if span[1] <= latest]
         lasts = [BEGIN, *accumulate((last for _, _, last in spans), max)]
         for place in reversed(range(len(spans))):
-            columns, _ = self._chunk_columns(recording, spans[place][0], channels)
+            columns = self._chunk_columns(recording, spans[place][0], channels)
             for chunk, last in columns.before(latest):
                 yield chunk, max(last, lasts[place])
 
     def _chunk_columns(
         self, recording: RecordingEntry, number: int, channels: Collection[int]
-    ) -> tuple[ChunkColumns, NDArray[np.void] | None]:
-        """The chunks of a segment with some channels, and header stamps of its parts."""
-        table, stamps = self._of_catalog(recording, self.catalog.decoded_table, number)
+    ) -> ChunkColumns:
+        """The chunks of a segment with some channels."""
+        table = self._of_catalog(recording, self.catalog.table, number)
         key = recording.id, number, frozenset(channels)
         known = self.shared.columns.get(key)
         if known is None or known[0] is not table:
             if len(self.shared.columns) >= _MAX_COLUMNS:
                 self.shared.columns.clear()
             known = self.shared.columns[key] = table, ChunkColumns(number, table, channels)
-        return known[1], stamps
+        return known[1]
 
     def _of_catalog(
         self,
@@ -526,7 +529,7 @@ class Session:
         found = [np.empty(0, PARTS)]
         for number, first, last in recording.spans_with(channels):
             if min(first, END - 1) < span[1] and last >= span[0]:
-                rows = self._chunk_columns(recording, number, channels)[0].parts
+                rows = self._chunk_columns(recording, number, channels).parts
                 found.append(rows[(placed(rows["first"]) < span[1]) & (rows["last"] >= span[0])])
         return np.concatenate(found)
 

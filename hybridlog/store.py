@@ -19,7 +19,6 @@ from typing import (
     Self,
     TypeAlias,
     cast,
-    overload,
 )
 
 from hybridlog.entries import free_name_in, put_entry, text
@@ -71,9 +70,9 @@ if TYPE_CHECKING:
     from hybridlog.live import LiveOptions, LiveRecording
     from hybridlog.maintenance.copying import CopyOptions, CopyReport, Target
     from hybridlog.maintenance.keep import KeepReport
-    from hybridlog.maintenance.repair import Repaired
+    from hybridlog.maintenance.report import Repaired
     from hybridlog.maintenance.sizes import Sizes
-    from hybridlog.maintenance.verify import Verification
+    from hybridlog.maintenance.verify import Finding, Verification
     from hybridlog.query.answers.regularity import TopicCheck
     from hybridlog.query.choice import During, Tags, Texts
     from hybridlog.query.question import Clock
@@ -943,24 +942,6 @@ class Store:
 
         return sizes_of(self.directory, self.catalog, self.select(recordings), self.database)
 
-    @overload
-    def verify(
-        self,
-        recordings: Names | None = None,
-        progress: Progress | None = None,
-        *,
-        repair: Literal[False] = False,
-    ) -> Verification: ...
-
-    @overload
-    def verify(
-        self,
-        recordings: Names | None = None,
-        progress: Progress | None = None,
-        *,
-        repair: Literal[True],
-    ) -> list[Repaired]: ...
-
     @again_if_lost
     def verify(
         self,
@@ -968,29 +949,29 @@ class Store:
         progress: Progress | None = None,
         *,
         repair: bool = False,
-    ) -> Verification | list[Repaired]:
+    ) -> Verification:
         """Check all checksums, and compare catalog and index with the segments.
 
         Args:
             recordings: The recordings; None for all.
             progress: Called after each chunk.
-            repair: Apply all repairs that lose no data; read the rest.
-
-        Returns:
-            What was found; with `repair`, what was mended, and what only a copy can restore.
+            repair: Make all repairs that lose no data first.
         """
         from hybridlog.maintenance.verify import verify
 
         if repair:
-            return self._repair(recordings, progress)
+            self._check_on_disk()
+            self._to_change().mend()
         self.refresh()
-        return verify(
-            self.directory,
-            self.catalog,
-            self.database,
-            recordings=None if recordings is None else self._with_unreadable(recordings),
-            progress=progress,
+        names = None if recordings is None else self._with_unreadable(recordings)
+        done, left = self._repair(names, progress) if repair else ([], [])
+        found = verify(
+            self.directory, self.catalog, self.database, recordings=names, progress=progress
         )
+        told = {(one.recording, one.place) for one in left}
+        left += [one for one in found.findings if (one.recording, one.place) not in told]
+        found.repaired, found.findings = done, left
+        return found
 
     def _with_unreadable(self, names: Names) -> dict[str, str]:
         """Names of recordings by id, where ids of those that cannot be read stand for them."""
@@ -999,14 +980,12 @@ class Store:
         others = self.select([one for one in names if not isinstance(one, str) or one not in found])
         return found | {one.id: one.name for one in others}
 
-    def _repair(self, recordings: Names | None, progress: Progress | None) -> list[Repaired]:
-        self._check_on_disk()
+    def _repair(
+        self, names: Mapping[str, str] | None, progress: Progress | None
+    ) -> tuple[list[Repaired], list[Finding]]:
         from hybridlog.maintenance.repair import repair, repair_index
 
-        self._to_change().mend()
-        self.refresh()
-        names = None if recordings is None else self._with_unreadable(recordings)
-        done = repair(self.directory, self.catalog, self.repairs, names)
+        done, left = repair(self.directory, self.catalog, self.repairs, names)
         self.refresh()
         database = self.shared.index.writable_database
         if database is not None:
@@ -1018,7 +997,7 @@ class Store:
                 progress=progress,
             )
             self.refresh()
-        return done
+        return done, left
 
     def keep(
         self,

@@ -227,7 +227,6 @@ class Segment:
         assert table is not None
         self._table(table, start)
         self.about = self._json("hybridlog.recording")[0]
-        self.end = next(iter(self._json("hybridlog.end")), None)
         self.losses = [row for said in self._json("hybridlog.losses") for row in said["rows"]]
 
     def _read(self, path: Path) -> bytes:
@@ -454,7 +453,7 @@ class Recording:
                 sealed[number] = None
         for number, log in listed.items():
             own = [row for row in self.manifest.rows if row["number"] == number]
-            if "gone" in log and (path / own[0]["name"]).is_file():
+            if "gone" in log and all(self._is_there(row) for row in own):
                 sealed[number] = GoneSegment(path / own[0]["name"], own, self.manifest.id)
         self.id = self.manifest.id
         self.segments = {
@@ -472,7 +471,6 @@ class Recording:
         self.end = self._end()
         self.damage = dict(self._damage())
         self.lost = [*self._lost_segments(listed), *self._lost_chunks()]
-        self.lost += self._lost_rows()
         self.status = self._status()
 
     def _is_believed(self, number: int, segment: Segment, listed: Mapping[str, Any] | None) -> bool:
@@ -529,19 +527,9 @@ class Recording:
                 about = (part.messages, topic, part.first, part.last)
                 yield _row(segment.path.name, place.offset, place.length, *about)
 
-    def _lost_rows(self) -> Iterator[dict[str, Any]]:
-        def key(file: Mapping[str, Any]) -> tuple[int, str]:
-            return file["number"], self.manifest.topics[int(next(iter(file["parts"])))]
-
-        lost = set()
-        for file in self.manifest.rows:
-            path = self.path / file["name"]
-            is_there = path.is_file() and path.stat().st_size == file["bytes"]
-            if not is_there and file["number"] in self.segments:
-                lost.add(key(file))
-        for file in self.manifest.rows:
-            if key(file) in lost:
-                yield from self._lost_file(file)
+    def _is_there(self, row: Mapping[str, Any]) -> bool:
+        path = self.path / row["name"]
+        return path.is_file() and path.stat().st_size == row["bytes"]
 
     def _status(self) -> str:
         if self._is_recorded() and (self.end is None or self.open):

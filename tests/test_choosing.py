@@ -213,7 +213,7 @@ def test_all_commands_choose_alike(store: hl.Store) -> None:
     rows = json.loads(call(store, "info", "--sizes", "recording", *chosen, "--json").out)["rows"]
     assert [row["recording"] for row in rows] == ["tuesday"]
     assert call(store, "verify", *chosen).out.startswith("1 recording,")
-    assert call(store, "verify", "--repair", *chosen).out == "nothing to mend\n"
+    assert call(store, "verify", "--repair", *chosen).out.startswith("1 recording,")
     for command in ("info", "verify", "verify --repair", "rm"):
         assert call(store, *command.split(), "--tag", "robot=9").code == 2
     for command in ("fetch", "intervals", "info --tables -t"):

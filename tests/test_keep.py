@@ -394,7 +394,7 @@ def test_what_is_said_meanwhile_keeps_a_recording(
 
 def test_what_may_have_lost_pins_is_left_alone_and_named(store: Path) -> None:
     places.manifest_of(places.folder(store, "run")).unlink()
-    answer("verify", "--repair", "--mongo", "none", store=store)
+    answer("verify", "--repair", "--mongo", "none", store=store, code=None)
     found = keep("--max-age", "0s", "--fields-age", "0s", store=store)
     assert (
         "run: left alone, since a manifest that was lost and made again may lack pins" in found.err
@@ -431,7 +431,7 @@ def test_whole_groups_go_when_no_payloads_are_left(store: Path) -> None:
                 (number,) for number in numbers
             ]
         assert opened.verify().findings == []
-    answer("verify", "--repair", "--mongo", "none", store=store)
+    answer("verify", "--repair", "--mongo", "none", store=store, code=None)
     with hl.open(store, mongo="none") as opened:
         assert opened.topic("/arm").count() == len(arms)
         (known,) = opened.summaries()

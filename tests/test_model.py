@@ -664,7 +664,7 @@ class Machine(RuleBasedStateMachine):
         self.open_again()
         assert self.store.repairs.unreadable.keys() == {recording}
         assert recording not in {one.id for one in self.store.recordings()}
-        cured = [one.place for one in self.store.verify(repair=True) if one.is_cured]
+        cured = [one.place for one in self.store.verify(repair=True).repaired]
         assert "manifest" in cured
         self.open_again()
         assert not self.store.repairs.unreadable

@@ -50,17 +50,16 @@ def look(store: Path) -> tuple[str, int, int]:
         return entry.status, entry.messages, lost
 
 
-def repair(store: Path) -> dict[tuple[str, str], bool]:
-    """What `repair` says, by recording and place: whether it is cured."""
+def repair(store: Path) -> tuple[set[tuple[str, str]], set[tuple[str, str]]]:
+    """What `repair` has mended, and what it has left, by recording and place."""
     with closing(hl.open(store, mongo=NOWHERE)) as opened:
-        done = {(one.recording, one.place): one.is_cured for one in opened.verify(repair=True)}
+        done = opened.verify(repair=True)
     with closing(hl.open(store, mongo=NOWHERE)) as opened:
-        # What was cured is cured, and what was not is said again.
+        # What was mended is whole, and what was not is said again.
         again = opened.verify(repair=True)
-        assert {(one.recording, one.place) for one in again} == {
-            k for k, v in done.items() if not v
-        }
-    return done
+        assert (again.repaired, again.findings) == ([], done.findings)
+    mended = {(one.recording, one.place) for one in done.repaired}
+    return mended, {(one.recording, one.place) for one in done.findings}
 
 
 def file(store: Path, number: int) -> Path:
@@ -69,7 +68,7 @@ def file(store: Path, number: int) -> Path:
 
 def test_a_store_that_is_whole(store: Path) -> None:
     before = {p: p.read_bytes() for p in places.root(store).rglob("*") if p.is_file()}
-    assert repair(store) == {}
+    assert repair(store) == (set(), set())
     assert {p: p.read_bytes() for p in places.root(store).rglob("*") if p.is_file()} == before
     assert look(store) == ("complete", COUNT, 0)
 
@@ -93,9 +92,9 @@ def test_what_can_be_proven_is_put_right(store: Path, fault: Callable[[Path], No
     status, messages, lost = look(store)
     assert (status, messages + lost) == ("damaged", COUNT)
     assert lost
-    done = repair(store)
-    assert done
-    assert all(done.values())
+    mended, left = repair(store)
+    assert mended
+    assert not left
     assert {n: file(store, n).read_bytes() for n in range(4)} == whole
     assert sorted(p.name for p in places.folder(store, "one").iterdir()) == names
     assert look(store) == ("complete", COUNT, 0)
@@ -114,7 +113,9 @@ def test_a_segment_whose_messages_are_damaged_stays_as_it_is(store: Path) -> Non
     data[400] ^= 4
     data[-60] ^= 4
     file(store, 1).write_bytes(data)
-    assert repair(store) == {("one", "000001.mcap"): False}
+    mended, left = repair(store)
+    assert not mended
+    assert {(one, place.partition(" ")[0]) for one, place in left} == {("one", "000001.mcap")}
     assert file(store, 1).read_bytes() == data
     assert not list(file(store, 1).parent.glob(".*"))
     status, messages, lost = look(store)
@@ -125,10 +126,10 @@ def test_damage_that_only_a_copy_mends_is_said(store: Path) -> None:
     data = bytearray(file(store, 1).read_bytes())
     data[1400] ^= 4
     file(store, 1).write_bytes(data)
-    ((where, is_cured),) = repair(store).items()
+    mended, (where,) = repair(store)
     assert where[0] == "one"
     assert where[1].startswith("000001.mcap byte ")
-    assert not is_cured
+    assert not mended
     with closing(hl.open(store, mongo=NOWHERE)) as opened:
         (finding,) = opened.verify().findings
         assert (finding.recording, finding.place) == where
@@ -141,7 +142,7 @@ def test_what_a_kill_has_left_is_sealed_before_its_manifest_is_made(store: Path)
         segment.rename(segment.with_name(f"{segment.name}.open"))
     places.manifest_of(folder).write_bytes(b"")
     (folder / MANIFEST_OLD).unlink()
-    assert repair(store) == {("one", "manifest"): True}
+    assert repair(store)[0] == {("one", "manifest")}
     assert look(store) == ("unproven", COUNT, 0)
 
 
@@ -168,7 +169,7 @@ def test_a_manifest_is_made_again_when_it_is_asked_for(
         (finding,) = opened.verify().findings
         assert (finding.place, "hybridlog verify" in finding.problem) == ("manifest", False)
     assert sorted(p.name for p in folder.iterdir()) == before
-    assert repair(store) == {("one", "manifest"): True}
+    assert repair(store)[0] == {("one", "manifest")}
     assert look(store) == ("unproven", COUNT, 0)
     with closing(hl.open(store, mongo=NOWHERE)) as opened:
         assert opened.entry("one").tags == ({"place": "lab"} if has_old else {})
@@ -206,11 +207,10 @@ def test_a_segment_that_was_restored_is_answered_from_again(store: Path) -> None
         with pytest.raises(SegmentError, match=r"byte \d+ of .*000001\.mcap is damaged"):
             opened.topic("/n").where("n >= 0").count()
         assert opened.topic("/n").in_recording("two").where("n >= 0").count() == COUNT
-        assert not [one for one in opened.verify(repair=True) if one.place == "index"]
+        assert "index" not in {one.place for one in opened.verify(repair=True).repaired}
         file(store, 1).write_bytes(whole)
-        assert [one.is_cured for one in opened.verify(repair=True) if one.place == "index"] == [
-            True
-        ]
+        done = opened.verify(repair=True)
+        assert ([one.place for one in done.repaired], done.findings) == (["index"], [])
         assert opened.entry("one").status == "complete"
         assert opened.topic("/n").where("n >= 0").count() == 2 * COUNT
         assert not opened.verify().findings
@@ -242,7 +242,7 @@ def test_a_recording_that_cannot_be_read_is_chosen_by_its_id(store: Path, chosen
     found = said.json
     assert ("one", "manifest") in {(one["recording"], one["place"]) for one in found["findings"]}
     assert found["recordings"] == (1 if chosen == "its id" else 2)
-    answer("verify", "--repair", *words, store=store)
+    answer("verify", "--repair", *words, store=store, code=None)
     assert look(store) == ("unproven", COUNT, 0)
 
 

@@ -407,7 +407,6 @@ def show_segment(path: Path, *, as_json: bool) -> None:
         "segment": str(path),
         "bytes": bytes_all,
         "recording": summary.recording,
-        "end": summary.end,
         "first_ns": min((place.first for place in chunks), default=None),
         "last_ns": max((place.last for place in chunks), default=None),
         "chunks": len(chunks),

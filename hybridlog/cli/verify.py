@@ -18,7 +18,7 @@ from hybridlog.wording import listed
 from hybridlog_storage.errors import DatabaseError, TopicError, WithoutMongoError
 
 if TYPE_CHECKING:
-    from hybridlog.maintenance.repair import Repaired
+    from hybridlog.maintenance.report import Repaired
     from hybridlog.maintenance.verify import Finding, Verification
     from hybridlog.store import Store
     from hybridlog_storage.summary import RecordingSummary
@@ -44,18 +44,24 @@ def verify_command(given: _Given) -> None:
 
     Exits with 1 when it finds a problem, and prints a cure for each. With --repair, it restores
     the names of segments, makes damaged summaries and lost manifests again, and brings catalog and
-    index up to date; it exits with 1 when something is left, as what only a copy restores.
+    index up to date before that.
     """
-    if given.repair:
-        _repair(given)
-        return
+    if given.new_id:
+        from hybridlog.maintenance.lease import become_another
+        from hybridlog.store import store_path
+
+        become_another(store_path(given.store), given.mongo)
+        output.note("The store has a new id now.")
     started = time.monotonic()
     with given.opened(verifies=True) as store:
+        if given.moved:
+            store.shared.index.take_over()
+            output.note("The index belongs to the store at this place now.")
         chosen, unreadable = _chosen(given, store)
         total = sum(entry.stored_bytes for entry in chosen)
         names = None if given.choice.is_everything else [*(one.id for one in chosen), *unreadable]
         with Bar("verify", total) as bar:
-            result = store.verify(names, bar.part)
+            result = store.verify(names, bar.part, repair=given.repair)
         why = store.shared.index.unavailable
     elapsed = time.monotonic() - started
     if given.as_json:
@@ -90,6 +96,8 @@ def _chosen(given: _Given, store: Store) -> tuple[Sequence[RecordingSummary], li
 
 
 def _print(result: Verification, elapsed: float) -> None:
+    for done in result.repaired:
+        _say(done, f"mended: {done.done}")
     for finding in result.findings:
         _say(finding, f"{finding.problem.removesuffix('.')}; {finding.cure}")
     verdict = "all is well" if result.index else "all is well in the files"
@@ -103,32 +111,6 @@ def _print(result: Verification, elapsed: float) -> None:
         f"{output.without_documents(result.without_documents)}"
     )
     output.tell(None, [told])
-
-
-def _repair(given: _Given) -> None:
-    """Mend what can be mended, and list what is left."""
-    if given.new_id:
-        from hybridlog.maintenance.lease import become_another
-        from hybridlog.store import store_path
-
-        become_another(store_path(given.store), given.mongo)
-        output.note("The store has a new id now.")
-    with given.opened(verifies=True) as store:
-        if given.moved:
-            store.shared.index.take_over()
-            output.note("The index belongs to the store at this place now.")
-        chosen, unreadable = _chosen(given, store)
-        names = None if given.choice.is_everything else [*(one.id for one in chosen), *unreadable]
-        with Bar("repair") as bar:
-            done = store.verify(names, bar.part, repair=True)
-    if given.as_json:
-        output.print_json([asdict(one) for one in done])
-    else:
-        for one in done:
-            _say(one, f"{'mended' if one.is_cured else 'left'}: {one.done}")
-        output.tell(None, [] if done or given.moved or given.new_id else ["nothing to mend"])
-    if not all(one.is_cured for one in done):
-        raise click.exceptions.Exit(1)
 
 
 def _say(one: Finding | Repaired, what: str) -> None:

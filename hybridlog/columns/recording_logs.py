@@ -170,7 +170,6 @@ def walk(
     begin = 0
     for number in (number for number, _, _ in entry.spans if str(number) in entry.digests):
         with open_log(recording / file_of(entry, number), number, rows) as reader:
-            summary = reader.summary().only(entry.held[str(number)])
-            yield WalkedSegment(number, reader, summary, begin, report)
+            yield WalkedSegment(number, reader, reader.summary(), begin, report)
             begin += reader.size
             report(begin)

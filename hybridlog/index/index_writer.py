@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hybridlog.index.indexing import ChunkIndexer
-from hybridlog_storage.catalog import decoded_rows
+from hybridlog_storage.catalog import decoded_in
 from hybridlog_storage.errors import DatabaseError, HybridlogError, SegmentError
 from hybridlog_storage.mongo.collection_names import collection_of
 from hybridlog_storage.mongo.index_state import IndexState
@@ -245,8 +245,8 @@ class IndexWriter:
 
     def seal(self, sealed: Sealed) -> None:
         """Note that a segment has all its chunks."""
-        self._places.setdefault(sealed.segment, [])
-        self._sealed[sealed.segment] = sealed.digest
+        self._places.setdefault(sealed.file.number, [])
+        self._sealed[sealed.file.number] = sealed.file.digest
         self._calls.put(None)
 
     def prepare(self, channel: Channel) -> None:
@@ -346,9 +346,9 @@ class IndexWriter:
         self._tables.cut(segment, digest)
         stats, count = self._stats.pop(segment, {}), len(self._places[segment])
         if len(stats) == count:
-            rows = decoded_rows([stats[number] for number in range(count)])
             with suppress(HybridlogError):  # it is derived, and the disk may be full
-                self._catalog.put_stamps(self._entry.id, [(segment, digest, rows)])
+                decoded = decoded_in(stats.values())
+                self._catalog.put_decoded(self._entry.id, segment, digest, decoded)
         del self._places[segment], self._read_to[segment], self._sealed[segment]
         self._close_reader(segment)
         if self._sender is not None and segment not in self._gaps:

@@ -182,9 +182,7 @@ class _StatsByChunk:
         payload_bytes = np.add.reduceat(batch.length, begins).tolist()
         spans = _spans(batch.log_time, begins)
         found = {
-            number: ChannelStats(
-                messages=count, payload_bytes=size, first=first, last=last, longest=last - first
-            )
+            number: ChannelStats(messages=count, payload_bytes=size, first=first, last=last)
             for number, count, size, (first, last) in zip(
                 numbers, messages, payload_bytes, spans, strict=True
             )

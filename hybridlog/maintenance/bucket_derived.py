@@ -16,7 +16,7 @@ from hybridlog.maintenance.opening import open_catalog
 from hybridlog.snapshot import UNFINISHED
 from hybridlog_storage.copy_places import read
 from hybridlog_storage.disk import files
-from hybridlog_storage.errors import CatalogError, StoreError, unreadable
+from hybridlog_storage.errors import StoreError, unreadable
 
 if TYPE_CHECKING:
     from collections.abc import Collection
@@ -61,13 +61,10 @@ def _describe(
     known: Catalog, entry: RecordingEntry, target: RemoteDirectory, catalog: Catalog
 ) -> None:
     """Make the row of the catalog from what is there, and from what decoding found out here."""
-    found = []
     for number, digest in entry.digests.items():
-        with suppress(CatalogError):
-            rows = known.decoded_table(entry, int(number))[1]
-            if rows is not None:
-                found.append((int(number), digest, rows))
-    catalog.put_stamps(entry.id, found)
+        decoded = known.decoded(entry, int(number))
+        if decoded is not None:
+            catalog.put_decoded(entry.id, int(number), digest, decoded)
     catalog.put_damage(entry.id, known.damage(entry.id))
     catalog.put(describe(catalog, take_inventory(target, entry.id)))
 

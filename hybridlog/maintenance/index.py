@@ -14,7 +14,7 @@ from hybridlog.entries import put_entry
 from hybridlog.index.indexing import ChunkIndexer
 from hybridlog.maintenance import tables
 from hybridlog.maintenance.report import Progress, RepairReport, reporter
-from hybridlog_storage.catalog import stamps_of
+from hybridlog_storage.catalog import decoded_in
 from hybridlog_storage.disk.directory import LOCK_WAIT_S
 from hybridlog_storage.errors import (
     HeldError,
@@ -241,8 +241,8 @@ def derive(
             number, summary = segment.number, segment.summary
             digest = entry.digests[str(number)]
             is_sent = sender is None or str(number) in done
-            is_decoded = catalog.stamps(entry, number, summary.table) is not None
-            stats: dict[int, Mapping[int, ChannelStats]] = {}
+            is_decoded = catalog.decoded(entry, number) is not None
+            stats: list[Mapping[int, ChannelStats]] = []
             wanted = {
                 place
                 for place in summary.chunks
@@ -255,7 +255,7 @@ def derive(
                 damage.pop((number, place.number), None)
                 writer.add(chunk, summary.channels)
                 documents, entries = indexer.documents_of([chunk], summary.channels)
-                stats[chunk.number] = entries[0].stats
+                stats.append(entries[0].stats)
                 if sender is not None and not is_sent:
                     made += 1
                     sender.add(documents, entries)
@@ -266,7 +266,7 @@ def derive(
             if sender is not None and not is_sent:
                 sender.end_segment(number, digest)
             if not is_decoded:
-                catalog.put_stamps(entry.id, [(number, digest, stamps_of(summary.table, stats))])
+                catalog.put_decoded(entry.id, number, digest, decoded_in(stats))
         if sender is not None:
             sender.send(wait=True)
         catalog.put_damage(entry.id, damage)

@@ -11,7 +11,7 @@ from collections.abc import Collection, Mapping
 from collections.abc import Set as AbstractSet
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from msgspec import to_builtins
 
@@ -42,7 +42,6 @@ from hybridlog_storage.errors import (
 from hybridlog_storage.manifest import Manifest, replace
 
 if TYPE_CHECKING:
-    from hybridlog.entries import Inventory
     from hybridlog.maintenance.report import RepairReport
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.disk.directory import Listing, StoreDirectory
@@ -305,11 +304,10 @@ def recover(directory: StoreDirectory, recording: str, report: RepairReport) -> 
     if recovered:
         report.recovered[inventory.name] = recovered
     adopt = unlisted(inventory)
-    end = None if manifest.is_ended else _end_of(inventory)
 
     def change(now: Manifest) -> Manifest:
         now = now if adopt is None else adopt(now)
-        return now if end is None or now.is_ended else ended(end)(now)
+        return now if now.is_ended else ended({"status": "recovered"})(now)
 
     directory.manifests.change(recording, change)
     return True
@@ -338,23 +336,23 @@ def recover_segments(
             "created": manifest.created,
         }
 
-    def announce(sealed: Sealed) -> None:
+    def announce(sealed: Sealed, found: Recovered) -> None:
         if manifest is None:
             return
-        before = manifest.logs.get(sealed.segment)
-        if before is None or before.digest != sealed.digest:
+        before = manifest.logs.get(sealed.file.number)
+        if before is None or before.digest != sealed.file.digest:
             lost = () if before is None else lost_in_crash(manifest, sealed)
 
             def change(now: Manifest) -> Manifest:
-                return replace(listed(sealed)(now), losses=(*now.losses, *lost))
+                return replace(
+                    listed(sealed)(now),
+                    losses=(*now.losses, *lost),
+                    cut_bytes=now.cut_bytes + found.cut_bytes,
+                    damage=(*now.damage, *found.damage),
+                )
 
             directory.manifests.change(recording, change)
 
     return [
         recover_segment(path / name, announce, recording=said) for name in listing.open.values()
     ]
-
-
-def _end_of(inventory: Inventory) -> dict[str, Any]:
-    """The `end` of a recording whose manifest does not have it."""
-    return dict(inventory.end or {"status": "recovered", "cut_bytes": 0, "damage": []})

@@ -1,10 +1,9 @@
-"""Repairs that lose no data: provable problems are repaired, others are reported."""
+"""Repairs that lose no data; what is left is found by `verify`."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from hybridlog.columns.recording_logs import RecordingRows
@@ -19,7 +18,8 @@ from hybridlog.entries import (
 from hybridlog.maintenance import tables
 from hybridlog.maintenance.index import StoreIndex
 from hybridlog.maintenance.opening import recover, recover_segments
-from hybridlog.maintenance.verify import RESTORE, damaged_files
+from hybridlog.maintenance.report import Repaired
+from hybridlog.maintenance.verify import AGAIN, Finding
 from hybridlog_storage.catalog import file_of
 from hybridlog_storage.disk.directory import LOCK_WAIT_S
 from hybridlog_storage.errors import HeldError, ManifestError, SegmentError, StoreError, TopicError
@@ -27,13 +27,8 @@ from hybridlog_storage.manifest import replace
 from hybridlog_storage.mongo.index_state import IndexState
 from hybridlog_storage.segments.gone_log import open_log
 from hybridlog_storage.segments.recovery import rebuild_summary
-from hybridlog_storage.segments.segment_check import damage_of
-from hybridlog_storage.segments.segment_file import is_rows
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
-    from hybridlog.entries import Inventory
     from hybridlog.maintenance.report import Progress, RepairReport
     from hybridlog_storage.catalog import Catalog, RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
@@ -41,29 +36,12 @@ if TYPE_CHECKING:
     from hybridlog_storage.mongo.database import Database
 
 
-@dataclass(frozen=True, slots=True)
-class Repaired:
-    """A repair, or a problem that could not be repaired.
-
-    Attributes:
-        recording: Name of the recording.
-        place: File or other subject.
-        done: The repair, or the remaining work.
-        is_cured: Whether the problem is solved.
-    """
-
-    recording: str
-    place: str
-    done: str
-    is_cured: bool = True
-
-
 def repair(
     directory: StoreDirectory,
     catalog: Catalog,
     repairs: RepairReport,
     names: Mapping[str, str] | None,
-) -> list[Repaired]:
+) -> tuple[list[Repaired], list[Finding]]:
     """Repair files, manifests and the catalog.
 
     Args:
@@ -72,11 +50,15 @@ def repair(
         repairs: Says which recordings cannot be read.
         names: Names of the recordings by id; None for all.
 
+    Returns:
+        What was repaired, and what could not be.
+
     Raises:
         StoreError: The store cannot be written.
     """
     directory.check_writable()
     done: list[Repaired] = []
+    left: list[Finding] = []
     checker = tables.TableChecker(directory)
     all_ids = (*directory.ids(), *directory.manifests.without())
     for recording, name in ({one: one for one in all_ids} if names is None else names).items():
@@ -84,54 +66,37 @@ def repair(
             with directory.writing(recording, name, wait_s=LOCK_WAIT_S):
                 done += _repair_one(directory, repairs, recording)
                 entry = put_entry(directory, catalog, recording)
-            if entry.status not in {"damaged", "open"}:
-                # Tables of lost data are valid again after its restoration.
-                for topic, why in checker.repair(entry).items():
-                    what = f"it cannot be made again: {why}" if why else "made again"
-                    done.append(Repaired(entry.name, f"table of {topic}", what, is_cured=not why))
+            if entry.status in {"damaged", "open"}:
+                continue  # tables of lost data are valid again after its restoration
+            for topic, why in checker.repair(entry).items():
+                place = f"table of {topic}"
+                if why:
+                    left.append(
+                        Finding(entry.name, place, f"it cannot be made again: {why}", AGAIN)
+                    )
+                else:
+                    done.append(Repaired(entry.name, place, "made again"))
         except HeldError as error:
             if names is not None or recording in repairs.unreadable:
-                done.append(Repaired(name, "recording", str(error), is_cured=False))
+                left.append(Finding(name, "recording", str(error), AGAIN))
         except (StoreError, TopicError) as error:
-            done.append(Repaired(name, "recording", str(error), is_cured=False))
-    return done
+            left.append(Finding(name, "recording", str(error), AGAIN))
+    return done, left
 
 
 def _repair_one(directory: StoreDirectory, report: RepairReport, recording: str) -> list[Repaired]:
-    done = _manifest(directory, report, recording)
-    rebuilt, lost = _segments(directory.recording(recording), take_inventory(directory, recording))
-    done += rebuilt
+    done, path = _manifest(directory, report, recording), directory.recording(recording)
     inventory = take_inventory(directory, recording)
-    for misfit in inventory.misfits:
-        place = misfit.file or f"segment {misfit.segment}"
-        what = f"{misfit.reason.removesuffix('.')}; {RESTORE}"
-        done.append(Repaired(inventory.name, place, what, is_cured=False))
-    return [*done, *lost]
-
-
-def _segments(path: Path, inventory: Inventory) -> tuple[list[Repaired], list[Repaired]]:
-    """Read every byte of segments and files of rows; make summaries again.
-
-    Returns:
-        What was repaired, and the damage that only a copy can restore.
-    """
-    rebuilt = []
-    lost = [(file.name, problem) for file, problem in damaged_files(path, inventory)]
-    for number, name in inventory.listing.sealed.items():
-        log = inventory.logs.get(number)
-        if is_rows(name):
-            continue
-        digest = log.digest if log is not None and log.name == name else ""
-        found, _ = damage_of(path / name, digest)
-        if found and digest and rebuild_summary(path / name, digest):
-            rebuilt.append(Repaired(inventory.name, name, "its summary was rebuilt"))
-        elif number in inventory.summaries:  # others are misfits
-            lost += [(f"{name} byte {offset}", problem) for offset, problem, _ in found]
-    told = [
-        Repaired(inventory.name, place, f"{problem}; {RESTORE}", is_cured=False)
-        for place, problem in lost
-    ]
-    return rebuilt, told
+    for number, log in inventory.logs.items():
+        is_there = inventory.listing.sealed.get(number) == log.name
+        with suppress(StoreError):  # what is left of it is told
+            if (
+                is_there
+                and number not in inventory.summaries
+                and rebuild_summary(path / log.name, log.digest)
+            ):
+                done.append(Repaired(inventory.name, log.name, "its summary was rebuilt"))
+    return done
 
 
 def _manifest(directory: StoreDirectory, report: RepairReport, recording: str) -> list[Repaired]:

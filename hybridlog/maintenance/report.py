@@ -20,6 +20,21 @@ def reporter(progress: Progress | None, name: str, total: int) -> Callable[[int]
     return lambda done: None if progress is None else progress(name, done, total)
 
 
+@dataclass(frozen=True, slots=True)
+class Repaired:
+    """A repair.
+
+    Attributes:
+        recording: Name of the recording.
+        place: File or other subject.
+        done: What was done.
+    """
+
+    recording: str
+    place: str
+    done: str
+
+
 @dataclass(slots=True)
 class RepairReport:
     """Repairs of a store; recordings by name.

@@ -24,13 +24,14 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from hybridlog.entries import Inventory
-    from hybridlog.maintenance.report import Progress
+    from hybridlog.maintenance.report import Progress, Repaired
     from hybridlog_storage.catalog import Catalog, RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.manifest import File, Manifest
     from hybridlog_storage.mongo.database import Database
 
 _REPAIR = "run `hybridlog verify --repair`"
+AGAIN = f"{_REPAIR} again"
 RESTORE = "`hybridlog copy --check` from a store that has it brings it back"
 _RESTORE_LOST = f"{RESTORE}; `hybridlog info --losses` lists the lost messages"
 _KNOWN = frozenset({LOCK})
@@ -65,6 +66,7 @@ class Verification:
         findings: All problems.
         index: True if the index was compared, too; MongoDB may be unavailable.
         without_documents: Messages of topics that were recorded with `--no-index`.
+        repaired: What was repaired before.
     """
 
     recordings: int = 0
@@ -74,6 +76,7 @@ class Verification:
     findings: list[Finding] = field(default_factory=list)
     index: bool = True
     without_documents: int = 0
+    repaired: list[Repaired] = field(default_factory=list)
 
 
 def verify(
@@ -263,7 +266,8 @@ class _Check:
         """Check every byte of the files of rows."""
         for file, problem in damaged_files(self._path, inventory):
             self.found(file.name, problem, RESTORE)
-            if inventory.manifest is not None and not inventory.logs[file.number].is_here:
+            is_counted = file.number in inventory.summaries
+            if is_counted and inventory.manifest and not inventory.logs[file.number].is_here:
                 lost = sum(part.messages for part in file.parts.values())
                 self._lost[collection_of(topic_of(file, inventory.manifest))] += lost
                 self._result.messages -= lost

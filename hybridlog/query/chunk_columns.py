@@ -16,6 +16,7 @@ from hybridlog_storage.times import BEGIN, END, placed
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from hybridlog_storage.catalog import ChannelStats
     from hybridlog_storage.segments.chunk_table import ChunkTable
     from hybridlog_storage.segments.segment_reader import ChunkPlace
 
@@ -103,31 +104,24 @@ class ChunkColumns:
         bounds: tuple[int, int] | None,
         clock: str = "log",
         *,
-        stamps: NDArray[np.void] | None = None,
         timed: Collection[int] = (),
     ) -> NDArray[np.bool_]:
         """True for chunks that may have messages in a time range.
 
         Args:
             bounds: `[begin, end)`, ns; None for all times.
-            clock: `log`, `publish` or `header`: the time that `bounds` refers to.
-            stamps: Header stamps of the table's parts; None where they are unknown, and every
-                chunk may hold any.
+            clock: `log`, `publish` or `header`: the time that `bounds` refers to; header stamps
+                are unknown here, so every chunk may hold any.
             timed: Ids of channels with publish times.
         """
-        is_unknown = (clock == "header" and stamps is None) or (
-            clock == "publish" and self._table.is_flushed
-        )
+        is_unknown = clock == "header" or (clock == "publish" and self._table.is_flushed)
         if bounds is None or is_unknown or not len(self.number):
             return np.ones(len(self.number), np.bool_)
         begin, end = (max(min(bound, END), BEGIN) for bound in bounds)
-        times = stamps if stamps is not None and clock == "header" else self._table.parts
-        own = times[self._rows]
-        suffix = {"log": "", "publish": "_publish", "header": "_stamp"}[clock]
+        own = self._table.parts[self._rows]
+        suffix = "_publish" if clock == "publish" else ""
         inside = (placed(own[f"first{suffix}"]) < end) & (own[f"last{suffix}"] >= begin)
-        if clock == "header":
-            inside &= own["stamped"] > 0
-        elif clock == "publish":
+        if clock == "publish":
             inside &= np.isin(own["channel"], np.fromiter(timed, np.int64, len(timed)))
         return np.logical_or.reduceat(inside, self._starts)
 
@@ -150,3 +144,34 @@ class ChunkColumns:
         order = np.argsort(self.first, kind="stable")
         last_by = np.maximum.accumulate(self.last[order])
         return order.tolist(), self.first[order].tolist(), last_by.tolist()
+
+
+def log_bounds(bounds: tuple[int, int], stats: Collection[ChannelStats]) -> tuple[int, int] | None:
+    """The range of log time in which messages with header stamps in a range lie.
+
+    Args:
+        bounds: `[begin, end)`, ns, of header stamps.
+        stats: Statistics of the channels, which are decoded.
+
+    Returns:
+        `[begin, end)`, ns; None for all times.
+    """
+    begin, end = bounds
+    known = [one for one in stats if one.skew_min is not None]
+    if begin <= 0 < end and any(one.unset for one in stats):
+        return None
+    if not all(map(_is_exact, known)):
+        return None
+    least = min((one.skew_min or 0 for one in known), default=0)
+    most = max((one.skew_max or 0 for one in known), default=0)
+    return (
+        begin if begin <= BEGIN else begin + least,
+        end if end >= END else end + most,
+    )
+
+
+def _is_exact(stats: ChannelStats) -> bool:
+    """True if the difference of no log time and header stamp runs over 64 bits."""
+    return (stats.last or 0) - (stats.first_stamp or 0) <= END and (stats.first or 0) - (
+        stats.last_stamp or 0
+    ) >= BEGIN

@@ -42,7 +42,7 @@ from hybridlog_storage.errors import (
 from hybridlog_storage.manifest import Manifest, Source, new_id
 from hybridlog_storage.manifest import replace as replaced
 from hybridlog_storage.mongo.index_state import IndexState
-from hybridlog_storage.segments.segment_format import END_METADATA, LOSSES_METADATA, json_metadata
+from hybridlog_storage.segments.segment_format import LOSSES_METADATA, json_metadata
 from hybridlog_storage.segments.segment_writer import RecordingWriter, SegmentSettings
 
 if TYPE_CHECKING:
@@ -197,7 +197,7 @@ class Capture:
         # From here on only the last group is sealed, which announces the end.
         self.writer.flush()
         self._end = end
-        self.writer.close(json_metadata(END_METADATA, end))
+        self.writer.close()
         return self._finish()
 
     def close_truncated(
@@ -213,9 +213,7 @@ class Capture:
         """
         self._end = end  # the segment holds the last losses
         try:
-            self.writer.close_truncated(
-                [json_metadata(LOSSES_METADATA, {"rows": lost}), json_metadata(END_METADATA, end)]
-            )
+            self.writer.close_truncated([json_metadata(LOSSES_METADATA, {"rows": lost})])
         except DiskFullError:
             if not self.writer.written.total():
                 self.rollback()

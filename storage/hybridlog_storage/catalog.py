@@ -11,17 +11,13 @@ from __future__ import annotations
 
 import json
 import math
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Collection, Container, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
-from zlib import compress, decompressobj
-from zlib import error as ZlibError  # noqa: N812
 
-import numpy as np
 from msgspec import convert, to_builtins
 from msgspec.json import Decoder, encode
 
@@ -29,9 +25,7 @@ from hybridlog_storage.cache import Cache
 from hybridlog_storage.cells import Cells, Statement, drop, put
 from hybridlog_storage.disk import durability, files
 from hybridlog_storage.errors import CatalogError, SegmentError
-from hybridlog_storage.lazy import RowType
-from hybridlog_storage.messages import MARKS_CHANNEL, Channel, Schema, schema_hash
-from hybridlog_storage.ordering import run_starts
+from hybridlog_storage.messages import EXPIRED_IDS, MARKS_CHANNEL, Channel, Schema, schema_hash
 from hybridlog_storage.segments.chunk_table import ChunkTable
 from hybridlog_storage.segments.gone_log import GoneLog, open_log
 from hybridlog_storage.segments.segment_file import sealed_name
@@ -44,8 +38,6 @@ from hybridlog_storage.summary import (
 )
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from hybridlog_storage.segments.open_segment import Flushed
 else:
     Flushed = Any  # in no file
@@ -55,8 +47,8 @@ CATALOG: Final = "catalog.sqlite"
 _SUMMARY: Final = "summary"
 _ENTRY: Final = "entry"
 _INDEX: Final = "index"
-_STAMPS: Final = "stamps"
-"""Kinds of the cells of a recording, whose key is its id; of stamps, each segment has one."""
+_DECODED: Final = "decoded"
+"""Kinds of the cells of a recording, whose key is its id; each segment has one of the last."""
 _TOPICS: Final = "topics"
 _SCHEMA: Final = "schema"
 """Kinds of the cells of sets of topics and of schemas, by hash; nothing removes them."""
@@ -67,20 +59,6 @@ _NOTING_S: Final = 0.1
 _MAX_TABLES: Final = 64 << 20  # bytes of chunk tables in memory
 _FEW: Final = 100  # cells that are read one by one
 _T = TypeVar("_T")
-_STAMP = RowType(
-    ("unreadable", "<u4"),
-    ("surplus", "<u4"),
-    ("stamped", "<u4"),
-    ("unset", "<u4"),
-    ("first_stamp", "<i8"),
-    ("last_stamp", "<i8"),
-    ("skew_sum", "<f8"),
-    ("skew_min", "<i8"),
-    ("skew_max", "<i8"),
-)
-"""Results of decoding; one row for each row of `ChunkTable.parts`."""
-
-
 _COUNTS: Final = (
     "messages", "payload_bytes", "unreadable", "surplus", "stamped", "unset", "skew_sum",
 )  # fmt: skip
@@ -111,8 +89,6 @@ class ChannelStats:
     skew_sum: float = 0.0
     skew_min: Int | None = None
     skew_max: Int | None = None
-    longest: Int = 0
-    """Longest span of log time of the channel's messages in one chunk."""
 
     @property
     def mean_skew(self) -> float | None:
@@ -125,8 +101,15 @@ class ChannelStats:
             setattr(self, name, getattr(self, name) + getattr(other, name))
         for name in ("first", "first_publish", "first_stamp", "skew_min"):
             setattr(self, name, _least(getattr(self, name), getattr(other, name)))
-        for name in ("last", "last_publish", "last_stamp", "skew_max", "longest"):
+        for name in ("last", "last_publish", "last_stamp", "skew_max"):
             setattr(self, name, _greatest(getattr(self, name), getattr(other, name)))
+
+
+_STORED: Final[dict[str, Any]] = {
+    "messages": 0, "payload_bytes": 0, "first": None, "last": None, "first_publish": None,
+    "last_publish": None,
+}  # fmt: skip
+"""What a chunk table says without decoding."""
 
 
 @dataclass(slots=True, repr=False)
@@ -282,97 +265,45 @@ class ChunkEntry:
 
 
 def channel_totals(
-    table: ChunkTable, stamps: NDArray[np.void] | None, silent: Container[int] = ()
+    table: ChunkTable, decoded: Mapping[int, ChannelStats] | None, silent: Container[int] = ()
 ) -> dict[int, ChannelStats]:
     """Statistics of the channels of a segment.
 
     Args:
         table: Its chunks.
-        stamps: Results of decoding, a row for each of `table.parts`; None before the
-        messages are decoded.
+        decoded: Results of decoding, from `decoded_in`; None before the messages are decoded.
         silent: Ids of channels without publish times.
     """
-    parts = table.parts
+    names = ("channel", "messages", "payload_bytes", "first", "last")
+    rows = table.by_channel()[[*names, "first_publish", "last_publish"]].tolist()
     found: dict[int, ChannelStats] = {}
-    order = np.argsort(parts["channel"], kind="stable")
-    ids = parts["channel"][order]
-    for begin, end in pairwise([*run_starts(ids).tolist(), len(ids)]):
-        rows = parts[order[begin:end]]
-        channel = int(ids[begin])
+    for channel, messages, payload_bytes, first, last, *published in rows:
         stats = found[channel] = ChannelStats(
-            messages=int(rows["messages"].sum()),
-            payload_bytes=int(rows["payload_bytes"].sum()),
-            first=int(rows["first"].min()),
-            last=int(rows["last"].max()),
-            longest=int((rows["last"] - rows["first"]).max()),
+            messages=messages, payload_bytes=payload_bytes, first=first, last=last
         )
         if channel not in silent and not table.is_flushed:
-            stats.first_publish = int(rows["first_publish"].min())
-            stats.last_publish = int(rows["last_publish"].max())
-        if stamps is not None:
-            _add_stamps(stats, stamps[order[begin:end]])
+            stats.first_publish, stats.last_publish = published
+        if decoded is not None and channel % EXPIRED_IDS in decoded:
+            stats.add(decoded[channel % EXPIRED_IDS])
     return found
 
 
-def _add_stamps(stats: ChannelStats, rows: NDArray[np.void]) -> None:
-    stats.unreadable = int(rows["unreadable"].sum())
-    stats.surplus = int(rows["surplus"].sum())
-    rows = rows[rows["stamped"] > 0]
-    if len(rows):
-        stats.stamped = int(rows["stamped"].sum())
-        stats.unset = int(rows["unset"].sum())
-        # Exact, so that the order of segments and chunks does not matter.
-        stats.skew_sum = math.fsum(rows["skew_sum"].tolist())
-        stats.first_stamp = int(rows["first_stamp"].min())
-        stats.last_stamp = int(rows["last_stamp"].max())
-    rows = rows[rows["stamped"] > rows["unset"]]
-    if len(rows):
-        stats.skew_min = int(rows["skew_min"].min())
-        stats.skew_max = int(rows["skew_max"].max())
-
-
-def stamps_of(
-    table: ChunkTable, chunks: Mapping[int, Mapping[int, ChannelStats]]
-) -> NDArray[np.void]:
-    """Header stamps and decoding failures of a segment, a row for each row of `table.parts`.
+def decoded_in(chunks: Iterable[Mapping[int, ChannelStats]]) -> dict[int, ChannelStats]:
+    """What decoding has found out of a segment, by the channels that its messages came on.
 
     Args:
-        table: The segment's chunks.
-        chunks: Statistics by channel, for each chunk number that could be decoded.
+        chunks: Statistics by channel, of each chunk that could be decoded.
     """
-    rows = np.zeros(len(table.parts), _STAMP)
-    bounds = table.part_bounds().tolist()
-    for number, by_channel in chunks.items():
-        for row in range(bounds[number], bounds[number + 1]):
-            stats = by_channel.get(int(table.parts["channel"][row]))
-            if stats is not None:
-                rows[row] = _decoded(stats)
-    return rows
-
-
-def decoded_rows(chunks: Iterable[Mapping[int, ChannelStats]]) -> NDArray[np.void]:
-    """The same of a segment whose chunks could all be decoded.
-
-    Args:
-        chunks: Statistics by channel, for each chunk of the segment.
-    """
-    rows = [_decoded(stats) for one in chunks for _, stats in sorted(one.items())]
-    return np.array(rows, _STAMP)
-
-
-def _decoded(stats: ChannelStats) -> tuple[float, ...]:
-    """A row of the results of decoding."""
-    return (
-        stats.unreadable,
-        stats.surplus,
-        stats.stamped,
-        stats.unset,
-        stats.first_stamp or 0,
-        stats.last_stamp or 0,
-        stats.skew_sum,
-        stats.skew_min or 0,
-        stats.skew_max or 0,
-    )
+    found: dict[int, ChannelStats] = {}
+    sums = defaultdict[int, list[float]](list)
+    for one in chunks:
+        for number, stats in one.items():
+            channel = number % EXPIRED_IDS
+            found.setdefault(channel, ChannelStats()).add(replace(stats, **_STORED))
+            sums[channel].append(stats.skew_sum)
+    for channel, stats in found.items():
+        stats.skew_sum = math.fsum(sums[channel])  # exact, whatever the order of chunks
+    return found
 
 
 @dataclass(frozen=True, slots=True)
@@ -520,29 +451,26 @@ class Catalog:
         rows = [(*place, reason) for place, reason in sorted(damage.items())]
         self._cells.write(lambda: [put(_INDEX, recording, _body(["", "", rows]))], _BUSY_S)
 
-    def put_stamps(
-        self, recording: str, stamps: Iterable[tuple[int, str, NDArray[np.void]]]
+    def put_decoded(
+        self, recording: str, number: int, digest: str, decoded: Mapping[int, ChannelStats]
     ) -> None:
-        """Store the decoding results of a recording's segments.
+        """Store the results of decoding a segment.
 
         Args:
-            recording: Its id.
-            stamps: Number and digest of a segment, and a row for each of the `parts` of its
-                chunk table.
+            recording: Id of its recording.
+            number: Its number.
+            digest: Its digest.
+            decoded: The results, from `decoded_in`.
         """
-        self._tables.drop("table", recording)
-        cells = []
-        for number, digest, rows in stamps:
-            body = b"%b %b" % (digest.encode(), compress(rows.tobytes(), 1))
-            cells.append(put(_STAMPS, recording, body, number))
-        self._cells.write(lambda: cells, _BUSY_S)
+        cell = put(_DECODED, recording, encode((digest, decoded)), number)
+        self._cells.write(lambda: [cell], _BUSY_S)
 
     def remove(self, recording: str) -> None:
         """Remove a recording."""
         self.has_changed = True
         self._remove_recordings_file()
         self._tables.drop("table", recording)
-        kinds = (_SUMMARY, _ENTRY, _INDEX, _STAMPS)
+        kinds = (_SUMMARY, _ENTRY, _INDEX, _DECODED)
         self._cells.write(lambda: [drop(kind, recording) for kind in kinds], _BUSY_S)
 
     # Answers.
@@ -602,19 +530,11 @@ class Catalog:
         """The unreadable chunks of a recording: reason by segment and number."""
         return {(segment, chunk): reason for segment, chunk, reason in self._index(recording)[2]}
 
-    def stamps(
-        self, entry: RecordingEntry, number: int, table: ChunkTable
-    ) -> NDArray[np.void] | None:
-        """Decoding results of a segment; None before its messages are decoded."""
-        body = self._cells.read(_STAMPS, entry.id, number) or b""
-        digest, _, packed = body.partition(b" ")
-        with suppress(ValueError, ZlibError):
-            most = len(table.parts) * _STAMP.itemsize
-            rows = np.frombuffer(decompressobj().decompress(packed, most + 1), _STAMP)
-            is_ours = digest.decode() == entry.digests.get(str(number))
-            if is_ours and len(rows) == len(table.parts):
-                return rows
-        return None
+    def decoded(self, entry: RecordingEntry, number: int) -> dict[int, ChannelStats] | None:
+        """Results of decoding a segment; None before its messages are decoded."""
+        found = _read(_DECODED_OF, self._cells.read(_DECODED, entry.id, number))
+        is_ours = found is not None and found[0] == entry.digests.get(str(number))
+        return found[1] if found is not None and is_ours else None
 
     # Schemas.
 
@@ -632,14 +552,8 @@ class Catalog:
 
     def table(self, entry: RecordingEntry, number: int) -> ChunkTable:
         """The chunks of a segment, from its footer."""
-        return self.decoded_table(entry, number)[0]
-
-    def decoded_table(
-        self, entry: RecordingEntry, number: int
-    ) -> tuple[ChunkTable, NDArray[np.void] | None]:
-        """The chunks of a segment, and the results of decoding for each row of its parts."""
         if number in entry.flushed:
-            return entry.flushed[number].table, None
+            return entry.flushed[number].table
         digest = entry.digests.get(str(number), "")
         return self._tables.made(
             "table",
@@ -647,26 +561,22 @@ class Catalog:
             number,
             digest + file_of(entry, number),
             make=lambda: self._read_table(entry, number, digest),
-            size_of=lambda found: _size(found[0]),
+            size_of=_size,
         )
 
-    def _read_table(
-        self, entry: RecordingEntry, number: int, digest: str
-    ) -> tuple[ChunkTable, NDArray[np.void] | None]:
+    def _read_table(self, entry: RecordingEntry, number: int, digest: str) -> ChunkTable:
         path = self._store / _RECORDINGS / entry.id / file_of(entry, number)
         try:
             with open_log(path, number) as reader:
-                is_ours = not isinstance(reader, GoneLog) or digest.startswith(reader.digest())
+                is_ours = not isinstance(reader, GoneLog) or digest == reader.digest()
                 summary = reader.summary()
         except SegmentError as error:
             raise CatalogError(str(error)) from error
         said = summary.recording.get("id"), summary.recording.get("segment")
         is_ours &= said == (entry.id, number)
-        held = entry.held.get(str(number)) if str(number) in entry.files else None
-        table = summary.table if held is None else summary.table.only(held)
-        if not is_ours or {*spans_of(number, table)} - {*entry.spans}:
+        if not is_ours or {*spans_of(number, summary.table)} - {*entry.spans}:
             raise CatalogError(f"Segment {path} has changed since the store was opened.")
-        return table, self.stamps(entry, number, table)
+        return summary.table
 
 
 def _summary_body(summary: RecordingSummary) -> bytes:
@@ -684,6 +594,7 @@ _ENTRY_OF: Final = Decoder(tuple[str, RecordingEntry])
 _Indexed = tuple[str, str, list[tuple[Int, Int, str]]]
 """An index that is complete for a recording, its look then, and its unreadable chunks."""
 _INDEX_OF: Final = Decoder(_Indexed)
+_DECODED_OF: Final = Decoder(tuple[str, dict[int, ChannelStats]])
 _NAMES_OF: Final = Decoder(tuple[str, str])
 
 

@@ -215,7 +215,7 @@ def test_what_a_stopped_copy_has_left_is_out_of_sight(robots: Path, tmp_path: Pa
             copied(robots, to(lab), "recorded")
     with hl.open(lab, mongo="none") as store:
         assert (store.summaries(), store.repairs.unreadable) == ([], {})
-        assert not store.verify(repair=True)
+        assert not store.verify(repair=True).repaired
     report = copied(robots, to(lab), "recorded")
     assert (report.copied, report.bytes_copied) == (["recorded"], 0)
     recording = places.id_of(lab, "recorded")

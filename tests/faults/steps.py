@@ -12,12 +12,11 @@ import json
 import os
 import select
 import signal
-import socket
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -38,7 +37,6 @@ Fault = Literal[
     "database",  # from this step on the database fails
     "INT",
     "TERM",
-    "pause",  # stands still before each step until it is told to go on
 ]
 TORN = ("write", "insert", "delete", "replace all")
 """Steps of which half can be done."""
@@ -124,37 +122,6 @@ class Stepper:
         return self.wait()
 
 
-class Pauses:
-    """The other side of a command that stands still before each step. A context manager.
-
-    Args:
-        path: Of its socket.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        self._socket.bind(str(path))
-        self._socket.listen(1)
-        self._socket.settimeout(LIMIT_S)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._socket.close()
-        self.path.unlink()
-
-    def steps(self) -> Iterator[str]:
-        """Each step, before it is done; it is done when the next one is asked for."""
-        connection, _ = self._socket.accept()
-        with connection, connection.makefile("r") as lines:
-            connection.settimeout(LIMIT_S)
-            for line in lines:
-                yield line.rstrip()
-                connection.sendall(b"\n")
-
-
 # In the processes.
 
 
@@ -164,19 +131,14 @@ class Seam:
     Args:
         point: Which, and how.
         tell: Told of each step.
-        pauses: Path of the socket to stand still for.
     """
 
-    def __init__(self, point: Point, tell: Callable[[str], None], pauses: str = "") -> None:
+    def __init__(self, point: Point, tell: Callable[[str], None]) -> None:
         self._point = point
         self._tell = tell
         self._count = 0
         self._lock = threading.RLock()
         self._broken = False
-        self._socket: socket.socket | None = None
-        if pauses:
-            self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-            self._socket.connect(pauses)
 
     def step(
         self, kind: str, what: str, do: Callable[[], Any], half: Callable[[], object] | None = None
@@ -193,9 +155,6 @@ class Seam:
             number, point = self._count, self._point
             self._count += 1
             self._tell(f"{kind} {what}")
-            if self._socket is not None:
-                self._socket.sendall(f"{kind} {what}\n".encode())
-                self._socket.recv(1)
             if number == point.at and point.fault == "torn":
                 if half is not None:
                     half()
@@ -376,7 +335,8 @@ def _record(store: Any, args: Sequence[str]) -> None:
 def _repair(store: Any, _args: Sequence[str]) -> None:
     from hybridlog_storage.errors import StoreError
 
-    left = [one for one in store.verify(repair=True) if not one.is_cured]
+    found = store.verify(repair=True).findings
+    left = [one for one in found if "nothing else can prove it" not in one.cure]
     if left:  # the command line tells it, and exits with 1
         raise StoreError(str(left))
 
@@ -403,12 +363,9 @@ def _run(job: Mapping[str, Any], tell: Callable[[str], None]) -> tuple[str, str]
     name, *args = job["command"]
     point = Point(**job["point"])
     signals.install()
-    pauses = ""
-    if point.fault == "pause":
-        pauses, *args = args
 
     def arm() -> None:
-        seam = Seam(point, tell, pauses)
+        seam = Seam(point, tell)
         files.system = SteppedSystem(seam)
         step_database(seam)
 

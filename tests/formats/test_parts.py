@@ -253,28 +253,6 @@ def test_frames_that_do_not_unpack_are_kept(tmp_path: Path) -> None:
         assert [d.messages_lost for d in source.damage] == [0]
 
 
-def test_mcap_files_one_after_the_other_in_one_file(tmp_path: Path) -> None:
-    parts = [put_mcap(tmp_path / f"{n}.mcap", range(n * 5, n * 5 + 5)) for n in range(3)]
-    whole = [part.read_bytes() for part in parts]
-    joined = tmp_path / "joined.bin"
-    joined.write_bytes(b"".join(whole))
-    found = Found(joined)
-    assert (found.numbers, found.damage) == (FIFTEEN, [])
-    assert found.time_range == (BEGIN, BEGIN + 14 * SECOND + 1)
-    joined.write_bytes(whole[0] + whole[0])
-    assert (Found(joined).numbers, Found(joined).damage) == ([*FIFTEEN[:5] * 2], [])
-    # The first was not closed: it has no summary.
-    cut = whole[0].index(b"\x0f\x04\0\0\0\0\0\0\0")
-    joined.write_bytes(whole[0][:cut] + whole[1])
-    found = Found(joined)
-    assert found.numbers == FIFTEEN[:10]
-    assert found.damage == [("joined.bin", 0)]
-    assert "another log begins" in found.reasons[0]
-    # The last one is cut short.
-    joined.write_bytes(whole[0] + whole[1][:-20])
-    assert (Found(joined).numbers, Found(joined).damage) == (FIFTEEN[:10], [("joined.bin", 0)])
-
-
 def test_wrong_statistics_of_a_split_mcap(tmp_path: Path) -> None:
     put_mcap(tmp_path / "a_0.mcap", range(5))
     path = put_mcap(tmp_path / "a_1.mcap", range(5, 10))

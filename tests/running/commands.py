@@ -365,7 +365,7 @@ COMMANDS: dict[str, list[Asked]] = {
     "verify": [
         asked("verify --json", lambda a, _: a.json["findings"], lambda _: []),
         asked("verify", lambda a, _: f"as far as sealed: {LABEL}" in a.err, lambda _: True),
-        asked("verify --repair --json", lambda a, _: a.json, lambda _: []),
+        asked("verify --repair --json", lambda a, _: a.json["repaired"], lambda _: []),
     ],
     "index": [
         asked("index list --json", lambda a, _: a.json, lambda _: []),

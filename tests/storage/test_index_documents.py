@@ -55,7 +55,6 @@ def chunk_of(
         trailer=50,
         batch=batch,
         seq=arrivals,
-        compressed_size=90,
     )
 
 

@@ -15,7 +15,6 @@ from hybridlog_storage.segments.attachments import Attachment
 from hybridlog_storage.segments.compression import FilePart
 from hybridlog_storage.segments.open_segment import OpenSegment
 from hybridlog_storage.segments.segment_format import (
-    END_METADATA,
     LOSSES_METADATA,
     json_metadata,
 )
@@ -56,7 +55,7 @@ class Written:
                 writer.add_extra(
                     Attachment(1, 2, "a.txt", "text/plain", FilePart(BytesIO(content), 0, 700))
                 )
-        (path,) = writer.close(json_metadata(END_METADATA, {"status": "complete"}))
+        (path,) = writer.close()
         self.data = path.read_bytes()
         with SegmentReader(path, 0) as reader:
             self.summary: SegmentSummary = reader.summary()

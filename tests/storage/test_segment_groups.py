@@ -24,7 +24,6 @@ from hybridlog_storage.segments.chunk import StoredChunk
 from hybridlog_storage.segments.recovery import recover_segment
 from hybridlog_storage.segments.segment_file import Sealed, SegmentFile
 from hybridlog_storage.segments.segment_format import (
-    END_METADATA,
     LOSSES_METADATA,
     group_of,
     json_metadata,
@@ -71,12 +70,15 @@ class Recorded:
         self.writer.flush()
 
     def close(self) -> list[Path]:
-        return self.writer.close(json_metadata(END_METADATA, {"status": "complete"}))
+        return self.writer.close()
 
     def topics(self) -> list[dict[int, set[str]]]:
         """The topics of each segment, by number, group by group."""
         return [
-            {sealed.segment: {one.topic for one in sealed.channels} for sealed in group}
+            {
+                sealed.file.number: {one.topic for one in sealed.channels.values()}
+                for sealed in group
+            }
             for group in self.groups
         ]
 
@@ -144,21 +146,21 @@ def test_messages_come_back_in_total_order_byte_for_byte(
                 official[channel.topic, m.data, m.log_time, m.publish_time, m.sequence] += 1
     assert official == Counter(of_rows(made.rows))
     # Groups follow one another, and each begins with its first segment.
-    numbers = [sealed.segment for group in made.groups for sealed in group]
+    numbers = [sealed.file.number for group in made.groups for sealed in group]
     assert numbers == [*range(len(paths))] == sorted(int(path.stem) for path in paths)
     for group in made.groups:
-        assert {sealed.group for sealed in group} == {group[0].segment}
+        assert {sealed.file.group for sealed in group} == {group[0].file.number}
         assert len(group) <= 32
         for sealed in group:
-            with SegmentReader(made.folder / sealed.file, sealed.segment) as reader:
+            with SegmentReader(made.folder / sealed.file.name, sealed.file.number) as reader:
                 said = reader.summary().recording
-            assert group_of(said, sealed.segment) == sealed.group
+            assert group_of(said, sealed.file.number) == sealed.file.group
         for sealed in group[1:]:
-            assert LATCHED.topic not in {one.topic for one in sealed.channels}
-        own = [s for s in group[1:] if {one.topic for one in s.channels} == {NAMED.topic}]
+            assert LATCHED.topic not in {one.topic for one in sealed.channels.values()}
+        own = [s for s in group[1:] if {one.topic for one in s.channels.values()} == {NAMED.topic}]
         assert len(own) <= 1
         assert all(
-            sealed in own or NAMED.topic not in {one.topic for one in sealed.channels}
+            sealed in own or NAMED.topic not in {one.topic for one in sealed.channels.values()}
             for sealed in group
         )
 
@@ -220,8 +222,10 @@ def test_killed_with_several_open_segments(tmp_path: Path) -> None:
     for number, chunk in torn.items():
         os.truncate(opened[number], chunk.offset + chunk.length + 5)
     told: list[Sealed] = []
-    cut = [recover_segment(path, told.append).cut_bytes for path in opened]
-    assert {sealed.group for sealed in told} == {0}
+    cut = [
+        recover_segment(path, lambda sealed, _: told.append(sealed)).cut_bytes for path in opened
+    ]
+    assert {sealed.file.group for sealed in told} == {0}
     assert [number for number, size in enumerate(cut) if size] == [*torn]
     lost = {seq for chunk in torn.values() for seq in chunk.seq.tolist()}
     assert read_in(made.folder) == [
@@ -233,7 +237,7 @@ def test_a_group_that_cannot_be_listed_is_sealed_later(tmp_path: Path) -> None:
     tries: list[list[str]] = []
 
     def listing(group: Sequence[Sealed]) -> None:
-        tries.append([sealed.file for sealed in group])
+        tries.append([sealed.file.name for sealed in group])
         if len(tries) == 1:
             raise DiskFullError("no room for a line")
 
@@ -243,16 +247,15 @@ def test_a_group_that_cannot_be_listed_is_sealed_later(tmp_path: Path) -> None:
     with pytest.raises(DiskFullError, match="line"):
         made.close()
     assert {path.suffix for path in made.folder.iterdir()} == {".open"}
-    made.writer.close_truncated([json_metadata(END_METADATA, {"status": "damaged"})])
+    made.writer.close_truncated([])
     assert tries[0] == tries[1] == ["000000.mcap", "000001.mcap", "000002.mcap"]
     assert tries[2] == ["000003.mcap"]
     assert [message for _, message in read_in(made.folder)] == of_rows(made.rows)
 
 
-def test_the_end_lies_in_the_first_segment_after_a_full_disk(
+def test_a_group_is_sealed_after_a_full_disk(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One that cannot be completed keeps the others open, so that the end has a place."""
     made = Recorded(tmp_path / "r")
     made.write(0, 50)
     made.write(1, 900, 5)
@@ -267,13 +270,11 @@ def test_the_end_lies_in_the_first_segment_after_a_full_disk(
     monkeypatch.setattr(SegmentFile, "complete", complete)
     with pytest.raises(DiskFullError, match="summary"):
         made.close()
-    made.writer.close_truncated([json_metadata(END_METADATA, {"status": "damaged"})])
-    assert [[sealed.segment for sealed in group] for group in made.groups] == [[0, 1, 2]]
-    with SegmentReader(made.folder / "000000.mcap", 0) as reader:
-        assert reader.summary().end == {"status": "damaged", "segments": 3}
+    made.writer.close_truncated([])
+    assert [[sealed.file.number for sealed in group] for group in made.groups] == [[0, 1, 2]]
 
 
-def test_losses_that_found_no_room_come_with_the_end(
+def test_losses_that_found_no_room_come_in_the_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made = Recorded(tmp_path / "r")
@@ -281,7 +282,7 @@ def test_losses_that_found_no_room_come_with_the_end(
     real, fails = SegmentFile.add_metadata, [*range(3)]
 
     def add(segment: SegmentFile, record: Metadata) -> None:
-        if fails and record.name in {LOSSES_METADATA, END_METADATA}:
+        if fails and record.name == LOSSES_METADATA:
             fails.pop()
             raise DiskFullError("no room for a record")
         real(segment, record)
@@ -293,11 +294,10 @@ def test_losses_that_found_no_room_come_with_the_end(
         with suppress(DiskFullError):
             made.writer.add_extra(json_metadata(LOSSES_METADATA, {"rows": ledger.take()}))
     with pytest.raises(DiskFullError):
-        made.writer.close(json_metadata(END_METADATA, {"status": "complete"}))
-    made.writer.close_truncated([json_metadata(END_METADATA, {"status": "damaged"})])
+        made.writer.close()
+    made.writer.close_truncated([])
     with SegmentReader(made.folder / "000000.mcap", 0) as reader:
         assert {row["count"] for row in reader.summary().losses} == {16, 3}
-        assert reader.summary().end == {"status": "damaged", "segments": 1}
 
 
 def test_what_came_into_other_segments_counts_on_a_full_disk(

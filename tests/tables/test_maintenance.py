@@ -122,24 +122,23 @@ def test_repair_makes_missing_tables(few: hl.Store, limit: Limit) -> None:
     for path in (few.directory.path / TABLES).glob("*/*.parquet"):
         path.unlink()
     done = few.verify(repair=True)
-    assert [(one.place, one.is_cured) for one in done] == [
-        ("table of /a", True),
-        ("table of /b", True),
-    ]
+    assert [one.place for one in done.repaired] == ["table of /a", "table of /b"]
+    assert not done.findings
     assert contents(few) == before
-    assert not few.verify(repair=True)
+    assert not few.verify(repair=True).repaired
     path = next((few.directory.path / TABLES).glob("*/*.parquet"))
     data = bytearray(path.read_bytes())
     data[1000:1400] = bytes(400)
     path.write_bytes(data)
-    topics = [(one.place, False) for one in few.verify().findings]
+    topics = [one.place for one in few.verify().findings]
     limit(table_reserve_bytes=1 << 60)
     done = few.verify(repair=True)
-    assert [(one.place, one.is_cured) for one in done] == topics
+    assert [one.place for one in done.findings] == topics
     assert topics
-    assert all("MiB free; make room" in one.done for one in done)
+    assert all("MiB free; make room" in one.problem for one in done.findings)
     limit(table_reserve_bytes=0)
-    assert [one.is_cured for one in few.verify(repair=True)] == [True] * len(topics)
+    done = few.verify(repair=True)
+    assert ([one.place for one in done.repaired], done.findings) == (topics, [])
     assert contents(few) == before
 
 

@@ -170,7 +170,7 @@ def test_damaged_tables_are_none_and_are_made_again(
     if harm is not delete:
         assert f"table of {topic}" in places
         done = recorded.verify(repair=True)
-        assert {f"table of {topic}"} <= {one.place for one in done if one.is_cured}
+        assert {f"table of {topic}"} <= {one.place for one in done.repaired}
     else:
         assert not places
         assert not making.make(recorded.directory, entry)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
-import secrets
 import stat
 from pathlib import Path
 
@@ -24,22 +22,6 @@ def socket_base() -> Path:
     return base / f"hybridlog-{os.geteuid()}"
 
 
-def new_socket(directory: Path, name: str) -> Path:
-    """Path of a new socket for a store's directory, in a new private directory.
-
-    The directory is new each time, so that the end of one process cannot remove the socket
-    of the next.
-
-    Args:
-        directory: The directory that the socket belongs to; its name is part of the path.
-        name: Name of the socket.
-
-    Raises:
-        StoreError: The path is too long, or the directory is not private to this user.
-    """
-    return _private(socket_base() / f"{_part(directory)}-{secrets.token_hex(4)}" / name)
-
-
 def lasting_socket(file: int) -> Path:
     """Path of a socket that goes with an open file, the same in every process.
 
@@ -47,14 +29,10 @@ def lasting_socket(file: int) -> Path:
         file: Descriptor of the file.
 
     Raises:
-        StoreError: As for `new_socket`.
+        StoreError: The path is too long, or its directory is not private to this user.
     """
     about = os.fstat(file)
     return _private(socket_base() / f"{about.st_dev:x}-{about.st_ino:x}.sock")
-
-
-def _part(directory: Path) -> str:
-    return hashlib.sha256(os.fsencode(directory)).hexdigest()[:8]
 
 
 def _private(socket: Path) -> Path:

@@ -58,7 +58,6 @@ _WINDOW: Final = 1 << 20
 _MAX_PLAIN: Final = 1 << 26  # largest record that is neither chunk, message nor attachment
 _MAX_SUMMARY: Final = 1 << 28
 _MAX_MOVED: Final = 1 << 26  # of a summary that is not where the footer says
-_ANOTHER: Final = MAGIC + bytes([Opcode.HEADER])  # the beginning of another file
 _MAX_WHOLE: Final = 64 << 20  # content of a chunk that is decompressed at once
 
 _BETWEEN_CHUNKS: Final = {
@@ -105,7 +104,6 @@ class Scan:
         self._behind = self._at
         self._last = self._at  # start of the last record
         self._has_ended = False  # the data, and the summary follows
-        self._is_first = True  # of logs whose bytes follow one another
         self._needs_crc = False  # messages have no checksum of their own
         self._is_damaged = self._is_torn = False  # torn: the file ends in damage
         self._indexed: set[int] | None = None  # channels of the message indexes of the last chunk
@@ -129,8 +127,7 @@ class Scan:
         if self._parse_summary(start, end, crc) or is_there:
             self._stop = start
             return
-        # Where bytes of the data are missing, the summary begins before that place. Behind it
-        # begins that of another log, whose bytes follow.
+        # Where bytes of the data are missing, the summary begins before that place.
         first = max(len(MAGIC), end - _MAX_MOVED)
         found = bytes(self._read(first, end - first)).rfind(_DATA_END)
         moved = first + found + HEAD + 4
@@ -164,9 +161,6 @@ class Scan:
                 yield at, item
             if self._has_ended:
                 is_closed = self._pass_summary()
-                if is_closed and self._bytes.at(self._at, HEAD) == _ANOTHER:
-                    self._begin_another()
-                    continue
                 if self._at < self._bytes.size:
                     why = "bytes follow the end of the log"
                     yield self._behind_end(why if is_closed else "the summary is damaged")
@@ -184,9 +178,6 @@ class Scan:
             yield _damage(at, 0, "the record that ends the data is damaged", 0)
         elif len(head) < HEAD:
             yield self._torn(at, "the file ends in the middle of a record")
-        elif head == _ANOTHER:
-            yield _damage(at, 0, "another log begins before the end of this one", 0)
-            self._begin_another()
         else:
             opcode, length = RECORD_HEAD.unpack(head)
             yield from self._record(at, opcode, at + HEAD + length)
@@ -210,13 +201,6 @@ class Scan:
         else:
             self._at, self._behind = end, at + HEAD
             yield from self._plain(at, opcode, end)
-
-    def _begin_another(self) -> None:
-        """Go on with another log whose bytes follow; its summary counts from its own beginning."""
-        self._at = self._behind = self._at + len(MAGIC)
-        self._stop = None
-        self._chunked = self._is_first = self._has_ended = False
-        self._indexed = None
 
     # Chunks
 
@@ -415,7 +399,7 @@ class Scan:
             return
         crc = int.from_bytes(self._bytes.at(at + HEAD, 4), "little")
         # Where damage is known already, the checksum tells nothing new.
-        if crc and self._needs_crc and self._is_first and not self._is_damaged:
+        if crc and self._needs_crc and not self._is_damaged:
             found = 0
             for start in range(0, at, _WINDOW):
                 found = crc32(self._bytes.at(start, min(_WINDOW, at - start)), found)

@@ -99,7 +99,6 @@ class StoredChunk:
         trailer: Bytes of the message indexes and arrival numbers that follow it.
         batch: Its messages over the uncompressed content; `channel` holds channel ids.
         seq: int64[n], arrival numbers.
-        compressed_size: Bytes of compressed content.
     """
 
     segment: int
@@ -109,4 +108,3 @@ class StoredChunk:
     trailer: int
     batch: Batch
     seq: NDArray[np.int64]
-    compressed_size: int

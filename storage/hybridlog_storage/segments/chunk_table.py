@@ -20,8 +20,6 @@ from hybridlog_storage.segments.compression import decompress
 from hybridlog_storage.segments.segment_format import checked_frame
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
-
     from numpy.typing import NDArray
 
     from hybridlog_storage.messages import Batch, Buffer
@@ -102,19 +100,6 @@ class ChunkTable:
         parts = self.parts.copy()
         parts["channel"] %= EXPIRED_IDS
         return replace(self, parts=parts)
-
-    def only(self, channels: Collection[int]) -> ChunkTable:
-        """The table without the messages on other channels; chunks keep their numbers."""
-        is_kept = np.isin(self.parts["channel"], [*channels])
-        if is_kept.all():
-            return self
-        chunks, parts = self.chunks.copy(), self.parts[is_kept]
-        owner = np.repeat(np.arange(len(chunks)), chunks["parts"])[is_kept]
-        chunks["parts"] = np.bincount(owner, minlength=len(chunks))
-        starts = run_starts(owner)
-        chunks["first"][owner[starts]] = np.minimum.reduceat(parts["first"], starts)
-        chunks["last"][owner[starts]] = np.maximum.reduceat(parts["last"], starts)
-        return replace(self, chunks=chunks, parts=parts)
 
     def by_channel(self) -> NDArray[np.void]:
         """Totals of each channel.

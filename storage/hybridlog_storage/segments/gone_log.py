@@ -162,9 +162,6 @@ class GoneLog(SegmentReader):
                 raise SegmentError("its rows are not at hand")
             batch, seq = self._rows.left(self.number, place.number)
             channels = {channel % EXPIRED_IDS for channel in place.channels}
-            is_wanted = np.isin(batch.channel, [*channels])
-            if not is_wanted.all():  # of the others, not all files may be there
-                batch, seq = batch.take(is_wanted), seq[is_wanted]
             times = (place.first, place.last)
             is_all = (
                 len(batch)

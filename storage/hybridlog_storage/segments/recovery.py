@@ -6,7 +6,7 @@ skip. Then the summary is written, as the recorder would have done.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,19 +20,17 @@ from hybridlog_storage.messages import Schema
 from hybridlog_storage.segments.chunk_table import parts_of
 from hybridlog_storage.segments.segment_file import (
     OPEN_SUFFIX,
-    OnSealing,
+    Sealed,
     SegmentFile,
     sealed_name,
 )
 from hybridlog_storage.segments.segment_format import (
     ARRIVAL_HEAD,
-    END_METADATA,
     INDEX_HEAD,
     START,
     damaged_head,
     group_of,
     index_order,
-    json_metadata,
     trailer_of,
 )
 from hybridlog_storage.segments.segment_reader import SegmentReader, check_format, open_chunk
@@ -60,7 +58,7 @@ class Recovered:
 
 def recover_segment(
     path: Path,
-    on_sealing: OnSealing | None = None,
+    on_sealing: Callable[[Sealed, Recovered], object] = lambda *_: None,
     *,
     recording: Mapping[str, object] | None = None,
 ) -> Recovered:
@@ -69,7 +67,8 @@ def recover_segment(
     Args:
         path: A file whose name ends in `.mcap.open`, without a writer.
         on_sealing: Called when the segment is complete and on the disk, before it gets its
-            final name. If it fails, the file stays, and this can be called again.
+            final name, with what was recovered. If it fails, the file stays, and this can be
+            called again.
         recording: Catalog entry of the recording, for a segment whose own is damaged.
 
     Raises:
@@ -90,8 +89,9 @@ def recover_segment(
                 files.unlink(path)
                 files.sync_folder(path.parent)
                 return Recovered(None, cut_bytes=rest.cut_bytes, damage=rest.told)
-            sealed = rest.seal(recording, on_sealing or (lambda _: None))
-            return Recovered(sealed, rest.messages, rest.cut_bytes, rest.told)
+            found = Recovered(final, rest.messages, rest.cut_bytes, rest.told)
+            rest.seal(recording, lambda sealed: on_sealing(sealed, found))
+            return found
     except OSError as error:
         raise durability.explain(error, path, "recovering") from error
 
@@ -197,7 +197,9 @@ class _Rest:
         self._segment.note_chunk(offset, trailer, head, indexes, parts)
         return len(batch)
 
-    def seal(self, recording: Mapping[str, object] | None, on_sealing: OnSealing) -> Path:
+    def seal(
+        self, recording: Mapping[str, object] | None, on_sealing: Callable[[Sealed], object]
+    ) -> None:
         """Write what is missing, and give the file its name."""
         walk, segment = self._walk, self._segment
         if walk.recording is None and recording is None:
@@ -208,23 +210,19 @@ class _Rest:
         start = bytes(self._reader.read(0, len(START)))
         if start != START:
             self._damage.append(Damage(0, len(START), "the beginning of the file was damaged"))
-        is_new = bool(self._damage) or not (walk.has_end or self.is_complete)
-        if is_new:
+        if walk.recording is None:
             segment.cut(walk.end)
-            if walk.recording is None:
-                segment.add_recording(recording or {})
-            end = {"status": "recovered", "cut_bytes": self.cut_bytes, "damage": self.told}
-            segment.add_metadata(json_metadata(END_METADATA, end))
+            segment.add_recording(recording or {})
         # Only now: what is damaged looks well behind this.
         for one in self._damage:
             if one.offset == 0:
                 segment.rewrite(0, START)
             elif one.offset < walk.end:
                 segment.rewrite(one.offset, damaged_head(one.length))
-        if not is_new:
+        if walk.recording is not None:
             self._put_summary(segment.tail(walk.end))
         on_sealing(segment.prepare(sync=True))
-        return segment.publish()
+        segment.publish()
 
     def seal_again(self, digest: str) -> bool:
         """Write the summary of a sealed file, if the file then has its digest."""

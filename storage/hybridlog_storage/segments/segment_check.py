@@ -52,7 +52,8 @@ def damage_of(
         except SegmentError as error:
             walk = Walk(reader)
             walk.go_on()
-            damaged = [SegmentDamage(one.offset, one.reason) for one in walk.damaged]
+            places = [*walk.damaged, *([] if walk.stopped is None else [walk.stopped])]
+            damaged = [SegmentDamage(one.offset, one.reason) for one in places]
             return [SegmentDamage(max(reader.size - 1, 0), str(error)), *damaged], False
         if reader.digest(progress) == digest:
             return [], True

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from mcap.opcode import Opcode
 from mcap.records import (
@@ -26,6 +26,8 @@ from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk import durability, files
 from hybridlog_storage.disk.append_file import AppendFile
 from hybridlog_storage.errors import HybridlogError, StoreError
+from hybridlog_storage.manifest import Channel as ListedChannel
+from hybridlog_storage.manifest import File, Part
 from hybridlog_storage.mcap.mcap_content import RECORD_HEAD, ChunkHead, chunk_head_of
 from hybridlog_storage.messages import EXPIRED_IDS, schema_hash
 from hybridlog_storage.segments.attachments import Attachment
@@ -63,58 +65,54 @@ _SEALED = re.compile(r"(?P<number>[0-9]{6})\.mcap")
 _ROWS = re.compile(r"[0-9]{6}(\.[1-9][0-9]{0,9})?\.rows\.parquet")
 
 
-@dataclass(frozen=True, slots=True)
-class SealedChannel:
-    """Statistics of one channel in a sealed segment.
-
-    Attributes:
-        id: The channel's id in the recording.
-        topic: Its topic.
-        messages: Number of its messages.
-        payload_bytes: Bytes of their payloads.
-        first: Smallest log time, ns; None without messages.
-        last: Largest log time, ns.
-        encoding: Of the messages, such as `cdr`.
-        type: Name of the message type; empty without a definition.
-        schema: Hash of the definition; empty without one.
-    """
-
-    id: int
-    topic: str
-    messages: int
-    payload_bytes: int
-    first: int | None
-    last: int | None
-    encoding: str
-    type: str
-    schema: str
-
-
-@dataclass(frozen=True, slots=True)
-class Sealed:
+class Sealed(NamedTuple):
     """A complete segment, for the manifest of its recording.
 
     Attributes:
-        segment: Its number.
-        file: Its name once it is sealed.
-        bytes: Its size.
-        digest: BLAKE3 of all its bytes.
-        channels: Its channels, also those without messages, in the order of their ids.
-        group: Number of the first segment of its group.
-        has_losses: Whether the loss ledger has rows in it.
+        file: Its line.
+        channels: Its channels by id, also those without messages; without totals.
     """
 
-    segment: int
-    file: str
-    bytes: int
-    digest: str
-    channels: tuple[SealedChannel, ...]
-    group: int
-    has_losses: bool
+    file: File
+    channels: dict[int, ListedChannel]
 
+    @classmethod
+    def of(
+        cls,
+        place: tuple[int, int],
+        content: tuple[int, str],
+        table: ChunkTable,
+        channels: Mapping[int, Channel],
+        *,
+        has_losses: bool,
+    ) -> Sealed:
+        """A segment as a manifest lists it.
 
-OnSealing = Callable[[Sealed], None]
-"""Called when a segment is complete and on the disk, before it gets its final name."""
+        Args:
+            place: Its number, and that of the first segment of its group.
+            content: Its bytes, and their digest.
+            table: Its chunks.
+            channels: Its channels by id.
+            has_losses: Whether the loss ledger has rows in it.
+        """
+        number, group = place
+        (number, group), (size, digest) = place, content
+        spans = table.chunks[["first", "last"]]
+        file = File(
+            number,
+            group,
+            sealed_name(number),
+            "log",
+            size,
+            digest,
+            time.time_ns(),
+            int(spans["first"].min()) if len(spans) else None,
+            int(spans["last"].max()) if len(spans) else None,
+            listed_parts(table),
+            has_losses=has_losses,
+        )
+        known = {n: _listed(one) for n, one in sorted(channels.items()) if n < EXPIRED_IDS}
+        return cls(file, known)
 
 
 def sealed_name(number: int) -> str:
@@ -138,25 +136,16 @@ def rows_name(number: int, version: int = 0) -> str:
     return f"{number:06d}{f'.{version}' if version else ''}{ROWS_SUFFIX}"
 
 
-def sealed_channels(
-    table: ChunkTable, channels: Mapping[int, Channel]
-) -> tuple[SealedChannel, ...]:
-    """Statistics of each channel of a segment, without those of expired messages."""
-    rows = table.by_channel()
-    names = ("messages", "payload_bytes", "first", "last")
-    columns = (rows[name].tolist() for name in names)
-    stored: dict[int, tuple[int, int, int | None, int | None]] = dict(
-        zip(rows["channel"].tolist(), zip(*columns, strict=True), strict=True)
-    )
-    found = []
-    for number, channel in sorted(channels.items()):
-        if number in stored or number < EXPIRED_IDS:
-            schema = channel.schema
-            totals = stored.get(number, (0, 0, None, None))
-            kind, digest = ("", "") if schema is None else (schema.name, schema_hash(schema))
-            encoding = channel.message_encoding
-            found.append(SealedChannel(number, channel.topic, *totals, encoding, kind, digest))
-    return tuple(found)
+def listed_parts(table: ChunkTable) -> dict[int, Part]:
+    """What a segment has of each channel, as a manifest lists it."""
+    rows = table.by_channel()[["channel", "messages", "payload_bytes", "first", "last"]]
+    return {channel: Part(*values) for channel, *values in rows.tolist()}
+
+
+def _listed(channel: Channel) -> ListedChannel:
+    schema = channel.schema
+    kind, digest = ("", "") if schema is None else (schema.name, schema_hash(schema))
+    return ListedChannel(channel.topic, channel.message_encoding, kind, schema=digest)
 
 
 class SegmentFile:
@@ -328,7 +317,6 @@ class SegmentFile:
                     trailer=trailer,
                     batch=chunk.batch,
                     seq=chunk.seq,
-                    compressed_size=len(chunk.data),
                 )
             )
         self._append(parts)
@@ -438,14 +426,12 @@ class SegmentFile:
         channels = {number: channel for number, (_, channel) in self.channels.items()}
         with self._explained("reading"):
             digest = self._file.digest()
-        self._sealed = Sealed(
-            self.number,
-            sealed_name(self.number),
-            self.position,
-            digest,
-            sealed_channels(self.table.build(), channels),
-            self.group,
-            any(index.name == LOSSES_METADATA for index in self._metadata_indexes),
+        self._sealed = Sealed.of(
+            (self.number, self.group),
+            (self.position, digest),
+            self.table.build(),
+            channels,
+            has_losses=any(one.name == LOSSES_METADATA for one in self._metadata_indexes),
         )
 
     def trim(self) -> None:

@@ -50,7 +50,6 @@ FORMAT_VERSION: Final = 4
 OUR_NAMES: Final = "hybridlog."
 """Beginning of the names of the store's own metadata records and channel metadata."""
 RECORDING_METADATA: Final = "hybridlog.recording"
-END_METADATA: Final = "hybridlog.end"
 LOSSES_METADATA: Final = "hybridlog.losses"
 NO_PUBLISH_TIME: Final = "hybridlog.no_publish_time"
 NO_INDEX: Final = "hybridlog.no_index"

@@ -24,8 +24,6 @@ LATCHED: Final = 3
 """Key of the segment with latched messages, where they stay alone: a group of its own."""
 Key = Literal[1, 2, 3] | str
 """Which segment of a group: one of the above, or that of a topic."""
-MOST_SEALED: Final = 33
-"""Segments that are sealed together at most: 32 of a group, and that of latched messages."""
 _NAMED: Final = 14  # topics with segments of their own by a rule
 _OTHERS: Final = 16  # and by their size: a group has 32 segments at most
 _LEAST: Final = 16  # times that mean payload that it has had: small logs have few files

@@ -9,9 +9,9 @@ from __future__ import annotations
 import os
 import stat
 import struct
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -46,7 +46,6 @@ from hybridlog_storage.segments.chunk_table import ChunkTable
 from hybridlog_storage.segments.compression import FilePart, decompress
 from hybridlog_storage.segments.segment_format import (
     CHUNK_TABLE_OPCODE,
-    END_METADATA,
     FORMAT_VERSION,
     LOSSES_METADATA,
     MAGIC,
@@ -58,7 +57,7 @@ from hybridlog_storage.segments.segment_format import (
     metadata_of,
     trailer_of,
 )
-from hybridlog_storage.segments.statements import end_of, loss_rows
+from hybridlog_storage.segments.statements import loss_rows
 from hybridlog_storage.stopping import check_wanted
 
 if TYPE_CHECKING:
@@ -101,13 +100,7 @@ class ChunkPlace:
         """True if its payloads were deleted, or are to be copied later."""
         return EXPIRED_IDS <= self.channels[0] < MARKS_CHANNEL
 
-    def stored(
-        self,
-        segment: int,
-        batch: Batch,
-        seq: NDArray[np.int64],
-        compressed_size: int = 0,
-    ) -> StoredChunk:
+    def stored(self, segment: int, batch: Batch, seq: NDArray[np.int64]) -> StoredChunk:
         """The chunk of a segment with its content; see `StoredChunk`."""
         return StoredChunk(
             segment=segment,
@@ -117,7 +110,6 @@ class ChunkPlace:
             trailer=self.trailer,
             batch=batch,
             seq=seq,
-            compressed_size=compressed_size,
         )
 
 
@@ -127,7 +119,6 @@ class SegmentSummary:
 
     Attributes:
         recording: Catalog entry of the recording at the start of the segment.
-        end: The end of the recording; None except in its last segment.
         channels: Channels by id, and those of messages without payload, see `EXPIRED_IDS`.
         counts: Number of messages by channel id.
         losses: Rows of the loss ledger written with its messages.
@@ -139,7 +130,6 @@ class SegmentSummary:
     """
 
     recording: dict[str, object]
-    end: dict[str, object] | None
     channels: dict[int, Channel]
     counts: dict[int, int]
     losses: list[dict[str, Any]]
@@ -153,11 +143,6 @@ class SegmentSummary:
     def chunks(self) -> list[ChunkPlace]:
         """Position of each chunk that has messages, in file order."""
         return [place for place in places_of(self.table) if place.channels]
-
-    def only(self, channels: Collection[int]) -> SegmentSummary:
-        """The summary without the messages on other channels."""
-        table = self.table.only(channels)
-        return replace(self, table=table, counts=table.counts())
 
 
 class SegmentReader:
@@ -270,18 +255,15 @@ class SegmentReader:
         return table
 
     def _summary(self, records: Summary, body: Buffer | None, start: int) -> SegmentSummary:
-        found: dict[str, dict[str, object]] = {}
+        recording: dict[str, object] | None = None
         losses: list[dict[str, Any]] = []
         for index in records.metadata_indexes:
-            if index.name in {RECORDING_METADATA, END_METADATA}:
-                found[index.name] = json_of(self.metadata(index))
-                if index.name == RECORDING_METADATA:
-                    check_format(found[index.name], self.path)
-                else:
-                    found[index.name] = dict(end_of(found[index.name]))
+            if index.name == RECORDING_METADATA:
+                recording = json_of(self.metadata(index))
+                check_format(recording, self.path)
             elif index.name == LOSSES_METADATA:
                 losses += loss_rows(json_of(self.metadata(index)))
-        if RECORDING_METADATA not in found:
+        if recording is None:
             raise SegmentError(f"{self.path} is no segment of a hybridlog store.")
         table = self._table(body, start)
         stated = records.statistics.channel_message_counts if records.statistics else {}
@@ -293,8 +275,7 @@ class SegmentReader:
         counts = table.counts()
         channels = {i: channel_of(r, records.schemas) for i, r in records.channels.items()}
         return SegmentSummary(
-            recording=found[RECORDING_METADATA],
-            end=found.get(END_METADATA),
+            recording=recording,
             channels=with_expired(channels, counts),
             counts=counts,
             losses=losses,
@@ -382,7 +363,7 @@ class SegmentReader:
             seq = trailer.arrivals(len(batch))
         except SegmentError as error:
             raise self._damaged(place, error) from error
-        return place.stored(self.number, batch, seq, head.end - head.start)
+        return place.stored(self.number, batch, seq)
 
     def _damaged(self, place: ChunkPlace, error: SegmentError) -> SegmentError:
         return SegmentError(f"Chunk at byte {place.offset} of {self.path} is damaged: {error}")

@@ -29,11 +29,6 @@ from hybridlog_storage.segments.chunk import PackedChunk, StoredChunk, pack
 from hybridlog_storage.segments.compression import Compressor
 from hybridlog_storage.segments.open_chunk import OpenChunk
 from hybridlog_storage.segments.segment_file import Sealed, SegmentFile
-from hybridlog_storage.segments.segment_format import (
-    END_METADATA,
-    json_metadata,
-    json_of,
-)
 from hybridlog_storage.segments.segment_group import FIRST, LATCHED, Division, Key, SegmentGroup
 from hybridlog_storage.stopping import safe_point
 
@@ -265,18 +260,13 @@ class RecordingWriter:
                 self._close_chunk(key)
         self._limit_queue(limit=4)
 
-    def close(self, end: Metadata | None = None) -> list[Path]:
-        """Flush and seal the last group; return the paths of all segments.
-
-        Args:
-            end: The last metadata record, with the end of the recording.
-        """
+    def close(self) -> list[Path]:
+        """Flush and seal the last group; return the paths of all segments."""
         try:
             self.flush()
+            for record in [*self._extras]:  # for which there was no room
+                self._disk.submit(self._add, record).result()
             self._disk.submit(self._define_rest).result()
-            if end is not None:
-                self.add_extra(end)
-                self._drain(limit=0)
             self._disk.submit(self._seal).result()
         finally:
             self._shut_down()
@@ -297,8 +287,8 @@ class RecordingWriter:
             self._seal()
         first = self._open_group().first
         kept = [one for one in self._extras if isinstance(one, Metadata)]  # such as losses
-        for extra in (*(one for one in kept if one.name != END_METADATA), *extras):
-            first.add_metadata(self._stated(extra))
+        for extra in (*kept, *extras):
+            first.add_metadata(extra)
         self._seal()
 
     def written_of(self, channel: Channel) -> int:
@@ -468,21 +458,12 @@ class RecordingWriter:
     def _add(self, record: Metadata | Attachment) -> None:
         group = self._open_group()
         if isinstance(record, Metadata):
-            self._with_room(partial(group.first.add_metadata, self._stated(record)))
+            self._with_room(partial(group.first.add_metadata, record))
         else:
             group.first.add_attachment(record)
         self._extras.remove(record)
         if isinstance(record, Attachment) and group.position >= self.settings.segment_size:
             self._seal()
-
-    def _stated(self, record: Metadata) -> Metadata:
-        """A record as it is written: the end of the recording says how many segments there are.
-
-        Others of its group may be lost in a crash that keeps it.
-        """
-        if record.name != END_METADATA:
-            return record
-        return json_metadata(END_METADATA, {**json_of(record), "segments": self._number})
 
     def _define_rest(self) -> None:
         """Define the channels without messages in the last group."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from typing import Any, Literal, TypedDict
+from typing import Any, TypedDict
 
 from msgspec import convert
 
@@ -26,27 +26,6 @@ LossRow = TypedDict(
     },
 )
 """A row of the loss ledger: `from` and `to` are log times, ns; None for what is unknown."""
-
-
-class End(TypedDict, total=False):
-    """The end of a recording; `segments`: how many it has, by the one that a recorder wrote."""
-
-    status: Literal["complete", "damaged", "recovered"]
-    losses: list[LossRow]
-    cut_bytes: Count
-    damage: list[Text]
-    segments: Count
-
-
-def end_of(value: object) -> dict[str, Any]:
-    """The end of a recording, see `End`.
-
-    Raises:
-        SegmentError: It is damaged.
-    """
-    found: dict[str, Any] = _checked(value, End)
-    _check_spans(found.get("losses", []))
-    return found
 
 
 def loss_rows(value: Mapping[str, object]) -> list[dict[str, Any]]:

@@ -1,7 +1,7 @@
 """Walks over the records of a segment without a summary: one being written, or left by a crash.
 
 Each record has a checksum of its own, so what is whole is known at once. Behind damage the walk
-goes on where the damaged record ends, or at the next record that proves itself.
+goes on at the next record that proves itself.
 """
 
 from __future__ import annotations
@@ -29,7 +29,6 @@ from hybridlog_storage.segments.chunk_table import PART, parts_of
 from hybridlog_storage.segments.segment_format import (
     ARRIVAL_OPCODE,
     DAMAGED_OPCODE,
-    END_METADATA,
     LOSSES_METADATA,
     PADDING_OPCODE,
     RECORDING_METADATA,
@@ -55,7 +54,6 @@ _SEARCHED: Final = 1 << 20  # bytes searched at once for the next record
 _MAX_RECORD: Final = 1 << 28  # bytes of what is read into memory as a whole
 _MAX_PADDING: Final = 2 * _WINDOW  # bytes
 _UNKNOWN: Final = np.iinfo(np.int64)  # publish times stand in the messages only
-_ORPHAN: Final = "it belongs to no chunk"
 
 
 class WalkedChunk(NamedTuple):
@@ -90,7 +88,6 @@ class Walk:
         schemas: Schemas by id, also of channels that are not defined.
         chunks: Its chunks, in file order.
         losses: Rows of the loss ledger.
-        has_end: Whether the end of the recording is there.
         attachments: Its attachments, in file order.
         metadata: All metadata records, in file order.
         damaged: What cannot be read, in file order.
@@ -107,7 +104,6 @@ class Walk:
         self.schemas: dict[int, SchemaRecord] = {}
         self.chunks: list[WalkedChunk] = []
         self.losses: list[dict[str, Any]] = []
-        self.has_end = False
         self.attachments: list[AttachmentIndex] = []
         self.metadata: list[MetadataIndex] = []
         self.damaged: list[Damage] = []
@@ -129,22 +125,17 @@ class Walk:
             try:
                 self.end = self._record(at)
             except SegmentError as error:
-                is_torn = isinstance(error, _TornError)
-                behind = self._search(at + 1, self._reader.size) if is_torn else self._next(at)
-                if behind is not None:
-                    self._damage(at, behind, str(error))
-                    self.end = behind
-                    continue
-                if not is_torn:
-                    self.stopped = Damage(at, self._reader.size - at, str(error))
-                return
+                size = self._reader.size
+                behind = self._bytes.search(at + 1, size, _PROVABLE, self._proves_itself)
+                if behind is None:
+                    if not isinstance(error, _TornError):
+                        self.stopped = Damage(at, size - at, str(error))
+                    return
+                self._damage(at, behind, str(error))
+                self.end = behind
 
     def _damage(self, at: int, behind: int, reason: str) -> None:
-        last = self.damaged[-1] if self.damaged else None
-        if last is not None and reason == _ORPHAN and last.offset + last.length == at:
-            self.damaged[-1] = Damage(last.offset, behind - last.offset, last.reason)
-        else:
-            self.damaged.append(Damage(at, behind - at, reason))
+        self.damaged.append(Damage(at, behind - at, reason))
 
     def _peek(self, at: int, size: int) -> memoryview:
         """Bytes of the file, fewer at its end."""
@@ -186,7 +177,7 @@ class Walk:
                 raise SegmentError("padding has other bytes than zeros")
             return end
         if opcode in {Opcode.MESSAGE_INDEX, ARRIVAL_OPCODE}:
-            raise SegmentError(_ORPHAN)
+            raise SegmentError("it belongs to no chunk")
         raise SegmentError(f"a record of kind {opcode}")
 
     def _take_metadata(self, at: int, end: int) -> None:
@@ -198,7 +189,6 @@ class Walk:
             self.losses += loss_rows(json_of(record))
         elif record.name == RECORDING_METADATA:
             self.recording = json_of(record)
-        self.has_end |= record.name == END_METADATA
         self.metadata.append(MetadataIndex(offset=at, length=end - at, name=record.name))
 
     # Chunks
@@ -275,36 +265,12 @@ class Walk:
 
     # Behind damage
 
-    def _next(self, at: int) -> int | None:
-        """Byte of the next whole record behind a damaged one; None if none follows."""
-        try:
-            _, behind = self._head(at)
-            is_plausible = self._is_plausible(behind)
-        except _TornError:
-            return None
-        found = self._search(at + HEAD, behind if is_plausible else self._reader.size)
-        return behind if found is None and is_plausible else found
-
-    def _is_plausible(self, at: int) -> bool:
-        """True if a record may start at a byte, or the data of the file end there."""
-        if at >= self._reader.size or self._is_room(at):
-            return at <= self._reader.size
-        try:
-            opcode, end = self._head(at)
-        except _TornError:
-            return False
-        return opcode in _KINDS and end <= self._reader.size
-
     def _is_room(self, at: int) -> bool:
         """True if zeros follow, as a writer leaves behind its last block."""
         if any(self._peek(at, HEAD)):
             return False
         rest = self._reader.read(at, min(self._reader.size - at, _SEARCHED))
         return not np.frombuffer(rest, np.uint8).any()
-
-    def _search(self, start: int, end: int) -> int | None:
-        """The first byte of a range where a chunk or a metadata record proves itself."""
-        return self._bytes.search(start, end, _PROVABLE, self._proves_itself)
 
     def _proves_itself(self, at: int) -> bool:
         try:
@@ -322,18 +288,6 @@ class Walk:
 
 
 _PROVABLE: Final = frozenset({Opcode.CHUNK, Opcode.METADATA})
-_KINDS: Final = frozenset(
-    {
-        Opcode.CHUNK,
-        Opcode.MESSAGE_INDEX,
-        Opcode.METADATA,
-        Opcode.ATTACHMENT,
-        Opcode.DATA_END,
-        ARRIVAL_OPCODE,
-        PADDING_OPCODE,
-        DAMAGED_OPCODE,
-    }
-)
 
 
 def _parts_by_index(indexes: list[tuple[int, NDArray[np.void]]], size: int) -> NDArray[np.void]:
