@@ -45,7 +45,6 @@ _WAKE_BYTES = 4 << 20  # queued bytes that wake the writing thread: a batch has 
 _TICK_S = 0.1  # interval of the writing thread when little comes
 _FLUSH_AT = 0.95  # share of the flush interval after which chunks are closed
 _INDEX_INTERVALS = 4  # flush intervals between two passes of the index
-_INDEXING_S = 2.0  # time to pack, write, convert and send the documents of a chunk
 _MAX_NS = 1 << 63
 _SOURCE = {"path": "", "kind": "live", "profile": "", "bytes": 0}
 LIVE_SETTINGS = SegmentSettings(segment_size=1 << 30, segment_span_s=600.0)
@@ -550,11 +549,6 @@ def _check_channel(channel: object) -> None:
 def _index_interval_s(flush_interval_s: float) -> float:
     """Longest time between two passes of the index, seconds."""
     return min(_INDEX_INTERVALS * flush_interval_s, INTERVAL_S)
-
-
-def indexed_within_s(flush_interval_s: float) -> float:
-    """Seconds in which an index that keeps up receives a message."""
-    return flush_interval_s + _index_interval_s(flush_interval_s) + _INDEXING_S
 
 
 def _batch(messages: deque[_Message]) -> LooseBatch:

@@ -31,32 +31,7 @@ _MAX_BYTES: Final = 1 << 26
 
 @dataclass(frozen=True, slots=True)
 class RecorderState:
-    """State of a recorder at one time.
-
-    Attributes:
-        name: Name of the recorder: that of its recording.
-        elapsed_s: Seconds since its start.
-        topics: Topics with publishers or messages, by name.
-        messages: Messages received so far.
-        stored: Messages in chunks, or on their way to the disk.
-        lost: Messages lost so far, by cause, as far as they can be counted.
-        filled: Used share of the memory budget, 0 to 1.
-        lag: Messages that are not indexed yet.
-        late: Of these, the overdue ones: they wait longer than messages of slow topics do.
-        index_failure: The error that stopped the index; empty while it works.
-        free_bytes: Free space of the disk.
-        stored_bytes: Payload bytes stored so far.
-        stalled_s: Seconds for which received messages have waited for longer than the flush
-            interval, and nothing was written; 0 while writing goes on.
-        incidents: What was marked and pinned so far.
-        let_go: Messages that the ring has let go; None without a ring.
-        taken: Messages that are stored or will be, by topic.
-        silent: Topics that are silent for longer than the contract allows.
-        breaches: Such silences so far.
-        clock_set_s: Seconds by which the clock of this machine was set since the start.
-        memory_bytes: Memory of the recorder's process; 0 where that is unknown.
-        sim_time: Time of `/clock`, ns, 0 before it comes; None for the clock of the machine.
-    """
+    """State of a recorder at one time; `docs/live.md` says what each field is."""
 
     name: str
     elapsed_s: float
@@ -66,7 +41,6 @@ class RecorderState:
     lost: Mapping[str, int]
     filled: float
     lag: int
-    late: int
     index_failure: str
     free_bytes: int
     stored_bytes: int
@@ -100,10 +74,6 @@ class StateFile:
     """The file with the state of a recorder.
 
     Files that killed recorders have left are removed.
-
-    Args:
-        directory: The store.
-        recording: Id of its recording.
     """
 
     def __init__(self, directory: StoreDirectory, recording: str) -> None:
@@ -157,16 +127,12 @@ def running(directory: StoreDirectory) -> dict[str, str]:
     return {one.id: one.name for one in sorted(found, key=attrgetter("created"))}
 
 
-def states(
-    directory: StoreDirectory, recording: str, every_s: float
-) -> Iterator[RecorderState | None]:
-    """Poll the state of a recorder until it ends; None before it has said one."""
+def states(directory: StoreDirectory, recording: str, every_s: float) -> Iterator[RecorderState]:
+    """Poll the state of a recorder until it ends."""
     while directory.is_recorded(recording):
         started = time.monotonic()
-        state: RecorderState | None = None
-        with suppress(StoreError):
-            state = read(directory.path, recording)
-        yield state
+        with suppress(StoreError):  # it has just started
+            yield read(directory.path, recording)
         pause(max(every_s - (time.monotonic() - started), 0))
 
 
@@ -188,13 +154,11 @@ def choose(directory: StoreDirectory, named: Sequence[str]) -> list[str]:
             "recordings there."
         )
     names = running(directory)
-    if named:
-        return list(dict.fromkeys(_resolve(name, names) for name in named))
     if not names:
         raise UsageError("No recorder runs on this store; start one with `hybridlog record`.")
-    if len(names) > 1:
+    if not named and len(names) > 1:
         raise UsageError(f"Several recorders run; name one of {', '.join(names.values())}.")
-    return [*names]
+    return list(dict.fromkeys(_resolve(name, names) for name in named)) or [*names]
 
 
 def _resolve(name: str, recorders: Mapping[str, str]) -> str:
@@ -203,21 +167,16 @@ def _resolve(name: str, recorders: Mapping[str, str]) -> str:
     Raises:
         UsageError: No recorder matches, or several do.
     """
-    fitting = (
-        [one for one, known in recorders.items() if name in {one, known}]
-        or [one for one, known in recorders.items() if name and known.startswith(name)]
-        or [
-            one
-            for one in recorders
-            if name and (one.startswith(name) or one[-16:].startswith(name))
-        ]
-    )
-    if len(fitting) > 1:
-        found = ", ".join(recorders[one] for one in fitting)
-        raise UsageError(f"{name!r} is ambiguous: it may be {found}.")
-    if not fitting:
-        known = ", ".join(recorders.values()) or "none"
-        raise UsageError(f"No running recorder matches {name!r}; running: {known}.")
+    whole = [one for one, known in recorders.items() if name in {one, known}]
+    named = [one for one, known in recorders.items() if name and known.startswith(name)]
+    begun = [
+        one for one in recorders if name and name in {one[: len(name)], one[-16:][: len(name)]}
+    ]
+    fitting = whole or named or begun
+    if len(fitting) != 1:
+        what = "is ambiguous" if fitting else "is no running recorder"
+        known = ", ".join(recorders[one] for one in fitting or recorders)
+        raise UsageError(f"{name!r} {what}: name one of {known}.")
     return fitting[0]
 
 

@@ -23,9 +23,9 @@ import pytest
 
 import hybridlog as hl
 from hybridlog.contract import Contract, TopicRules
+from hybridlog.follow.triggers import Trigger
 from hybridlog.live import ring
 from hybridlog.live.recorder import Recorder, RecorderOptions
-from hybridlog.live.triggers import Trigger
 from hybridlog.maintenance.edit import mark_now
 from hybridlog.maintenance.retention import MIN_SEGMENT
 from hybridlog.maintenance.sizes import disk_bytes
@@ -81,7 +81,7 @@ class Robot:
         self.is_full = False
         contract = Contract({"/points": TopicRules(longest_gap=round(seconds / 20 * SECOND))})
         options = RecorderOptions(
-            part, reserve_bytes=0, flush_interval_s=FLUSH_S, contract=contract
+            name=part, reserve_bytes=0, flush_interval_s=FLUSH_S, contract=contract
         )
         if part == "box":
             self.speed = speed / SLOWER
@@ -129,6 +129,8 @@ class Robot:
         os.writev = lambda *words: self.write(writev, *words)  # type: ignore[assignment]
         os.pwritev = lambda *words: self.write(pwritev, *words)  # type: ignore[assignment]
         self.recorder.start()
+        if self.part == "box":  # a ring waits for its triggers
+            wait_for(lambda: self.recorder._triggers._read is not None)
         events: list[tuple[float, Any]] = [
             (0.3, self.pin),
             (0.4, self.mark),

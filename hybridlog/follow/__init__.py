@@ -1,0 +1,1 @@
+"""Brings what is derived of recordings up to date; evaluates triggers beside a live recorder."""
