@@ -11,7 +11,7 @@ import pytest
 
 from hybridlog.live.sources.base import Cause
 from hybridlog.live.sources.foxglove.protocol import MESSAGE_DATA
-from hybridlog.live.sources.foxglove.session import Notifier, Session
+from hybridlog.live.sources.foxglove.session import Session
 from hybridlog.live.sources.ros1.stream import Stream
 from hybridlog.live.sources.sequence_gaps import SequenceGap, SequenceGapDetector
 from hybridlog_storage.messages import Channel, Schema
@@ -86,7 +86,7 @@ def heard_by_foxglove(*payloads: bytes) -> Heard:
     heard = Heard()
 
     async def hear() -> None:
-        session = Unanswered(heard, Notifier(heard, "server"), {})
+        session = Unanswered(heard, "server", {})
         session._advertise(
             [{"id": 1, "topic": "/a", "encoding": "ros1", "schemaName": "T", "schema": DEFINITION}]
         )
