@@ -176,10 +176,10 @@ class SimulatedTime(Sink):
         if self._held is None or not self._hold(loss):
             self._report(loss, self.at(loss.first), self.at(loss.last))
 
-    def topic_came(self, topic: str, type_name: str, publishers: int) -> None:
+    def topic_came(self, topic: str, type_name: str) -> None:
         """See `Sink.topic_came`."""
         if self._is_recorded(topic):
-            self._recorder.topic_came(topic, type_name, publishers)
+            self._recorder.topic_came(topic, type_name)
 
     def topic_gone(self, topic: str) -> None:
         """See `Sink.topic_gone`."""

@@ -172,7 +172,7 @@ class Recorder:
         self._recorded: dict[Channel, _RecordedChannel] = {}
         self._recorded_by_content: dict[tuple[object, ...], _RecordedChannel] = {}
         self._topics: dict[str, TopicRates] = {}
-        self._present: dict[str, int] = {}
+        self._present: set[str] = set()
         self._lock = threading.Lock()
         self._said: set[str] = set()
         self._expected = 0
@@ -562,16 +562,16 @@ class Recorder:
         recorded.tally.add(size, at)
         self._lose(recorded, cause, detail, at)
 
-    def topic_came(self, topic: str, type_name: str, publishers: int) -> None:
+    def topic_came(self, topic: str, type_name: str) -> None:
         """See `Sink.topic_came`."""
         with self._lock:
-            self._present[topic] = publishers
+            self._present.add(topic)
             self._topics.setdefault(topic, TopicRates(topic, type_name))
 
     def topic_gone(self, topic: str) -> None:
         """See `Sink.topic_gone`."""
         with self._lock:
-            self._present.pop(topic, None)
+            self._present.discard(topic)
 
     def say(self, text: str) -> None:
         """See `Sink.say`."""

@@ -167,7 +167,7 @@ def test_a_clock_that_is_not_wanted_gives_the_time_all_the_same(store: hl.Store)
     assert sink is not None
     assert sink.wants("/clock", "rosgraph_msgs/Clock")
     assert not sink.wants("/scan", "")
-    sink.topic_came("/clock", "rosgraph_msgs/Clock", 1)
+    sink.topic_came("/clock", "rosgraph_msgs/Clock")
     sink.expect(CLOCK)
     simulation.tick(5)
     simulation.say("a")

@@ -75,8 +75,8 @@ class Sink(Protocol):
         """
         ...
 
-    def topic_came(self, topic: str, type_name: str, publishers: int) -> None:
-        """Note the number of publishers of a wanted topic, at least one."""
+    def topic_came(self, topic: str, type_name: str) -> None:
+        """Note that a wanted topic has publishers."""
         ...
 
     def topic_gone(self, topic: str) -> None:

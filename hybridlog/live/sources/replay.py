@@ -13,7 +13,6 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections import Counter
 from collections.abc import Iterator
 from itertools import count
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -78,7 +77,7 @@ class ReplaySource(LiveSource):
         self._source: Source
         self._sink: Sink
         self._is_late = False
-        self._publishers: Counter[str] = Counter()
+        self._present: set[str] = set()
         self._channels: list[Channel | None] = []
         self._told = 0  # damaged places
         self._failure = ""
@@ -118,7 +117,7 @@ class ReplaySource(LiveSource):
                 self._sink.ended(f"{self.address}: playing failed ({error!r})")
             raise
         if not self._stop.is_set():
-            for topic in self._publishers:
+            for topic in self._present:
                 self._sink.topic_gone(topic)
             self._sink.ended(self._failure)
 
@@ -188,8 +187,9 @@ class ReplaySource(LiveSource):
         type_name = "" if channel.schema is None else channel.schema.name
         if not self._sink.wants(channel.topic, type_name):
             return None
-        self._publishers[channel.topic] += 1
-        self._sink.topic_came(channel.topic, type_name, self._publishers[channel.topic])
+        if channel.topic not in self._present:
+            self._present.add(channel.topic)
+            self._sink.topic_came(channel.topic, type_name)
         self._sink.expect(channel)
         return channel
 

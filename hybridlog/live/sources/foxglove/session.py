@@ -273,7 +273,8 @@ class Session(WSListener):
         self._subscriptions[offer.id] = subscription
         self._routes[subscription.number] = (offer.channel, gaps)
         self._topics[topic] += 1
-        self._sink.topic_came(topic, offer.type_name, self._topics[topic])
+        if self._topics[topic] == 1:
+            self._sink.topic_came(topic, offer.type_name)
         self._sink.expect(offer.channel)
         since = self._missed.pop(topic, None)
         if since is not None:
@@ -297,9 +298,7 @@ class Session(WSListener):
             self._routes.pop(self._retired.popleft(), None)
         topic = gone.offer.channel.topic
         self._topics[topic] -= 1
-        if self._topics[topic]:
-            self._sink.topic_came(topic, gone.offer.type_name, self._topics[topic])
-        else:
+        if not self._topics[topic]:
             del self._topics[topic]
             self._sink.topic_gone(topic)
 

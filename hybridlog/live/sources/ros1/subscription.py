@@ -67,7 +67,7 @@ class Subscription:
         self._type = ""
         self._types: dict[str, bool] = {}
         self._channels: dict[tuple[tuple[str, str], ...], Channel] = {}
-        self._reported = (0, "")
+        self._reported = (False, "")
 
     def update(self, type_name: str, uris: Iterable[str], *, is_wanted: bool) -> None:
         """Updates the publishers.
@@ -94,13 +94,13 @@ class Subscription:
         self.report()
 
     def report(self) -> None:
-        """Reports the number of connected publishers to the sink if it has changed."""
-        now = (sum(link.is_up for link in self._links.values()), self._type)
+        """Tells the sink whether a publisher is connected, if that has changed."""
+        now = (any(link.is_up for link in self._links.values()), self._type)
         if now == self._reported:
             return
         before, self._reported = self._reported, now
         if now[0]:
-            self._context.sink.topic_came(self.topic, self._type, now[0])
+            self._context.sink.topic_came(self.topic, self._type)
         elif before[0]:
             self._context.sink.topic_gone(self.topic)
 

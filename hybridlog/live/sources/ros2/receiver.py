@@ -48,7 +48,6 @@ class _Channel(msgspec.Struct, tag_field="event", tag="channel"):
 class _Topic(msgspec.Struct, tag_field="event", tag="topic"):
     topic: str
     type: str
-    publishers: _Number
 
 
 class _Gone(msgspec.Struct, tag_field="event", tag="gone"):
@@ -146,9 +145,9 @@ class Receiver:
                     self._peer.sendall(command.encode("ascii") + b"\n")
             case _Channel():
                 self._channel(event)
-            case _Topic(topic, kind, publishers):
+            case _Topic(topic, kind):
                 self.present.add(topic)
-                self._sink.topic_came(topic, kind, publishers)
+                self._sink.topic_came(topic, kind)
             case _Gone(topic):
                 self.present.discard(topic)
                 self._sink.topic_gone(topic)

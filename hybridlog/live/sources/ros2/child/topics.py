@@ -121,8 +121,8 @@ class Topics:
 
     def _update(self, topic: Topic, before: list[Offer]) -> None:
         """Handles the publishers of a wanted topic."""
-        if len(before) != len(topic.offers):
-            self._tell_publishers(topic)
+        if not before:
+            self._outbox.event("topic", topic=topic.name, type=topic.kind)
         stream = topic.stream
         if stream is None:
             self._report_problem(topic)
@@ -134,10 +134,6 @@ class Topics:
                 return
         self._set_channels(topic, stream, topic.offers)
         self._check(topic, stream, known)
-
-    def _tell_publishers(self, topic: Topic) -> None:
-        count = len(topic.offers)
-        self._outbox.event("topic", topic=topic.name, type=topic.kind, publishers=count)
 
     def _adapt(self, topic: Topic, stream: Stream, *, is_first: bool) -> None:
         """Adapts a subscription to new publishers."""
@@ -207,7 +203,8 @@ class Topics:
         if topic is None or topic.is_wanted:
             return
         topic.is_wanted = True
-        self._tell_publishers(topic)
+        if topic.offers:
+            self._outbox.event("topic", topic=topic.name, type=topic.kind)
         try:
             topic.definition = self._definitions.find(kind)
             found = self._middleware.subscribe(name, parse_type(kind), self._wanted(topic))
