@@ -10,6 +10,7 @@ import math
 import shutil
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -35,7 +36,7 @@ from hybridlog.live.recording import LiveOptions
 from hybridlog.live.ring import GROUPS, Ring
 from hybridlog.live.silence import RULE, Silence, SilenceWatch
 from hybridlog.live.state import RecorderState, StateFile
-from hybridlog.live.statistics import Tally, TopicRates
+from hybridlog.live.statistics import Tally, TopicCounts
 from hybridlog.maintenance.edit import change, remove_if
 from hybridlog.maintenance.keep import RetentionThread
 from hybridlog.maintenance.retention import Rules
@@ -171,8 +172,7 @@ class Recorder:
         self._directory = store.directory
         self._recorded: dict[Channel, _RecordedChannel] = {}
         self._recorded_by_content: dict[tuple[object, ...], _RecordedChannel] = {}
-        self._topics: dict[str, TopicRates] = {}
-        self._present: set[str] = set()
+        self._topics: dict[str, TopicCounts] = {}
         self._lock = threading.Lock()
         self._said: set[str] = set()
         self._expected = 0
@@ -188,7 +188,6 @@ class Recorder:
         self._looked = self._written_at = self._started
         self._written = 0
         self._stored_bytes = 0
-        self._lost: dict[tuple[str, Cause], int] = {}
         self._clock_marks: list[Moment] = []
         self._newest = max(store.summaries(), key=attrgetter("created"), default=None)
         self._silence = SilenceWatch(options.contract, self._now, self._note_silence)
@@ -353,28 +352,14 @@ class Recorder:
         elapsed = max(now - self._looked, 1e-3)
         self._looked = now
         self._check_clock(now)
-        missing: dict[tuple[str, bool], int] = {}
-        lost: dict[str, int] = {}
         self._look_for_topics(now)
-        with self._lock:
-            totals = dict(self._lost)
-        for (topic, cause), count in totals.items():
-            key = topic, cause is Cause.THROTTLE
-            missing[key] = missing.get(key, 0) + count
-            lost[cause.value] = lost.get(cause.value, 0) + count
-        with self._lock:
-            rates = sorted(self._topics.items())
         now_steady = self._now()
-        topics = [
-            rate.look(
-                elapsed,
-                now_steady,
-                thinned=missing.get((topic, True), 0),
-                lost=missing.get((topic, False), 0),
-            )
-            for topic, rate in rates
-            if rate.tallies or topic in self._present
-        ]
+        lost: Counter[str] = Counter()
+        with self._lock:
+            for one in self._topics.values():
+                lost.update({cause.value: count for cause, count in one.lost.items()})
+            shown = [one for one in self._topics.values() if one.tallies or one.is_present]
+        topics = [one.look(elapsed, now_steady) for one in sorted(shown, key=attrgetter("topic"))]
         stored, stored_bytes = self._target.stored
         failure = self._target.index_failure
         state = RecorderState(
@@ -383,7 +368,7 @@ class Recorder:
             topics,
             sum(topic.messages for topic in topics),
             stored,
-            lost,
+            dict(lost),
             self._target.filled,
             self._target.lag,
             "" if failure is None else str(failure),
@@ -453,7 +438,7 @@ class Recorder:
         """Options that name topics of which none has come, in words."""
         options = self._options
         with self._lock:
-            topics = [*self._topics]
+            topics = [name for name, one in self._topics.items() if one.has_come]
             found = [
                 f"'{as_text(pattern)}'"
                 for chosen in (options.matcher, options.no_index)
@@ -469,7 +454,7 @@ class Recorder:
 
     def _look_for_topics(self, now: float) -> None:
         """Tell what names no topic once others may have come."""
-        if self._topics and not self._settled_at:
+        if not self._settled_at and any(one.has_come for one in [*self._topics.values()]):
             self._settled_at = now + _SETTLED_S
         if self._settled_at and now >= self._settled_at:
             self._settled_at = math.inf
@@ -481,9 +466,15 @@ class Recorder:
         with self._lock:
             return sorted(
                 topic
-                for topic, rate in self._topics.items()
-                if not any(tally.messages for tally in rate.tallies)
+                for topic, one in self._topics.items()
+                if one.has_come and not any(tally.messages for tally in one.tallies)
             )
+
+    def _topic(self, name: str, type_name: str = "") -> TopicCounts:
+        """What is counted of a topic; the caller holds the lock."""
+        found = self._topics.setdefault(name, TopicCounts(name))
+        found.type = found.type or type_name
+        return found
 
     # The sink.
 
@@ -565,13 +556,12 @@ class Recorder:
     def topic_came(self, topic: str, type_name: str) -> None:
         """See `Sink.topic_came`."""
         with self._lock:
-            self._present.add(topic)
-            self._topics.setdefault(topic, TopicRates(topic, type_name))
+            self._topic(topic, type_name).is_present = True
 
     def topic_gone(self, topic: str) -> None:
         """See `Sink.topic_gone`."""
         with self._lock:
-            self._present.discard(topic)
+            self._topic(topic).is_present = False
 
     def say(self, text: str) -> None:
         """See `Sink.say`."""
@@ -613,8 +603,6 @@ class Recorder:
             if recorded is None:
                 topic = channel.topic
                 type_name = channel.schema.name if channel.schema is not None else ""
-                rates = self._topics.setdefault(topic, TopicRates(topic, type_name))
-                rates.type = rates.type or type_name
                 hz = first_fit(self._options.throttles, topic)
                 priority = first_fit(self._options.priorities, topic)
                 recorded = _RecordedChannel(
@@ -623,7 +611,7 @@ class Recorder:
                     None if hz is None else Throttle(hz),
                     Priority.NORMAL if priority is None else Priority(int(priority)),
                 )
-                rates.tallies.append(recorded.tally)
+                self._topic(topic, type_name).tallies.append(recorded.tally)
                 self._recorded_by_content[content] = recorded
             if payload is None:
                 return recorded
@@ -694,7 +682,7 @@ class Recorder:
 
     def _count_lost(self, topic: str, cause: Cause, count: int) -> None:
         with self._lock:
-            self._lost[topic, cause] = self._lost.get((topic, cause), 0) + count
+            self._topic(topic).lost[cause] += count
 
     def _refuse(self, cause: Cause, reason: str) -> None:
         """Stop storing; further messages are counted as lost."""

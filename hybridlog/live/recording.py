@@ -200,11 +200,10 @@ class LiveRecording:
             UsageError: A channel cannot be stored, or the recording was closed.
             DiskFullError: The disk is full.
         """
-        with self._lock:
-            self._check()
-            for channel in channels:
-                _check_channel(channel)
-                self._capture.expect(channel)
+        self._check()
+        for channel in channels:
+            _check_channel(channel)
+            self._capture.expect(channel)
 
     def write(
         self,
@@ -479,9 +478,9 @@ class LiveRecording:
 
     def _most_open(self) -> int | None:
         """Bytes that open chunks may have: what they hold is missing in the budget."""
-        if self._is_tight:
-            self._is_tight = False
-            return 0
+        is_tight, self._is_tight = self._is_tight, False
+        if is_tight and self._capture.writer.is_idle:
+            return 0  # or nothing would ever make room
         budget = self._options.budget_bytes
         return budget // 8 if self._unwritten > budget // 4 else None
 

@@ -8,9 +8,11 @@ expected rate.
 from __future__ import annotations
 
 import math
-from collections import deque
+from collections import Counter, deque
 from dataclasses import dataclass, field
 from statistics import median
+
+from hybridlog.record.losses import Cause
 
 _RATES = 60  # so many past rates give the expected rate
 _NS = 1e9
@@ -57,17 +59,24 @@ class TopicState:
 
 
 @dataclass(slots=True)
-class TopicRates:
-    """Turns the counters of a topic into rates."""
+class TopicCounts:
+    """What was received and lost of a topic."""
 
     topic: str
-    type: str
+    type: str = ""
+    is_present: bool | None = None  # has publishers; None: has never had any
     tallies: list[Tally] = field(default_factory=list)
+    lost: Counter[Cause] = field(default_factory=Counter)
     _messages: int = 0
     _bytes: int = 0
     _usual: deque[float] = field(default_factory=lambda: deque(maxlen=_RATES))
 
-    def look(self, elapsed_s: float, now: int, *, thinned: int, lost: int) -> TopicState:
+    @property
+    def has_come(self) -> bool:
+        """True if it has had publishers or messages; not of what is lost alone."""
+        return bool(self.tallies) or self.is_present is not None
+
+    def look(self, elapsed_s: float, now: int) -> TopicState:
         """The topic's statistics since the last call."""
         messages = sum(tally.messages for tally in self.tallies)
         size = sum(tally.payload_bytes for tally in self.tallies)
@@ -77,6 +86,7 @@ class TopicRates:
         expected = median(self._usual) if len(self._usual) >= 3 else None
         self._usual.append(hz)
         last = max((tally.last for tally in self.tallies), default=0)
+        thinned = self.lost[Cause.THROTTLE]
         return TopicState(
             self.topic,
             self.type,
@@ -88,7 +98,7 @@ class TopicRates:
             self._jitter(),
             max(now - last, 0) / _NS if last else None,
             thinned,
-            lost,
+            sum([*self.lost.values()]) - thinned,
         )
 
     def _jitter(self) -> float | None:

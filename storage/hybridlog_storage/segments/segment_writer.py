@@ -189,6 +189,11 @@ class RecordingWriter:
         self._synced = 0
         self._syncing: Future[None] | None = None
 
+    @property
+    def is_idle(self) -> bool:
+        """True if all closed chunks are in the files."""
+        return self._closed_bytes == self.stored_bytes
+
     def append(self, batch: Batch | LooseBatch, channels: Sequence[Channel]) -> None:
         """Append a batch; `batch.channel` indexes `channels`.
 
