@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import os
 import socket
 import threading
+from concurrent.futures import Future
 from typing import TYPE_CHECKING, Final, NamedTuple
 from urllib.parse import urlsplit
 
@@ -88,7 +88,7 @@ class Network:
     """
 
     def __init__(self) -> None:
-        self._lookups: dict[str, asyncio.Future[Addresses]] = {}
+        self._lookups: dict[str, Future[Addresses]] = {}
 
     async def connect(self, endpoint: Endpoint) -> socket.socket:
         """A connected socket that does not block.
@@ -130,11 +130,12 @@ class Network:
         except OSError:
             pass  # a name
         lookup = self._lookups.get(host)
-        if lookup is None:
-            lookup = self._lookups[host] = _in_thread(host)
-            lookup.add_done_callback(lambda _: self._lookups.pop(host))
+        if lookup is None or lookup.done():
+            lookup = self._lookups[host] = Future()
+            lookup.set_running_or_notify_cancel()  # who stops waiting does not cancel it
+            threading.Thread(target=_settle, args=(lookup, host), daemon=True).start()
         async with asyncio.timeout(PATIENCE_S):
-            return await asyncio.shield(lookup)
+            return await asyncio.wrap_future(lookup)
 
 
 def _look_up(host: str, flags: int = 0) -> Addresses:
@@ -145,27 +146,8 @@ def _look_up(host: str, flags: int = 0) -> Addresses:
     return [(int(family), address) for family, _, _, _, address in found]
 
 
-def _in_thread(host: str) -> asyncio.Future[Addresses]:
-    """Looks up a name in its own thread."""
-    loop = asyncio.get_running_loop()
-    answer: asyncio.Future[Addresses] = loop.create_future()
-
-    def settle(found: Addresses | OSError) -> None:
-        if isinstance(found, OSError):
-            answer.set_exception(found)
-            answer.exception()  # retrieved, since its caller may be gone
-        else:
-            answer.set_result(found)
-
-    def work() -> None:
-        found: Addresses | OSError
-        try:
-            found = _look_up(host)
-        except OSError as error:
-            found = error
-        # The loop may have ended meanwhile.
-        with contextlib.suppress(RuntimeError):
-            loop.call_soon_threadsafe(settle, found)
-
-    threading.Thread(target=work, name="ros1-look-up", daemon=True).start()
-    return answer
+def _settle(lookup: Future[Addresses], host: str) -> None:
+    try:
+        lookup.set_result(_look_up(host))
+    except OSError as error:
+        lookup.set_exception(error)
