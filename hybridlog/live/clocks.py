@@ -32,18 +32,10 @@ CLOCK: Final = "/clock"
 
 _MAX_TICKS: Final = 4096  # past times, for messages and losses that are told late
 _MAX_JUMPS: Final = 10  # jumps that are told
-_OVERHEAD: Final = 256  # bytes of memory for a held message besides its payload
+_OVERHEAD: Final = 1024  # bytes of memory for a held message besides its payload
 _MAX_NS: Final = 1 << 63
 _ROS1 = struct.Struct("<II")
 _CDR = {0: struct.Struct(">4xiI"), 1: struct.Struct("<4xiI")}
-
-
-class _Message(NamedTuple):
-    channel: Channel
-    payload: bytes
-    received: int
-    sent: int | None
-    sequence: int | None
 
 
 class Recording(Sink, Protocol):
@@ -78,7 +70,8 @@ class SimulatedTime(Sink):
         self._latest = (0, 0)
         self._ticks: deque[tuple[int, int]] = deque(maxlen=_MAX_TICKS)
         self._jumps = 0
-        self._held: deque[_Message | Loss] | None = deque()
+        # What is done when the clock comes, and when it does not.
+        self._held: deque[tuple[Callable[[int], None], Callable[[], None]]] | None = deque()
         self._held_bytes = 0
 
     @property
@@ -123,11 +116,8 @@ class SimulatedTime(Sink):
         """Count what is held as lost, if the clock never came."""
         with self._lock:
             held, self._held = self._held, None
-        for item in held or ():
-            if isinstance(item, Loss):
-                self._report(item, item.first, item.last)
-            else:
-                self._drop(item, item.received)
+        for _, drop in held or ():
+            drop()
 
     # The sink.
 
@@ -165,16 +155,29 @@ class SimulatedTime(Sink):
                 self.clock(now, received=received)
             if not self._is_clock_recorded:
                 return
-        message = _Message(channel, payload, received, sent, sequence)
-        if self._held is None or not self._hold(message):
-            self._record(message, self.at(received))
+
+        def record(log_time: int) -> None:
+            self._recorder.take(channel, payload, received=log_time, sent=sent, sequence=sequence)
+
+        def drop() -> None:
+            detail = f"it came before the first time of {CLOCK}"
+            self._recorder.drop(channel, len(payload), Cause.CLOCK, detail, received)
+
+        if self._held is None or not self._hold(len(payload), record, drop):
+            record(self.at(received))
 
     def lost(self, loss: Loss) -> None:
         """See `Sink.lost`."""
         if not self._is_recorded(loss.topic):
             return
-        if self._held is None or not self._hold(loss):
-            self._report(loss, self.at(loss.first), self.at(loss.last))
+
+        def report(first: int, last: int) -> None:
+            self._recorder.lost(replace(loss, first=first, last=last))
+
+        if self._held is None or not self._hold(
+            0, lambda now: report(now, now), lambda: report(loss.first, loss.last)
+        ):
+            report(self.at(loss.first), self.at(loss.last))
 
     def topic_came(self, topic: str, type_name: str) -> None:
         """See `Sink.topic_came`."""
@@ -199,22 +202,17 @@ class SimulatedTime(Sink):
     def _is_recorded(self, topic: str) -> bool:
         return self._is_clock_recorded or topic != CLOCK
 
-    def _hold(self, item: _Message | Loss) -> bool:
+    def _hold(self, size: int, record: Callable[[int], None], drop: Callable[[], None]) -> bool:
         """Keep an item until the clock comes; False once everything held has been passed on."""
-        size = _OVERHEAD + (len(item.payload) if isinstance(item, _Message) else 0)
         with self._lock:
             if self._held is None:
                 return False
-            fits = self._held_bytes + size <= self._max_bytes
+            fits = self._held_bytes + size + _OVERHEAD <= self._max_bytes
             if fits:
-                self._held_bytes += size
-                self._held.append(item)
-        if fits:
-            return True
-        if isinstance(item, _Message):
-            self._drop(item, item.received)
-        else:
-            self._report(item, item.first, item.last)
+                self._held_bytes += size + _OVERHEAD
+                self._held.append((record, drop))
+        if not fits:
+            drop()
         return True
 
     def _release(self, now: int) -> None:
@@ -225,27 +223,8 @@ class SimulatedTime(Sink):
                     self._held = None
                     return
                 held, self._held, self._held_bytes = self._held, deque(), 0
-            for item in held:
-                if isinstance(item, _Message):
-                    self._record(item, now)
-                else:
-                    self._report(item, now, now)
-
-    def _record(self, message: _Message, log_time: int) -> None:
-        channel, payload, _, sent, sequence = message
-        self._recorder.take(channel, payload, received=log_time, sent=sent, sequence=sequence)
-
-    def _report(self, loss: Loss, first: int, last: int) -> None:
-        self._recorder.lost(replace(loss, first=first, last=last))
-
-    def _drop(self, message: _Message, at: int) -> None:
-        self._recorder.drop(
-            message.channel,
-            len(message.payload),
-            Cause.CLOCK,
-            f"it came before the first time of {CLOCK}",
-            at,
-        )
+            for record, _ in held:
+                record(now)
 
 
 def clock_time(channel: Channel, payload: bytes) -> int | None:
