@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Hashable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
@@ -22,6 +23,7 @@ from hybridlog.query.latching import depth_of, is_key_frame, is_video, publisher
 from hybridlog.query.planner import Planner
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import TimeLike, is_relative, parse_time
+from hybridlog_storage.errors import SegmentError
 from hybridlog_storage.times import END, earlier, span_of
 
 if TYPE_CHECKING:
@@ -128,6 +130,7 @@ def _last_of(
     return next(messages_in(run, picture_of(session)))
 
 
+_FIRST_LOOK = 1 << 30  # ns, about a second
 _Key = tuple[int, int]
 """Log time, ns, and arrival number of a message."""
 
@@ -285,3 +288,38 @@ def _merged_scan(scans: Sequence[RecordingScan]) -> RecordingScan:
         (min(begin for begin, _ in bounds), bounds[0][1]),
         [*chunks.values()],
     )
+
+
+def next_time(session: Session, recording: RecordingEntry, topic: str, moment: int) -> int | None:
+    """The least log time of a topic's messages that is not before a time, ns; None without any.
+
+    Chunk tables tell it, and the message indexes of chunks that hold the time itself. Damaged
+    ones are left out.
+
+    Args:
+        session: The open store.
+        recording: The recording.
+        topic: Full name.
+        moment: The time, ns.
+    """
+    channels = [channel.channel_id for channel in session.channels_of(recording, [topic])]
+    if recording.span is None or not channels:
+        return None
+    first, last = recording.span
+    moment = max(moment, first)
+    width = _FIRST_LOOK
+    while True:
+        end = moment + width
+        parts = session.parts(recording, channels, (moment, end))
+        found = parts["first"][parts["first"] >= moment].tolist()
+        cut = parts[(parts["first"] < moment) & (parts["last"] >= moment)]
+        for segment, chunk, channel in cut[["segment", "chunk", "channel"]].tolist():
+            with suppress(SegmentError):
+                times = session.times(recording, segment, chunk)[channel]
+                found.append(int(times[np.searchsorted(times, moment)]))
+        # Chunks that were not looked at hold nothing before the end.
+        if found and min(found) < end:
+            return int(min(found))
+        if end > last:
+            return None
+        width *= 4
