@@ -491,7 +491,7 @@ class Session:
         self, recording: RecordingEntry, number: int, channels: Collection[int]
     ) -> ChunkColumns:
         """The chunks of a segment with some channels."""
-        table = self._of_catalog(recording, self.catalog.table, number)
+        table = self.chunk_table(recording, number)
         key = recording.id, number, frozenset(channels)
         known = self.shared.columns.get(key)
         if known is None or known[0] is not table:
@@ -500,27 +500,18 @@ class Session:
             known = self.shared.columns[key] = table, ChunkColumns(number, table, channels)
         return known[1]
 
-    def _of_catalog(
-        self,
-        recording: RecordingEntry,
-        ask: Callable[[RecordingEntry, int], _T],
-        number: int,
-    ) -> _T:
-        """An answer of the catalog about a segment; the files are read again if they changed.
+    def chunk_table(self, recording: RecordingEntry, number: int) -> ChunkTable:
+        """The chunks of a segment of a recording.
 
         Raises:
-            ChangedError: They are not those of the entry any more.
+            ChangedError: Its file is not that of the entry any more.
         """
         try:
-            return ask(recording, number)
+            return self.catalog.table(recording, number)
         except CatalogError:
             self._check_same(recording, number)
             read_again(self.directory, self.catalog, recording)
-            return ask(recording, number)
-
-    def chunk_table(self, recording: RecordingEntry, number: int) -> ChunkTable:
-        """The chunks of a segment of a recording."""
-        return self._of_catalog(recording, self.catalog.table, number)
+            return self.catalog.table(recording, number)
 
     def parts(
         self, recording: RecordingEntry, channels: Collection[int], span: tuple[int, int]

@@ -73,7 +73,7 @@ if TYPE_CHECKING:
     from hybridlog.maintenance.report import Repaired
     from hybridlog.maintenance.sizes import Sizes
     from hybridlog.maintenance.verify import Finding, Verification
-    from hybridlog.query.answers.regularity import TopicCheck
+    from hybridlog.query.answers.statistics import TopicCheck
     from hybridlog.query.choice import During, Tags, Texts
     from hybridlog.query.question import Clock
     from hybridlog.query.times import DurationLike, TimeLike

@@ -617,7 +617,7 @@ def documented_classes() -> list[type]:
     from hybridlog.maintenance.report import Repaired, RepairReport
     from hybridlog.maintenance.verify import Finding, Verification
     from hybridlog.query.answers.completeness import Completeness
-    from hybridlog.query.answers.field_statistics import FieldStatistics
+    from hybridlog.query.answers.statistics import FieldStatistics
     from hybridlog.query.counters import Counters
     from hybridlog.query.intervals import Interval, Intervals
     from hybridlog.record.recorder import RecordReport

@@ -17,7 +17,7 @@ import numpy as np
 from hybridlog.across.match import UNKNOWN
 from hybridlog.across.topic_reader import TopicReader
 from hybridlog.message import messages_in
-from hybridlog.query.answers.last_message import message_at
+from hybridlog.query.answers.current import message_at
 from hybridlog.query.answers.lost import completeness_of
 from hybridlog.query.answers.video import picture_of
 from hybridlog.query.counters import Counters

@@ -14,7 +14,7 @@ import pyarrow as pa
 
 from hybridlog.across.match import UNKNOWN, quaternion_paths
 from hybridlog.frames.names import free_name
-from hybridlog.query.answers.last_message import message_at
+from hybridlog.query.answers.current import message_at
 from hybridlog.query.answers.lost import lost_times
 from hybridlog.query.counters import Counters
 from hybridlog.query.intervals import joined

@@ -19,7 +19,7 @@ from hybridlog.wording import listed
 from hybridlog_storage.errors import HybridlogError, UsageError
 
 if TYPE_CHECKING:
-    from hybridlog.query.answers.regularity import TopicCheck
+    from hybridlog.query.answers.statistics import TopicCheck
 
 
 MAX_RULES: Final = 1000

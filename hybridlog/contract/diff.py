@@ -16,8 +16,7 @@ from hybridlog.wording import counted
 
 if TYPE_CHECKING:
     from hybridlog.contract import Contract
-    from hybridlog.query.answers.field_statistics import FieldStatistics
-    from hybridlog.query.answers.regularity import TopicCheck
+    from hybridlog.query.answers.statistics import FieldStatistics, TopicCheck
     from hybridlog.query.times import TimeLike
     from hybridlog.recordings import Recordings
     from hybridlog.session import Session

@@ -14,9 +14,9 @@ from hybridlog.across.match import match
 from hybridlog.arrays.message_arrays import plain_type
 from hybridlog.query.answers.lost import completeness_of
 from hybridlog.query.answers.marks import marks_in
-from hybridlog.query.answers.match_times import match_times
-from hybridlog.query.answers.regularity import Regularity
+from hybridlog.query.answers.statistics import Regularity
 from hybridlog.query.counters import Counters
+from hybridlog.query.planner import match_times
 from hybridlog.query.query import Query
 from hybridlog.query.question import Question
 from hybridlog.query.times import format_duration
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hybridlog.contract import Contract, TopicRules
-    from hybridlog.query.answers.regularity import TopicCheck
+    from hybridlog.query.answers.statistics import TopicCheck
     from hybridlog.session import Session
     from hybridlog_storage.summary import RecordingSummary
 

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from hybridlog.query.answers.interval_queries import IntervalQueries
-from hybridlog.query.answers.match_times import match_times
 from hybridlog.query.counters import Counters
 from hybridlog.query.periods import GAP_PERIODS, usual_period
+from hybridlog.query.planner import match_times
 from hybridlog.query.question import Question
 from hybridlog_storage.errors import ResourceError, SegmentError, TopicError, UsageError
 from hybridlog_storage.times import BEGIN, END, placed
@@ -23,7 +23,7 @@ from hybridlog_storage.times import BEGIN, END, placed
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from hybridlog.query.answers.match_times import MatchTimes
+    from hybridlog.query.planner import MatchTimes
     from hybridlog.query.query import Query
     from hybridlog.query.question import Span
     from hybridlog.session import Session

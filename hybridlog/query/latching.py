@@ -149,7 +149,6 @@ class LatchedFront:
         self._channels: list[Channel] = []
         self._keys: dict[Hashable, _Held] = {}
         self._publishers: list[Hashable] = []
-        self._has_publish_time: list[bool] = []
         self._last: dict[Hashable, list[_Held]] = defaultdict(list)
         self._at_begin: list[_Held] = []
         self._size = 0
@@ -175,7 +174,6 @@ class LatchedFront:
             self._depths.append(KEEP_ALL - 1 if is_video(channel) else depth_of(channel))
             self._channels.append(channel)
             self._publishers.append(publisher_of(channel))
-            self._has_publish_time.append(channel.has_publish_time)
         depth = np.array(self._depths, np.int64)[batch.channel]
         before = batch.log_time < self._begin
         always = before & (depth == KEEP_ALL)
@@ -258,7 +256,7 @@ class LatchedFront:
         moved = batch.take(slice(None))
         moved.log_time = np.maximum(batch.log_time, self._begin)
         # Without publish times, they repeat the log times.
-        has_own = np.array(self._has_publish_time)[batch.channel]
+        has_own = np.array([one.has_publish_time for one in self._channels])[batch.channel]
         moved.publish_time = np.where(has_own, batch.publish_time, moved.log_time)
         return moved
 

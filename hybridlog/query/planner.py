@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.rows import TABLE_ERRORS, Rows
 from hybridlog.schema.column import STAMP
 from hybridlog.schema.states import GONE
-from hybridlog_storage.errors import ChangedError, TopicError
+from hybridlog_storage.errors import ChangedError, TopicError, UsageError
 from hybridlog_storage.lazy import lazy
 
 if TYPE_CHECKING:
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from hybridlog.query.rows import MatchColumns, Values
     from hybridlog.schema.states import State
     from hybridlog.session import Session
+    from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.summary import RecordingSummary
 
 _GROUP_GROWTH = 64  # so many times more recordings are planned after each group
@@ -339,6 +340,33 @@ class Planner:
             raise TopicError(
                 f"{topic} came without publish times (ROS 1 bags have none): use --clock log."
             )
+
+
+class MatchTimes(NamedTuple):
+    """Some messages of one topic of one recording, in order of log time and arrival.
+
+    Attributes:
+        recording: The recording.
+        topic: Full name.
+        log_time: int64[n], ns since the epoch.
+        seq: int64[n], arrival numbers, each once in a recording.
+    """
+
+    recording: RecordingEntry
+    topic: str
+    log_time: NDArray[np.int64]
+    seq: NDArray[np.int64]
+
+
+def match_times(session: Session, question: Question, counters: Counters) -> Iterator[MatchTimes]:
+    """The times of an answer, some at a time; recordings and topics one after the other."""
+    if not question.returns_all:
+        raise UsageError("Times are those of all messages: leave out limit and every.")
+    planner = Planner(session, question, counters)
+    for part in planner.decided(planner.parts()):
+        for found in planner.outcomes(part):
+            holds = found.holds
+            yield MatchTimes(part.recording, part.topic, found.log_time[holds], found.seq[holds])
 
 
 def _after(item: _Rows, key: tuple[int, int]) -> _Rows | None:

@@ -42,10 +42,9 @@ if TYPE_CHECKING:
     from hybridlog.across.align import Aligned
     from hybridlog.message import Message
     from hybridlog.query.answers.completeness import Completeness
-    from hybridlog.query.answers.field_statistics import FieldStatistics
     from hybridlog.query.answers.follow import Following
     from hybridlog.query.answers.interval_queries import IntervalQueries
-    from hybridlog.query.answers.regularity import TopicCheck
+    from hybridlog.query.answers.statistics import FieldStatistics, TopicCheck
     from hybridlog.query.choice import During, Tags, Texts
     from hybridlog.query.intervals import Intervals
     from hybridlog.query.predicate.tree import Near
@@ -427,7 +426,7 @@ class Query:
             TopicError: no such message exists.
             UsageError: the question has a time range, or another clock than log time.
         """
-        from hybridlog.query.answers.last_message import just_before
+        from hybridlog.query.answers.current import just_before
 
         now = of_now(self)
         found = _message_at(now, moment)
@@ -462,7 +461,7 @@ class Query:
         video topics from the last key frame on. Their log time is the beginning of the range.
         Take them before `batches`, and with separate counters.
         """
-        from hybridlog.query.answers.latched import in_force
+        from hybridlog.query.answers.current import in_force
 
         self.counters.reset()
         return in_force(self.session, self.question, self.counters, original_times=original_times)
@@ -597,7 +596,7 @@ class Query:
                 windows.
             TimeError: no duration, or a range outside of all recordings.
         """
-        from hybridlog.query.answers.regularity import Regularity
+        from hybridlog.query.answers.statistics import Regularity
 
         with self.counters.timed():
             return Regularity(self.session, self.question, self.counters).rate(window)
@@ -613,7 +612,7 @@ class Query:
             UsageError: `limit`, `every`, `reverse`, or another clock than the log's.
             TimeError: a range outside of all recordings.
         """
-        from hybridlog.query.answers.regularity import Regularity
+        from hybridlog.query.answers.statistics import Regularity
 
         with self.counters.timed():
             return Regularity(self.session, self.question, self.counters).check()
@@ -630,7 +629,7 @@ class Query:
             UsageError: `limit`, `every`, `reverse`, or no field is a number.
             TimeError: a range outside of all recordings.
         """
-        from hybridlog.query.answers.field_statistics import statistics
+        from hybridlog.query.answers.statistics import statistics
 
         self._as_they_came("Statistics")
         now = of_now(self)
@@ -731,7 +730,7 @@ class Query:
                 log's, or no number of periods.
             TimeError: no duration, or a range outside of all recordings.
         """
-        from hybridlog.query.answers.regularity import Regularity
+        from hybridlog.query.answers.statistics import Regularity
 
         with self.counters.timed():
             return Regularity(self.session, self.question, self.counters).gaps(longer_than, periods)
@@ -877,7 +876,7 @@ def _message_at(query: Query, moment: TimeLike) -> Message:
             "A message at a time is the last one by log time; `between`, `during` and "
             "`clock` cannot be combined with it."
         )
-    from hybridlog.query.answers.last_message import message_at
+    from hybridlog.query.answers.current import message_at
 
     with query.counters.timed():
         found = message_at(query.session, query.question, query.counters, moment)

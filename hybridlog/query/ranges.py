@@ -253,18 +253,19 @@ class RangeResolver:
             start, end = self._clock_span(summaries[places[0]])
             parse_range(begin, stop, start=start, end=end)
         raise TimeError(
-            f"Nothing was recorded between {begin} and {stop}: {'; '.join(spans)}.{self._others()}"
+            f"Nothing was recorded between {begin} and {stop}: {'; '.join(spans)}.{self.others()}"
             f"{units_of(begin, stop)}"
         )
 
-    def _others(self) -> str:
+    def others(self) -> str:
         """A sentence about recordings that span the range and were not asked; or nothing."""
-        shared = self._shared_bounds()
+        shared = None if self._question.bounds is None else self._shared_bounds()
         if self._question.recordings is None or shared is None:
             return ""
         snapshot = self._session.snapshot()
         places = snapshot.between(snapshot.having(self._question.topics), *shared).tolist()
-        names = [snapshot.summaries[place].name for place in places]
+        known = [snapshot.summaries[place] for place in places]
+        names = [one.name for one in known if one.id not in self._question.recordings]
         return f" Other recordings span that time: {listed(names, _MAX_NAMES)}." if names else ""
 
 

@@ -22,9 +22,8 @@ from hybridlog.record.losses import lost_spans
 from hybridlog.schema.codec import columns_of
 from hybridlog.schema.kinds import SINGLE, element_of, width_of
 from hybridlog.snapshot import UNFINISHED
-from hybridlog_storage.catalog import ChannelStats, channel_totals
 from hybridlog_storage.errors import HybridlogError, ResourceError, SegmentError, StoreError
-from hybridlog_storage.times import inside, placed
+from hybridlog_storage.times import BEGIN, END, inside, placed
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -172,25 +171,21 @@ class Rows:
 
     def _of_sealed(self, part: Part) -> Tabled | None:
         """A part of a running recording; None if no segment has a table, or times overlap."""
-        entry = part.recording
         ids = [channel.channel_id for channel in part.channels]
-        stats: dict[int, dict[int, ChannelStats]] = {}
-        for number, _, _ in entry.spans_with(ids):
-            table = self.session.chunk_table(entry, number)
-            rows = table.parts[np.isin(table.parts["channel"], ids)]
-            stats[number] = channel_totals(replace(table, parts=rows), None)
-        messages = {n: sum(one.messages for one in own.values()) for n, own in stats.items()}
-        made = self.session.tables.of_sealed(entry, part.topic, Counter(messages))
+        held = self.session.parts(part.recording, ids, (BEGIN, END))
+        messages: Counter[int] = Counter()
+        for segment, number in held[["segment", "messages"]].tolist():
+            messages[segment] += number
+        made = self.session.tables.of_sealed(part.recording, part.topic, messages)
         if made is None:
             return None
-        table_of_topic, segments = made
-        sealed = _within(part, stats, segments)
-        rest = _within(part, stats, stats.keys() - segments)
-        lasts = [one.last for one in sealed.stats if one.last is not None]
-        firsts = [one.first for one in rest.stats if one.first is not None]
-        if not lasts or (firsts and max(lasts) >= min(firsts)):
+        table, segments = made
+        is_sealed = np.isin(held["segment"], [*segments])
+        early, late = held["last"][is_sealed], held["first"][~is_sealed]
+        if not len(early) or (len(late) and early.max() >= late.min()):
             return None
-        return Tabled(table_of_topic, sealed, rest, segments)
+        rest = _within(part, messages.keys() - segments)
+        return Tabled(table, _within(part, segments), rest, segments)
 
     # Answers.
 
@@ -531,27 +526,10 @@ class Rows:
         return self.session.parts(part.recording, ids, span)
 
 
-def _within(
-    part: Part, stats: Mapping[int, Mapping[int, ChannelStats]], segments: Collection[int]
-) -> Part:
-    """A part in some segments of its recording.
-
-    Args:
-        part: The part.
-        stats: Statistics of its channels in each segment, by number and id.
-        segments: Numbers of the segments.
-    """
-    totals = {channel.channel_id: ChannelStats() for channel in part.channels}
-    for number in segments:
-        for channel_id, own in stats.get(number, {}).items():
-            totals[channel_id].add(own)
+def _within(part: Part, segments: Collection[int]) -> Part:
+    """A part in some segments of its recording; statistics are those of all."""
     spans = [span for span in part.recording.spans if span[0] in segments]
-    recording = replace(part.recording, spans=spans)
-    channels = tuple(
-        replace(channel, recording=recording, stats=totals[channel.channel_id])
-        for channel in part.channels
-    )
-    return replace(part, recording=recording, channels=channels)
+    return replace(part, recording=replace(part.recording, spans=spans))
 
 
 def summaries_in(fields: Collection[str] | None, types: Mapping[str, str] | None) -> set[str]:

@@ -14,9 +14,8 @@ import pyarrow.compute as pc
 from hybridlog.frames.answer import stream, to_arrow
 from hybridlog.frames.columns import flat
 from hybridlog.query.answers.lost import completeness_of
-from hybridlog.query.answers.match_times import match_times
 from hybridlog.query.counters import Counters
-from hybridlog.query.planner import Planner
+from hybridlog.query.planner import Planner, match_times
 from hybridlog.query.question import Question
 from hybridlog.tf import is_of_transforms
 from hybridlog.tf.transform import Transform

@@ -12,9 +12,9 @@ import numpy as np
 
 from hybridlog.across.match import match
 from hybridlog.drawing.images import shown_pixels
-from hybridlog.query.answers.match_times import match_times
 from hybridlog.query.counters import Counters
 from hybridlog.query.periods import GAP_PERIODS, usual_period
+from hybridlog.query.planner import match_times
 from hybridlog.query.query import Query
 from hybridlog.query.question import Question
 from hybridlog.query.times import format_duration, format_time

@@ -20,7 +20,7 @@ from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 from starlette.routing import Route
 
-from hybridlog.query.answers.match_times import next_time
+from hybridlog.query.answers.current import next_time
 from hybridlog.query.times import TIME_LIMIT
 from hybridlog.record.losses import extent_of
 from hybridlog.view.sql_process import SqlProcess

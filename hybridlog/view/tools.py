@@ -17,9 +17,9 @@ from hybridlog.arrays.message_arrays import IMAGES, plain_type
 from hybridlog.drawing.images import Picture, picture
 from hybridlog.query.answers.completeness import coverage
 from hybridlog.query.answers.infer_fields import infer_fields
-from hybridlog.query.answers.match_times import match_times
 from hybridlog.query.asked import field_types
 from hybridlog.query.counters import Counters
+from hybridlog.query.planner import match_times
 from hybridlog.query.predicate.tokens import MAX_TEXT
 from hybridlog.query.times import format_duration, format_time
 from hybridlog.record.losses import losses_of

@@ -12,7 +12,7 @@ import pytest
 from mcap.writer import Writer
 
 import hybridlog as hl
-from hybridlog.query.answers.regularity import TopicCheck
+from hybridlog.query.answers.statistics import TopicCheck
 from tests import independent
 from tests.cli.within import answer as run
 from tests.data import DATA, needs_data

@@ -22,7 +22,7 @@ from hybridlog.drawing.series import series
 from hybridlog.drawing.times import gaps as silent
 from hybridlog.drawing.times import lane_of
 from hybridlog.query import periods
-from hybridlog.query.answers.field_statistics import _Running
+from hybridlog.query.answers.statistics import _Running
 from hybridlog_storage.errors import TimeError, TopicError, UsageError
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings

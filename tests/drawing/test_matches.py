@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hybridlog.drawing.times import Match, Matches
-from hybridlog.query.answers.match_times import match_times
+from hybridlog.query.planner import match_times
 from hybridlog_storage.errors import ResourceError, UsageError
 from tests.limits import Limit
 

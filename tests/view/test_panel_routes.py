@@ -12,7 +12,7 @@ from starlette.testclient import TestClient
 
 import hybridlog as hl
 from hybridlog.drawing.tree import tree
-from hybridlog.query.answers.match_times import next_time
+from hybridlog.query.answers.current import next_time
 from hybridlog_storage.errors import TopicError
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings

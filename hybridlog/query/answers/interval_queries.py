@@ -13,7 +13,6 @@ import numpy as np
 
 from hybridlog.query.answers.lost import lost_times
 from hybridlog.query.answers.marks import mark_topics, marks
-from hybridlog.query.answers.match_times import match_times
 from hybridlog.query.intervals import Intervals, changing, clipped, holding
 from hybridlog.query.planner import Planner
 from hybridlog.query.ranges import RangeResolver
@@ -147,8 +146,8 @@ class IntervalQueries:
                 for index in np.unique(run.batch.channel).tolist():
                     yield entry_of[index], run.batch.log_time[run.batch.channel == index]
             return
-        for found in match_times(self._session, self._question, self._planner.counters):
-            yield found.recording, found.log_time
+        for part in self._planner.decided(self._planner.parts()):
+            yield part.recording, self._planner.times(part)
 
     def _spans(self) -> Iterator[tuple[Part, Span]]:
         """The one part of each recording, without a time range, with each span of the question."""

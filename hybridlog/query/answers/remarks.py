@@ -14,9 +14,8 @@ from hybridlog.query.planner import Planner
 from hybridlog.query.predicate.tree import Exists, is_meta
 from hybridlog.query.question import Question, field_types
 from hybridlog.query.ranges import RangeResolver
-from hybridlog.query.times import format_time, is_relative
+from hybridlog.query.times import format_time
 from hybridlog.wording import listed
-from hybridlog_storage.errors import TimeError
 
 if TYPE_CHECKING:
     from hybridlog.query.question import RecordedChannel, Span
@@ -173,8 +172,8 @@ def _causes(session: Session, question: Question) -> Iterator[str]:
     if question.bounds is None or not question.is_by_log_time:
         return
     yield from _topics_beside(session, question)
-    if question.recordings is not None and not any(map(is_relative, question.bounds)):
-        yield from _others(session, question)
+    if others := RangeResolver(session, question).others():
+        yield others.strip()
 
 
 def _topics_beside(session: Session, question: Question) -> Iterator[str]:
@@ -196,19 +195,3 @@ def _topics_beside(session: Session, question: Question) -> Iterator[str]:
                 f"No message of {topic} is in that time; it has messages from "
                 f"{format_time(first)} to {format_time(last)}."
             )
-
-
-def _others(session: Session, question: Question) -> Iterator[str]:
-    """Recordings that were not asked and have messages in the time range."""
-    everywhere = replace(question, recordings=None)
-    try:
-        ranges = RangeResolver(session, everywhere).resolve()
-    except TimeError:
-        return
-    names = [
-        each.summary.name
-        for each in islice(ranges, _MAX_RECORDINGS)
-        if each.summary.id not in (question.recordings or ())
-    ]
-    if names:
-        yield f"Other recordings span that time: {listed(names, _MAX_NAMES)}."

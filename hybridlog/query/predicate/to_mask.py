@@ -316,10 +316,9 @@ class _Columns(_Messages):
         stat = self._types.statistic(parts)
         if stat is None:
             return list(self._reach(start, parts, ()))
-        arrays = list(self._reach(start, parts[:-1], ()))
-        if self._types.known:
-            return [self._statistic(array, stat) for array in arrays]
-        return [leaf for array in arrays for leaf in self._either(array, stat)]
+        if not self._types.known:
+            raise _UnfitError  # a message may have a field of that name
+        return [self._statistic(array, stat) for array in self._reach(start, parts[:-1], ())]
 
     def _statistic(self, leaves: _Leaves, stat: Stat) -> _Leaves:
         """A statistic of arrays whose types are known."""
@@ -329,23 +328,6 @@ class _Columns(_Messages):
             values, rows = _some(leaves.values, leaves.rows, _valid(leaves.values))
             return _Leaves(pc.struct_field(values, stat), rows, is_element=True)
         return _computed(leaves, stat)
-
-    def _either(self, leaves: _Leaves, stat: Stat) -> Iterator[_Leaves]:
-        """A statistic of an array, or a field of that name, where types are unknown."""
-        kind = leaves.values.type
-        if _is_scalar(kind):
-            return
-        if pa.types.is_struct(kind):
-            if set(_names(kind)) == {"n"}:
-                raise _UnfitError  # it may be the summary of an array of any type
-            yield from self._reach(leaves, (stat,), ())
-            return
-        if not is_list(kind) or not (_is_scalar(kind.value_type) or is_list(kind.value_type)):
-            raise _UnfitError  # elements may have a field of that name
-        if stat == "n" or (is_numeric(kind.value_type) and not leaves.values.flatten().null_count):
-            yield _computed(leaves, stat)
-            return
-        raise _UnfitError
 
     def _reach(
         self,
@@ -361,7 +343,9 @@ class _Columns(_Messages):
                 yield leaves
             return
         if names and self._is_summary(kind, names, is_element=leaves.is_element):
-            yield from self._behind(_Leaves(values, rows), parts)
+            if parts:
+                raise _UnfitError
+            yield _Leaves(values, rows, is_summary=True)
             return
         if not parts:
             yield leaves._replace(values=values)
@@ -404,18 +388,9 @@ class _Columns(_Messages):
             return False
         if self._types.known:
             return not is_element and ".".join(names) in self._types.arrays
-        return set(_names(kind)) in _SUMMARIES
-
-    def _behind(self, leaves: _Leaves, parts: Parts) -> Iterator[_Leaves]:
-        """The values behind summaries when a path continues with some parts."""
-        if not parts and self._types.known:
-            yield leaves._replace(is_summary=True)
-        elif len(parts) == 1 and parts[0] in _names(leaves.values.type) and not self._types.known:
-            # It may also be a message with fields of these names.
-            values, rows = _some(leaves.values, leaves.rows, _valid(leaves.values))
-            yield _Leaves(pc.struct_field(values, str(parts[0])), rows)
-        else:
-            raise _UnfitError
+        if set(_names(kind)) in _SUMMARIES:
+            raise _UnfitError  # or a message with fields of these names
+        return False
 
 
 # Arrays.

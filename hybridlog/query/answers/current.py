@@ -1,30 +1,136 @@
-"""Messages in front of a slice: latched ones, and frames of video from the key frame on."""
+"""What is current at a time: the last message, and what stands in front of a slice.
+
+In front of a slice are the latched messages that a late subscriber receives, and frames of video
+from the key frame on.
+"""
 
 from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Hashable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hybridlog.query.chunk_scan import ChunkScan, RecordingScan, ScanPlan, with_payloads
+from hybridlog.message import messages_in
+from hybridlog.query.answers.video import picture_of
+from hybridlog.query.chunk_scan import ChunkScan, MessageRun, RecordingScan, ScanPlan, with_payloads
 from hybridlog.query.counters import Counters
 from hybridlog.query.latching import depth_of, is_key_frame, is_video, publisher_of
 from hybridlog.query.planner import Planner
 from hybridlog.query.ranges import RangeResolver
+from hybridlog.query.times import TimeLike, is_relative, parse_time
+from hybridlog_storage.errors import SegmentError
+from hybridlog_storage.times import END, earlier, span_of
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from hybridlog.message import Message
     from hybridlog.query.chunk_columns import Chunk
     from hybridlog.query.chunk_scan import MessageRun
-    from hybridlog.query.question import Question, RecordedChannel
+    from hybridlog.query.counters import Counters
+    from hybridlog.query.question import Question, RecordedChannel, Span
     from hybridlog.session import Session
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.messages import Batch
     from hybridlog_storage.summary import RecordingSummary
 
+
+def message_at(
+    session: Session, question: Question, counters: Counters, moment: TimeLike
+) -> Message | None:
+    """The last message not after a time, in any recording; None if none exists."""
+    snapshot = session.look(question.recordings)
+    places = session.chosen(question)
+    start, end = snapshot.begin[places], snapshot.end[places]
+    latest = np.minimum(_moments(moment, start, end), np.where(end == END, END, end - 1))
+    latest[(start >= end) | (start > latest)] = -1
+    best: tuple[tuple[int, str, int], Message] | None = None
+    # Ask the recording that could hold the latest message first: it usually does.
+    while len(latest):
+        row = int(latest.argmax())
+        now = int(latest[row])
+        if now < 0 or (best is not None and now < best[0][0]):
+            break
+        latest[row] = -1
+        recording = session.entry_of(snapshot.summaries[places[row]])
+        found = _last_of(session, question, counters, recording, (int(start[row]), now))
+        if found is not None:
+            place = found.log_time_ns, recording.key, found.seq
+            if best is None or place > best[0]:
+                best = place, found
+    return best[1] if best is not None else None
+
+
+def _moments(
+    moment: TimeLike, start: NDArray[np.int64], end: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """A time in each of some recordings, ns."""
+    if not is_relative(moment):
+        return np.full(len(start), parse_time(moment, start=None, end=None), np.int64)
+    spans = zip(start.tolist(), end.tolist(), strict=True)
+    return np.array([parse_time(moment, start=a, end=b) for a, b in spans], np.int64)
+
+
+def just_before(question: Question, recording: str, begin: int, latest: int) -> Question:
+    """The question about the last message of a recording in `[begin, latest]`, ns."""
+    return replace(
+        question,
+        recordings=(recording,),
+        bounds=span_of(begin, latest),
+        clock="log",
+        reverse=True,
+        limit=1,
+        every=1,
+    )
+
+
+def _last_of(
+    session: Session,
+    question: Question,
+    counters: Counters,
+    recording: RecordingEntry,
+    span: Span,
+) -> Message | None:
+    """The last message of a recording in `[start, latest]`, ns."""
+    if question.predicate is not None:
+        start, latest = span
+        for begin in earlier(latest, start):
+            narrow = just_before(question, recording.id, begin, latest)
+            for run in Planner(session, narrow, counters).runs():
+                return next(messages_in(run, picture_of(session)))
+        return None
+    channels = session.channels_of(recording, {*question.topics})
+    number = {channel.channel_id: row for row, channel in enumerate(channels)}
+    best: tuple[int, int, Batch] | None = None
+    for entry, last in session.chunks_before(recording, [*number], span[1]):
+        if best is not None and last < best[0]:
+            break
+        chunk = session.chunk(recording, entry.segment, entry.place, counters.add_chunk)
+        fits = chunk.batch.log_time <= span[1]
+        if not number.keys() >= {*entry.place.channels}:
+            fits &= np.isin(chunk.batch.channel, [*number])
+        (rows,) = fits.nonzero()
+        if len(rows):
+            # Rows are in order of arrival: of equal times, the last one is wanted.
+            row = int(rows[-1 - chunk.batch.log_time[rows][::-1].argmax()])
+            place = int(chunk.batch.log_time[row]), int(chunk.seq[row])
+            if best is None or place > best[:2]:
+                best = *place, chunk.batch.take(slice(row, row + 1))
+    if best is None:
+        return None
+    _, seq, batch = best
+    counters.add_messages(batch)
+    batch.channel = np.array([number[batch.channel.item()]], np.int32)
+    run = MessageRun(batch, np.array([seq], np.int64), channels)
+    return next(messages_in(run, picture_of(session)))
+
+
+_FIRST_LOOK = 1 << 30  # ns, about a second
 _Key = tuple[int, int]
 """Log time, ns, and arrival number of a message."""
 
@@ -182,3 +288,38 @@ def _merged_scan(scans: Sequence[RecordingScan]) -> RecordingScan:
         (min(begin for begin, _ in bounds), bounds[0][1]),
         [*chunks.values()],
     )
+
+
+def next_time(session: Session, recording: RecordingEntry, topic: str, moment: int) -> int | None:
+    """The least log time of a topic's messages that is not before a time, ns; None without any.
+
+    Chunk tables tell it, and the message indexes of chunks that hold the time itself. Damaged
+    ones are left out.
+
+    Args:
+        session: The open store.
+        recording: The recording.
+        topic: Full name.
+        moment: The time, ns.
+    """
+    channels = [channel.channel_id for channel in session.channels_of(recording, [topic])]
+    if recording.span is None or not channels:
+        return None
+    first, last = recording.span
+    moment = max(moment, first)
+    width = _FIRST_LOOK
+    while True:
+        end = moment + width
+        parts = session.parts(recording, channels, (moment, end))
+        found = parts["first"][parts["first"] >= moment].tolist()
+        cut = parts[(parts["first"] < moment) & (parts["last"] >= moment)]
+        for segment, chunk, channel in cut[["segment", "chunk", "channel"]].tolist():
+            with suppress(SegmentError):
+                times = session.times(recording, segment, chunk)[channel]
+                found.append(int(times[np.searchsorted(times, moment)]))
+        # Chunks that were not looked at hold nothing before the end.
+        if found and min(found) < end:
+            return int(min(found))
+        if end > last:
+            return None
+        width *= 4
