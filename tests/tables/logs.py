@@ -165,13 +165,15 @@ def decoded(store: hl.Store, recording: str, topic: str) -> list[Decoded]:
 def same(cell: Any, value: Any) -> bool:
     """Whether a cell of a table says what a field of a decoded message does."""
     if hasattr(value, "sec"):
-        return bool(cell.value == value.sec * SECOND + value.nanosec)
+        return bool(getattr(cell, "value", cell) == value.sec * SECOND + value.nanosec)
     if isinstance(cell, dict):
         if set(cell) in ({"n"}, {"n", "min", "max", "mean"}) and not hasattr(value, "n"):
             return _summarises(cell, value)
         return all(same(inner, getattr(value, name)) for name, inner in cell.items())
     if isinstance(value, list | tuple | np.ndarray):
         return len(cell) == len(value) and all(map(same, cell, value))
+    if isinstance(cell, bool) and not isinstance(value, bool | np.bool_):
+        return True  # a message without fields
     if isinstance(value, float | np.floating):
         return bool(cell == value) or (math.isnan(cell) and math.isnan(value))
     return bool(cell == value)
