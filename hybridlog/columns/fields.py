@@ -25,7 +25,6 @@ from hybridlog.schema.arrow_types import (
     Array,
     common_type,
     converted,
-    exact,
     is_array,
     is_bytes,
     is_list,
@@ -238,24 +237,23 @@ def joined(pieces: Sequence[Array]) -> Array:
     Raises:
         UnfitError: no common type exists.
     """
-    pieces = alike(pieces)
+    try:
+        kind = common_type(pieces, summaries=True)
+        pieces = [converted(piece, kind) for piece in pieces]
+    except (pa.ArrowException, NotImplementedError) as error:
+        raise UnfitError(str(error)) from error
     return pa.concat_arrays(pieces) if len(pieces) > 1 else pieces[0]
 
 
-def alike(pieces: Sequence[Array], *, by_type: bool = False) -> list[Array]:
-    """Columns converted to their common type.
-
-    Args:
-        pieces: The columns.
-        by_type: True if all values of their types must fit, not only these.
+def type_of_all(kinds: Sequence[Any]) -> Any:
+    """The type that all values of some types fit.
 
     Raises:
-        UnfitError: no common type exists.
+        UnfitError: There is none.
     """
     try:
-        kind = common_type(pieces, widened if by_type else exact, summaries=True)
-        return [converted(piece, kind) for piece in pieces]
-    except (pa.ArrowException, NotImplementedError) as error:
+        return common_type([pa.nulls(0, kind) for kind in kinds], widened, summaries=True)
+    except pa.ArrowException as error:
         raise UnfitError(str(error)) from error
 
 

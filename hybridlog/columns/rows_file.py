@@ -7,7 +7,7 @@ behind the message. Unlike a table it is never made again.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final
 
 import pyarrow as pa
 
@@ -23,27 +23,13 @@ if TYPE_CHECKING:
 RESTORE: Final = " Restore it from a copy; `hybridlog verify` shows what is affected."
 
 
-class Place(NamedTuple):
-    """Rows of a chunk in a file.
-
-    Attributes:
-        group: Row group.
-        begin: Its first row in the group.
-        rows: Number of rows.
-    """
-
-    group: int
-    begin: int
-    rows: int
-
-
 class RowsFile(ColumnFile):
     """One file of rows: messages of a topic. Thread safe.
 
     Attributes:
         listed: Its line of the manifest.
         topic: Its topic.
-        places: Rows of each chunk, by number.
+        places: Row group, its first row and number of rows of each chunk, by number.
 
     Raises:
         StoreError: It is missing, damaged, or another file than the listed one.
@@ -80,14 +66,14 @@ class RowsFile(ColumnFile):
             f"The file of rows {self.path} is not the one that the manifest lists.{RESTORE}"
         )
 
-    def _read_places(self, chunks: Any) -> dict[int, Place]:
-        found: dict[int, Place] = {}
+    def _read_places(self, chunks: Any) -> dict[int, tuple[int, int, int]]:
+        found: dict[int, tuple[int, int, int]] = {}
         if len(chunks) != len(self.groups):
             raise ValueError("its row groups and its chunks differ")
         for group, inside in enumerate(chunks):
             at = 0
             for chunk, rows in inside:
-                found[int(chunk)] = Place(group, at, int(rows))
+                found[int(chunk)] = (group, at, int(rows))
                 at += int(rows)
             if at != self.groups[group]:
                 raise ValueError("its row groups and its chunks differ")
@@ -99,15 +85,15 @@ class RowsFile(ColumnFile):
         Raises:
             StoreError: They are damaged.
         """
-        place = self.places[chunk]
-        group = self._cache.made(
+        group, begin, rows = self.places[chunk]
+        found = self._cache.made(
             "column",
             self.number,
-            place.group,
-            make=lambda: self._struct(place.group),
+            group,
+            make=lambda: self._struct(group),
             size_of=lambda one: int(one.nbytes),
         )
-        return group.slice(place.begin, place.rows)
+        return found.slice(begin, rows)
 
     def _struct(self, group: int) -> pa.StructArray:
         return self.read(group, range(len(self.leaves))).to_struct_array().combine_chunks()

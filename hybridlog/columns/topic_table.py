@@ -13,10 +13,10 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from hybridlog.columns.column_file import FIRST
-from hybridlog.columns.fields import alike, names_of, records_of
+from hybridlog.columns.fields import joined, names_of, records_of, type_of_all
 from hybridlog.columns.layout import POINTS
 from hybridlog.schema.arrow_columns import structs
-from hybridlog.schema.arrow_types import is_list
+from hybridlog.schema.arrow_types import converted, is_list
 from hybridlog.schema.column import ranges
 from hybridlog.schema.states import State
 from hybridlog_storage.ordering import order_of
@@ -109,7 +109,12 @@ class TopicTable:
         Raises:
             UnfitError: the files have no common type.
         """
-        return self.empty(paths).type
+        key = None if paths is None else frozenset(paths)
+        if key not in self._types:
+            if len(self._types) >= _MAX_TYPES:
+                self._types.clear()
+            self._types[key] = self._find_type(paths)
+        return self._types[key]
 
     @property
     def has_fields(self) -> bool:
@@ -121,8 +126,7 @@ class TopicTable:
         """Type of the column of points that all rows have; None without."""
         if not self.has_arrays or any(POINTS not in file.own for file in self.files):
             return None
-        kinds = [pa.nulls(0, file.schema.field(POINTS).type) for file in self.files]
-        return alike(kinds)[0].type
+        return joined([pa.nulls(0, file.schema.field(POINTS).type) for file in self.files]).type
 
     def has(self, path: str, *, summaries: bool = True) -> bool:
         """True if every file has the field: an array is a summary in some, a list in others.
@@ -177,7 +181,7 @@ class TopicTable:
         Raises:
             StoreError: the data read is damaged.
         """
-        kind = self.empty(paths)
+        kind = self.fields(paths)
 
         if all(part.first == FIRST for part in self._parts):  # in order, whatever they are
             yield from (self._read(part, paths, own, kind) for part in self._parts)
@@ -219,7 +223,7 @@ class TopicTable:
     ) -> TableRows:
         ours, records = self.read(part, paths, {"t", "seq", *own})
         t, seq = (ours.pop(name).to_numpy() for name in ("t", "seq"))
-        return TableRows(t, seq, ours, alike([kind, records], by_type=True)[1])
+        return TableRows(t, seq, ours, converted(records, kind))
 
     @property
     def parts(self) -> list[TablePart]:
@@ -283,27 +287,14 @@ class TopicTable:
         column = self._column(part, top, (leaf,))
         return _has_values(column)
 
-    def empty(self, paths: Collection[str] | None) -> Any:
-        """An empty array with the common type of the rows of all files.
-
-        Raises:
-            UnfitError: the files have no common type.
-        """
-        key = None if paths is None else frozenset(paths)
-        if key not in self._types:
-            if len(self._types) >= _MAX_TYPES:
-                self._types.clear()
-            self._types[key] = self._find_type(paths)
-        return self._types[key]
-
     def _find_type(self, paths: Collection[str] | None) -> Any:
         found = []
         for file in self.files:
             chosen = file.choose(paths, (), arrays=self.has_arrays).values()
             table = file.read(None, [*chain.from_iterable(chosen)])
             columns = [(field.name, pa.nulls(0, field.type)) for field in table.schema]
-            found.append(self._records(file, dict(columns), 0))
-        return alike(found, by_type=True)[0].slice(0, 0)
+            found.append(self._records(file, dict(columns), 0).type)
+        return type_of_all(found)
 
 
 def _has_values(column: Any) -> bool:

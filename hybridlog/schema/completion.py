@@ -23,6 +23,7 @@ from hybridlog.schema.definition import (
     parse_definition,
     parse_for_release,
     releases,
+    standard_text,
     typestore,
 )
 from hybridlog.schema.definition_text import canonical, has_parts
@@ -164,13 +165,8 @@ def _with_nested(
 
 def _sections(release: Release, names: frozenset[str]) -> bytes:
     """The definitions of standard types, to be appended to a definition."""
-    store, version = typestore(release), 1 if release.startswith("ROS1") else 2
-    texts = []
-    for name in sorted(names):
-        package, _, leaf = name.rpartition("/")
-        text, _ = store.generate_msgdef(f"{package}/msg/{leaf}", ros_version=version)
-        own = text.split("=" * 80, maxsplit=1)[0]
-        texts.append(f"\n{'=' * 80}\nMSG: {name}\n{own}")
+    rule = "=" * 80
+    texts = (f"\n{rule}\nMSG: {name}\n{standard_text(name, release)}" for name in sorted(names))
     return "".join(texts).encode()
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache, lru_cache
-from typing import TYPE_CHECKING, Literal, TypeAlias, cast
+from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
 
@@ -260,35 +260,15 @@ def _parse_text(name: str, section: Section, ros: int) -> dict[str, list[RawFiel
     return {name: parse_msg(name, section.text, defaults=ros == 2)}
 
 
-def _standard_fields(name: str, release: Release) -> list[RawField] | None:
-    """Fields of a standard type from the tables of rosbags."""
-    from rosbags.interfaces import Nodetype
-
+def standard_text(name: str, release: Release) -> str | None:
+    """The definition of a standard type alone, without those of nested types; None of others."""
     package, _, leaf = name.rpartition("/")
     key = name if "/" in package else f"{package}/msg/{leaf}"
-    definition = typestore(release).fielddefs.get(key)
-    if definition is None:
+    store = typestore(release)
+    if key not in store.fielddefs:
         return None
-
-    def raw(field_name: str, desc: object) -> RawField:
-        node, detail = cast("tuple[Nodetype, tuple[object, int] | str]", desc)
-        if node == Nodetype.NAME:
-            return RawField(field_name, canonical(cast("str", detail)))
-        inner, size = cast("tuple[object, int]", detail)
-        if node == Nodetype.BASE:
-            return RawField(field_name, cast("str", inner), text_bound=size or None)
-        element = raw(field_name, inner)
-        fixed = node == Nodetype.ARRAY
-        return RawField(
-            field_name,
-            element.type,
-            array=True,
-            width=size if fixed else None,
-            bound=None if fixed else size or None,
-            text_bound=element.text_bound,
-        )
-
-    return [raw(field_name, desc) for field_name, desc in definition[1]]
+    text, _ = store.generate_msgdef(key, ros_version=1 if release.startswith("ROS1") else 2)
+    return text.split("=" * 80, maxsplit=1)[0]
 
 
 @dataclass(frozen=True, slots=True)
@@ -330,10 +310,11 @@ class _Resolver:
             raise self._fail(f"messages are nested deeper than {MAX_DEPTH}")
         raw_fields = self._types.get(name)
         if raw_fields is None:
-            raw_fields = _standard_fields(name, self._release)
+            text = standard_text(name, self._release)
             self.supplied.add(name)
-        if raw_fields is None:
-            raise self._fail(f"the definition does not say what {name} is")
+            if text is None:
+                raise self._fail(f"the definition does not say what {name} is")
+            raw_fields = parse_msg(name, text, defaults=self._ros == 2)
         if [raw.name for raw in raw_fields] == [_DUMMY]:
             raw_fields = []
         self._open.add(name)

@@ -6,11 +6,11 @@ import duckdb
 import pytest
 
 import hybridlog as hl
+from hybridlog.schema.arrow_types import plain_values
 from hybridlog.sql.pieces import TopicOfRecording
 from hybridlog_storage.errors import UsageError
 from tests.sql.conftest import LARGE, SCANS
 from tests.tables.logs import BASE, SECOND, decoded, same
-from tests.tables.test_writer import cells
 
 LATER = BASE + 3600 * SECOND
 
@@ -36,7 +36,7 @@ def test_a_view_holds_what_messages_say(store: hl.Store, topic: str) -> None:
     found = store.sql(EVERYTHING.format(view)).to_arrow().to_struct_array().combine_chunks()
     messages = decoded(store, "first", topic)
     assert len(messages) > 0
-    for row, message in zip(cells(found), messages, strict=True):
+    for row, message in zip(plain_values(found), messages, strict=True):
         value = message.value
         assert (row["t"], row["seq"], row["pub"]) == (message.t, message.seq, message.pub)
         assert (row["log_time"], row["stamp"]) == (message.t // 1000, row["header"]["stamp"])

@@ -165,7 +165,7 @@ def decoded(store: hl.Store, recording: str, topic: str) -> list[Decoded]:
 def same(cell: Any, value: Any) -> bool:
     """Whether a cell of a table says what a field of a decoded message does."""
     if hasattr(value, "sec"):
-        return bool(cell == value.sec * SECOND + value.nanosec)
+        return bool(getattr(cell, "value", cell) == value.sec * SECOND + value.nanosec)
     if isinstance(cell, dict):
         if set(cell) in ({"n"}, {"n", "min", "max", "mean"}) and not hasattr(value, "n"):
             return _summarises(cell, value)

@@ -51,26 +51,6 @@ def topics_of(entry: RecordingEntry) -> list[str]:
     return sorted({c.topic for c in entry.channels if c.stats.messages})
 
 
-def cells(records: Any) -> list[dict[str, Any]]:
-    """Rows of a table as Python has them, times as nanoseconds."""
-    found: list[dict[str, Any]] = _plain(records).to_pylist()
-    return found
-
-
-def _plain(array: Any) -> Any:
-    kind = array.type
-    if pa.types.is_timestamp(kind) or pa.types.is_duration(kind):
-        return array.view(pa.int64())
-    if pa.types.is_struct(kind) and kind.num_fields:
-        names = [kind.field(n).name for n in range(kind.num_fields)]
-        inner = [_plain(array.field(n)) for n in range(kind.num_fields)]
-        return pa.StructArray.from_arrays(inner, names=names, mask=array.is_null())
-    if pa.types.is_list(kind):
-        array = array.take(pa.array(np.arange(len(array))))  # offsets from 0
-        return pa.ListArray.from_arrays(array.offsets, _plain(array.values), mask=array.is_null())
-    return array
-
-
 def compare(store: hl.Store, recording: str | None = None) -> int:
     """Every row of every table with the message itself; returns how many rows there are."""
     tables = Tables(store.directory.path)
@@ -96,7 +76,7 @@ def compare_rows(block: TableRows, messages: list[Decoded]) -> None:
     assert block.own["ref"].field("len").to_pylist() == [len(m.raw) for m in messages]
     micros = block.own["log_time"].view(pa.int64()).to_pylist()
     assert micros == [message.t // 1000 for message in messages]
-    rows = zip(cells(block.records), block.own["state"].to_pylist(), messages, strict=True)
+    rows = zip(block.records.to_pylist(), block.own["state"].to_pylist(), messages, strict=True)
     for cell, state, message in rows:
         if message.value is None:
             assert state == "unreadable"
