@@ -9,6 +9,8 @@ from functools import reduce
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
 
 from hybridlog.across.match import match
 from hybridlog.drawing.images import shown_pixels
@@ -17,11 +19,11 @@ from hybridlog.query.counters import Counters
 from hybridlog.query.periods import GAP_PERIODS, usual_period
 from hybridlog.query.query import Query
 from hybridlog.query.question import Question
+from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import format_duration, format_time
 from hybridlog_storage.errors import DefinitionError, PayloadError, TopicError, UsageError
 
 if TYPE_CHECKING:
-    import pyarrow as pa
     from numpy.typing import NDArray
 
     from hybridlog.message import Message
@@ -93,8 +95,6 @@ def episodes(
         UsageError: There is a gap that is refused, or a field is no number.
         TopicError: A recording lacks a topic.
     """
-    from hybridlog.query.ranges import RangeResolver
-
     name, query = piece
     for summary, (begin, end) in RangeResolver(query.session, query.question).spans():
         reader = _Reader(query.session, summary.id, begin, end)
@@ -215,9 +215,6 @@ class _Reader:
             TopicError: There are none.
             UsageError: A field is no number, or an array whose length changes.
         """
-        import pyarrow as pa
-        import pyarrow.compute as pc
-
         table = self.query(source.topic).fields(*source.paths).to_arrow()
         present = [column for column in table.column_names if column in source.paths]
         if missing := set(source.paths).difference(present):
@@ -246,9 +243,6 @@ class _Reader:
 
 def _numbers(column: pa.ChunkedArray, topic: str, path: str) -> NDArray[np.float32]:
     """The numbers of a column: float32[n, width]."""
-    import pyarrow as pa
-    import pyarrow.compute as pc
-
     kind = column.type
     width = 1
     if pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind):
