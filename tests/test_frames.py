@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hybridlog.frames import columns as columns_module
-from hybridlog.frames.answer import Block, TableBuilder
+from hybridlog.frames.answer import Block, table_of
 from hybridlog.frames.frame import frame_of
 from hybridlog.schema.arrow_columns import records_array
 from hybridlog.schema.arrow_objects import values_array
@@ -39,21 +39,18 @@ def times(*values: int) -> np.ndarray[Any, Any]:
     return np.array(values, np.int64)
 
 
-def add(builder: TableBuilder, time: Any, seq: Any, records: Records, topic: str = "/t") -> None:
-    builder.append(Block(topic, time, seq, {}, records_array(records), 0))
+def block(time: Any, seq: Any, records: Records, topic: str = "/t") -> Block:
+    return Block(topic, time, seq, {}, records_array(records), 0)
 
 
 def built(*chunks: tuple[list[int], dict[str, Column]], topics: list[str] | None = None) -> Any:
-    builder = TableBuilder()
+    blocks, rows = [], 0
     for number, (time, fields) in enumerate(chunks):
-        add(
-            builder,
-            times(*time),
-            np.arange(len(builder), len(builder) + len(time)),
-            Records(fields, len(time)),
-            "/t" if topics is None else topics[number],
-        )
-    return builder
+        seq = np.arange(rows, rows + len(time))
+        topic = "/t" if topics is None else topics[number]
+        blocks.append(block(times(*time), seq, Records(fields, len(time)), topic))
+        rows += len(time)
+    return table_of(blocks)
 
 
 def full(rows: int) -> Records:
@@ -118,16 +115,14 @@ def nanoseconds(table: pa.Table) -> pa.Table:
     return pa.table(dict(zip(table.column_names, columns, strict=True)))
 
 
-def builder_of(rows: int) -> TableBuilder:
-    builder = TableBuilder()
-    add(builder, times(), times(), full(0))
-    add(builder, np.arange(rows), np.arange(rows), full(rows))
-    add(builder, np.arange(rows) + 100, np.arange(rows) + rows, full(rows))
-    return builder
+def filled(rows: int) -> pa.Table:
+    place = np.arange(rows)
+    some = block(place, place, full(rows)), block(place + 100, place + rows, full(rows))
+    return table_of([block(times(), times(), full(0)), *some])
 
 
 def test_arrow_types_and_values() -> None:
-    table = builder_of(5).to_arrow()
+    table = filled(5)
     table.validate(full=True)
     assert {name: str(table.schema.field(name).type) for name in table.column_names} == {
         "log_time": "timestamp[ns, tz=UTC]",
@@ -148,7 +143,7 @@ def test_arrow_types_and_values() -> None:
 
 
 def test_pandas_types_and_values() -> None:
-    frame = frame_of(builder_of(5).to_arrow())
+    frame = frame_of(filled(5))
     assert frame.index.name == "log_time"
     assert str(frame.index.dtype) == "datetime64[ns, UTC]"
     assert frame.index.astype("int64").tolist() == [*range(5), *range(100, 105)]
@@ -182,20 +177,21 @@ def test_pandas_types_and_values() -> None:
     st.sampled_from([1, 5, 1 << 31]),
 )
 def test_sorted_by_log_time_then_arrival(chunks: list[list[tuple[int, int]]], limit: int) -> None:
-    def fill() -> TableBuilder:
-        builder = TableBuilder()
+    def fill() -> pa.Table:
+        blocks, rows = [], 0
         for chunk in chunks:
             time = times(*(t for t, _ in chunk))
             cells = [[t] * w for t, w in chunk]
+            seq = np.arange(rows, rows + len(chunk))
             fields: dict[str, Column] = {
-                "n": Scalars(np.arange(len(builder), len(builder) + len(chunk))),
+                "n": Scalars(seq),
                 "s": strings(*(f"{t}{'x' * w}" for t, w in chunk)),
                 "a": arrays("i2", *cells),
                 "l": Arrays(strings(*(str(v) for c in cells for v in c)), offsets(cells)),
             }
-            seq = np.arange(len(builder), len(builder) + len(chunk))
-            add(builder, time, seq, Records(fields, len(chunk)))
-        return builder
+            blocks.append(block(time, seq, Records(fields, len(chunk))))
+            rows += len(chunk)
+        return table_of(blocks)
 
     rows = [(t, n, w) for n, (t, w) in enumerate(pair for chunk in chunks for pair in chunk)]
     rows.sort()
@@ -207,8 +203,8 @@ def test_sorted_by_log_time_then_arrival(chunks: list[list[tuple[int, int]]], li
         wanted = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(columns_module, "OFFSET_LIMIT", limit)
-        table = fill().to_arrow()
-        frame = frame_of(fill().to_arrow())
+        table = fill()
+        frame = frame_of(fill())
     table.validate(full=True)
     assert nanoseconds(table).to_pylist() == wanted
     assert len(frame) == len(wanted)
@@ -219,13 +215,13 @@ def test_sorted_by_log_time_then_arrival(chunks: list[list[tuple[int, int]]], li
 
 
 def test_rows_that_stop_being_equal() -> None:
-    builder = built(
+    table = built(
         ([1, 2], {"c": arrays("f8", [1.0, 2.0], [1.0, 2.0])}),
         ([3], {"c": arrays("f8", [1.0, 2.5])}),
         ([4], {"c": arrays("f8", [7.0])}),
         ([5], {"c": arrays("f8", [])}),
     )
-    frame = frame_of(builder.to_arrow())
+    frame = frame_of(table)
     assert [cell.tolist() for cell in frame["c"]] == [[1, 2], [1, 2], [1, 2.5], [7], []]
 
 
@@ -245,7 +241,7 @@ def test_columns_missing_in_some_chunks() -> None:
         ),
         ([6], {}),
     )
-    table = built(*chunks).to_arrow()
+    table = built(*chunks)
     table.validate(full=True)
     assert nanoseconds(table).to_pydict() == {
         "log_time": [1, 2, 3, 4, 5, 6],
@@ -259,7 +255,7 @@ def test_columns_missing_in_some_chunks() -> None:
         "l": [None, None, None, ["p"], ["q"], None],
         "d": [None, None, None, 9, 10, None],
     }
-    frame = frame_of(built(*chunks).to_arrow())
+    frame = frame_of(built(*chunks))
     assert {name: int(n) for name, n in frame.isna().sum().items()} == {
         name: 6 - n
         for name, n in {
@@ -311,7 +307,7 @@ def test_types_that_change() -> None:
             },
         ),
         ([4], {"x": Scalars(np.array([True])), "l": arrays("i8", [9])}),
-    ).to_arrow()
+    )
     table.validate(full=True)
     got = table.drop_columns("log_time").to_pydict()
     assert table.schema.field("n").type == pa.float64()
@@ -333,16 +329,14 @@ def test_types_that_change() -> None:
 
 def test_text_is_repaired_and_nul_kept() -> None:
     cells = [b"ok", b"\xff\xfe", b"a\xc3", b"\xa9b", "é\0".encode(), b""]
-    table = built(([1] * 6, {"s": strings(*cells)})).to_arrow()
+    table = built(([1] * 6, {"s": strings(*cells)}))
     table.validate(full=True)
     assert table["s"].to_pylist() == [cell.decode("utf-8", "replace") for cell in cells]
 
 
 def test_names_that_clash() -> None:
     inner = Records({"b": Scalars(times(2))}, 1)
-    table = built(
-        ([1], {"a.b": Scalars(times(1)), "a": inner, "log_time": Scalars(times(3))})
-    ).to_arrow()
+    table = built(([1], {"a.b": Scalars(times(1)), "a": inner, "log_time": Scalars(times(3))}))
     assert table.drop_columns("log_time").to_pydict() == {"a.b": [1], "a.b_": [2], "log_time_": [3]}
     assert table.schema.field("log_time_").metadata == {b"hybridlog.field": b"log_time"}
 
@@ -353,14 +347,14 @@ def test_topics_of_different_types_have_columns_of_their_own() -> None:
         ([1], {"pose": inner, "n": Scalars(np.array([1]))}),
         ([2], {"pose": Scalars(np.array([7])), "n": Scalars(np.array([(1 << 64) - 1], "u8"))}),
     )
-    table = built(*chunks, topics=["/a", "/b"]).to_arrow()
+    table = built(*chunks, topics=["/a", "/b"])
     assert table.drop_columns("log_time").to_pydict() == {
         "pose.x": [1.5, None],
         "n": [1, (1 << 64) - 1],
         "pose": [None, 7],
     }
     assert table.schema.field("n").type == pa.uint64()
-    table = built(*chunks).to_arrow()
+    table = built(*chunks)
     assert table["pose"].to_pylist() == ['{"x":1.5}', "7"]
 
 
@@ -379,7 +373,7 @@ def test_topics_of_different_types_have_columns_of_their_own() -> None:
 )
 def test_the_common_type_of_numbers(one: str, other: str, kind: pa.DataType) -> None:
     chunks = [([n], {"v": Scalars(np.array([n], dtype))}) for n, dtype in enumerate([one, other])]
-    table = built(*chunks).to_arrow()
+    table = built(*chunks)
     assert table.schema.field("v").type == kind
 
 

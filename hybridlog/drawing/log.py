@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 from hybridlog_storage.errors import HybridlogError, TimeError, UsageError
-from hybridlog_storage.lazy import lazy
 
 if TYPE_CHECKING:
     from hybridlog.message import Message
@@ -82,62 +81,46 @@ def kind_of(type_name: str) -> Kind:
     return kind
 
 
-@dataclass(frozen=True)
-class Log:
+def filtered(query: Query, kind: Kind, level: str = "", text: str = "") -> Query:
     """The lines of a log that pass some filters.
 
-    Attributes:
+    Args:
         query: About one topic of one recording.
         kind: Its kind of messages.
         level: Least level, one of `LEVELS`; empty for all lines.
         text: Characters that the text or the sender has, in any case; no regular expression.
     """
+    if level and kind.levels:
+        query = query.where(f"level >= {kind.levels[LEVELS.index(level)]}")
+    if text:
+        # Written as numbers, characters mean nothing to the pattern nor to the predicate.
+        pattern = "".join(c if c.isalnum() else f"\\x{{{ord(c):x}}}" for c in text)
+        fields = [field for field in (kind.text, kind.name) if field]
+        query = query.where(" or ".join(f'{field} ~ "(?i){pattern}"' for field in fields))
+    return query
 
-    query: Query
-    kind: Kind
-    level: str = ""
-    text: str = ""
 
-    @lazy
-    def filtered(self) -> Query:
-        """The query for these lines."""
-        query, kind = self.query, self.kind
-        if self.level and kind.levels:
-            query = query.where(f"level >= {kind.levels[LEVELS.index(self.level)]}")
-        if self.text:
-            # Written as numbers, characters mean nothing to the pattern nor to the predicate.
-            pattern = "".join(c if c.isalnum() else f"\\x{{{ord(c):x}}}" for c in self.text)
-            fields = [field for field in (kind.text, kind.name) if field]
-            query = query.where(" or ".join(f'{field} ~ "(?i){pattern}"' for field in fields))
-        return query
+def lines(
+    query: Query, kind: Kind, time: int, seq: int, count: int, *, before: bool = False
+) -> list[Line]:
+    """The next lines behind one, or the last ones in front of it, in order.
 
-    def after(self, time: int, seq: int, count: int) -> list[Line]:
-        """The next lines, in order.
-
-        Args:
-            time: Log time of the line before them, ns.
-            seq: Arrival number of that line; -1 for all lines of that time, too.
-            count: Most lines.
-        """
-        beside = self.filtered.between(time, time + 1).where(f"_meta.seq > {seq}")
-        return self._read((beside, self.filtered.between(time + 1)), count)
-
-    def before(self, time: int, seq: int, count: int) -> list[Line]:
-        """The lines before one, in order; see `after`."""
-        beside = self.filtered.between(time, time + 1).where(f"_meta.seq < {seq}").reverse()
-        return self._read((beside, self.filtered.between(None, time).reverse()), count)[::-1]
-
-    def count(self) -> int:
-        """Number of lines."""
-        return self.filtered.count()
-
-    def _read(self, queries: tuple[Query, ...], count: int) -> list[Line]:
-        found: list[Line] = []
-        for query in queries:
-            with suppress(TimeError):  # a range before or behind the recording has no lines
-                limited = query.limit(count - len(found))
-                found += [_line(message, self.kind) for message in limited]
-        return found
+    Args:
+        query: As of `filtered`.
+        kind: As there.
+        time: Log time of that line, ns.
+        seq: Its arrival number; -1 for all lines of that time, too.
+        count: Most lines.
+        before: Those in front.
+    """
+    beside = query.between(time, time + 1).where(f"_meta.seq {'<' if before else '>'} {seq}")
+    rest = query.between(None, time) if before else query.between(time + 1)
+    found: list[Line] = []
+    for part in (beside, rest):
+        with suppress(TimeError):  # a range before or behind the recording has no lines
+            ordered = part.reverse() if before else part
+            found += [_line(message, kind) for message in ordered.limit(count - len(found))]
+    return found[::-1] if before else found
 
 
 def _line(message: Message, kind: Kind) -> Line:

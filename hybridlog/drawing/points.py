@@ -24,7 +24,6 @@ MAX_POINTS: Final = 500_000
 COLOUR: Final = "rgb"
 """Name of the values that are colours: red * 65536 + green * 256 + blue."""
 _MAX_VALUES = 64
-_BLOCK = 1 << 18  # points that are looked at together, which bounds the memory
 _FAR_M = 8192.0  # m; from here on float32 has steps of a millimetre
 _AXES = ("x", "y", "z")
 _NONE: Final = np.empty(0)
@@ -108,23 +107,16 @@ def _drawn(decoded: Any, rows: NDArray[Any], values: Collection[str] | None, lim
     with np.errstate(over="ignore", invalid="ignore"):
         origin = tuple(_origin(axis) for axis in axes_of(_some(rows)))
 
-        def near(part: NDArray[Any]) -> NDArray[np.float32]:
-            axes = zip(axes_of(part), origin, strict=True)
-            return np.stack([(axis - base).astype(np.float32) for axis, base in axes], axis=1)
-
-        chosen = np.empty(len(rows), np.bool_)
-        finite = 0
-        for begin in range(0, len(rows), _BLOCK):
-            part = rows[begin : begin + _BLOCK]
-            is_finite = np.isfinite(near(part)).all(axis=1)
-            finite += int(np.count_nonzero(is_finite))
-            if is_scan:
-                is_finite &= (part["range"] >= least) & (part["range"] <= greatest)
-            chosen[begin : begin + _BLOCK] = is_finite
-        count = int(np.count_nonzero(chosen))
+        axes = zip(axes_of(rows), origin, strict=True)
+        xyz = np.stack([(axis - base).astype(np.float32) for axis, base in axes], axis=1)
+        chosen = np.isfinite(xyz).all(axis=1)
+        finite = int(np.count_nonzero(chosen))
+        if is_scan:
+            chosen &= (rows["range"] >= least) & (rows["range"] <= greatest)
+        places = np.flatnonzero(chosen)
+        count = len(places)
         every = max(1, -(-count // max(limit, 1)))
-        taken = rows[_every(chosen, every)]
-        xyz = near(taken)
+        xyz, taken = xyz[places[::every]], rows[places[::every]]
         offered = _offered(taken)
         chosen_values = {
             name: _relative(column) if name != COLOUR else (column.astype(np.float32), 0.0)
@@ -145,16 +137,6 @@ def _drawn(decoded: Any, rows: NDArray[Any], values: Collection[str] | None, lim
         is_flat=is_scan if not len(xyz) else bool((xyz[:, 2] == xyz[0, 2]).all()),
         remarks=tuple(remarks),
     )
-
-
-def _every(chosen: NDArray[np.bool_], step: int) -> NDArray[np.intp]:
-    """Places of every n-th that is chosen, from the first one on."""
-    found, seen = [np.empty(0, np.intp)], 0
-    for begin in range(0, len(chosen), _BLOCK):
-        places = np.flatnonzero(chosen[begin : begin + _BLOCK])
-        found.append(places[-seen % step :: step] + begin)
-        seen += len(places)
-    return np.concatenate(found)
 
 
 def _axes(rows: NDArray[Any]) -> list[NDArray[Any]]:

@@ -10,6 +10,8 @@ from itertools import islice
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
 
 from hybridlog.frames.names import FIELD, is_summary
 from hybridlog.query.answers.infer_fields import infer_fields
@@ -25,7 +27,6 @@ from hybridlog_storage.errors import SegmentError, TopicError, UsageError
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    import pyarrow as pa
     from numpy.typing import NDArray
 
     from hybridlog.message import Message
@@ -243,8 +244,6 @@ class Wanted:
 
 def _stepped(array: Any, step: int | str) -> Any:
     """An element of each list, or a field of each message; None if the type has none."""
-    import pyarrow as pa
-
     if array is None:
         return None
     if isinstance(array, pa.ChunkedArray):
@@ -263,8 +262,6 @@ def _stepped(array: Any, step: int | str) -> Any:
 
 def _numbers(array: Any) -> Numbers | None:
     """Values as in a `Series`, NaN for null; None if they are no numbers."""
-    import pyarrow as pa
-
     types, kind = pa.types, array.type
     if kind == pa.json_():
         array = _numbers_in_json(array.cast(pa.string()))
@@ -285,9 +282,6 @@ def _numbers(array: Any) -> Numbers | None:
 
 def _numbers_in_json(texts: Any) -> Any:
     """The numbers among JSON values of several types; null for others."""
-    import pyarrow as pa
-    import pyarrow.compute as pc
-
     for word, number in (("true", "1"), ("false", "0")):
         texts = pc.if_else(pc.equal(texts, word), number, texts)
     is_number = pc.match_substring_regex(texts, r"^-?[0-9][0-9.eE+-]*$")

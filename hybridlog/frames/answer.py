@@ -57,11 +57,8 @@ def to_arrow(planner: Planner) -> pa.Table:
         DefinitionError: a topic has no definition to derive columns from.
     """
     question = planner.question
-    builder = _builder(question)
-    for group in _groups(planner, planner.parts(), in_order=not question.returns_all):
-        for block in group:
-            builder.append(block)
-    return _finished(builder, question)
+    groups = _groups(planner, planner.parts(), in_order=not question.returns_all)
+    return _table([block for group in groups for block in group], question)
 
 
 def _groups(
@@ -96,22 +93,18 @@ def stream(planner: Planner, *, at_once: bool = False) -> Iterator[pa.Table]:
     """
     question = planner.question
     part = None if question.reverse else planner.only_part()
-    builder, size, given = _builder(question), 0, False
+    blocks: list[Block] = []
+    rows, size, given = 0, 0, False
     for group in _groups(planner, None if part is None else [part], in_order=True):
         for block in group:
-            builder.append(block)
-            size += block.size
+            blocks.append(block)
+            rows, size = rows + len(block.log_time), size + block.size
         # Blocks of one group overlap in time, so no table ends between them.
-        if at_once or len(builder) >= _BLOCK_ROWS or size >= _BLOCK_BYTES:
-            yield _finished(builder, question)
-            given = True
-            builder, size = _builder(question), 0
-    if len(builder) or not given:
-        yield _finished(builder, question)
-
-
-def _builder(question: Question) -> TableBuilder:
-    return TableBuilder(question.fields, tag_columns(question.tags))
+        if at_once or rows >= _BLOCK_ROWS or size >= _BLOCK_BYTES:
+            yield _table(blocks, question)
+            rows, size, given = 0, 0, True
+    if rows or not given:
+        yield _table(blocks, question)
 
 
 def _values_of_tables(planner: Planner, parts: Sequence[Part]) -> Sequence[Iterator[Values]] | None:
@@ -169,8 +162,8 @@ def _is_open(channel: RecordedChannel) -> bool:
     return channel.encoding not in FIXED
 
 
-def _finished(builder: TableBuilder, question: Question) -> pa.Table:
-    table = builder.to_arrow()
+def _table(blocks: list[Block], question: Question) -> pa.Table:
+    table = table_of(blocks, question.fields, tag_columns(question.tags))
     return table.take(np.arange(table.num_rows - 1, -1, -1)) if question.reverse else table
 
 
@@ -378,8 +371,12 @@ class Block(NamedTuple):
     summaries: Mapping[str, pa.Array[Any]] = MappingProxyType({})
 
 
-class TableBuilder:
-    """Collects blocks and joins them to one table.
+def table_of(
+    blocks: list[Block],
+    fields: Sequence[str] | None = None,
+    tags: Mapping[str, str] = MappingProxyType({}),
+) -> pa.Table:
+    """The table of some blocks, sorted by log time and order; the list is empty afterwards.
 
     Nested messages become dotted columns (`pose.position.x`). A column that a block lacks
     is null there. A column whose type changes gets the common exact type
@@ -387,78 +384,56 @@ class TableBuilder:
     flattened, which makes the table independent of the division into chunks.
 
     Args:
+        blocks: The blocks.
         fields: Requested paths; None for all fields.
         tags: Keys of tags, by the names of their columns.
+
+    Returns:
+        The first column is `log_time`, timestamp[ns, UTC]. Numbers keep their wire
+        type; times are timestamp[ns, UTC], durations duration[ns], strings string,
+        arrays fixed_size_list if the definition fixes their length and list
+        otherwise.
     """
-
-    def __init__(
-        self, fields: Sequence[str] | None = None, tags: Mapping[str, str] | None = None
-    ) -> None:
-        self._fields = fields
-        self._tags = tags or {}
-        self._blocks: list[Block] = []
-        self._rows = 0
-
-    def __len__(self) -> int:
-        """Number of rows so far."""
-        return self._rows
-
-    def append(self, block: Block) -> None:
-        """Add a block. Its arrays are referenced, not copied."""
-        self._blocks.append(block)
-        self._rows += len(block.log_time)
-
-    def to_arrow(self) -> pa.Table:
-        """The table, sorted by log time and order.
-
-        Returns:
-            The first column is `log_time`, timestamp[ns, UTC]. Numbers keep their wire
-            type; times are timestamp[ns, UTC], durations duration[ns], strings string,
-            arrays fixed_size_list if the definition fixes their length and list
-            otherwise.
-        """
-        blocks, self._blocks, self._rows = self._blocks, [], 0
-        blocks.sort(key=_beginning)
-        order = _order(blocks)
-        times = [numbers(block.log_time, "time") for block in blocks]
-        names = [pa.field("log_time", TIME)]
-        columns = [_ordered(times, TIME, order)]
-        for name in dict.fromkeys(name for block in blocks for name in block.own):
-            arrays = [block.own[name] for block in blocks]
-            columns.append(_ordered(arrays, common_type(arrays), order))
-            tag = {TAG: self._tags[name]} if name in self._tags else None
-            names.append(pa.field(name, columns[-1].type, metadata=tag))
-        parts = self._flat(blocks)
-        lengths = [len(block.log_time) for block in blocks]
-        del blocks
-        taken = {field.name for field in names}
-        for path in dict.fromkeys(path for part in parts for path in part):
-            name = free_name(path, taken)
-            taken.add(name)
-            found = [part.pop(path, None) for part in parts]
-            kind = common_type([array for array in found if array is not None])
-            arrays = [
-                pa.nulls(rows, kind) if array is None else converted(array, kind)
-                for array, rows in zip(found, lengths, strict=True)
-            ]
-            columns.append(_ordered(arrays, kind, order))
-            of = {FIELD: path} if name != path else None
-            names.append(pa.field(name, kind, metadata=of))
-        table = pa.Table.from_arrays(columns, schema=pa.schema(names))
-        return table.select(arranged(table.column_names, self._fields, self._tags))
-
-    def _flat(self, blocks: Sequence[Block]) -> list[dict[str, pa.Array[Any]]]:
-        """The leaves of each block, with one type for each topic."""
-        topics: dict[str, list[pa.StructArray]] = {}
-        for block in blocks:
-            topics.setdefault(block.topic, []).append(block.records)
-        kinds = {topic: common_type(records) for topic, records in topics.items()}
-        return [
-            with_summaries(
-                flat(converted(block.records, kinds[block.topic])), self._fields, block.summaries
-            )
-            for block in blocks
+    blocks.sort(key=_beginning)
+    order = _order(blocks)
+    times = [numbers(block.log_time, "time") for block in blocks]
+    names = [pa.field("log_time", TIME)]
+    columns = [_ordered(times, TIME, order)]
+    for name in dict.fromkeys(name for block in blocks for name in block.own):
+        arrays = [block.own[name] for block in blocks]
+        columns.append(_ordered(arrays, common_type(arrays), order))
+        tag = {TAG: tags[name]} if name in tags else None
+        names.append(pa.field(name, columns[-1].type, metadata=tag))
+    parts = _flat(blocks, fields)
+    lengths = [len(block.log_time) for block in blocks]
+    blocks.clear()  # the columns below take their memory
+    taken = {field.name for field in names}
+    for path in dict.fromkeys(path for part in parts for path in part):
+        name = free_name(path, taken)
+        taken.add(name)
+        found = [part.pop(path, None) for part in parts]
+        kind = common_type([array for array in found if array is not None])
+        arrays = [
+            pa.nulls(rows, kind) if array is None else converted(array, kind)
+            for array, rows in zip(found, lengths, strict=True)
         ]
+        columns.append(_ordered(arrays, kind, order))
+        of = {FIELD: path} if name != path else None
+        names.append(pa.field(name, kind, metadata=of))
+    table = pa.Table.from_arrays(columns, schema=pa.schema(names))
+    return table.select(arranged(table.column_names, fields, tags))
+
+
+def _flat(blocks: Sequence[Block], fields: Sequence[str] | None) -> list[dict[str, pa.Array[Any]]]:
+    """The leaves of each block, with one type for each topic."""
+    topics: dict[str, list[pa.StructArray]] = {}
+    for block in blocks:
+        topics.setdefault(block.topic, []).append(block.records)
+    kinds = {topic: common_type(records) for topic, records in topics.items()}
+    return [
+        with_summaries(flat(converted(one.records, kinds[one.topic])), fields, one.summaries)
+        for one in blocks
+    ]
 
 
 def _beginning(block: Block) -> tuple[int, int]:

@@ -7,15 +7,13 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import pyarrow as pa
+from pyarrow import types
 
-from hybridlog.schema.arrow_types import is_number
-
-if TYPE_CHECKING:
-    import pyarrow as pa
-
+from hybridlog.query.times import format_duration, format_time
+from hybridlog.schema.arrow_types import is_bytes, is_list, is_number, numpy_type, time_of_day
 
 MAX_CELL: Final = 40
 """Characters of a text in a table."""
@@ -56,11 +54,6 @@ def _forms(
     *, exact: bool
 ) -> list[tuple[Callable[[pa.DataType], bool], Callable[[pa.Scalar], str]]]:
     """Tests of a column's type, and how its values are shown."""
-    from pyarrow import types
-
-    from hybridlog.query.times import format_duration
-    from hybridlog.schema.arrow_types import is_bytes, is_list, time_of_day
-
     return [
         (types.is_floating, _exact if exact else lambda value: f"{value.as_py():.6g}"),
         (types.is_timestamp, _time),
@@ -75,14 +68,10 @@ def _forms(
 
 def _exact(value: pa.Scalar) -> str:
     """The shortest digits that give a number back in its type."""
-    from hybridlog.schema.arrow_types import numpy_type
-
     return str(numpy_type(value.type).type(value.as_py())).removesuffix(".0")
 
 
 def _time(value: pa.Scalar) -> str:
-    from hybridlog.query.times import format_time
-
     ns = value.value * UNITS[value.type.unit]
     try:
         return format_time(ns)

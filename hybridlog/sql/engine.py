@@ -11,6 +11,9 @@ from difflib import get_close_matches
 from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
+import pyarrow as pa
+
+from hybridlog.query.answers.lost import completeness_of
 from hybridlog.query.question import Question
 from hybridlog.query.topics import namesakes
 from hybridlog.schema.states import without_fields
@@ -25,7 +28,6 @@ from hybridlog_storage.errors import ChangedError, HybridlogError, TopicError, U
 
 if TYPE_CHECKING:
     import pandas as pd
-    import pyarrow as pa
 
     from hybridlog.query.answers.completeness import Completeness
     from hybridlog.session import Asked
@@ -182,15 +184,11 @@ class SqlConnection:
         self, content: StoreContent, topics: Collection[str], recordings: Collection[str]
     ) -> Completeness:
         """Completeness of the answer of a query."""
-        from hybridlog.query.answers.lost import completeness_of
-
         asked = replace(self.scope, topics=tuple(topics), recordings=tuple(recordings))
         return completeness_of(content.session, asked)
 
     def schema(self, view: str) -> pa.Schema:
         """Columns of a view or table of the store; none without such a view."""
-        import pyarrow as pa
-
         content = self.content
         topic = content.names.topic(view)
         if topic is not None:
@@ -346,8 +344,6 @@ class SqlAnswer:
         Raises:
             ResourceError: it needs more memory or time than it may.
         """
-        import pyarrow as pa
-
         if self._result is not None:
             return self._result
         if self._relation is None:
@@ -367,8 +363,6 @@ class SqlAnswer:
         Raises:
             ResourceError: it needs more memory or time than it may.
         """
-        import pyarrow as pa
-
         taken: list[pa.RecordBatch] = []
         room, bytes_taken = rows, 0
         # Few rows at a time: each may be an image.
@@ -399,8 +393,6 @@ class SqlAnswer:
 
     def _batches(self, size: int, limit: int | None) -> Iterator[pa.RecordBatch]:
         """The answer in batches of so many rows, up to a limit."""
-        import pyarrow as pa
-
         with closing(self._worker()) as worker:
             reader, batch = self._tried(lambda: worker.run(partial(self._stream, size, limit)))
             if batch is None:

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import reduce
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
 
 from hybridlog.across.match import match
 from hybridlog.drawing.images import shown_pixels
@@ -17,11 +20,11 @@ from hybridlog.query.periods import GAP_PERIODS, usual_period
 from hybridlog.query.planner import match_times
 from hybridlog.query.query import Query
 from hybridlog.query.question import Question
+from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import format_duration, format_time
 from hybridlog_storage.errors import DefinitionError, PayloadError, TopicError, UsageError
 
 if TYPE_CHECKING:
-    import pyarrow as pa
     from numpy.typing import NDArray
 
     from hybridlog.message import Message
@@ -93,15 +96,14 @@ def episodes(
         UsageError: There is a gap that is refused, or a field is no number.
         TopicError: A recording lacks a topic.
     """
-    from hybridlog.query.ranges import RangeResolver
-
     name, query = piece
     for summary, (begin, end) in RangeResolver(query.session, query.question).spans():
-        reader = _Reader(query.session, summary.id, begin, end)
-        read: dict[Source, Values] = {}
-        times = {topic: reader.times(topic) for topic in features.images.values()}
+        times, read = {}, {}
+        for topic in features.images.values():
+            times[topic] = _times(_query(query.session, summary.id, topic, begin, end))
         for source in (part for parts in features.vectors.values() for part in parts):
-            read[source] = reader.values(source)
+            own = _query(query.session, summary.id, source.topic, begin, end)
+            read[source] = _values(own, source)
             times[source.topic] = read[source].times
         first = max([begin, *(int(own[0]) for own in times.values())])
         count = max(end - first, 0) * fps // 10**9 + 1
@@ -147,8 +149,7 @@ def pictures(
     """
     current: Message | None = None
     place, frames = 0, episode.times.tolist()
-    reader = _Reader(session, episode.recording, frames[0], frames[-1] + 1)
-    for message in reader.query(topic):
+    for message in _query(session, episode.recording, topic, frames[0], frames[-1] + 1):
         shown = place
         while place < len(frames) and frames[place] < message.log_time_ns:
             place += 1
@@ -172,83 +173,53 @@ def _picture_or_none(message: Message | None) -> NDArray[np.uint8] | None:
     return np.ascontiguousarray(pixels[:, :, :3])
 
 
-@dataclass(frozen=True, slots=True)
-class _Reader:
-    """Reads topics of a recording in a range, and the messages that are current at its begin.
+def _query(session: Session, recording: str, topic: str, begin: int, end: int) -> Query:
+    """The messages of a topic in a range, and the one before that is current at its begin."""
+    whole = Query(session, Question((topic,), (recording,)))
+    with suppress(TopicError):
+        begin = whole.at(begin).log_time_ns
+    return whole.between(begin, end)
 
-    Attributes:
-        session: The open store.
-        recording: Id of the recording.
-        begin: First log time, ns.
-        end: Last log time, exclusive, ns.
-    """
 
-    session: Session
-    recording: str
-    begin: int
-    end: int
+def _times(query: Query) -> NDArray[np.int64]:
+    """Log times of the messages, ns; at least one."""
+    parts = match_times(query.session, query.question, Counters())
+    times = np.concatenate([np.empty(0, np.int64), *(part.log_time for part in parts)])
+    _check(query, times)
+    return times
 
-    def query(self, topic: str) -> Query:
-        """The question for the messages in the range, and for the current one before it."""
-        whole = Query(self.session, Question((topic,), (self.recording,)))
-        try:
-            begin = whole.at(self.begin).log_time_ns
-        except TopicError:
-            begin = self.begin
-        return whole.between(begin, self.end)
 
-    def times(self, topic: str) -> NDArray[np.int64]:
-        """Log times of the messages of a topic, ns.
+def _values(query: Query, source: Source) -> Values:
+    """Numbers of a topic; messages without them are left out."""
+    table = query.fields(*source.paths).to_arrow()
+    present = [column for column in table.column_names if column in source.paths]
+    if missing := set(source.paths).difference(present):
+        raise UsageError(f"{source.topic} has no field {min(missing)}.")
+    table = table.filter(reduce(pc.and_, (pc.is_valid(table[name]) for name in present)))
+    columns, names = [], []
+    for path in source.paths:
+        numbers = _numbers(table[path], source.topic, path)
+        short = f"{source.topic.strip('/')}.{path}"
+        is_array = table[path].type.num_fields > 0
+        names += [f"{short}[{n}]" for n in range(numbers.shape[1])] if is_array else [short]
+        columns.append(numbers)
+    times = table["log_time"].cast(pa.int64()).to_numpy()
+    _check(query, times)
+    return Values(times, np.concatenate(columns, axis=1), tuple(names))
 
-        Raises:
-            TopicError: There are none.
-        """
-        query = self.query(topic)
-        parts = match_times(query.session, query.question, Counters())
-        found = [part.log_time for part in parts]
-        return self._checked(topic, np.concatenate([np.empty(0, np.int64), *found]))
 
-    def values(self, source: Source) -> Values:
-        """Numbers of a topic; messages without them are left out.
-
-        Raises:
-            TopicError: There are none.
-            UsageError: A field is no number, or an array whose length changes.
-        """
-        import pyarrow as pa
-        import pyarrow.compute as pc
-
-        table = self.query(source.topic).fields(*source.paths).to_arrow()
-        present = [column for column in table.column_names if column in source.paths]
-        if missing := set(source.paths).difference(present):
-            raise UsageError(f"{source.topic} has no field {min(missing)}.")
-        table = table.filter(reduce(pc.and_, (pc.is_valid(table[name]) for name in present)))
-        columns, names = [], []
-        for path in source.paths:
-            numbers = _numbers(table[path], source.topic, path)
-            short = f"{source.topic.strip('/')}.{path}"
-            is_array = table[path].type.num_fields > 0
-            names += [f"{short}[{n}]" for n in range(numbers.shape[1])] if is_array else [short]
-            columns.append(numbers)
-        times = table["log_time"].cast(pa.int64()).to_numpy()
-        self._checked(source.topic, times)
-        return Values(times, np.concatenate(columns, axis=1), tuple(names))
-
-    def _checked(self, topic: str, times: NDArray[np.int64]) -> NDArray[np.int64]:
-        if not len(times):
-            name = self.session.entry(self.recording).name
-            raise TopicError(
-                f"Recording {name} has no message of {topic} before "
-                f"{format_time(self.end)}: leave the recording out, or map another topic."
-            )
-        return times
+def _check(query: Query, times: NDArray[np.int64]) -> None:
+    if not len(times):
+        (recording,), (topic,) = query.summaries(), query.topics
+        _, end = query.question.bounds or (0, 0)
+        raise TopicError(
+            f"Recording {recording.name} has no message of {topic} before "
+            f"{format_time(end)}: leave the recording out, or map another topic."  # type: ignore[arg-type]
+        )
 
 
 def _numbers(column: pa.ChunkedArray, topic: str, path: str) -> NDArray[np.float32]:
     """The numbers of a column: float32[n, width]."""
-    import pyarrow as pa
-    import pyarrow.compute as pc
-
     kind = column.type
     width = 1
     if pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind):

@@ -12,6 +12,7 @@ from hybridlog.query.predicate.parser import names_topics, parse
 from hybridlog.query.predicate.tokens import MAX_TEXT
 from hybridlog.query.predicate.tree import Near
 from hybridlog.query.times import format_time
+from hybridlog.record.losses import extent_of
 from hybridlog_storage.errors import UsageError, WhereError
 
 if TYPE_CHECKING:
@@ -132,14 +133,9 @@ class PageQuestion:
 
     def file_name(self) -> str:
         """The name of its file: recording and range."""
-        begin, end = self._extent() if self.span is None else self.span
+        begin, end = self.span or extent_of(self.recording)
         times = "_".join(format_time(time).replace(":", "") for time in (begin, end))
         return f"{_NO_NAME.sub('_', self.recording.name)}_{times}.mcap"
-
-    def _extent(self) -> Span:
-        from hybridlog.record.losses import extent_of
-
-        return extent_of(self.recording)
 
     def _topics(self) -> Sequence[str]:
         return self.topics or sorted({channel.topic for channel in self.recording.channels})

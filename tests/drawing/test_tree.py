@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import hybridlog as hl
-from hybridlog.drawing.log import LEVELS, Line, Log, kind_of
+from hybridlog.drawing.log import LEVELS, Kind, Line, filtered, kind_of, lines
 from hybridlog.drawing.tree import MAX_NODES, MAX_SHOWN, MAX_TEXT, tree
 from hybridlog_storage.errors import PayloadError, UsageError
 from tests.odd_messages import HOSTILE, LOGS, LONG, LOOSE, MS, START, log_time, ros_channel
@@ -181,8 +181,9 @@ TOPICS = {
 }
 
 
-def log_of(odd: hl.Store, topic: str, level: str = "", text: str = "") -> Log:
-    return Log(odd.query([topic]), kind_of(TOPICS[topic]), level, text)
+def log_of(odd: hl.Store, topic: str, level: str = "", text: str = "") -> tuple[hl.Query, Kind]:
+    kind = kind_of(TOPICS[topic])
+    return filtered(odd.query([topic]), kind, level, text), kind
 
 
 def written(topic: str, numbers: range) -> list[tuple[int, str, str, str]]:
@@ -196,8 +197,8 @@ def written(topic: str, numbers: range) -> list[tuple[int, str, str, str]]:
     return found
 
 
-def told(lines: list[Line]) -> list[tuple[int, str, str, str]]:
-    return [(line.time, line.level, line.name, line.text) for line in lines]
+def told(some: list[Line]) -> list[tuple[int, str, str, str]]:
+    return [(line.time, line.level, line.name, line.text) for line in some]
 
 
 @pytest.mark.parametrize("topic", TOPICS)
@@ -206,7 +207,7 @@ def test_pages_of_lines_meet_without_missing_or_repeating_one(odd: hl.Store, top
     log = log_of(odd, topic)
     found: list[Line] = []
     time, seq = 0, -1
-    while page := log.after(time, seq, 7):
+    while page := lines(*log, time, seq, 7):
         found += page
         time, seq = page[-1].time, page[-1].seq
     if topic == "/rosout":
@@ -217,7 +218,7 @@ def test_pages_of_lines_meet_without_missing_or_repeating_one(odd: hl.Store, top
     assert all(line.is_readable and line.is_whole for line in found)
     back: list[Line] = []
     time, seq = found[-1].time + 1, 0
-    while page := log.before(time, seq, 7):
+    while page := lines(*log, time, seq, 7, before=True):
         back = page + back
         time, seq = page[0].time, page[0].seq
     assert back == found
@@ -230,8 +231,8 @@ def test_lines_of_a_level_and_above(odd: hl.Store, topic: str, level: str) -> No
     wanted = [
         row for row in written(topic, range(len(LOGS))) if row[1] in LEVELS[LEVELS.index(level) :]
     ]
-    assert told(log.after(0, -1, 1000)) == wanted
-    assert log.count() == len(wanted)
+    assert told(lines(*log, 0, -1, 1000)) == wanted
+    assert log[0].count() == len(wanted)
 
 
 @pytest.mark.parametrize(
@@ -246,7 +247,7 @@ def test_lines_with_a_text(odd: hl.Store, text: str) -> None:
             for row in written(topic, range(len(LOGS)))
             if text.lower() in row[2].lower() or text.lower() in row[3].lower()
         ]
-        assert told(log.after(0, -1, 1000)) == wanted
+        assert told(lines(*log, 0, -1, 1000)) == wanted
 
 
 def test_other_types_are_refused() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING, Any, Final
 
-from hybridlog.drawing.log import LEVELS, Line, Log, kind_of
+from hybridlog.drawing.log import LEVELS, Kind, Line, filtered, kind_of, lines
 from hybridlog.drawing.tree import MAX_SHOWN, tree
 from hybridlog.query.asked import channels_of
 from hybridlog.query.times import format_time
@@ -68,12 +68,12 @@ def log(context: Context, params: RequestParams) -> dict[str, Any]:
     after = params.integer("after", 0, _MAX_LINES, 0)
     recording, query = context.topic(params)
     start = start_of(recording)
-    lines = _log(query, params)
+    some, kind = _filtered(query, params)
     time = params.moment(start)
     # A line at the time itself is before the cursor, as it is current there.
     seq = params.integer("seq", 0, _MAX_SEQ, _MAX_SEQ)
-    found = lines.before(time, seq, before)
-    later = lines.after(time, seq, after)
+    found = lines(some, kind, time, seq, before, before=True)
+    later = lines(some, kind, time, seq, after)
     return {
         "lines": [_line(line, start) for line in (*found, *later)],
         "first": len(found) < before,
@@ -84,15 +84,16 @@ def log(context: Context, params: RequestParams) -> dict[str, Any]:
 def log_count(context: Context, params: RequestParams) -> dict[str, Any]:
     """Number of lines that pass the filters."""
     _, query = context.topic(params)
-    return {"count": _log(query, params).count()}
+    return {"count": _filtered(query, params)[0].count()}
 
 
-def _log(query: Query, params: RequestParams) -> Log:
+def _filtered(query: Query, params: RequestParams) -> tuple[Query, Kind]:
     level = params.word("level", ("", *LEVELS), "")
     text = params.text("text", "", longest=_MAX_FILTER)
     schemas = (channel.channel.schema for channel in channels_of(query))
     type_name = next((schema.name for schema in schemas if schema is not None), "")
-    return Log(query, kind_of(type_name), level, text)
+    kind = kind_of(type_name)
+    return filtered(query, kind, level, text), kind
 
 
 def _line(line: Line, start: int) -> dict[str, Any]:
