@@ -216,7 +216,6 @@ def watch_command(given: _Watch) -> None:
 
 def _look(store: Store) -> Iterator[StoreError]:
     """Index what has come since the last look, and print it; yields what cannot be read."""
-    store.mend()
     if store.session.snapshot().is_open.any() or store.shared.has_changed():
         store.refresh()
     repairs = store.repairs

@@ -145,14 +145,6 @@ def test_a_full_disk_behind_standard_output(store: Path) -> None:
     assert (ended.returncode, b"standard output cannot" in ended.stderr) == (1, True)
 
 
-def test_the_answer_says_how_complete_it_is(store: Path) -> None:
-    torn = run("fetch", "-t", "scan", "-r", "torn", "--count", store=store)
-    assert "torn is not complete" in torn.err
-    assert "`hybridlog info torn`" in torn.err
-    whole = run("fetch", "-t", "scan", "-r", "robot", "--count", store=store)
-    assert "complete" not in whole.err
-
-
 def test_damage_that_has_cost_no_message(logs: Path, tmp_path: Path) -> None:
     whole = (logs / "odd.mcap").read_bytes()
     (tmp_path / "open.mcap").write_bytes(whole[:-8])  # the recorder did not close it

@@ -213,15 +213,6 @@ def test_split_bag_with_missing_and_broken_files(tmp_path: Path) -> None:
         open_source(folder)
 
 
-@pytest.mark.parametrize("text", ["", "{", "a: b", "[" * 3000, "rosbag2_bagfile_information: 3"])
-def test_damaged_metadata(tmp_path: Path, text: str) -> None:
-    folder = make(tmp_path / "bag")
-    (folder / "metadata.yaml").write_text(text)
-    found, damage = read(folder)
-    assert found.total() == 300
-    assert [(each.file.name, each.messages_lost) for each in damage] == [("metadata.yaml", 0)]
-
-
 @settings(max_examples=100, deadline=None)
 @given(st.text(max_size=60) | st.sampled_from(["!!python/object:os.system x", "&a [*a]"]))
 def test_metadata_is_untrusted(text: str) -> None:
