@@ -153,12 +153,6 @@ class Inventory:
             return reader.digest()
 
     @property
-    def end(self) -> Mapping[str, Any] | None:
-        """The end of the recording; None before it has one."""
-        is_ended = self.manifest is not None and self.manifest.is_ended
-        return end_values(self.manifest) if self.manifest is not None and is_ended else None
-
-    @property
     def state(self) -> str:
         """A value that changes with its files, and with what the manifest says of them."""
         return state_of(self.listing, self.manifest)
@@ -283,12 +277,12 @@ def describe(catalog: Catalog, inventory: Inventory, *, is_open: bool = False) -
     """Make the complete entry of a recording."""
     from hybridlog.schema.codecs import codec_for
 
-    if inventory.manifest is None:
+    manifest = inventory.manifest
+    if manifest is None:
         raise ManifestError(NO_MANIFEST.format(inventory.id))
-    entry = _base(inventory)
+    entry = _base(inventory, manifest)
     channels: dict[int, Channel] = {}
     lost: list[dict[str, Any]] = []
-    end = inventory.end
     for summary in inventory.summaries.values():
         channels.update(summary.channels)
         lost += summary.losses
@@ -297,13 +291,13 @@ def describe(catalog: Catalog, inventory: Inventory, *, is_open: bool = False) -
         entry.metadata_records += len(summary.metadata)
     entry.segments = len(inventory.summaries)
     entry.stored_bytes = sum(size for _, _, size in entry.rows)
-    entry.end = dict(end) if end is not None else {}
+    entry.end = end_values(manifest) if manifest.is_ended else {}
     ours = [row for sealed in inventory.lost for row in _losses_of_segment(inventory, sealed)]
     ours += _losses_of_chunks(inventory, catalog.damage(inventory.id))
-    if not inventory.manifest.is_ended:  # what went to make room
-        ours += map(loss_values, inventory.manifest.losses)
-    has_losses = bool(ours) or any(row["cause"] == Cause.SEGMENT for row in _ledger(end))
-    entry.status = _status(inventory, end, is_open=is_open, has_losses=has_losses)
+    if not manifest.is_ended:  # what went to make room
+        ours += map(loss_values, manifest.losses)
+    has_losses = bool(ours) or any(row.cause == Cause.SEGMENT for row in manifest.losses)
+    entry.status = _status(inventory, manifest, is_open=is_open, has_losses=has_losses)
     if lost or ours:
         entry.end["losses"] = joined([*entry.end.get("losses", ()), *lost]) + ours
     for number, summary in inventory.summaries.items():
@@ -340,10 +334,6 @@ def described_of(
     """
     shown = with_marks(entry)
     return Described(entry, summary_of(shown, look), topic_types(shown), files, channels or {})
-
-
-def _ledger(end: Mapping[str, Any] | None) -> Iterable[Mapping[str, Any]]:
-    return () if end is None else end.get("losses", ())
 
 
 def describe_now(
@@ -485,9 +475,7 @@ def topic_types(entry: RecordingEntry) -> set[TopicType]:
     return found | {TopicType(topic, "", "") for topic in lost}
 
 
-def _base(inventory: Inventory) -> RecordingEntry:
-    manifest = inventory.manifest
-    assert manifest is not None
+def _base(inventory: Inventory, manifest: Manifest) -> RecordingEntry:
     return RecordingEntry(
         id=manifest.id,
         name=manifest.name,
@@ -583,11 +571,9 @@ def pin_values(pin: truth.Pin) -> dict[str, Any]:
     return {"id": pin.id, **span, "topics": topics, "reason": pin.reason}
 
 
-def _status(
-    inventory: Inventory, end: Mapping[str, Any] | None, *, is_open: bool, has_losses: bool
-) -> str:
+def _status(inventory: Inventory, manifest: Manifest, *, is_open: bool, has_losses: bool) -> str:
     # The holder of an ended recording does not record it.
-    if is_open and (end is None or inventory.listing.open):
+    if is_open and (inventory.listing.open or not manifest.is_ended):
         return "open"
     if inventory.listing.open:
         return "unfinished"
@@ -595,7 +581,7 @@ def _status(
         return "damaged"
     if not inventory.is_proven:
         return "unproven"
-    return str(end.get("status", "complete")) if end is not None else "recovered"
+    return manifest.status if manifest.is_ended else "recovered"
 
 
 def _losses_of_segment(inventory: Inventory, file: File) -> list[dict[str, Any]]:

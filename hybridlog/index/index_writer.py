@@ -362,7 +362,7 @@ class IndexWriter:
             return reader
         path = self._recording / f"{segment:06d}{OPEN_SUFFIX}"
         try:
-            reader = SegmentReader(path, segment, direct=True)
+            reader = SegmentReader(path, segment)
         except SegmentError:  # it is sealed by now
             reader = SegmentReader(path.with_name(sealed_name(segment)), segment)
         self._readers[segment] = reader

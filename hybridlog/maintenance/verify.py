@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from shlex import quote
 from typing import TYPE_CHECKING
@@ -21,13 +21,11 @@ from hybridlog_storage.segments.segment_check import damage_of
 from hybridlog_storage.segments.segment_file import is_rows
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from hybridlog.entries import Inventory
     from hybridlog.maintenance.report import Progress, Repaired
     from hybridlog_storage.catalog import Catalog, RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
-    from hybridlog_storage.manifest import File, Manifest
+    from hybridlog_storage.manifest import Manifest
     from hybridlog_storage.mongo.database import Database
 
 _REPAIR = "run `hybridlog verify --repair`"
@@ -110,16 +108,6 @@ def verify(
             cure = "restore its files"
             result.findings.append(Finding(recording, "recording", str(error), cure))
     return result
-
-
-def damaged_files(path: Path, inventory: Inventory) -> Iterator[tuple[File, str]]:
-    """Read every byte of files of rows that are no misfits; yield damaged ones and why."""
-    told = {misfit.file for misfit in inventory.misfits}
-    for file in (file for file in inventory.rows if file.name not in told):
-        try:
-            rows_file.RowsFile(path, file).check()
-        except StoreError as error:
-            yield file, str(error).removesuffix(rows_file.RESTORE)
 
 
 class _Index:
@@ -264,8 +252,13 @@ class _Check:
 
     def _check_rows(self, inventory: Inventory) -> None:
         """Check every byte of the files of rows."""
-        for file, problem in damaged_files(self._path, inventory):
-            self.found(file.name, problem, RESTORE)
+        told = {misfit.file for misfit in inventory.misfits}
+        for file in (file for file in inventory.rows if file.name not in told):
+            try:
+                rows_file.RowsFile(self._path, file).check()
+                continue
+            except StoreError as error:
+                self.found(file.name, str(error).removesuffix(rows_file.RESTORE), RESTORE)
             is_counted = file.number in inventory.summaries
             if is_counted and inventory.manifest and not inventory.logs[file.number].is_here:
                 lost = sum(part.messages for part in file.parts.values())

@@ -32,16 +32,11 @@ class Buffers:
         # point, on a thread that is taking one.
         self._idle: deque[mmap.mmap] = deque()
 
-    def take(self, size: int, *, whole_pages: bool = False) -> NDArray[np.uint8]:
-        """Take a buffer of at least `size` bytes with arbitrary content.
-
-        Args:
-            size: Bytes.
-            whole_pages: Whether it must begin at a memory page; large ones always do.
-        """
-        if size < _LEAST and not whole_pages:
+    def take(self, size: int) -> NDArray[np.uint8]:
+        """Take a buffer of at least `size` bytes with arbitrary content."""
+        if size < _LEAST:
             return np.empty(size, np.uint8)
-        size = 1 << (max(size, _LEAST) - 1).bit_length()
+        size = 1 << (size - 1).bit_length()
         memory = self._find(size)
         if memory is None:
             memory = new_memory(size)

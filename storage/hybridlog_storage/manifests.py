@@ -48,9 +48,6 @@ if TYPE_CHECKING:
 
 WAIT_S: Final = 30.0
 """Longest wait of a change for others, which take milliseconds."""
-_YIELD_S: Final = 0.05
-_last: Final[dict[Path, tuple[float, float]]] = {}
-"""Of the lock that this process had last: when it was left, and how long it was held."""
 _NO_LOCKS: Final = frozenset({errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS})
 MANIFESTS: Final = "manifests"
 _RECORDINGS: Final = "recordings"
@@ -613,27 +610,14 @@ def _present(manifest: Manifest) -> Manifest:
 
 @contextmanager
 def _locked(path: Path, wait_s: float | None = None) -> Iterator[None]:
-    """Hold a file's lock. If the file was deleted meanwhile, the one of its name is locked.
-
-    A process that changes a recording again and again would find the lock free before others
-    look for it: it waits for as long as it has just held it.
-    """
-    left, held = _last.get(path, (0.0, 0.0))
-    if (pause := left + held - time.monotonic()) > 0:
-        time.sleep(min(pause, _YIELD_S))
+    """Hold a file's lock. If the file was deleted meanwhile, the one of its name is locked."""
     end = time.monotonic() + (WAIT_S if wait_s is None else wait_s)
     while True:
         fd = _opened(path, os.O_RDWR)
         try:
             _lock(fd, path, end)
             if files.is_at(fd, path):
-                locked = time.monotonic()
-                try:
-                    yield
-                finally:
-                    left = time.monotonic()
-                    _last.clear()
-                    _last[path] = (left, left - locked)
+                yield
                 return
         finally:
             os.close(fd)

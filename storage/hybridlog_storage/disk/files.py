@@ -184,7 +184,6 @@ def _content(fd: int, most: int, path: Path | str) -> bytes:
 def write_file(
     path: Path,
     content: bytes,
-    mode: int = 0o666,
     *,
     sync: bool = True,
     modified: int | None = None,
@@ -195,13 +194,12 @@ def write_file(
     Args:
         path: The file.
         content: Its bytes.
-        mode: Its permissions, before the umask.
         sync: Whether it is on the disk when this returns.
         modified: Time of its modification, ns; None for the one that the system gives.
         temporary: A free name beside it, until all is written; None for a random one.
     """
     temporary = temporary or path.with_name(f".{path.name}.{secrets.token_hex(8)}")
-    fd = open_file(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
+    fd = open_file(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL)
     try:
         try:
             left = memoryview(content)

@@ -106,7 +106,6 @@ class Scan:
         self._has_ended = False  # the data, and the summary follows
         self._needs_crc = False  # messages have no checksum of their own
         self._is_damaged = self._is_torn = False  # torn: the file ends in damage
-        self._indexed: set[int] | None = None  # channels of the message indexes of the last chunk
 
     def _read(self, offset: int, length: int) -> memoryview:
         self._file.seek(offset)
@@ -213,7 +212,7 @@ class Scan:
 
     def _chunk(self, at: int, chunk: ChunkHead) -> Iterator[tuple[int, Item]]:
         """The messages of a chunk, of its beginning if the file ends in it."""
-        self._chunked, self._indexed = True, set()
+        self._chunked = True
         self._needs_crc |= not chunk.crc
         end = min(chunk.end, self._bytes.size)
         self._at = self._behind = end
@@ -310,7 +309,6 @@ class Scan:
         """A chunk whose lengths contradict each other."""
         ends = [end] if chunk is None else [one for one in (chunk.end, end) if one >= chunk.start]
         right = next((one for one in ends if self._goes_on(one)), None)
-        self._indexed = set()
         if right is None:
             yield self._lost(at, f"a chunk record claims {end - at - HEAD} bytes")
         elif chunk is None:
@@ -347,7 +345,9 @@ class Scan:
         if opcode == Opcode.DATA_END:
             yield from self._data_end(at, end)
         elif opcode == Opcode.MESSAGE_INDEX:
-            yield from self._message_index(at, bytes(self._bytes.at(start, min(size, 6))))
+            entries = int.from_bytes(self._bytes.at(start + 2, min(size, 4)), "little")
+            if start + 6 + entries == end:
+                self._behind = end
         elif size > _MAX_PLAIN and opcode != Opcode.ATTACHMENT:
             reason = f"a record of {size} bytes is above the limit of {_MAX_PLAIN}"
             yield _damage(at, end - at, reason, 0)
@@ -372,18 +372,6 @@ class Scan:
             self._behind = start + found[1]
             if found[0] is not None:
                 yield at, found[0]
-
-    def _message_index(self, at: int, fields: bytes) -> Iterator[tuple[int, Item]]:
-        """Tell that a chunk was missed: it has one index for each channel."""
-        if self._behind + 6 + int.from_bytes(fields[2:], "little") == self._at:
-            self._behind = self._at
-        if self.summary is not None or not any(fields[2:]):
-            return  # totals tell it, too
-        channel = int.from_bytes(fields[:2], "little")
-        if self._indexed is None or channel in self._indexed:
-            yield _damage(at, 0, "the chunk of these message indexes is missing")
-            self._indexed = set()
-        self._indexed.add(channel)
 
     # The end of the data
 

@@ -177,12 +177,6 @@ class GoneLog(SegmentReader):
         batch.channel = batch.channel + np.int32(self._added)
         return place.stored(self.number, batch, seq)
 
-    def read_times(self, place: ChunkPlace) -> dict[int, NDArray[np.int64]]:
-        """As of a log."""
-        batch = self.read_chunk(place).batch
-        channels = distinct(batch.channel).tolist()
-        return {c: np.sort(batch.log_time[batch.channel == c]) for c in channels}
-
 
 def open_log(path: Path, number: int, rows: Rows | None = None) -> SegmentReader:
     """Open a sealed log, or what is left of it.

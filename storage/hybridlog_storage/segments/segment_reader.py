@@ -22,7 +22,6 @@ from mcap.records import AttachmentIndex, Metadata, MetadataIndex
 from hybridlog_storage.buffers import buffers
 from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk import files
-from hybridlog_storage.disk.append_file import BLOCK, DIRECT
 from hybridlog_storage.errors import SegmentError, exhausted
 from hybridlog_storage.manifest import hasher
 from hybridlog_storage.mcap.mcap_content import (
@@ -151,8 +150,6 @@ class SegmentReader:
     Args:
         path: The file.
         number: Its number in the recording.
-        direct: Read past the page cache, if the file system allows it: for data that was
-            just written that way and will not be read again soon.
 
     Raises:
             SegmentError: The file is missing or cannot be opened.
@@ -160,14 +157,13 @@ class SegmentReader:
 
     _added = 0  # to ids of channels
 
-    def __init__(self, path: Path, number: int, *, direct: bool = False) -> None:
+    def __init__(self, path: Path, number: int) -> None:
         self.path = path
         self.number = number
-        self._direct = direct and bool(DIRECT)
         cure = "Restore the file, or run `hybridlog verify` for a list of what is affected."
         try:
             # Opening must not block, for example on a named pipe.
-            self._fd = self._open(path)
+            self._fd = files.open_file(path, os.O_RDONLY)
         except OSError as error:
             problem = f"Segment {path} cannot be opened: {error.strerror}. {cure}"
             raise (exhausted(error.errno, f"opening {path}") or SegmentError(problem)) from error
@@ -177,13 +173,6 @@ class SegmentReader:
             raise SegmentError(f"Segment {path} is not an ordinary file. {cure}")
         self.size = about.st_size
         self.bytes_read = 0
-
-    def _open(self, path: Path) -> int:
-        if self._direct:
-            with suppress(OSError):
-                return files.open_file(path, os.O_RDONLY | DIRECT)
-            self._direct = False
-        return files.open_file(path, os.O_RDONLY)
 
     def close(self) -> None:
         """Close the file."""
@@ -379,14 +368,12 @@ class SegmentReader:
         Raises:
             SegmentError: They are missing or damaged; the message names file and offset.
         """
-        check_wanted()
-        behind = self.read(place.offset + place.length, place.trailer)
-        try:
+        with suppress(SegmentError):
+            behind = self.read(place.offset + place.length, place.trailer)
             indexes = trailer_of(behind, place.offset).indexes
-        except SegmentError as error:
-            raise self._damaged(place, error) from error
-        if indexes:
-            return {channel: rows["log_time"].astype(np.int64) for channel, rows in indexes}
+            if indexes:
+                check_wanted()
+                return {channel: rows["log_time"].astype(np.int64) for channel, rows in indexes}
         batch = self.read_chunk(place).batch
         channels = distinct(batch.channel).tolist()
         return {c: np.sort(batch.log_time[batch.channel == c]) for c in channels}
@@ -433,19 +420,15 @@ class SegmentReader:
                 f"{self.path} ends at byte {self.size}, but bytes {offset} to "
                 f"{offset + length} are referred to: the file was cut short."
             )
-        # Direct reads start and end at whole blocks, in the file and in memory.
-        ahead = offset % BLOCK if self._direct else 0
-        wanted = ahead + length
-        size = wanted + -wanted % BLOCK if self._direct else wanted
-        buffer = buffers.take(size, whole_pages=self._direct).data
+        buffer = buffers.take(length).data
         try:
-            count = files.preadv(self._fd, [buffer[:size]], offset - ahead)
+            count = files.preadv(self._fd, [buffer[:length]], offset)
         except OSError as error:
             raise SegmentError(f"{self.path} cannot be read: {error.strerror}.") from error
-        if count < wanted:
-            raise SegmentError(f"{self.path} gives {count - ahead} bytes of {length} at {offset}.")
+        if count < length:
+            raise SegmentError(f"{self.path} gives {count} bytes of {length} at {offset}.")
         self.bytes_read += length
-        return buffer[ahead:wanted]
+        return buffer[:length]
 
 
 def places_of(table: ChunkTable) -> list[ChunkPlace]:
