@@ -70,7 +70,7 @@ PLACES = {
     "manifest_wait_s": "hybridlog_storage.manifests.WAIT_S",
     "inserted_documents": "hybridlog_storage.mongo.database.BATCH_DOCUMENTS",
     "inserted_bytes_together": "hybridlog_storage.mongo.database._MAX_COMMAND_BYTES",
-    "mongod_silence_s": "hybridlog_storage.mongo.mongod.SILENCE_LIMIT_S",
+    "mongod_start_s": "hybridlog_storage.mongo.mongod.START_LIMIT_S",
     "segment_chunks": "hybridlog_storage.segments.segment_group._MAX_CHUNKS",
     "segment_parts": "hybridlog_storage.segments.segment_group._MAX_PARTS",
     "sync_stride_bytes": "hybridlog_storage.segments.segment_writer._SYNC_STRIDE",

@@ -59,7 +59,6 @@ INTERVAL_S: Final = 5.0
 _SEND_BYTES: Final = 8 << 20  # documents that are sent together, at most
 _GROUP_BYTES: Final = 1 << 20  # content of small chunks that are decoded together
 _RETRY_S: Final = 2.0  # between attempts after the database has failed
-_NONE: Final = np.empty(0, np.int64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,9 +150,7 @@ class _Sender:
             if name not in self._collections:
                 self.database.ensure_collection(name)
                 self._collections.add(name)
-            lengths = [np.full(len(table), table.shape[1]) for table in tables]
-            data = b"".join(table.data for table in tables)
-            self.database.insert_raw(name, data, np.concatenate([_NONE, *lengths]))
+            self.database.insert_raw(name, [row.tobytes() for table in tables for row in table])
         if segments:
             IndexState(self.database).put_segments(self._key, segments)
         self.messages += messages

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import bson
-import numpy as np
 from pymongo import MongoClient
 
 import hybridlog as hl
@@ -125,9 +124,8 @@ class Prepared:
                 for collection, data in self.documents.items():
                     if not collection.startswith(CATALOG_PREFIX):
                         database.ensure_collection(collection)
-                    sizes = [len(bson.encode(one)) for one in bson.decode_all(data)]
-                    if sizes and collection != STORE:
-                        database.insert_raw(collection, data, np.array(sizes))
+                    if collection != STORE:
+                        database.insert_raw(collection, [*map(bson.encode, bson.decode_all(data))])
                 IndexState(database).claim(
                     StoreDirectory(path).settings.store_id,
                     f"{platform.node()}:{os.path.realpath(path)}",

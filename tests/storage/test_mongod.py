@@ -381,7 +381,7 @@ def test_a_mongod_that_never_answers(
     directory: Path, fake: Callable[[str], None], limit: Limit
 ) -> None:
     fake("exec sleep 60")
-    limit(mongod_silence_s=1.0)
+    limit(mongod_start_s=1.0)
     with pytest.raises(DatabaseError, match="did not answer within 1 s"):
         EmbeddedMongod(directory, linger_s=LINGER_S).start()
     wait_for(lambda: not processes_on(directory))
