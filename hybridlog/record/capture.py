@@ -147,7 +147,6 @@ class Capture:
         self.writer = RecordingWriter(
             folder,
             recording_metadata(self.entry),
-            lambda *_: None,
             settings,
             no_index=self._no_index,
             is_named=lambda topic: rules.topic_rule(topic) is not None,
