@@ -281,10 +281,10 @@ class Database:
         inserted = 0
         for first in range(0, len(documents), BATCH_DOCUMENTS):
             parts = [*map(RawBSONDocument, documents[first : first + BATCH_DOCUMENTS])]
-            inserted += self._again(partial(self._insert, collection, parts))
+            inserted += self._again(partial(self._insert_batch, collection, parts))
         return inserted
 
-    def _insert(self, collection: str, documents: Sequence[RawBSONDocument]) -> int:
+    def _insert_batch(self, collection: str, documents: Sequence[RawBSONDocument]) -> int:
         from pymongo.errors import BulkWriteError
 
         try:
