@@ -20,13 +20,13 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
-from hybridlog.columns.recording_logs import walk
+from hybridlog.columns.recording_logs import RecordingRows
 from hybridlog.columns.table_writer import TableWriter
 from hybridlog.entries import put_entry
 from hybridlog.index.indexing import ChunkIndexer
 from hybridlog.maintenance.report import reporter
 from hybridlog.maintenance.tables import channels_of, missing
-from hybridlog_storage.catalog import decoded_in
+from hybridlog_storage.catalog import decoded_in, file_of
 from hybridlog_storage.errors import (
     DatabaseError,
     HybridlogError,
@@ -36,6 +36,7 @@ from hybridlog_storage.errors import (
 )
 from hybridlog_storage.mongo.collection_names import collection_of
 from hybridlog_storage.mongo.index_state import IndexState
+from hybridlog_storage.segments.gone_log import open_log
 from hybridlog_storage.segments.open_segment import OpenSegment
 from hybridlog_storage.segments.segment_reader import places_of
 from hybridlog_storage.threads import Threads
@@ -52,7 +53,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.messages import Channel
     from hybridlog_storage.mongo.database import Database
     from hybridlog_storage.segments.chunk import StoredChunk
-    from hybridlog_storage.segments.segment_reader import ChunkPlace
+    from hybridlog_storage.segments.segment_reader import ChunkPlace, SegmentReader
 
 INTERVAL_S: Final = 5.0
 """Longest time between two looks at a recording in progress, seconds."""
@@ -230,7 +231,7 @@ class Follower:
         self._renewed: Database | None = None
         self._retry_at = 0.0
         self._indexed = 0
-        self._gap = self.failure  # why the index has missed something
+        self._gap: DatabaseError | None = None  # why the index has missed something
         self._begin()
 
     def _begin(self) -> None:
@@ -280,9 +281,7 @@ class Follower:
             opened = segment.opened = segment.opened or OpenSegment(self._path, number)
             opened.follow()
             table = opened.flushed.table
-            places = places_of(table)[segment.chunks :]
-            read = ((place, _read(opened.reader.read_chunk, place)) for place in places)
-            for group in self._groups(number, read):
+            for group in self._groups(number, opened.reader, places_of(table)):
                 self._take(segment, group, opened.channels)
                 if self.is_stopped:
                     return
@@ -315,7 +314,7 @@ class Follower:
                 self._catalog.put_damage(entry.id, self._damage)
             entry = put_entry(self._directory, self._catalog, entry.id)
             self._tables.close(entry)
-            self.failure = self._gap
+            self.failure = self._gap or self.failure
         finally:
             self.discard()
         return entry
@@ -328,34 +327,53 @@ class Follower:
 
     def _read_sealed(self, entry: RecordingEntry) -> None:
         in_tables = None if self._topics is None else channels_of(entry, self._topics)
-        report = reporter(self._progress, entry.name, entry.stored_bytes)
-        for walked in walk(self._path, entry, report):
-            number, summary = walked.number, walked.summary
-            if number in self._ended:
-                continue
-            segment = self._segments.setdefault(number, _Segment())
-            segment.is_wanted = self._target.is_wanted and str(number) not in self._done
-            if not segment.is_wanted:
-                segment.is_decoded = self._catalog.decoded(entry, number) is not None
-            channels = in_tables if segment.is_decoded else None
-            for group in self._groups(number, walked.chunks(_wanted(segment.chunks, channels))):
-                if time.monotonic() > self._until:
-                    raise TimeoutError
-                self._take(segment, group, summary.channels)
-            self._end_segment(number, entry.digests[str(number)])
+        rows, done = RecordingRows(self._path), 0
+        for number in [n for n, _, _ in entry.spans if str(n) in entry.digests]:
+            with open_log(self._path / file_of(entry, number), number, rows) as reader:
+                report = reporter(self._progress, entry.name, entry.stored_bytes, done)
+                if number not in self._ended:
+                    self._read_segment(entry, reader, in_tables, report)
+                done += reader.size
+                report(reader.size)
+
+    def _read_segment(
+        self,
+        entry: RecordingEntry,
+        reader: SegmentReader,
+        in_tables: AbstractSet[int] | None,
+        report: Callable[[int], None],
+    ) -> None:
+        """Read what is left of a sealed segment."""
+        number = reader.number
+        summary = reader.summary()
+        segment = self._segments.setdefault(number, _Segment())
+        segment.is_wanted = self._target.is_wanted and str(number) not in self._done
+        places = summary.chunks
+        if not segment.is_wanted and self._catalog.decoded(entry, number) is not None:
+            segment.is_decoded = True
+            if in_tables is not None:
+                places = [one for one in places if not in_tables.isdisjoint(one.channels)]
+        for group in self._groups(number, reader, places):
+            if time.monotonic() > self._until:
+                raise TimeoutError
+            self._take(segment, group, summary.channels)
+            report(group[-1].offset)
+        self._end_segment(number, entry.digests[str(number)])
 
     def _groups(
-        self, number: int, chunks: Iterable[tuple[ChunkPlace, StoredChunk | SegmentError]]
+        self, number: int, reader: SegmentReader, places: Iterable[ChunkPlace]
     ) -> Iterator[list[StoredChunk]]:
-        """The chunks of a segment that can be read; small ones together."""
+        """The chunks of a segment that can be read and were not; small ones together."""
+        segment, size = self._segments[number], 0
         group: list[StoredChunk] = []
-        size = 0
-        for place, chunk in chunks:
-            if not self._segments[number].is_decoded:
+        for place in [one for one in places if one.number >= segment.chunks]:
+            if not segment.is_decoded:
                 self._damage.pop((number, place.number), None)
-            if isinstance(chunk, SegmentError):
-                if not self._segments[number].is_decoded:  # else tables may have its fields
-                    self._damage[number, place.number] = str(chunk)
+            try:
+                chunk = reader.read_chunk(place)
+            except SegmentError as error:
+                if not segment.is_decoded:  # else tables may have its fields
+                    self._damage[number, place.number] = str(error)
                 continue
             size += len(chunk.batch.buffer)
             if group and size > _GROUP_BYTES:
@@ -381,8 +399,9 @@ class Follower:
         if not segment.is_wanted:
             return
         self.made += len(chunks)
-        segment.is_sent &= self._sender is not None
-        if self._sender is not None:
+        if self._sender is None:
+            segment.is_sent, self._gap = False, self.failure
+        else:
             with self._noting_failure():
                 self._sender.add(documents, messages)
 
@@ -445,11 +464,12 @@ class Follower:
         try:
             yield
         except HybridlogError as error:
+            self.failure = error if isinstance(error, DatabaseError) else DatabaseError(str(error))
+            if self._sender is not None:
+                self._gap = self.failure  # of what was sent, some may be lost
+                for segment in self._segments.values():
+                    segment.is_sent = False
             self._stop_sending()
-            for segment in self._segments.values():
-                segment.is_sent = False  # of what was sent, some may be lost
-            known = error if isinstance(error, DatabaseError) else DatabaseError(str(error))
-            self.failure = self._gap = known
             self._retry_at = time.monotonic() + _RETRY_S
 
     def _stop_sending(self) -> None:
@@ -596,19 +616,3 @@ def make_tables(
         return bring(directory, catalog, entry, **options).problem
     except (StoreError, TopicError) as error:
         return str(error)
-
-
-def _wanted(first: int, channels: AbstractSet[int] | None) -> Callable[[ChunkPlace], bool]:
-    """Chooses the chunks from a number on that have messages of some channels, or of any."""
-    return lambda place: (
-        place.number >= first and (channels is None or not channels.isdisjoint(place.channels))
-    )
-
-
-def _read(
-    read: Callable[[ChunkPlace], StoredChunk], place: ChunkPlace
-) -> StoredChunk | SegmentError:
-    try:
-        return read(place)
-    except SegmentError as error:
-        return error

@@ -12,7 +12,6 @@ from contextlib import suppress
 from functools import wraps
 from typing import TYPE_CHECKING, NamedTuple, ParamSpec, TypeVar
 
-from hybridlog.maintenance.report import RepairReport
 from hybridlog_storage.errors import (
     ConnectionBrokenError,
     ConnectionLostError,
@@ -168,8 +167,6 @@ class IndexAccess:
         """The index, for a new recording; it may lack other recordings, or be unavailable."""
         from hybridlog.follow.follower import IndexTarget
 
-        if self.connected is not None and not self.connected.ping():
-            self.disconnect()
         # Those that a crash has cut are brought into the index by another opening.
         try:
             database = self.database_for(purpose, writes=True, brings=self._recovers)
@@ -311,15 +308,12 @@ class IndexAccess:
         """An additional connection to the index, after one has failed.
 
         Raises:
-            DatabaseError: It does not answer, or belongs to another store.
+            HybridlogError: It does not answer, or belongs to another store.
         """
-        try:
-            if not self.id:
-                with self._connecting:
-                    self._open()
-            return self.another()
-        except (StoreError, ResourceError, MissingDependencyError) as error:
-            raise DatabaseError(str(error)) from error
+        if not self.id:
+            with self._connecting:
+                self._open()
+        return self.another()
 
     def _reached(self, *, brings: bool) -> Database | None:
         """The index, connected when it is needed; `brings` it up to date first."""
@@ -335,25 +329,19 @@ class IndexAccess:
         shared = self._shared
         if self.connected is None:
             self._is_complete = False
-        repairs = RepairReport()
         changed: set[str] = set()
-        try:
-            database = self._open()
-            if brings and self.may_write:
-                store = index.StoreIndex(shared.directory, shared.catalog, database, self._progress)
-                session = self._shared.now()
-                changed = store.bring_up_to_date(
-                    session.snapshot(),
-                    session.entry_of,
-                    index=self.id,
-                    removes=self._owns,
-                    report=repairs,
-                )
-        finally:
-            shared.repairs.indexed.update(repairs.indexed)
-            shared.repairs.unreadable.update(repairs.unreadable)
-            shared.repairs.removed += repairs.removed
-        self._is_available()
+        database = self._open()
+        if brings and self.may_write:
+            store = index.StoreIndex(shared.directory, shared.catalog, database, self._progress)
+            session = self._shared.now()
+            changed = store.bring_up_to_date(
+                session.snapshot(),
+                session.entry_of,
+                index=self.id,
+                removes=self._owns,
+                report=shared.repairs,
+            )
+        self.unavailable, self._rests_until = None, 0.0
         if brings:
             self._is_complete = True
             if changed:
@@ -382,10 +370,6 @@ class IndexAccess:
             self.id = "" if owner is None else owner.made
             self._owns = owner is not None and owner.place == self._own_place
         return database
-
-    def _is_available(self) -> None:
-        self.unavailable = None
-        self._rests_until = 0.0
 
 
 def _bounded_cache_mb(stored: int | None) -> int:

@@ -294,8 +294,7 @@ def step_database(seam: Seam) -> None:
 
     stepped("insert_raw", "insert", half_of_insert)
     stepped("delete", "delete", half_of_delete)
-    for method in ("replace", "update"):
-        stepped(method, method)
+    stepped("update", "update")
     for method in ("ensure_collection", "create_index", "drop_index"):
         stepped(method, "collection")
 

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
+import bson
 import pytest
 
 from hybridlog_storage.catalog import ChannelStats, RecordingEntry, channel_entry
@@ -33,7 +34,7 @@ def state(database: Database) -> IndexState:
             for at in range(5):
                 key = key_bound(at)[:8] + bytes.fromhex(of[-16:]) + bytes(8)
                 meta = {"rec": of[-16:], "ref": {"seg": at}}
-                database.replace(name, {"_id": key}, {"_id": key, "_meta": meta})
+                database.insert_raw(name, [bson.encode({"_id": key, "_meta": meta})])
     return IndexState(database)
 
 
@@ -89,7 +90,7 @@ def test_whoever_asks_sees_that_documents_were_about_to_go(state: IndexState) ->
 def test_documents_of_what_is_no_recording_can_be_cleared(
     state: IndexState, database: Database, key: Any
 ) -> None:
-    database.replace("one", {"_id": b"x" * 24}, {"_id": b"x" * 24, "_meta": {"rec": key}})
+    database.insert_raw("one", [bson.encode({"_id": b"x" * 24, "_meta": {"rec": key}})])
     state.clear_everywhere([key])
     assert database.count("one", {"_id": b"x" * 24}) == 0
     assert left(database, ONE) == left(database, OTHER) == list(range(5))

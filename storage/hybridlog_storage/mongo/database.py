@@ -191,17 +191,6 @@ class Database:
         with timeout(_GONE_S):
             self._client.close()
 
-    def ping(self) -> bool:
-        """True if the server answers within a second, whatever the other timeouts are."""
-        from pymongo import timeout
-
-        try:
-            with _mapped(self._address), timeout(_GONE_S):
-                self._client.admin.command("ping")
-        except DatabaseError:
-            return False
-        return True
-
     def _again(self, command: Callable[[], _T], *, question: bool = False) -> _T:
         """Run a command, again if its connection breaks."""
         from pymongo.errors import AutoReconnect, CursorNotFound, ServerSelectionTimeoutError
@@ -401,16 +390,6 @@ class Database:
             for found in decode_all(raw):
                 numbers[found["_id"]["place"]].append((found["_id"].get("rec"), found["n"]))
         return numbers
-
-    def replace(
-        self,
-        collection: str,
-        filter: Mapping[str, object],  # noqa: A002
-        document: Mapping[str, object],
-    ) -> None:
-        """Replace the first matching document, or insert it if none matches."""
-        of = self._database[collection]
-        self._again(lambda: of.replace_one(dict(filter), dict(document), upsert=True))
 
     def update(
         self,

@@ -160,5 +160,5 @@ class IndexState:
         The index gets a new id, so that nothing is believed of it that was known before.
         """
         owner = Owner(store, place, secrets.token_hex(8))
-        self._db.replace(STORE, {"_id": "store"}, {"_id": "store", **owner._asdict()})
+        self._db.update(STORE, {"_id": "store"}, {"$set": owner._asdict()}, upsert=True)
         return owner
