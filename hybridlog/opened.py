@@ -157,7 +157,7 @@ class OpenStore(Shared):
                 self._mend(time.monotonic() + seconds)
 
     def _mend(self, until: float) -> None:
-        from hybridlog.maintenance.tables import make_noted
+        from hybridlog.follow.follower import make_tables
 
         repairs = self.repairs
         known = self.now().snapshot().summaries
@@ -173,10 +173,18 @@ class OpenStore(Shared):
         session = self.now()
         for recording, topics in by_recording.items():
             entry = session.entry_if_there(recording)
-            if entry is None or make_noted(
-                self.directory, entry, topics, self.tables, repairs, until=until
-            ):
-                repairs.noted_tables -= {(recording, topic) for topic in topics}
+            if entry is not None:
+                try:
+                    problem = make_tables(
+                        self.directory, self.catalog, entry, topics=topics, until=until
+                    )
+                except TimeoutError:
+                    continue
+                if not problem:
+                    self.tables.look_again()
+                    made = (one for one in sorted(topics) if self.tables.of(entry, one) is not None)
+                    repairs.tables += [(entry.name, one) for one in made]
+            repairs.noted_tables -= {(recording, topic) for topic in topics}
 
     # Closing.
 

@@ -182,7 +182,7 @@ class Shared(ABC):
             return None  # another process has just removed it
         if entry is not None and is_new:
             # The index may have what the files had before.
-            self.index.note_changes(entry.id)
+            self.index.note_changes()
         return entry
 
     def known_entry(self, recording: str) -> RecordingEntry | None:

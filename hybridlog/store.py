@@ -180,7 +180,7 @@ def _session_of(address: str | Path, mongo: str | None) -> Session:
 @contextmanager
 def _target(to: str | Path, options: CopyOptions, store: Store) -> Iterator[Target]:
     """Where recordings of a store are copied to."""
-    from hybridlog.maintenance import tables
+    from hybridlog.follow.follower import make_tables
     from hybridlog.maintenance.copying import Target
     from hybridlog_storage.copy_places import BucketStore, Directory
 
@@ -218,7 +218,7 @@ def _target(to: str | Path, options: CopyOptions, store: Store) -> Iterator[Targ
         yield found
         other.shared.catch_up()
         for entry in other.select(found.arrived):  # so that other readers find them
-            tables.make(other.directory, entry)
+            make_tables(other.directory, other.catalog, entry)
 
 
 def _local(to: str | Path) -> Path:
@@ -863,7 +863,6 @@ class Store:
             options: Options of the recording.
             choices: Fields of `LiveOptions`, instead of `options`.
         """
-        from hybridlog.index.index_writer import IndexTarget
         from hybridlog.live import LiveOptions, LiveRecording
 
         chosen = options or LiveOptions(**choices)
@@ -871,11 +870,11 @@ class Store:
         return LiveRecording(
             self.directory,
             self.catalog,
-            IndexTarget() if chosen.is_ring else target,
+            target,
             name,
             chosen,
             known=self._newest(),
-            on_close=self._after_ring if chosen.is_ring else self._after,
+            on_close=self._after,
         )
 
     def _newest(self) -> Callable[[], Snapshot]:
@@ -883,46 +882,23 @@ class Store:
         _ = self.session  # what a crash has left is mended before
         return self.shared.newest
 
-    def _after_ring(self, report: RecordReport) -> None:
-        """Make tables and index documents of what a ring has left."""
-        from hybridlog.maintenance.index import derive
-
-        shared, entry = self._to_change(), report.entry
-        index = shared.index
-        index.disconnect()
-        shared.catch_up(entry.id)
-        try:
-            if index.has_none:
-                with suppress(StoreError), self.directory.writing(entry.id, entry.name):
-                    derive(self.directory, self.catalog, entry)
-            else:
-                self.connect()
-                report.indexed = entry.documents
-                self.repairs.indexed.pop(entry.name, None)  # no repair
-        except HybridlogError as error:
-            report.failure, report.missed = DatabaseError(str(error)), entry.documents
-        report.entry = self.entry(entry.id)
-
     def _after(self, report: RecordReport) -> None:
         """Update the store after the end of a recording."""
         self._to_change().catch_up(report.entry.id)
-        connected = self.shared.index.connected
-        if report.failure is None and (connected is None or connected.ping()):
-            if connected is not None:
+        if report.failure is None:
+            if self.shared.index.connected is not None:
                 # The next connection need not look at it.
                 self.catalog.put_indexed([report.entry.id], self.shared.index.id)
             return
-        # MongoDB has ended meanwhile. If it is available again, the rest is indexed.
+        # If MongoDB is available again, the rest is indexed.
         self.shared.index.disconnect()
         try:
             self.connect()
         except HybridlogError as error:
-            if report.failure is not None:
-                report.failure = error if isinstance(error, DatabaseError) else report.failure
+            report.failure = error if isinstance(error, DatabaseError) else report.failure
             return
-        if report.failure is not None:
-            report.entry = self.entry(report.entry.id)
-            report.indexed, report.missed, report.failure = report.entry.documents, 0, None
+        report.entry = self.entry(report.entry.id)
+        report.indexed, report.missed, report.failure = report.entry.documents, 0, None
 
     @again_if_lost
     def sizes(self, recordings: Names | None = None) -> Sizes:

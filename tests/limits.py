@@ -30,7 +30,6 @@ PLACES = {
     "output_held_bytes": "hybridlog.formats.tables.HELD_BYTES",
     "tables_piece_bytes": "hybridlog.formats.tables.PIECE_BYTES",
     "frame_block_rows": "hybridlog.frames.answer._BLOCK_ROWS",
-    "index_group_bytes": "hybridlog.index.index_writer._GROUP_BYTES",
     "clock_wait_s": "hybridlog.live.recorder._CLOCK_WAIT_S",
     "expected_topics": "hybridlog.live.recorder._MAX_EXPECTED",
     "settled_topics_s": "hybridlog.live.recorder._SETTLED_S",
@@ -71,7 +70,7 @@ PLACES = {
     "manifest_wait_s": "hybridlog_storage.manifests.WAIT_S",
     "inserted_documents": "hybridlog_storage.mongo.database.BATCH_DOCUMENTS",
     "inserted_bytes_together": "hybridlog_storage.mongo.database._MAX_COMMAND_BYTES",
-    "mongod_silence_s": "hybridlog_storage.mongo.mongod.SILENCE_LIMIT_S",
+    "mongod_start_s": "hybridlog_storage.mongo.mongod.START_LIMIT_S",
     "segment_chunks": "hybridlog_storage.segments.segment_group._MAX_CHUNKS",
     "segment_parts": "hybridlog_storage.segments.segment_group._MAX_PARTS",
     "sync_stride_bytes": "hybridlog_storage.segments.segment_writer._SYNC_STRIDE",
@@ -85,7 +84,6 @@ PLACES = {
     "connection_patience_s": "hybridlog.view.server.BoundedConnection.patience_s",
     "directory_is_writable": "hybridlog_storage.disk.directory.StoreDirectory.is_writable",
     "index_interval": "hybridlog.live.recording._index_interval_s",
-    "index_interval_bytes": "hybridlog.index.index_writer._INTERVAL_BYTES",
     "recording_filled": "hybridlog.live.recording.LiveRecording.filled",
 }
 

@@ -96,7 +96,6 @@ class Made:
         writer = RecordingWriter(
             self.path,
             self.said,
-            lambda *_: None,
             SegmentSettings(chunk_size=1 << 10, sync="never", segment_size=1),
             on_sealing=self._announce,
         )
@@ -278,9 +277,7 @@ def _older(made: Made, number: int) -> None:
     """Whole, of this recording and of this number, and not what the manifest lists."""
     old = made.directory.path / "old"
     old.mkdir()
-    writer = RecordingWriter(
-        old, made.said, lambda *_: None, SegmentSettings(segment_size=1, sync="never")
-    )
+    writer = RecordingWriter(old, made.said, SegmentSettings(segment_size=1, sync="never"))
     for n in range(number + 1):
         writer.append(batch(range(PER_SEGMENT * n, PER_SEGMENT * n + 5)), TOPICS)
         writer.flush()

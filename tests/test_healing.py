@@ -346,10 +346,12 @@ def test_a_user_who_may_only_read_can_ask_everything(
         for change in (
             opened.index.rebuild,
             lambda: opened.index.add(IMU, "header.seq"),
-            lambda: opened.start("more"),
         ):
             with pytest.raises(DatabaseError, match="may only read"):
                 change()
+        recording = opened.start("more")
+        assert "may only read" in str(recording.index_failure)
+        recording.abort()
     # What the index lacks is answered by tables and messages, and is not written.
     shutil.move(store, tmp_path / "moved")
     write_bag(tmp_path / "three.bag", duration_s=1, seed=3, topics=TOPICS)
@@ -374,7 +376,7 @@ def test_too_few_handles_are_told_as_that(store: Path) -> None:
     command = [sys.executable, "-m", "hybridlog", "verify", "--store", str(store)]
     done = subprocess.run([*LIMITED, *command], capture_output=True, text=True, check=False)
     assert done.returncode == 6, done.stderr
-    assert "ran out of file handles. Raise the hard limit" in done.stderr
+    assert "ran out of memory or of file handles" in done.stderr
     assert "damaged" not in done.stderr
     assert "all is well in the files" in done.stdout
     ended(store)
@@ -452,20 +454,3 @@ def test_a_catalog_lost_while_the_store_is_open(store: Path, way: str) -> None:
         opened.refresh()
         assert len(opened.recordings()) == 2
         assert (imu.count(), imu.where(WHERE).count(), sum(1 for _ in imu)) == want
-
-
-@pytest.mark.parametrize("way", ["removed", "cut", "garbled"])
-def test_damaged_tables_are_made_again(store: Path, way: str) -> None:
-    question = ("fetch", "-t", IMU, "--where", WHERE, "--count", "-q")
-    want = run(*question, store=store)
-    assert want.err == ""
-    for file in (store / "tables").rglob("*.parquet"):
-        {
-            "removed": file.unlink,
-            "cut": lambda file=file: os.truncate(file, file.stat().st_size // 2),
-            "garbled": lambda file=file: file.write_bytes(b"x" * file.stat().st_size),
-        }[way]()
-    done = run(*question, store=store)
-    assert done.out == want.out
-    assert done.err == "6 tables made again: missing or damaged.\n"
-    assert run(*question, store=store) == want

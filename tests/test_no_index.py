@@ -10,7 +10,7 @@ import pytest
 from mcap.reader import make_reader
 
 import hybridlog as hl
-from hybridlog.maintenance.index import StoreIndex
+from hybridlog.follow.follower import bring as bring_up_to_date
 from hybridlog.query.topics import matcher
 from hybridlog_storage.catalog import CATALOG
 from hybridlog_storage.errors import TopicError
@@ -84,8 +84,9 @@ def test_every_rebuild_keeps_it(store: hl.Store) -> None:
         assert again.verify().findings == []
         (entry,) = again.recordings()
         assert [c.topic for c in entry.channels if not c.is_indexed] == LEFT_OUT
-        index = StoreIndex(again.directory, again.catalog, again.connect())
-        assert index.bring(entry) is None
+        assert (
+            bring_up_to_date(again.directory, again.catalog, entry, again.connect()).chunks is None
+        )
 
 
 @pytest.mark.mongo("embedded")

@@ -165,10 +165,7 @@ def dump(store: hl.Store) -> dict[str, list[bytes]]:
     }
     for name in ("hybridlog.recordings", "hybridlog.store"):
         documents = [bson.decode(document) for document in found[name]]
-        found[name] = [
-            bson.encode({**d, "index": {**d["index"], "made": ""}} if d["_id"] != "store" else d)
-            for d in documents
-        ]
+        found[name] = [bson.encode({**d, "made": ""}) for d in documents]
     return found
 
 

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 import hybridlog as hl
 from benchmarks.simulator.write import write_bag
-from hybridlog.columns.recording_logs import WalkedSegment
 from hybridlog.index.of_store import contents
 from hybridlog_storage.errors import (
     ConnectionLostError,
@@ -19,6 +17,7 @@ from hybridlog_storage.errors import (
     WithoutMongoError,
 )
 from hybridlog_storage.mongo.index_state import IndexState
+from hybridlog_storage.segments.segment_reader import SegmentReader
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from hybridlog_storage.settings import (
     EMBEDDED,
@@ -167,18 +166,15 @@ def test_a_store_is_adopted_where_mongodb_is(
         for name in ("one", "two"):
             store.record(bag, name=name, again=True, settings=SMALL)
         chunks = {entry.name: entry.chunks for entry in store.recordings()}
-    read = WalkedSegment.chunks
     left = [chunks["one"] + chunks["two"] // 2]
 
-    def some(segment: WalkedSegment, *args: Any) -> Any:
-        for one in read(segment, *args):
-            if not left[0]:
-                raise StoreError("killed")
-            left[0] -= 1
-            yield one
+    def killed(*_: object) -> None:
+        left[0] -= 1
+        if left[0] < 0:
+            raise StoreError("killed")
 
     with hl.open(path, mongo=EMBEDDED) as store, monkeypatch.context() as patch:
-        patch.setattr(WalkedSegment, "chunks", some)
+        Calls(patch)(SegmentReader, "read_chunk", killed)
         with pytest.raises(StoreError, match="killed"):
             store.connect()
     with hl.open(path, mongo=EMBEDDED) as store:

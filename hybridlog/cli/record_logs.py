@@ -146,7 +146,6 @@ def _shown(bar: Bar, before: int, name: str, read: int, messages: int) -> None:
 
 def check_new_store(choices: RecordChoices, logs: Sequence[LogSet]) -> None:
     """Fail before a store is made, when no log can be read or the server does not answer."""
-    from hybridlog.maintenance.lease import check
     from hybridlog.store import store_path
     from hybridlog_storage.settings import NAME, is_uri, with_password
 
@@ -168,12 +167,13 @@ def check_new_store(choices: RecordChoices, logs: Sequence[LogSet]) -> None:
     if is_uri(choices.mongo):
         # The new store stores the URI, so it has to be right.
         from hybridlog_storage.mongo.database import Database
-        from hybridlog_storage.mongo.index_state import IndexState
+        from hybridlog_storage.mongo.index_state import IndexState, other_store
 
         with Database.connect(with_password(choices.mongo)) as database:
-            mark = IndexState(database).mark()
-            if not os.path.lexists(store_path(choices.store) / NAME):  # nobody has made it yet
-                check(mark, {"id": ""}, database)
+            owner = IndexState(database).owner()
+            is_new = not os.path.lexists(store_path(choices.store) / NAME)
+            if owner is not None and is_new:  # nobody has made it meanwhile
+                raise other_store(database)
 
 
 def _check_not_empty(

@@ -27,11 +27,6 @@ if TYPE_CHECKING:
 @dataclass(frozen=True, kw_only=True)
 class _Given(Named, InStore, AsJson, Quiet):
     repair: bool = option("Mend what can be mended without losing anything; list the rest.")
-    moved: bool = option(
-        "With --repair: the store was moved to here, take its index over.",
-        needs=("repair",),
-        excludes=("new_id",),
-    )
     new_id: bool = option(
         "With --repair: the store is a copy, give it an id of its own, with the index at --mongo.",
         needs=("repair",),
@@ -47,16 +42,13 @@ def verify_command(given: _Given) -> None:
     index up to date before that.
     """
     if given.new_id:
-        from hybridlog.maintenance.lease import become_another
+        from hybridlog.maintenance.repair import become_another
         from hybridlog.store import store_path
 
         become_another(store_path(given.store), given.mongo)
         output.note("The store has a new id now.")
     started = time.monotonic()
     with given.opened(verifies=True) as store:
-        if given.moved:
-            store.shared.index.take_over()
-            output.note("The index belongs to the store at this place now.")
         chosen, unreadable = _chosen(given, store)
         total = sum(entry.stored_bytes for entry in chosen)
         names = None if given.choice.is_everything else [*(one.id for one in chosen), *unreadable]

@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import threading
 from collections import defaultdict
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from hybridlog_storage.cache import Cache
-from hybridlog_storage.catalog import file_of
 from hybridlog_storage.errors import SegmentError, StoreError
 from hybridlog_storage.lazy import lazy
 from hybridlog_storage.manifests import manifests_at
-from hybridlog_storage.segments.gone_log import open_log
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
     import numpy as np
@@ -24,15 +21,8 @@ if TYPE_CHECKING:
     from hybridlog.columns.column_file import OpenFiles
     from hybridlog.columns.rows_file import RowsFile
     from hybridlog.columns.topic_table import TopicTable
-    from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.manifest import File
     from hybridlog_storage.messages import Batch
-    from hybridlog_storage.segments.chunk import StoredChunk
-    from hybridlog_storage.segments.segment_reader import (
-        ChunkPlace,
-        SegmentReader,
-        SegmentSummary,
-    )
 
 
 class RecordingRows:
@@ -115,61 +105,3 @@ class RecordingRows:
                     except StoreError as error:
                         self._problems[log].append(str(error))
             return found
-
-
-@dataclass(frozen=True, slots=True)
-class WalkedSegment:
-    """A segment in a walk over a recording.
-
-    Attributes:
-        number: Its number.
-        reader: Reads it.
-        summary: Its footer.
-        begin: Bytes of the segments before it.
-        report: Told the bytes of the walk behind each chunk that was read.
-    """
-
-    number: int
-    reader: SegmentReader
-    summary: SegmentSummary
-    begin: int
-    report: Callable[[int], None]
-
-    def chunks(
-        self, is_wanted: Callable[[ChunkPlace], bool] = lambda _: True
-    ) -> Iterator[tuple[ChunkPlace, StoredChunk | SegmentError]]:
-        """The wanted chunks in order; what is wrong with those that cannot be read."""
-        for place in self.summary.chunks:
-            if not is_wanted(place):
-                continue
-            found: StoredChunk | SegmentError
-            try:
-                found = self.reader.read_chunk(place)
-            except SegmentError as error:
-                found = error
-            yield place, found
-            self.report(self.begin + place.offset + place.length)
-
-
-def walk(
-    recording: Path,
-    entry: RecordingEntry,
-    report: Callable[[int], None] = lambda _: None,
-) -> Iterator[WalkedSegment]:
-    """Open sealed segments of a recording that have messages, one after the other.
-
-    Args:
-        recording: The recording's directory.
-        entry: Its entry.
-        report: As for `WalkedSegment`; told at the end of each segment, too.
-
-    Raises:
-        SegmentError: One cannot be opened.
-    """
-    rows = RecordingRows(recording)
-    begin = 0
-    for number in (number for number, _, _ in entry.spans if str(number) in entry.digests):
-        with open_log(recording / file_of(entry, number), number, rows) as reader:
-            yield WalkedSegment(number, reader, reader.summary(), begin, report)
-            begin += reader.size
-            report(begin)

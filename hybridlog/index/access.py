@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import platform
 import re
 import threading
 import time
@@ -11,7 +12,6 @@ from contextlib import suppress
 from functools import wraps
 from typing import TYPE_CHECKING, NamedTuple, ParamSpec, TypeVar
 
-from hybridlog.maintenance.report import RepairReport
 from hybridlog_storage.errors import (
     ConnectionBrokenError,
     ConnectionLostError,
@@ -26,10 +26,11 @@ from hybridlog_storage.errors import (
 from hybridlog_storage.settings import EMBEDDED, MIN_CACHE_MB, NAME, NONE, with_password
 
 if TYPE_CHECKING:
-    from hybridlog.index.index_writer import IndexTarget
+    from hybridlog.follow.follower import IndexTarget
     from hybridlog.maintenance.report import Progress
     from hybridlog.shared import Shared
     from hybridlog_storage.mongo.database import Database
+    from hybridlog_storage.mongo.index_state import Owner
     from hybridlog_storage.mongo.mongod import EmbeddedMongod
 
 _P = ParamSpec("_P")
@@ -112,14 +113,13 @@ class IndexAccess:
         self._uri: str | None = None
         self._mongod: EmbeddedMongod | None = None
         self._database: Database | None = None
+        self._owns = False  # no copy of the store does
         self._rests_until = 0.0
         self._connecting = threading.RLock()
         self._is_complete = False  # the index has all recordings
-        self._stale: set[str] = set()  # recordings that the index may lack
 
-    def note_changes(self, *recordings: str) -> None:
-        """Note that the index may lack something, of some recordings for certain."""
-        self._stale.update(recordings)
+    def note_changes(self) -> None:
+        """Note that the index may lack something."""
         self._is_complete = False
 
     @property
@@ -164,28 +164,15 @@ class IndexAccess:
         return database
 
     def index_to_record(self, purpose: str) -> IndexTarget:
-        """The index, for a new recording; it may lack other recordings, or be unavailable.
+        """The index, for a new recording; it may lack other recordings, or be unavailable."""
+        from hybridlog.follow.follower import IndexTarget
 
-        Raises:
-            DatabaseError: as for `database_for`, if it was reached.
-            StoreError: it holds the index of another store, or this store is a copy.
-        """
-        from hybridlog.index.index_writer import IndexTarget
-
-        if self.connected is not None and self.may_write:
-            if self.connected.ping():
-                return IndexTarget(self.connected, renew=self._another_again)
-            self.disconnect()
         # Those that a crash has cut are brought into the index by another opening.
-        brings = self._recovers
-        why = self.unavailable if self._reached(brings=brings) is None else None
-        if isinstance(why, ConnectionLostError):
-            return IndexTarget(failure=why, renew=self._another_again)
-        if why is not None and self.has_none:
-            return IndexTarget()
-        if isinstance(why, StoreError):
-            raise why
-        database = self.database_for(purpose, writes=True, brings=brings)
+        try:
+            database = self.database_for(purpose, writes=True, brings=self._recovers)
+        except DatabaseError as error:
+            why = self.unavailable if isinstance(self.unavailable, DatabaseError) else error
+            return IndexTarget(failure=None if self.has_none else why, renew=self._another_again)
         return IndexTarget(database, renew=self._another_again)
 
     def connect(self, *, brings: bool = True) -> Database:
@@ -196,7 +183,6 @@ class IndexAccess:
 
         Raises:
             DatabaseError: MongoDB does not answer, or the store does without.
-            StoreError: it holds the index of another store, or this store is a copy.
         """
         with self._connecting:
             if self.connected is not None and (self._is_complete or not brings):
@@ -229,23 +215,20 @@ class IndexAccess:
             self._mongod.stop()
         self._mongod = None
 
-    def take_over(self) -> None:
-        """Record in the index that the store is at this location.
-
-        Raises:
-            DatabaseError: MongoDB does not answer.
-            StoreError: the database holds the index of another store.
-        """
-        from hybridlog.maintenance import lease
+    def claim(self, database: Database) -> Owner:
+        """Note in the index that it is of the store at this place."""
         from hybridlog_storage.mongo.index_state import IndexState
 
-        self.disconnect()
-        with self.another() as database:
-            state = IndexState(database)
-            place = lease.place_of(self._directory)
-            lease.check(state.mark(), place, database, embedded=True)
-            state.claim(place)
-        self._is_available()
+        owner = IndexState(database).claim(self._directory.settings.store_id, self._own_place)
+        self.id, self._owns = owner.made, True
+        return owner
+
+    @property
+    def _own_place(self) -> str:
+        """The place of the store, as its index has it; the embedded MongoDB moves with it."""
+        if self._uri == EMBEDDED:
+            return EMBEDDED
+        return f"{platform.node()}:{os.path.realpath(self._directory.path)}"
 
     def address(self, wait_s: float) -> IndexAddress:
         """The address of the index for other programs; it stays the same.
@@ -325,15 +308,12 @@ class IndexAccess:
         """An additional connection to the index, after one has failed.
 
         Raises:
-            DatabaseError: It does not answer, or belongs to another store.
+            HybridlogError: It does not answer, or belongs to another store.
         """
-        try:
-            if not self.id:
-                with self._connecting:
-                    self._open()
-            return self.another()
-        except (StoreError, ResourceError, MissingDependencyError) as error:
-            raise DatabaseError(str(error)) from error
+        if not self.id:
+            with self._connecting:
+                self._open()
+        return self.another()
 
     def _reached(self, *, brings: bool) -> Database | None:
         """The index, connected when it is needed; `brings` it up to date first."""
@@ -349,27 +329,20 @@ class IndexAccess:
         shared = self._shared
         if self.connected is None:
             self._is_complete = False
-        repairs = RepairReport()
         changed: set[str] = set()
-        try:
-            database = self._open()
-            if brings and self.may_write:
-                store = index.StoreIndex(shared.directory, shared.catalog, database, self._progress)
-                session = self._shared.now()
-                changed = store.bring_up_to_date(
-                    session.snapshot(),
-                    session.entry_of,
-                    index=self.id,
-                    stale=self._stale,
-                    report=repairs,
-                )
-        finally:
-            shared.repairs.indexed.update(repairs.indexed)
-            shared.repairs.unreadable.update(repairs.unreadable)
-            shared.repairs.removed += repairs.removed
-        self._is_available()
+        database = self._open()
+        if brings and self.may_write:
+            store = index.StoreIndex(shared.directory, shared.catalog, database, self._progress)
+            session = self._shared.now()
+            changed = store.bring_up_to_date(
+                session.snapshot(),
+                session.entry_of,
+                index=self.id,
+                removes=self._owns,
+                report=shared.repairs,
+            )
+        self.unavailable, self._rests_until = None, 0.0
         if brings:
-            self._stale = set()
             self._is_complete = True
             if changed:
                 shared.catch_up(*changed)  # what came meanwhile is seen, and indexed next
@@ -377,30 +350,26 @@ class IndexAccess:
 
     def _open(self) -> Database:
         """Connect, and check that the database belongs to this store."""
-        from hybridlog.maintenance import lease
-        from hybridlog_storage.mongo.index_state import IndexState
+        from hybridlog_storage.mongo.index_state import IndexState, other_store
 
         database = self.connected
         if database is None:
             if self._database is not None:
                 self._database.close()
             database = self._database = self.another()
-            state = IndexState(database)
-            place = lease.place_of(self._directory)
+            state, store_id = IndexState(database), self._directory.settings.store_id
             self.may_write = database.may_write()
-            mark = state.mark()
-            if self._uri == EMBEDDED and mark is not None and mark.get("id") != place["id"]:
+            owner = state.owner()
+            if owner is not None and owner.store != store_id:
+                if self._uri != EMBEDDED:
+                    raise other_store(database)
                 database.drop_all()  # the store is a copy that has an id of its own now
-                mark = None
-            is_new = lease.check(mark, place, database, embedded=self._uri == EMBEDDED)
-            if (is_new or mark is None or "index" not in mark) and self.may_write:
-                mark = state.claim(place)
-            self.id = "" if mark is None else str(mark.get("index", ""))
+                owner = None
+            if owner is None and self.may_write:
+                owner = self.claim(database)
+            self.id = "" if owner is None else owner.made
+            self._owns = owner is not None and owner.place == self._own_place
         return database
-
-    def _is_available(self) -> None:
-        self.unavailable = None
-        self._rests_until = 0.0
 
 
 def _bounded_cache_mb(stored: int | None) -> int:

@@ -80,6 +80,7 @@ class Index:
         index = StoreIndex(shared.directory, shared.catalog, database, progress)
         if recordings is None:
             index.clear()
+            shared.index.claim(database)
         left = index.rebuild(chosen)
         if recordings is not None and left:
             raise next(iter(left.values()))
@@ -171,8 +172,15 @@ class Index:
         snapshot = session.snapshot()
         places = snapshot.having([*names]).tolist()
         entries = [session.entry_of(snapshot.summaries[place]) for place in places]
-        directory, tables = shared.directory, shared.tables
-        return index_arrays(directory, entries, [*names], tables, off=off, progress=progress)
+        return index_arrays(
+            shared.directory,
+            shared.catalog,
+            entries,
+            [*names],
+            shared.tables,
+            off=off,
+            progress=progress,
+        )
 
     @again_if_lost
     def address(self) -> IndexAddress:

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 import numpy as np
 
 from hybridlog.columns.table_writer import load
-from hybridlog.index.index_writer import INTERVAL_S
+from hybridlog.follow.follower import INTERVAL_S
 from hybridlog.live.memory import MIN_USER_BUDGET, default_budget
 from hybridlog.live.policy import SMALL_BYTES
 from hybridlog.record.capture import Capture
@@ -33,7 +33,7 @@ from hybridlog_storage.segments.segment_format import LOSSES_METADATA, json_meta
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 
 if TYPE_CHECKING:
-    from hybridlog.index.index_writer import IndexTarget
+    from hybridlog.follow.follower import IndexTarget
     from hybridlog.query.topics import TopicMatcher
     from hybridlog.snapshot import Snapshot
     from hybridlog_storage.catalog import Catalog

@@ -6,7 +6,7 @@ from collections import Counter
 from typing import TYPE_CHECKING
 
 from hybridlog.columns.layout import topics_of, type_prefix
-from hybridlog.maintenance import tables
+from hybridlog.follow.follower import make_tables
 from hybridlog.maintenance.report import ArraysOfTopic
 from hybridlog_storage.messages import EXPIRED_IDS
 from hybridlog_storage.settings import read_settings
@@ -17,12 +17,13 @@ if TYPE_CHECKING:
 
     from hybridlog.columns.tables import Tables
     from hybridlog.maintenance.report import Progress
-    from hybridlog_storage.catalog import RecordingEntry
+    from hybridlog_storage.catalog import Catalog, RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
 
 
 def index_arrays(
     directory: StoreDirectory,
+    catalog: Catalog,
     entries: Sequence[RecordingEntry],
     topics: Sequence[str],
     known: Tables,
@@ -34,6 +35,7 @@ def index_arrays(
 
     Args:
         directory: The store.
+        catalog: Its catalog.
         entries: Its recordings.
         topics: Full names.
         known: The tables.
@@ -54,7 +56,7 @@ def index_arrays(
         wanted = {topic for topic in own if _differs(known, entry, found[topic], off=off)}
         if not wanted:
             continue
-        tables.make(directory, entry, wanted, progress=progress)
+        make_tables(directory, catalog, entry, topics=wanted, progress=progress)
         known.look_again()
         for topic in wanted:
             is_left = _differs(known, entry, found[topic], off=off)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
 from typing import TYPE_CHECKING
 
-from hybridlog.entries import free_name_in, text, with_said
+from hybridlog.entries import free_name_in, text
 from hybridlog.maintenance import tables
 from hybridlog.query.times import TimeLike, format_time, parse_time
 from hybridlog.record.losses import extent_of
@@ -58,7 +58,7 @@ def change(
         StoreError: The manifest cannot be written.
         TopicError: The recording is gone.
     """
-    directory, catalog, index = shared.directory, shared.catalog, shared.index
+    directory = shared.directory
     directory.check_changes()
     with ExitStack() as held:
         if name is not None:
@@ -69,14 +69,10 @@ def change(
                 return replace(others(now), name=free)
 
         try:
-            made = directory.manifests.change(entry.id, how)
+            directory.manifests.change(entry.id, how)
         except RecordingGoneError as error:
             raise gone(entry.name) from error
     shared.catch_up(entry.id)
-    row = catalog.recording(entry.id)
-    if row is not None and index.connected is not None and index.may_write:
-        with suppress(ConnectionLostError):  # the next connection mirrors it
-            IndexState(index.connected).show(with_said(row[1], made))
     return shared.now().entry(entry.id)
 
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import secrets
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from typing import TYPE_CHECKING
+
+from msgspec import structs
 
 from hybridlog.columns.recording_logs import RecordingRows
 from hybridlog.entries import (
@@ -15,20 +18,31 @@ from hybridlog.entries import (
     take_inventory,
     unlisted,
 )
+from hybridlog.follow.follower import bring, make_tables
+from hybridlog.index import consent
 from hybridlog.maintenance import tables
-from hybridlog.maintenance.index import StoreIndex
 from hybridlog.maintenance.opening import recover, recover_segments
 from hybridlog.maintenance.report import Repaired
 from hybridlog.maintenance.verify import AGAIN, Finding
 from hybridlog_storage.catalog import file_of
 from hybridlog_storage.disk.directory import LOCK_WAIT_S
-from hybridlog_storage.errors import HeldError, ManifestError, SegmentError, StoreError, TopicError
+from hybridlog_storage.errors import (
+    HeldError,
+    ManifestError,
+    SegmentError,
+    StoreError,
+    TopicError,
+    UsageError,
+)
 from hybridlog_storage.manifest import replace
 from hybridlog_storage.mongo.index_state import IndexState
 from hybridlog_storage.segments.gone_log import open_log
 from hybridlog_storage.segments.recovery import rebuild_summary
+from hybridlog_storage.settings import EMBEDDED, is_uri, read_settings, write_settings
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from hybridlog.maintenance.report import Progress, RepairReport
     from hybridlog_storage.catalog import Catalog, RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
@@ -68,7 +82,7 @@ def repair(
                 entry = put_entry(directory, catalog, recording)
             if entry.status in {"damaged", "open"}:
                 continue  # tables of lost data are valid again after its restoration
-            for topic, why in checker.repair(entry).items():
+            for topic, why in _tables(directory, catalog, checker, entry).items():
                 place = f"table of {topic}"
                 if why:
                     left.append(
@@ -82,6 +96,21 @@ def repair(
         except (StoreError, TopicError) as error:
             left.append(Finding(name, "recording", str(error), AGAIN))
     return done, left
+
+
+def _tables(
+    directory: StoreDirectory, catalog: Catalog, checker: tables.TableChecker, entry: RecordingEntry
+) -> dict[str, str]:
+    """Make missing and damaged tables again; by topic, why that failed, or nothing."""
+    damaged = checker.damage(entry)
+    wanted = tables.missing(directory, entry, checker.tables).union(damaged)
+    if not wanted:
+        return {}
+    problem = make_tables(directory, catalog, entry, topics=damaged)
+    checker.tables.look_again()
+    lacking, damaged = tables.missing(directory, entry, checker.tables), checker.damage(entry)
+    found = {topic: problem or damaged.get(topic, "") for topic in sorted(wanted)}
+    return {one: why for one, why in found.items() if why or one not in lacking}
 
 
 def _repair_one(directory: StoreDirectory, report: RepairReport, recording: str) -> list[Repaired]:
@@ -138,7 +167,6 @@ def repair_index(
     Raises:
         DatabaseError: MongoDB fails.
     """
-    index = StoreIndex(directory, catalog, database, progress)
     known = IndexState(database).of([entry.key for entry in entries])
     done = []
     for entry in entries:
@@ -149,8 +177,10 @@ def repair_index(
         is_whole = indexed is not None and indexed.is_whole(entry) and entry.is_decoded
         if is_whole and not is_restored:
             continue
-        with suppress(HeldError, TopicError), directory.writing(entry.id):
-            chunks = index.bring(entry, anew=is_restored)
+        with suppress(HeldError, TopicError):
+            chunks = bring(
+                directory, catalog, entry, database, anew=is_restored, progress=progress
+            ).chunks
             how = "damaged chunks are readable again" if is_restored else f"{chunks} chunks indexed"
             done.append(Repaired(entry.name, "index", how))
     return done
@@ -165,3 +195,28 @@ def _is_restored(directory: StoreDirectory, catalog: Catalog, entry: RecordingEn
             reader.read_chunk(reader.summary().chunks[chunk])
             return True
     return False
+
+
+def become_another(path: Path, mongo: str | None) -> None:
+    """Give a copied store a new id.
+
+    Args:
+        path: The store.
+        mongo: URI of the MongoDB for its index, `embedded`, or `none`; None to keep the embedded
+            one, or none.
+
+    Raises:
+        UsageError: It names a MongoDB, and no other one is given.
+        StoreError: It cannot be written.
+    """
+    settings = read_settings(path)
+    if is_uri(settings.mongo) and mongo is None:
+        raise UsageError(
+            "The copy names the same MongoDB as the store that it was copied from. Give it one "
+            "of its own: --mongo mongodb://host/NAME, or --mongo embedded."
+        )
+    own = None if mongo == EMBEDDED else mongo or settings.mongo
+    changed = structs.replace(settings, store_id=secrets.token_hex(16), mongo=own)
+    write_settings(path, changed)
+    if is_uri(own):
+        consent.trust(changed.store_id, own)

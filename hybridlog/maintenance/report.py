@@ -15,9 +15,11 @@ Progress = Callable[[str, int, int], None]
 """Called with the recording's name, bytes done and bytes in all."""
 
 
-def reporter(progress: Progress | None, name: str, total: int) -> Callable[[int], None]:
-    """Reports the bytes done of a recording."""
-    return lambda done: None if progress is None else progress(name, done, total)
+def reporter(
+    progress: Progress | None, name: str, total: int, before: int = 0
+) -> Callable[[int], None]:
+    """Reports the bytes done of a recording, behind those `before`."""
+    return lambda done: None if progress is None else progress(name, before + done, total)
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-import math
 import os
-import time
 from collections.abc import Collection
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from hybridlog.columns.layout import PARTS, parts_folder, topics_of, type_prefix
-from hybridlog.columns.recording_logs import walk
-from hybridlog.maintenance.report import reporter
 from hybridlog_storage.disk import files
-from hybridlog_storage.errors import SegmentError, StoreError, TopicError
+from hybridlog_storage.errors import StoreError, TopicError
 
 if TYPE_CHECKING:
     from hybridlog.columns.column_file import ColumnFile
     from hybridlog.columns.tables import Tables
-    from hybridlog.maintenance.report import Progress, RepairReport
     from hybridlog.snapshot import Snapshot
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
@@ -48,89 +43,9 @@ def missing(
     }
 
 
-def make(
-    directory: StoreDirectory,
-    entry: RecordingEntry,
-    topics: Collection[str] | None = None,
-    *,
-    until: float = math.inf,
-    progress: Progress | None = None,
-) -> str:
-    """Create tables of a recording again from its segments.
-
-    Args:
-        directory: The store.
-        entry: The recording's entry in the catalog.
-        topics: Topics of the tables; None for those that are missing.
-        until: When this is given up, by `time.monotonic`.
-        progress: Called after each chunk.
-
-    Returns:
-        Why no tables were created; empty if nothing is missing.
-
-    Raises:
-        TimeoutError: It was given up.
-    """
-    if entry.status == "open" or not directory.is_writable:
-        return "the recording is being written, or the store is read-only"
-    wanted = missing(directory, entry) if topics is None else {*topics}
-    if not wanted:
-        return ""
-    try:
-        with directory.writing(entry.id):
-            from hybridlog.columns.table_writer import TableWriter
-
-            writer = TableWriter(directory.path, entry.id, entry.name, topics=wanted, is_new=False)
-            try:
-                channels = channels_of(entry, wanted)
-                path = directory.recording(entry.id)
-                report = reporter(progress, entry.name, entry.stored_bytes)
-                for segment in walk(path, entry, report):
-                    for _, chunk in segment.chunks(lambda p: not channels.isdisjoint(p.channels)):
-                        if time.monotonic() > until:
-                            raise TimeoutError
-                        if not isinstance(chunk, SegmentError):
-                            writer.add(chunk, segment.summary.channels)
-                    writer.cut(segment.number, entry.digests[str(segment.number)])
-                writer.close(entry)
-            finally:
-                writer.discard()
-    except (StoreError, TopicError) as error:
-        return str(error)
-    return writer.problem
-
-
 def can_be_made(entry: RecordingEntry, topic: str, tables: Tables) -> bool:
     """True if the missing table of a topic can be created again."""
     return tables.can_have(entry, topic) or bool(tables.lacking(entry, [topic]))
-
-
-def make_noted(
-    directory: StoreDirectory,
-    entry: RecordingEntry,
-    topics: Collection[str],
-    tables: Tables,
-    report: RepairReport,
-    *,
-    until: float,
-) -> bool:
-    """Create tables of a recording that a question met missing or damaged.
-
-    All that are missing are created with them, so that no chunk is read for each of them.
-
-    Returns:
-        False if time was short.
-    """
-    wanted = {*topics, *missing(directory, entry, tables)}
-    try:
-        problem = make(directory, entry, wanted, until=until)
-    except TimeoutError:
-        return False
-    if not problem:
-        tables.look_again()
-        made = (one for one in sorted(wanted) if tables.of(entry, one) is not None)
-        report.tables += [(entry.name, one) for one in made]
-    return True
 
 
 def channels_of(entry: RecordingEntry, topics: Collection[str]) -> set[int]:
@@ -145,26 +60,15 @@ class TableChecker:
         from hybridlog.columns.tables import Tables
 
         self._directory = directory
-        self._tables = Tables(directory.path)
+        self.tables = Tables(directory.path)
         self._checked: dict[int, str] = {}
-
-    def repair(self, entry: RecordingEntry) -> dict[str, str]:
-        """Make missing and damaged tables again; by topic, why that failed, or nothing."""
-        wanted = missing(self._directory, entry, self._tables).union(self.damage(entry))
-        if not wanted:
-            return {}
-        problem = make(self._directory, entry, wanted)
-        self._tables.look_again()
-        lacking, damaged = missing(self._directory, entry, self._tables), self.damage(entry)
-        found = {topic: problem or damaged.get(topic, "") for topic in sorted(wanted)}
-        return {one: why for one, why in found.items() if why or one not in lacking}
 
     def damage(self, entry: RecordingEntry) -> dict[str, str]:
         """Problems of the existing tables, by topic. Reads every byte of them."""
         found: dict[str, str] = {}
         for topic in sorted(topics_of(entry)):
             try:
-                problems = map(self._problem, self._tables.check(entry, topic).files)
+                problems = map(self._problem, self.tables.check(entry, topic).files)
                 problem = next(filter(None, problems), "")
             except FileNotFoundError:
                 continue  # a missing table is no problem

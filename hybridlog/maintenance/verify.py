@@ -312,8 +312,6 @@ class _Check:
         indexed = IndexState(self._indexed.database).one(entry.key)
         if indexed is None or not indexed.is_whole(entry):
             self.found("index", "it is not complete", self._rebuild)
-        elif not indexed.mirrors(entry):
-            self.found("index", "its entry of the recording differs", self._rebuild)
         have = self._indexed.documents_of(entry)
         expected: Counter[str] = Counter()
         for channel in entry.channels:

@@ -150,9 +150,9 @@ class IndexReader:
             )
             keys = {part.recording.key for part in parts}
             try:
-                indexed = IndexState(database).of(keys, ())
+                indexed = IndexState(database).of(keys)
                 found = ask(_Asked(database, parts, indexed))
-                if _made(IndexState(database).of(keys, ())) == _made(indexed):
+                if _made(IndexState(database).of(keys)) == _made(indexed):
                     return found
             except ConnectionLostError as error:
                 failure = error

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any, Final
 
 from msgspec import convert
 
-from hybridlog.columns.table_writer import TableWriter
 from hybridlog.entries import (
     ended,
     free_name_in,
@@ -25,10 +24,11 @@ from hybridlog.entries import (
     recording_metadata,
     text,
 )
-from hybridlog.index.index_writer import INTERVAL_S, IndexTarget, IndexWriter
+from hybridlog.follow.follower import Follower, FollowerThread, IndexTarget
 from hybridlog.maintenance.expiry import make_rows
 from hybridlog.maintenance.retention import Rules
 from hybridlog.query.latching import depth_of
+from hybridlog.schema.codecs import codec_for
 from hybridlog.wording import parse_size
 from hybridlog_storage.catalog import RecordingEntry
 from hybridlog_storage.disk.directory import LOCK_WAIT_S
@@ -50,9 +50,9 @@ if TYPE_CHECKING:
     from hybridlog_storage.catalog import Catalog
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.messages import Channel
-    from hybridlog_storage.mongo.database import Database
     from hybridlog_storage.segments.segment_file import Sealed
 
+_FOLLOW_S: Final = 0.5  # between two looks of the follower of a log
 _REMOTE_SEGMENT: Final = "128MiB"
 _REMOTE_SEGMENTS: Final = 64 << 20, 256 << 20
 """Least and greatest size in bytes: what a cut costs again, and what requests cost."""
@@ -72,11 +72,11 @@ class Capture:
         settings: Rotation, chunks and compression of segments.
         on_written: Called on another thread when less content waits for the disk; for a caller
             that cannot wait for it.
-        index_interval_s: Longest time between two passes of the index, seconds.
+        index_interval_s: Time between two looks of the follower, seconds.
         no_index: Returns whether the messages of a topic get no documents in MongoDB; None for
             no topic.
-        is_ring: Whether files of it go while it is recorded. Then nothing is derived of it, and
-            latched messages have files of their own.
+        is_ring: Whether files of it go while it is recorded. Then what is left is followed at its
+            end, and latched messages have files of their own.
         check: Called with all recordings before anything is written, while no other process can
             start a recording; raises to refuse.
         make_room: Called when the disk is full; returns whether to try again.
@@ -84,7 +84,7 @@ class Capture:
     Attributes:
         entry: The recording's catalog entry.
         writer: Writer of its segments.
-        index: Writer of its index.
+        index: Makes what is derived of it.
     """
 
     def __init__(
@@ -99,7 +99,7 @@ class Capture:
         source: Mapping[str, Any],
         settings: SegmentSettings,
         on_written: Callable[[], None] | None = None,
-        index_interval_s: float = INTERVAL_S,
+        index_interval_s: float = _FOLLOW_S,
         no_index: Callable[[str], bool] | None = None,
         is_ring: bool = False,
         check: Callable[[Snapshot], None] | None = None,
@@ -134,7 +134,7 @@ class Capture:
                         source=convert(dict(source), Source),
                         tags={text(key): text(value) for key, value in tags.items()},
                     )
-                    self.entry = self._begin(create, manifest, target.database)
+                    self.entry = self._begin(create, manifest)
             except BaseException:
                 with suppress(HybridlogError):
                     directory.manifests.remove(recording)
@@ -142,19 +142,11 @@ class Capture:
             self._held = self._held.pop_all()
         self._target = target
         folder = directory.recording(recording)
-        self._tables = TableWriter(directory.path, self.entry.id, self.entry.name)
-        self.index = IndexWriter(
-            folder,
-            self.entry,
-            target,
-            catalog,
-            tables=self._tables,
-            interval_s=index_interval_s,
-        )
+        self.index = Follower(directory, catalog, self.entry, target)
+        self._follower = FollowerThread(self.index, None if is_ring else index_interval_s)
         self.writer = RecordingWriter(
             folder,
             recording_metadata(self.entry),
-            (lambda *_: None) if is_ring else self.index.submit,
             settings,
             no_index=self._no_index,
             is_named=lambda topic: rules.topic_rule(topic) is not None,
@@ -183,7 +175,7 @@ class Capture:
 
     def expect(self, channel: Channel) -> None:
         """Prepare a channel before its first message."""
-        self.index.prepare(channel)
+        codec_for(channel).paths()
 
     def close(self, end: Mapping[str, Any]) -> DatabaseError | None:
         """Complete the recording; `entry` is then complete, too.
@@ -228,8 +220,6 @@ class Capture:
             self._change(lambda now: ended(end)(change(now)))
         else:
             self._change(change)
-        for sealed in () if self._is_ring else group:
-            self.index.seal(sealed)
 
     def _change(self, how: Callable[[Manifest], Manifest]) -> None:
         while True:
@@ -241,29 +231,19 @@ class Capture:
                     raise
 
     def _finish(self) -> DatabaseError | None:
-        self.index.close()
-        failure = self.index.failure
         recording = self.entry.id
         if not self._rules.is_empty and not self._is_ring:
             with suppress(StoreError):  # or else they are written when their logs go
                 make_rows(self._directory, recording)
-        if self.index.damage:
-            self.catalog.put_damage(recording, self.index.damage)
         self.entry = put_entry(self._directory, self.catalog, recording)
-        if failure is None and self._target.database is not None:
-            try:
-                IndexState(self._target.database).end(self.entry)
-            except DatabaseError as error:
-                failure = error
-        self._tables.close(self.entry)
+        self.entry = self._follower.finish(self.entry)
         self._held.close()
-        return failure
+        return self.index.failure
 
     def abort(self) -> None:
         """Stop at once; flushed messages stay, and the next opening of the store seals them."""
         self.writer.abort()
-        self.index.abandon()
-        self._tables.discard()
+        self._follower.abandon()
         self._held.close()
 
     def rollback(self) -> None:
@@ -272,8 +252,7 @@ class Capture:
         with suppress(HybridlogError):  # or else the files go first
             manifests.change(entry.id, lambda now: replaced(now, status="removed"))
         self.writer.abort()
-        self.index.abandon()
-        self._tables.discard()
+        self._follower.abandon()
         with suppress(HybridlogError):
             manifests.remove(entry.id)
         with suppress(HybridlogError):
@@ -287,19 +266,14 @@ class Capture:
                 state.remove([entry.key])
         self._held.close()
 
-    def _begin(
-        self, create: Callable[[Manifest], None], manifest: Manifest, database: Database | None
-    ) -> RecordingEntry:
-        """Create and lock the recording's folder, then its manifest and its index entry."""
+    def _begin(self, create: Callable[[Manifest], None], manifest: Manifest) -> RecordingEntry:
+        """Create and lock the recording's folder, then its manifest."""
         recording = manifest.id
         self._directory.make_folder(recording)
         lock = self._directory.writing(recording, wait_s=LOCK_WAIT_S, records=True)
         self._held.enter_context(lock)
         create(manifest)
-        entry = put_entry(self._directory, self.catalog, recording, is_open=True)
-        if database is not None:
-            IndexState(database).begin(entry)
-        return entry
+        return put_entry(self._directory, self.catalog, recording, is_open=True)
 
 
 def remote_segment_size(table: Mapping[str, Any] | None) -> float:

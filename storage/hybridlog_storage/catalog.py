@@ -250,20 +250,6 @@ class RecordingEntry:
         return {**found, "spans": spans, "rows": rows}
 
 
-@dataclass(frozen=True, slots=True)
-class ChunkEntry:
-    """One chunk: numbers of its segment and of itself in it, and statistics by channel id."""
-
-    segment: int
-    number: int
-    stats: Mapping[int, ChannelStats]
-
-    @property
-    def messages(self) -> int:
-        """Number of its messages."""
-        return sum(stats.messages for stats in self.stats.values())
-
-
 def channel_totals(
     table: ChunkTable, decoded: Mapping[int, ChannelStats] | None, silent: Container[int] = ()
 ) -> dict[int, ChannelStats]:

@@ -346,7 +346,7 @@ def test_a_question_by_content_imports_what_it_needs(store: Path, tmp_path: Path
     # A table answers.
     unneeded = {"pandas", "pydantic", "rich", "pymongo", "rosbags"}
     assert {name.split(".")[0] for name in loaded} & unneeded == set()
-    assert not loaded & {"numpy.ma", "hybridlog.record.recorder", "hybridlog.index.index_writer"}
+    assert not loaded & {"numpy.ma", "hybridlog.record.recorder", "hybridlog.follow.follower"}
 
 
 @pytest.mark.parametrize(

@@ -369,7 +369,7 @@ def test_a_server_that_is_not_there_makes_no_store(logs: Path, tmp_path: Path) -
 def test_a_database_of_another_store(server: Server, logs: Path, tmp_path: Path) -> None:
     uri, _ = server
     run("record", logs / "odd.mcap", "--mongo", uri, "-q", store=tmp_path / "one")
-    done = run("record", logs / "odd.mcap", "--mongo", uri, store=tmp_path / "two", code=5)
+    done = run("record", logs / "odd.mcap", "--mongo", uri, store=tmp_path / "two", code=6)
     assert "another store" in done.err
     assert not (tmp_path / "two").exists()
 

@@ -47,18 +47,6 @@ def test_a_recording_that_is_removed_is_no_unreadable_one(
     assert look(case).recordings.keys() == {"b"}
 
 
-def test_a_mirror_that_is_late_says_nothing_of_the_index(case: Case) -> None:
-    with case.open() as store:
-        state = IndexState(store.connect())
-        (entry,) = store.select(["a"])
-        state.begin(entry)
-        before = state.one(entry.key)
-        state.show(entry)
-        assert state.one(entry.key) == before
-        assert before is not None
-        assert before.segments == {}
-
-
 def test_what_the_index_lacks_while_documents_go(case: Case) -> None:
     with case.open() as store:
         database = store.connect()

@@ -11,7 +11,6 @@ import threading
 import time
 from collections import Counter
 from contextlib import closing
-from dataclasses import astuple
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,6 @@ from mcap.reader import make_reader
 
 import hybridlog as hl
 from benchmarks.simulator.write import write_bag
-from hybridlog.columns.table_writer import TableWriter
 from hybridlog.live import LiveRecording
 from hybridlog.live import recording as live
 from hybridlog_storage.disk import append_file
@@ -419,49 +417,6 @@ def test_documents_of_many_chunks_are_sent_together(
     names = [collection for _, collection, *_ in inserted if collection.startswith("topic")]
     assert sorted(names) == [collection_of(own.topic) for own in topics]
     assert [m.raw[4] for m in store.topic("/topic1")] == list(range(5))
-    assert store.verify().findings == []
-
-
-@pytest.mark.parametrize("bound", ["_INTERVAL_BYTES", "a segment"])
-def test_the_index_does_not_wait_for_the_interval(
-    store: hl.Store, limit: Limit, bound: str
-) -> None:
-    """When many bytes were flushed, or a segment was sealed."""
-    limit(index_interval=lambda _: 1e6)
-    settings = SegmentSettings(segment_size=20_000)
-    if bound == "_INTERVAL_BYTES":
-        limit(index_interval_bytes=20_000)
-        settings = SegmentSettings()
-    own = channel("/talk")
-    with store.start("talk", flush_interval_s=0.05, settings=settings) as recording:
-        totals = recording._capture.writer.totals
-        for number in range(15):
-            recording.write(own, text(os.urandom(2000)), log_time=number)
-            wait_for(lambda n=number: totals.chunks == n + 1)
-        wait_for(lambda: recording.lag < 8)
-    assert recording.close().indexed == 15
-    assert store.verify().findings == []
-
-
-def test_memory_has_no_chunks_that_wait(store: hl.Store, calls: Calls) -> None:
-    """However far the index is behind; of sealed segments not even their places."""
-    go_on = threading.Event()
-    calls(TableWriter, "add", lambda *_: go_on.wait(60) or pytest.fail("waited in vain"))
-    own = channel("/talk")
-    payloads = [text(os.urandom(20_000)) for _ in range(60)]
-    settings = SegmentSettings(chunk_size=20_000, segment_size=200_000)
-    with store.start("talk", flush_interval_s=0.05, settings=settings) as recording:
-        for number, payload in enumerate(payloads):
-            recording.write(own, payload, log_time=number)
-        wait_for(lambda: recording._capture.writer.totals.chunks == 60)
-        index = recording._capture.index
-        held = [astuple(place) for places in index._places.values() for place in places]
-        assert len(held) == 60
-        assert all(isinstance(value, int | tuple) for one in held for value in one)
-        go_on.set()
-        wait_for(lambda: recording.lag == 0)
-        assert len(index._places) <= 1
-    assert [m.raw for m in store.topic("/talk")] == payloads
     assert store.verify().findings == []
 
 

@@ -81,7 +81,7 @@ def test_documents_that_mongodb_loses_after_their_messages_expired_are_made_agai
         database = store.connect()
         # Or what is sent now would say anew what is there.
         wait_for(lambda: not recorder.look().lag)
-        nothing = {"$set": {"index.segments": {}}}
+        nothing = {"$set": {"segments": {}}}
         database.update(RECORDINGS, {"_id": folder.name[-16:]}, nothing)
         database._client.admin.command("fsync")
         kill_mongod(path)

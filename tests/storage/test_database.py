@@ -82,7 +82,7 @@ def lengths_of(documents: list[bytes]) -> np.ndarray:
 
 
 def put(database: Database, name: str, documents: list[bytes]) -> int:
-    return database.insert_raw(name, b"".join(documents), lengths_of(documents))
+    return database.insert_raw(name, documents)
 
 
 def raw_of(

@@ -37,9 +37,7 @@ class Written:
     def __init__(self, folder: Path) -> None:
         folder.mkdir()
         settings = SegmentSettings(chunk_size=1 << 20, compression="none", sync="never")
-        writer = RecordingWriter(
-            folder, RECORDING, lambda *_: None, settings, is_latched=lambda _: True
-        )
+        writer = RecordingWriter(folder, RECORDING, settings, is_latched=lambda _: True)
         for chunk in range(6):
             rows: list[Row] = [
                 (n % 2 + chunk // 4, b"%d" % n * (n % 7), 1000 * chunk + 90 - 10 * n, n, n)

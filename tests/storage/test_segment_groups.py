@@ -29,7 +29,8 @@ from hybridlog_storage.segments.segment_format import (
     json_metadata,
 )
 from hybridlog_storage.segments.segment_reader import SegmentReader
-from hybridlog_storage.segments.segment_writer import RecordingWriter, SegmentSettings
+from hybridlog_storage.segments.segment_writer import SegmentSettings
+from tests.storage.noting import NotingWriter
 from tests.storage.test_segments import RECORDING, Row, batch_of, problems
 
 TOPICS = [Channel(f"/{n}", "json", None) for n in range(40)]
@@ -49,10 +50,10 @@ class Recorded:
         self.groups: list[list[Sealed]] = []
         self.rows: list[Row] = []
         options.setdefault("on_sealing", lambda group: self.groups.append([*group]))
-        self.writer = RecordingWriter(
+        self.writer = NotingWriter(
             folder,
             RECORDING,
-            lambda chunk, _: self.chunks.append(chunk),
+            self.chunks,
             setup,
             is_named=lambda topic: topic == NAMED.topic,
             is_latched=lambda channel: channel is LATCHED,

@@ -49,6 +49,7 @@ from hybridlog_storage.segments.segment_reader import ChunkPlace, SegmentReader,
 from hybridlog_storage.segments.segment_writer import AT_WORK, RecordingWriter, SegmentSettings
 from tests.calls import Calls
 from tests.limits import Limit
+from tests.storage.noting import NotingWriter
 from tests.storage.steps import Steps, through
 
 RECORDING = {
@@ -116,7 +117,7 @@ def recorder(
     """A writer that puts its chunks into a list, and all of them into first segments."""
     noted = [] if chunks is None else chunks
     options.setdefault("is_latched", lambda _: True)
-    return RecordingWriter(directory, RECORDING, lambda c, _: noted.append(c), setup, **options)
+    return NotingWriter(directory, RECORDING, noted, setup, **options)
 
 
 def problems(path: Path, digest: str = "") -> list[tuple[int, str]]:

@@ -13,6 +13,7 @@ from hybridlog.columns.column_file import ColumnFile
 from hybridlog.columns.folders import TableFolders
 from hybridlog.columns.layout import PARTS, TABLES
 from hybridlog.columns.tables import Tables
+from hybridlog.follow.follower import make_tables
 from hybridlog.maintenance import tables as making
 from hybridlog.maintenance.verify import RESTORE
 from hybridlog.record.marks import MARKS
@@ -92,7 +93,7 @@ def test_only_what_is_missing_is_made(few: hl.Store, tmp_path: Path, limit: Limi
     kept = other.stat().st_mtime_ns
     one.unlink()
     assert len(making.missing(few.directory, entry)) == 1
-    assert not making.make(few.directory, entry)
+    assert not make_tables(few.directory, few.catalog, entry)
     assert other.stat().st_mtime_ns == kept
     assert compare(few) == 2490
 
@@ -105,7 +106,7 @@ def test_a_damaged_chunk_costs_no_table(few: hl.Store) -> None:
     data = bytearray(path.read_bytes())
     data[2000] ^= 1
     path.write_bytes(data)
-    making.make(few.directory, entry, ["/a"])
+    make_tables(few.directory, few.catalog, entry, topics=["/a"])
     assert contents(few) == before
     (finding,) = few.verify().findings
     assert finding.cure == RESTORE
@@ -143,7 +144,7 @@ def test_repair_makes_missing_tables(few: hl.Store, limit: Limit) -> None:
 
 
 def test_rows_of_another_segment_are_not_kept(few: hl.Store) -> None:
-    """Stale rows are no damage; a topic that is made again makes no other one valid again."""
+    """Stale rows are no damage, and are made again."""
     (entry,) = few.recordings()
     stale = dict.fromkeys(entry.digests, "0" * 64)
     path = next((few.directory.path / TABLES).glob("*/*.parquet"))
@@ -157,15 +158,15 @@ def test_rows_of_another_segment_are_not_kept(few: hl.Store) -> None:
     folders._write(path, pieces)
     assert not making.TableChecker(few.directory).damage(entry)
     assert making.missing(few.directory, entry) == {"/a", "/b"}
-    assert not making.make(few.directory, entry, ["/a"])
-    assert making.missing(few.directory, entry) == {"/b"}
+    assert not make_tables(few.directory, few.catalog, entry, topics=["/a"])
+    assert making.missing(few.directory, entry) == set()
 
 
 def test_a_store_that_cannot_be_written_makes_none(few: hl.Store, limit: Limit) -> None:
     (entry,) = few.recordings()
     limit(directory_is_writable=False)
     shutil.rmtree(few.directory.path / TABLES)
-    assert making.make(few.directory, entry)
+    assert make_tables(few.directory, few.catalog, entry)
     assert not folders(few)
 
 
@@ -173,5 +174,5 @@ def test_a_recording_that_is_held_is_left_alone(few: hl.Store) -> None:
     (entry,) = few.recordings()
     shutil.rmtree(few.directory.path / TABLES)
     with few.directory.writing(few.entry("few").id):
-        assert making.make(few.directory, entry)
+        assert make_tables(few.directory, few.catalog, entry)
     assert not folders(few)

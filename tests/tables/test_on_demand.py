@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import hybridlog as hl
-from hybridlog.maintenance import tables as making
+from hybridlog.follow import follower
 from hybridlog.query.rows import Rows
 from hybridlog_storage.messages import Channel, Schema
 
@@ -47,13 +47,13 @@ def test_a_topic_without_a_table_is_tried_once(
     store: hl.Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made: list[set[str]] = []
-    monkeypatch.setattr(making, "make", lambda *known, until: made.append(known[2]) or True)
+    monkeypatch.setattr(follower, "make_tables", lambda *_, topics, until: made.append(topics))
     shutil.rmtree(store.directory.path / "tables")
     store.refresh()
     for _ in range(2):
         assert store.topic("/imu").where("x > 1").count() > 0
         store.mend()
-    assert made == [{"/imu", "/mixed"}]  # which share their chunks
+    assert made == [{"/imu"}]
 
 
 def test_frames_come_from_tables(store: hl.Store, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -21,7 +21,7 @@ from hybridlog.columns.layout import Section, TopicCounts
 from hybridlog.columns.parquet_file import ParquetFileWriter
 from hybridlog.columns.tables import Tables
 from hybridlog.columns.topic_table import TopicTable
-from hybridlog.maintenance import tables as making
+from hybridlog.follow.follower import make_tables
 from hybridlog_storage.cache import Cache
 from hybridlog_storage.errors import StoreError
 from tests.some import in_turn
@@ -173,7 +173,7 @@ def test_damaged_tables_are_none_and_are_made_again(
         assert {f"table of {topic}"} <= {one.place for one in done.repaired}
     else:
         assert not places
-        assert not making.make(recorded.directory, entry)
+        assert not make_tables(recorded.directory, recorded.catalog, entry)
     assert recorded.topic(topic).where("i8 > 0").count() == want
     assert recorded.verify().findings == []
     assert path.read_bytes() == whole

@@ -16,10 +16,8 @@ import contextlib
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from functools import partial
 from typing import TYPE_CHECKING, Any, Self, TypeVar
-
-import numpy as np
 
 from hybridlog_storage.errors import (
     ConnectionBrokenError,
@@ -33,11 +31,9 @@ from hybridlog_storage.settings import LOGIN_CURE
 
 if TYPE_CHECKING:
     from bson.raw_bson import RawBSONDocument
-    from numpy.typing import NDArray
     from pymongo import MongoClient
     from pymongo.database import Database as PymongoDatabase
 
-    from hybridlog_storage.messages import Buffer
 
 Document = dict[str, Any]
 """A decoded document with values of the `bson` package."""
@@ -45,8 +41,6 @@ Sort = Sequence[tuple[str, int]]
 """Field paths with 1 (ascending) or -1 (descending)."""
 _T = TypeVar("_T")
 
-BATCH_BYTES = 16 << 20
-"""Most bytes of documents in one insert command; a single document may have as many."""
 BATCH_DOCUMENTS = 5000
 """Most documents in one insert command; more make the server slower, not faster."""
 OLDEST_SERVER = (5, 3)
@@ -58,8 +52,6 @@ _GONE_S = 1.0  # seconds without an answer after which the server counts as ende
 _TRIES = 3  # for a command whose connection breaks
 _ELECTION_S = 20.0  # seconds for a replica set to elect a primary; it takes about 12
 _REPLICATION_S = 60.0  # seconds for a majority of its members to take over a write
-_NO_LONGER_PRIMARY = frozenset({91, 189, 10107, 11600, 11602, 13435, 13436})
-"""Server error codes of a member that stops being the primary."""
 _DUPLICATE_KEY = 11000
 _NAMESPACE_EXISTS = 48
 _DISK_FULL = frozenset({14031})
@@ -199,17 +191,6 @@ class Database:
         with timeout(_GONE_S):
             self._client.close()
 
-    def ping(self) -> bool:
-        """True if the server answers within a second, whatever the other timeouts are."""
-        from pymongo import timeout
-
-        try:
-            with _mapped(self._address), timeout(_GONE_S):
-                self._client.admin.command("ping")
-        except DatabaseError:
-            return False
-        return True
-
     def _again(self, command: Callable[[], _T], *, question: bool = False) -> _T:
         """Run a command, again if its connection breaks."""
         from pymongo.errors import AutoReconnect, CursorNotFound, ServerSelectionTimeoutError
@@ -266,8 +247,8 @@ class Database:
 
         self._again(create)
 
-    def insert_raw(self, collection: str, documents: Buffer, lengths: NDArray[np.int64]) -> int:
-        """Insert documents as they are.
+    def insert_raw(self, collection: str, documents: Sequence[bytes]) -> int:
+        """Insert BSON documents as they are.
 
         An existing `_id` is skipped: documents are a pure function of the segment, so the
         document is the same. After an error any part may have been inserted, and inserting
@@ -275,8 +256,7 @@ class Database:
 
         Args:
             collection: The target, created by `ensure_collection`.
-            documents: BSON documents, one after the other.
-            lengths: int64[count], bytes of each.
+            documents: The documents.
 
         Returns:
             Number of new documents; fewer after a repeated command.
@@ -287,44 +267,26 @@ class Database:
         """
         from bson.raw_bson import RawBSONDocument
 
-        whole = bytes(documents)
-        ends = np.concatenate([[0], np.cumsum(lengths)])
-        if ends[-1] != len(whole):
-            raise ValueError(f"the documents end at byte {ends[-1]} of {len(whole)}")
         inserted = 0
-        for first, last in _batches(ends):
-            places = ends[first : last + 1].tolist()
-            parts = [RawBSONDocument(whole[begin:end]) for begin, end in pairwise(places)]
-            inserted += self._insert_batch(collection, parts)
+        for first in range(0, len(documents), BATCH_DOCUMENTS):
+            parts = [*map(RawBSONDocument, documents[first : first + BATCH_DOCUMENTS])]
+            inserted += self._again(partial(self._insert_batch, collection, parts))
         return inserted
 
     def _insert_batch(self, collection: str, documents: Sequence[RawBSONDocument]) -> int:
-        if not collection or "$" in collection or "\0" in collection:
-            raise DatabaseError(f"{collection!r} cannot be the name of a collection.")
-        command: Document = {
-            "insert": collection,
-            "documents": documents,
-            "ordered": False,
-            "writeConcern": self._database.write_concern.document,
-        }
+        from pymongo.errors import BulkWriteError
 
-        def insert() -> Document:
-            from pymongo.errors import NotPrimaryError
-
-            reply = self._database.command(command)
-            failed = reply.get("writeConcernError") or {}
-            if failed.get("code") in _NO_LONGER_PRIMARY:
-                raise NotPrimaryError(str(failed.get("errmsg", "")), failed)
-            return reply
-
-        reply = self._again(insert)
-        for error in reply.get("writeErrors", ()):
-            if error["code"] != _DUPLICATE_KEY:
-                raise _refused(self._address, error["code"], str(error.get("errmsg", "")))
-        failed = reply.get("writeConcernError")
-        if failed:
-            raise _refused(self._address, failed.get("code", 0), str(failed.get("errmsg", "")))
-        return int(reply["n"])
+        try:
+            self._database[collection].insert_many(documents, ordered=False)
+        except BulkWriteError as error:
+            found = error.details or {}
+            failed = [*found.get("writeErrors", ()), *found.get("writeConcernErrors", ())]
+            for one in failed:
+                if one.get("code") != _DUPLICATE_KEY:
+                    words = str(one.get("errmsg", ""))
+                    raise _refused(self._address, one.get("code", 0), words) from None
+            return int(found["nInserted"])
+        return len(documents)
 
     def each(
         self,
@@ -429,16 +391,6 @@ class Database:
                 numbers[found["_id"]["place"]].append((found["_id"].get("rec"), found["n"]))
         return numbers
 
-    def replace(
-        self,
-        collection: str,
-        filter: Mapping[str, object],  # noqa: A002
-        document: Mapping[str, object],
-    ) -> None:
-        """Replace the first matching document, or insert it if none matches."""
-        of = self._database[collection]
-        self._again(lambda: of.replace_one(dict(filter), dict(document), upsert=True))
-
     def update(
         self,
         collection: str,
@@ -529,16 +481,6 @@ def without_secrets(uri: str) -> str:
         return "the given URI"
     # From the last @, since an unencoded password may contain any character.
     return f"{scheme}://{rest.rpartition('@')[2].partition('?')[0]}"
-
-
-def _batches(ends: NDArray[np.int64]) -> Iterator[tuple[int, int]]:
-    """Half-open ranges of documents, each within the limits of one command."""
-    first, count = 0, len(ends) - 1
-    while first < count:
-        fit = int(np.searchsorted(ends, ends[first] + BATCH_BYTES, side="right")) - 1
-        last = min(fit, first + BATCH_DOCUMENTS)
-        yield first, last
-        first = last
 
 
 @contextlib.contextmanager

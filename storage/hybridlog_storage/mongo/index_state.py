@@ -1,19 +1,18 @@
-"""Stores in MongoDB the indexing progress of each recording.
+"""Stores in MongoDB which segments of each recording are indexed.
 
-`hybridlog.recordings` mirrors the catalog for other programs. It also states for each
-recording which segments have all their documents. Reads see only what a majority of a replica
-set has, so the documents, written before, cannot be lost.
+Reads see only what a majority of a replica set has, so the documents, written before, cannot be
+lost.
 """
 
 from __future__ import annotations
 
 import secrets
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
-from itertools import chain
-from typing import Any, Final
+from dataclasses import dataclass
+from typing import Final, NamedTuple
 
 from hybridlog_storage.catalog import RecordingEntry
+from hybridlog_storage.errors import DatabaseError
 from hybridlog_storage.mongo.collection_names import CATALOG_PREFIX, collection_of
 from hybridlog_storage.mongo.database import Database
 from hybridlog_storage.mongo.index_documents import between
@@ -22,19 +21,6 @@ RECORDINGS: Final = f"{CATALOG_PREFIX}recordings"
 STORE: Final = f"{CATALOG_PREFIX}store"
 """Collection that names the store that owns a database."""
 _AROUND_NS: Final = 3600 * 10**9  # what a crash has cut may be so far from the rest
-_CHANNEL_BYTES: Final = 600  # of a channel in the mirror, without its texts
-_MAX_CHANNEL_BYTES: Final = 8 << 20  # of all: a document of MongoDB has at most 16 MiB
-_SHOWN: Final = (
-    "name",
-    "tags",
-    "status",
-    "notes",
-    "marks",
-    "pins",
-    "rows",
-    "stored_bytes",
-)
-"""Values of an entry that may change while its segments stay."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,21 +31,36 @@ class Indexed:
         made: Drawn at random when the documents were begun. Who reads the same before and after
             a question knows that none were removed meanwhile.
         segments: Digest of each completely indexed segment, by its number as text.
-        shown: Name, tags, notes and marks in the mirror.
     """
 
     made: str
     segments: Mapping[str, str]
-    shown: Mapping[str, Any] = field(default_factory=dict)
-
-    def mirrors(self, entry: RecordingEntry) -> bool:
-        """True if the mirror of a recording with the same segments is current."""
-        document = _mirrored(entry)
-        return all(self.shown.get(name) == document[name] for name in _SHOWN)
 
     def is_whole(self, entry: RecordingEntry) -> bool:
         """True if all documents of a recording are there."""
         return dict(self.segments) == entry.digests
+
+
+class Owner(NamedTuple):
+    """The owner of a database.
+
+    Attributes:
+        store: Id of the store.
+        place: Its host and path. A copy of it at another place has the same id.
+        made: Id of the index.
+    """
+
+    store: str
+    place: str
+    made: str
+
+
+def other_store(database: Database) -> DatabaseError:
+    """The error for a database that another store owns."""
+    return DatabaseError(
+        f"The database {database.name!r} at {database.address} holds the index of another store. "
+        "Name a database of its own in the URI: mongodb://host/NAME."
+    )
 
 
 class IndexState:
@@ -72,55 +73,36 @@ class IndexState:
         """The index state of a recording by its key; None if it is unknown."""
         return self.of([key]).get(key)
 
-    def of(
-        self, keys: Collection[str] | None = None, shown: Collection[str] = _SHOWN
-    ) -> dict[str, Indexed]:
-        """The index states of these recordings, or of all, by key; `shown` are read, too."""
+    def of(self, keys: Collection[str] | None = None) -> dict[str, Indexed]:
+        """The index states of these recordings, or of all, by key."""
         chosen: dict[str, object] = {} if keys is None else {"_id": {"$in": sorted(keys)}}
-        found: dict[str, Indexed] = {}
-        for document in self._db.find(RECORDINGS, chosen, dict.fromkeys(("index", *shown), 1)):
-            index = document.get("index") or {}
-            found[document["_id"]] = Indexed(
-                str(index.get("made", "")),
-                dict(index.get("segments") or {}),
-                {name: document.get(name) for name in shown},
-            )
-        return found
+        return {
+            found["_id"]: Indexed(str(found.get("made", "")), dict(found.get("segments") or {}))
+            for found in self._db.find(RECORDINGS, chosen)
+        }
 
     def count(self) -> int:
-        """Number of recordings in the mirror; may be wrong after the server was killed."""
+        """Number of recordings; may be wrong after the server was killed."""
         return self._db.count(RECORDINGS)
 
     def begin(self, entry: RecordingEntry, segments: Mapping[str, str] | None = None) -> None:
         """Note that documents of a recording are about to be made, or removed.
 
-        A mirror that is there stays until the end: it says which documents may be there.
-
         Args:
             entry: The recording.
             segments: Digest of each segment whose documents stay, by its number as text.
         """
-        index = {"made": secrets.token_hex(8), "segments": dict(segments or {})}
-        change = {"$set": {"index": index}, "$setOnInsert": _mirrored(entry)}
-        self._db.update(RECORDINGS, {"_id": entry.key}, change, upsert=True)
-
-    def show(self, entry: RecordingEntry) -> None:
-        """Mirror a recording; leave the state of its index unchanged."""
-        self._db.update(RECORDINGS, {"_id": entry.key}, {"$set": _mirrored(entry)})
-
-    def end(self, entry: RecordingEntry) -> None:
-        """Mirror a recording all of whose documents are in the index."""
-        done = {**_mirrored(entry), "index.segments": entry.digests}
-        self._db.update(RECORDINGS, {"_id": entry.key}, {"$set": done})
+        state = {"id": entry.id, "made": secrets.token_hex(8), "segments": dict(segments or {})}
+        self._db.update(RECORDINGS, {"_id": entry.key}, {"$set": state}, upsert=True)
 
     def put_segments(self, key: str, segments: Mapping[str, str]) -> None:
-        """Store that the index of a recording has all documents of some segments.
+        """Note that all documents of some segments are there.
 
         Args:
-            key: Its key.
+            key: Key of the recording.
             segments: Their digests, by number as text.
         """
-        digests = {f"index.segments.{number}": digest for number, digest in segments.items()}
+        digests = {f"segments.{number}": digest for number, digest in segments.items()}
         self._db.update(RECORDINGS, {"_id": key}, {"$set": digests})
 
     def clear(self, entry: RecordingEntry, but: Collection[str] = ()) -> None:
@@ -133,19 +115,13 @@ class IndexState:
             entry: The recording.
             but: Numbers of the segments whose documents stay, as text.
         """
-        topics = {channel.topic for channel in entry.channels}
-        times = [*(entry.span or ())]
-        mirror = self._db.find_one(RECORDINGS, {"_id": entry.key}, {"channels": 1}) or {}
-        for channel in mirror.get("channels") or ():
-            stats = channel.get("stats") or {}
-            topics.add(str(channel.get("topic", "")))
-            times += [at for name in ("first", "last") if (at := stats.get(name)) is not None]
         chosen: dict[str, object] = {"_meta.rec": entry.key}
-        if times:
-            chosen.update(between(max(0, min(times) - _AROUND_NS), max(times) + _AROUND_NS))
+        if entry.span is not None:
+            first, last = entry.span
+            chosen.update(between(max(0, first - _AROUND_NS), last + _AROUND_NS))
         if but:
             chosen["_meta.ref.seg"] = {"$nin": sorted(map(int, but))}
-        for topic in topics:
+        for topic in {channel.topic for channel in entry.channels}:
             self._db.delete(collection_of(topic), chosen)
 
     def clear_everywhere(self, keys: Collection[object]) -> None:
@@ -164,36 +140,25 @@ class IndexState:
             self._db.delete(collection, {"_meta.rec": {"$nin": list(but)}})
 
     def remove(self, keys: Collection[str]) -> None:
-        """Remove recordings from the mirror, as the last step of their removal."""
+        """Remove the states of recordings, as the last step of their removal."""
         self._db.delete(RECORDINGS, {"_id": {"$in": list(keys)}})
 
     def document_collections(self) -> list[str]:
         """Names of the collections that hold index documents."""
         return [c for c in self._db.list_collections() if not c.startswith(CATALOG_PREFIX)]
 
-    def mark(self) -> Mapping[str, Any] | None:
-        """The store that owns the database, and its place; None without an owner."""
-        return self._db.find_one(STORE, {"_id": "store"})
+    def owner(self) -> Owner | None:
+        """The store that owns the database; None without an owner."""
+        found = self._db.find_one(STORE, {"_id": "store"})
+        return (
+            None if found is None else Owner(*(str(found.get(name, "")) for name in Owner._fields))
+        )
 
-    def claim(self, values: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Register the store that owns the database; return its mark.
+    def claim(self, store: str, place: str) -> Owner:
+        """Register the store that owns the database.
 
         The index gets a new id, so that nothing is believed of it that was known before.
         """
-        mark = {"_id": "store", **values, "index": secrets.token_hex(8)}
-        self._db.replace(STORE, {"_id": "store"}, mark)
-        return mark
-
-
-def _mirrored(entry: RecordingEntry) -> dict[str, Any]:
-    """An entry as MongoDB accepts it."""
-    document = entry.to_document()
-    del document["held"]
-    text = (
-        len(part)
-        for channel in entry.channels
-        for part in (channel.topic, channel.reason or "", *chain(*channel.metadata.items()))
-    )
-    if len(entry.channels) * _CHANNEL_BYTES + sum(text) > _MAX_CHANNEL_BYTES:
-        document["channels"] = [{"topic": channel.topic} for channel in entry.channels]
-    return document
+        owner = Owner(store, place, secrets.token_hex(8))
+        self._db.update(STORE, {"_id": "store"}, {"$set": owner._asdict()}, upsert=True)
+        return owner

