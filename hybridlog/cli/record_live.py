@@ -42,6 +42,19 @@ if TYPE_CHECKING:
 _MIN_CHUNK: Final = 1 << 19
 _STATE_S = 1.0
 _RECOVERY_POLL_S = 0.05
+_FOLLOWER_S: Final = 5.0
+"""To wait for triggers where a service manager, or another recording, waits."""
+
+
+class _Stop(Flag):
+    """A flag that the first signal sets."""
+
+    number: int = signal.SIGINT
+
+    @property
+    def follower_s(self) -> float | None:
+        """Seconds to wait for triggers; a person can press Ctrl-C again instead."""
+        return None if self.number == signal.SIGINT else _FOLLOWER_S
 
 
 def record_live(choices: RecordChoices) -> None:
@@ -84,7 +97,7 @@ def _record(choices: RecordChoices) -> None:
                     last = _watch(recorder, stop, display)
                 if stop.is_set or not recorder.is_full:
                     break
-                reports += recorder.stop()
+                reports += recorder.stop(_FOLLOWER_S)
                 options, full = recorder.rest, recorder.name
                 sources = [held.enter_context(source) for source in sources_of(choices)]
             notify_service("STOPPING=1", "STATUS=writing what is left")
@@ -92,7 +105,7 @@ def _record(choices: RecordChoices) -> None:
                 lag = output.counted(last.late, "message")
                 wait = f", and waiting for MongoDB, which lacks {lag}" if last.late else ""
                 output.note(f"hybridlog: writing what is left{wait}; Ctrl-C leaves at once")
-            reports += recorder.stop()
+            reports += recorder.stop(stop.follower_s)
             while recovery.is_alive() and not stop.wait(_RECOVERY_POLL_S):
                 pass
         rules, results = options.contract, []
@@ -110,10 +123,10 @@ def recorder_options(choices: RecordChoices) -> RecorderOptions:
         TopicError: A pattern that is malformed.
     """
     from hybridlog.contract import Contract
+    from hybridlog.follow.triggers import Trigger
     from hybridlog.live.memory import default_budget
     from hybridlog.live.policy import priority_rule, throttle_rule
     from hybridlog.live.recorder import RecorderOptions
-    from hybridlog.live.triggers import Trigger
 
     chosen, no_index = matchers(choices)
     budget_bytes = choices.budget or default_budget()
@@ -201,12 +214,12 @@ def _watch(recorder: Recorder, stop: Flag, display: _Display) -> RecorderState:
 
 
 @contextmanager
-def _stop_flag() -> Iterator[Flag]:
+def _stop_flag() -> Iterator[_Stop]:
     """A flag that the first signal sets; the second signal ends the process at once.
 
     Flushed chunks stay, and the next command on the store seals them.
     """
-    with Flag() as stopped:
+    with _Stop() as stopped:
 
         def stop(number: int) -> None:
             if stopped.is_set:
@@ -215,6 +228,7 @@ def _stop_flag() -> Iterator[Flag]:
                 )
                 restore_echo()
                 os._exit(128 + number)
+            stopped.number = number
             stopped.set()
 
         with handled(stop):

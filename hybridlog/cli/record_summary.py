@@ -120,21 +120,12 @@ class LiveSummary:
         silent = self.recorder.silent()
         for topic in silent:
             yield f"{topic}: has a publisher that sent nothing"
-        topics = {*silent, *(topic.topic for topic in self.state.topics)}
-        matcher = self.options.matcher
-        unused = [] if matcher is None else matcher.unused()
-        for pattern in unused:
-            yield f"no topic fits {output.quoted(pattern)}"
+        unfitting = self.recorder.unfitting()
+        yield from (f"no topic fits {text}" for text in unfitting)
         for report in self.reports:
             yield from output.surpluses(report.entry.channels)
-        if matcher is not None and not unused and not topics:
+        if self.options.matcher is not None and not (unfitting or silent or self.state.topics):
             yield "no topic is left: --exclude takes away all that --topic names"
-        for option, rules in (
-            ("--throttle", self.options.throttles),
-            ("--priority", self.options.priorities),
-        ):
-            idle = (rule for rule in rules if not any(map(rule.fits, topics)))
-            yield from (f"no topic fits {output.quoted(one.pattern)} of {option}" for one in idle)
 
     def _errors(self, *, is_reason_shown: bool) -> Iterator[str]:
         """Lines that --quiet does not leave out."""

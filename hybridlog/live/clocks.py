@@ -312,6 +312,14 @@ class MachineClock:
             self._look()
         return log_time - self.set_by
 
+    def steady_before(self, log_time: int) -> int:
+        """The last time at which the clock said a log time, as a steady time, ns."""
+        now = self.steady(self.now())
+        for jump in reversed(self._jumps):
+            if jump.at <= log_time - jump.set_by <= now:
+                return log_time - jump.set_by
+        return log_time
+
     def log_time(self, steady: int) -> int:
         """The time of the clock at a steady time, ns."""
         return steady + next((j.set_by for j in reversed(self._jumps) if j.at <= steady), 0)

@@ -104,8 +104,8 @@ class Incidents:
             self._new[key] = hit
         return key
 
-    def write(self) -> None:
-        """Mark and pin all hits so far.
+    def write(self) -> bool:
+        """Mark and pin all hits so far; returns whether there were new ones.
 
         Raises:
             StoreError: The manifest cannot be written.
@@ -114,7 +114,7 @@ class Incidents:
             with self._lock:
                 hits, self._is_urgent = dict(self._new), False
             if not hits:
-                return
+                return False
             pins = {key: self._pin(key, hit) for key, hit in hits.items()}
             marks = {key: self._mark(key, hit) for key, hit in hits.items()}
             fresh: list[Mark] = []
@@ -134,6 +134,7 @@ class Incidents:
                 self._new = {k: hit for k, hit in self._new.items() if hits.get(k) != hit}
         for mark in fresh:
             self._say(f"{mark.text!r} {PINNED} from {format_time(mark.time)} on")
+        return True
 
     def _pin(self, key: str, hit: Hit) -> Pin:
         return Pin(key, *self._log_times(hit), reason=hit.text)

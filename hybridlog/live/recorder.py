@@ -6,6 +6,7 @@ topic the received messages are the stored ones plus those in the loss ledger.
 
 from __future__ import annotations
 
+import math
 import shutil
 import threading
 import time
@@ -17,6 +18,8 @@ from operator import attrgetter
 from typing import TYPE_CHECKING
 
 from hybridlog.entries import text as as_text
+from hybridlog.entries import with_said
+from hybridlog.follow.child import Follower
 from hybridlog.live.clocks import CLOCK, MachineClock, SimulatedTime
 from hybridlog.live.incidents import Hit, Incidents
 from hybridlog.live.memory import resident_bytes
@@ -38,8 +41,7 @@ from hybridlog.live.ring import GROUPS, Ring
 from hybridlog.live.silence import RULE, Silence, SilenceWatch
 from hybridlog.live.state import RecorderState, StateFile
 from hybridlog.live.statistics import Lateness, Tally, TopicRates
-from hybridlog.live.triggers import Trigger, Triggers
-from hybridlog.maintenance.edit import remove_if
+from hybridlog.maintenance.edit import change, remove_if
 from hybridlog.maintenance.keep import RetentionThread
 from hybridlog.maintenance.retention import Rules
 from hybridlog.query.times import format_duration, format_time
@@ -62,6 +64,7 @@ from hybridlog_storage.messages import REDUCED, Channel, left_channel
 
 if TYPE_CHECKING:
     from hybridlog.contract import Contract
+    from hybridlog.follow.triggers import Trigger
     from hybridlog.live.sources.base import LiveSource, Sink
     from hybridlog.query.topics import TopicMatcher
     from hybridlog.record.recorder import RecordReport
@@ -76,6 +79,7 @@ _SEQUENCES = 1 << 32
 _HELD_SHARE = 8  # of the memory budget, for messages that come before `/clock`
 _CLOCK_WAIT_S = 5.0
 _MAX_S = 86_400.0  # of a ring, and of what is pinned
+_SETTLED_S = 3.0  # after the first topic, when others may have come
 _SLOW_WRITE_S = 2.0  # to pack and write a chunk, on a disk that is busy
 
 
@@ -172,6 +176,7 @@ class Recorder:
         self._sources = sources
         self._options = options
         self._say = say
+        self._shared = store.shared
         self._directory = store.directory
         self._recorded: dict[Channel, _RecordedChannel] = {}
         self._recorded_by_content: dict[tuple[object, ...], _RecordedChannel] = {}
@@ -194,12 +199,10 @@ class Recorder:
         self._lateness = Lateness(indexed_within_s(options.flush_interval_s))
         self._stored_bytes = 0
         self._lost: dict[tuple[str, Cause], int] = {}
-        self._breaches = 0
         self._clock_marks: list[tuple[str, Mapping[str, str], int]] = []
         self._newest = max(store.summaries(), key=attrgetter("created"), default=None)
-        self._silence = None if options.contract is None else SilenceWatch(options.contract)
-        self._silences: dict[tuple[str, int], str] = {}  # ids of marks, by topic and beginning
-        self._watching = threading.Thread(target=self._watch, daemon=True)
+        self._silence = SilenceWatch(options.contract, self._now, self._note_silence)
+        self._settled_at = 0.0
         self._ended_at: int | None = None
         self._simulated: SimulatedTime | None = None
         if options.use_sim_time:
@@ -208,9 +211,18 @@ class Recorder:
         self._target = store.start(options.name, self._of_recording())
         self.name = self._target.name
         self._says = StateFile(store.directory, self._target.id)
+        self._follower = follower = Follower(
+            self._directory.address,
+            self._target.id,
+            options.triggers,
+            sum(self._around),
+            hit=self._fire_between,
+            say=self.say,
+        )
         ring_s = options.ring_s
-        self._ring = None if ring_s is None else Ring(self._directory, self._target, ring_s)
-        self._triggers = Triggers(options.triggers, say)
+        self._ring = (
+            None if ring_s is None else Ring(self._directory, self._target, ring_s, follower)
+        )
         self._incidents = Incidents(
             partial(self._directory.manifests.change, self._target.id),
             None if options.use_sim_time else self._clock,
@@ -257,16 +269,17 @@ class Recorder:
                 recording is removed.
         """
         try:
+            self._follower.start()
             for source in self._sources:
                 source.start(self._sink)
         except BaseException:
             for source in self._sources:
                 source.stop()
+            self._follower.stop()
             self._says.remove()
             self._target.abort()
             raise
-        if self._silence is not None:
-            self._watching.start()
+        self._silence.start()
         now = self._clock.now()
         if self._simulated is None and self._newest is not None and self._newest.created > now:
             says = f"the clock of this machine says {format_time(now)}"
@@ -278,11 +291,14 @@ class Recorder:
         """Wait for the end for at most so long; returns True once it has come."""
         return self._over.wait(seconds)
 
-    def stop(self) -> list[RecordReport]:
-        """Stop the sources; flush, index and seal everything.
+    def stop(self, follower_s: float | None = None) -> list[RecordReport]:
+        """Stop the sources; flush, index and seal everything; then wait for the triggers.
 
         The recording is removed if no source was ever reached and no message came, or if the
         disk had no room for any.
+
+        Args:
+            follower_s: Seconds to wait until triggers have seen all; None for as long as it takes.
 
         Returns:
             A report for each recording.
@@ -295,29 +311,39 @@ class Recorder:
             source.stop()
         self._mark_clock()
         self._over.set()
-        if self._silence is not None:
-            if self._watching.is_alive():
-                self._watching.join()
-            self._report_silences(self._silence, ended_at, is_end=True)
+        self._silence.stop(ended_at)
         if self._simulated is not None:
             self._simulated.close()
         self._says.remove()
         self._retention.stop()
         self._incidents.stop()
-        self._triggers.close()
         if self._is_marked(self._target.id) or (
             not (self.stopped_for_disk and self._target.is_empty)
             and (self._recorded_by_content or any(source.was_reached for source in self._sources))
         ):
-            reports = [self._target.close()]
+            report = self._target.close()
         else:
+            self._follower.stop()
             self._target.abort()
             return []
+        self._judge_last(report, follower_s)
         if self._target.cut_off:
             self._refuse(Cause.DISK, "the disk was full")
             for topic, count in self._target.cut_off.items():
                 self._count_lost(topic, Cause.DISK, count)
-        return reports
+        return [report]
+
+    def _judge_last(self, report: RecordReport, follower_s: float | None) -> None:
+        """Wait until triggers have seen the ended recording, and mark and pin what they found."""
+        if not self._follower.finish(follower_s):
+            self.say("triggers have not seen the last messages: that takes too long")
+        try:
+            if self._incidents.write():
+                change(self._shared, report.entry, lambda now: now)
+        except HybridlogError as error:
+            self.say(f"the last messages of triggers are not marked and pinned: {error}")
+        now = self._directory.manifests.read(self._target.id)
+        report.entry = with_said(report.entry, now)
 
     @property
     def rest(self) -> RecorderOptions:
@@ -340,9 +366,7 @@ class Recorder:
         self._check_clock(now)
         missing: dict[tuple[str, bool], int] = {}
         lost: dict[str, int] = {}
-        with self._lock:
-            names = [*self._topics]
-        self._triggers.look(names)
+        self._look_for_topics(now)
         with self._lock:
             totals = dict(self._lost)
         for (topic, cause), count in totals.items():
@@ -381,8 +405,8 @@ class Recorder:
             incidents=self._incidents.count,
             let_go=None if self._ring is None else self._ring.messages,
             taken=dict(self._target.taken),
-            silent=() if self._silence is None else self._silence.silent,
-            breaches=self._breaches,
+            silent=self._silence.silent,
+            breaches=self._silence.breaches,
             clock_set_s=self._clock.set_by / 1e9,
             memory_bytes=resident_bytes(),
             sim_time=None if self._simulated is None else self._simulated.latest,
@@ -405,13 +429,25 @@ class Recorder:
             text: Its name.
             steady: When it was, as a steady time, ns; None for now.
         """
-        before = self._options.before_s
-        if before is None:
-            before = self._options.ring_s or 0.0
-        around, text = (before, self._options.after_s), as_text(text)
-        before, after = (round(seconds * 1e9) for seconds in around)
         at = self._now() if steady is None else steady
-        self._incidents.hit(Hit(text, {"trigger": text}, at - before, at + after))
+        self._fire(text, at, at)
+
+    def _fire_between(self, text: str, first: int, last: int) -> None:
+        """The same for the messages of a trigger between two log times, ns."""
+        if self._simulated is None:
+            first, last = self._clock.steady_before(first), self._clock.steady_before(last)
+        self._fire(text, first, last)
+
+    def _fire(self, text: str, first: int, last: int) -> None:
+        text, (before, after) = as_text(text), self._around
+        self._incidents.hit(Hit(text, {"trigger": text}, first - before, last + after))
+
+    @property
+    def _around(self) -> tuple[int, int]:
+        """What is pinned before and after a trigger, ns."""
+        options = self._options
+        before = options.before_s if options.before_s is not None else options.ring_s or 0.0
+        return round(before * 1e9), round(options.after_s * 1e9)
 
     def _mark(self, mark: Mark) -> None:
         """Set a mark, or give one of its id another end."""
@@ -441,30 +477,41 @@ class Recorder:
         """A log time, ns, if the clock of this machine had never been set."""
         return log_time if self._simulated is not None else self._clock.steady(log_time)
 
-    def _watch(self) -> None:
-        """The thread that tells silences."""
-        assert self._silence is not None
-        while not self._over.wait(self._silence.interval_s):
-            self._report_silences(self._silence, self._now())
-
-    def _report_silences(self, watch: SilenceWatch, now: int, *, is_end: bool = False) -> None:
-        begun, ended = watch.look(now, is_end=is_end)
-        for one in begun:
-            self._breaches += 1
+    def _note_silence(self, one: Silence, mark: str, *, is_over: bool) -> None:
+        """Tell a silence that begins, and mark it from its beginning on; later its end."""
+        if not is_over:
             self._say(f"{one.text} ({RULE} of the contract)")
-            self._silences[one.topic, one.begin] = new_random()
-            self._mark_silence(one, None)
-        for one in ended:
-            self._mark_silence(one, self._clock.log_time(one.end))
-
-    def _mark_silence(self, one: Silence, end: int | None) -> None:
-        """Mark a silence from its beginning on, with its end once that has come."""
-        place = one.topic, one.begin
-        mark = self._silences[place] if end is None else self._silences.pop(place, new_random())
         tags = {"cause": CONTRACT, "rule": RULE, "topic": one.topic}
         begin = self._clock.log_time(one.begin)
-        last = None if end is None else max(begin, end)
-        self._mark(Mark(mark, begin, one.text, tags, last))
+        end = max(begin, self._clock.log_time(one.end)) if is_over else None
+        self._mark(Mark(mark, begin, one.text, tags, end))
+
+    def unfitting(self) -> list[str]:
+        """Options that name topics of which none has come, in words."""
+        options = self._options
+        with self._lock:
+            topics = [*self._topics]
+            found = [
+                f"'{as_text(pattern)}'"
+                for chosen in (options.matcher, options.no_index)
+                if chosen is not None
+                for pattern in chosen.unused()
+            ]
+        rules = [
+            *((one.fits, f"'{as_text(one.pattern)}' of --throttle") for one in options.throttles),
+            *((one.fits, f"'{as_text(one.pattern)}' of --priority") for one in options.priorities),
+            *((one.fits, f"the trigger '{as_text(one.text)}'") for one in options.triggers),
+        ]
+        return found + [text for fits, text in rules if not any(map(fits, topics))]
+
+    def _look_for_topics(self, now: float) -> None:
+        """Tell what names no topic once others may have come."""
+        if self._topics and not self._settled_at:
+            self._settled_at = now + _SETTLED_S
+        if self._settled_at and now >= self._settled_at:
+            self._settled_at = math.inf
+            for text in self.unfitting():
+                self.say(f"no topic fits {text} so far")
 
     def silent(self) -> list[str]:
         """Topics that had publishers and never sent a message."""
@@ -491,7 +538,7 @@ class Recorder:
             too_many = self._expected > _MAX_EXPECTED
         if not too_many:
             self._target.expect(channel)
-            self._triggers.expect(channel)
+            self._follower.expect(channel)
 
     def take(
         self,
@@ -530,8 +577,7 @@ class Recorder:
                 sequence=number,
                 wait=False,
             ):
-                if self._silence is not None:
-                    self._silence.take(recorded.channel.topic, steady)
+                self._silence.take(recorded.channel.topic, steady)
             elif size > SMALL_BYTES:
                 # Its fields may fit where its payload does not.
                 self._store_fields(recorded, payload, received, sent, number)
@@ -541,10 +587,6 @@ class Recorder:
             cause = _cause_of(error)
             self._refuse(cause, str(error))
             self._lose(recorded, cause, str(error), received)
-            return
-        if self._options.triggers:
-            for text in self._triggers.fired(recorded.channel, payload):
-                self.fire(text, steady)
 
     def lost(self, loss: Loss) -> None:
         """See `Sink.lost`."""
@@ -685,8 +727,7 @@ class Recorder:
             sequence=number,
             wait=False,
         ):
-            if self._silence is not None:
-                self._silence.take(recorded.channel.topic, self._steady(received))
+            self._silence.take(recorded.channel.topic, self._steady(received))
             self._lose(recorded, Cause.DEGRADE, "payload dropped, fields stored", received)
         else:
             self._lose_for_room(recorded, received)

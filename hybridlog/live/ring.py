@@ -7,7 +7,7 @@ stays while it has the latched messages that a late subscriber would receive.
 from __future__ import annotations
 
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Collection, Hashable
 from typing import TYPE_CHECKING, Final
 
@@ -16,13 +16,14 @@ from hybridlog.maintenance.retention import is_pinned
 from hybridlog.query.latching import depth_of, publisher_of
 
 if TYPE_CHECKING:
+    from hybridlog.follow.child import Follower
     from hybridlog.live.recording import LiveRecording
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.manifest import File, Manifest
 
 GROUPS: Final = 10
 """Groups of files in the time of a ring, about."""
-_LATE_S: Final = 1.0  # a trigger may be evaluated so long after its message has come
+_LATE_S: Final = 1.0  # a signal may come so long after what it is about
 
 
 class Ring:
@@ -32,6 +33,7 @@ class Ring:
         directory: The store.
         recording: The recording, which this process makes.
         span_s: Seconds after its end when a group goes.
+        follower: Triggers that must have seen a group before it goes; None without any.
 
     Attributes:
         messages: Messages that have gone.
@@ -42,13 +44,16 @@ class Ring:
         directory: StoreDirectory,
         recording: LiveRecording,
         span_s: float,
+        follower: Follower | None = None,
     ) -> None:
         self.messages = 0
         self._directory = directory
         self._recording = recording
         self._span_s = span_s + _LATE_S
+        self._follower = follower
         self._seen = 0
         self._ended: dict[int, float] = {}  # when each group was first seen sealed
+        self._files: dict[int, set[int]] = {}  # their numbers, by group
         self._kept: set[int] = set()  # must stay, as long as no other group is sealed
 
     def due(self, now: float) -> set[int]:
@@ -62,8 +67,14 @@ class Ring:
             logs = self._directory.manifests.read(self._recording.id).logs.values()
             seen = time.monotonic()
             self._ended = {log.group: self._ended.get(log.group, seen) for log in logs}
+            self._files = defaultdict(set)
+            for log in logs:
+                self._files[log.group].add(log.number)
             self._seen, self._kept = sealed, set()
         old = {group for group, at in self._ended.items() if now - at >= self._span_s}
+        judged = None if self._follower is None else self._follower.judged
+        if judged is not None:
+            old = {group for group in old if self._files[group].issubset(judged)}
         return old - self._kept
 
     def let_go(self, groups: Collection[int]) -> None:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 
 from hybridlog.query.times import format_duration
+from hybridlog_storage.manifest import new_random
 
 if TYPE_CHECKING:
     from hybridlog.contract import Contract
@@ -36,25 +37,62 @@ class Silence(NamedTuple):
         return f"{self.topic}: no message for more than {format_duration(self.limit)}"
 
 
+class Note(Protocol):
+    """What is called with a silence and the id of its mark."""
+
+    def __call__(self, one: Silence, mark: str, *, is_over: bool) -> None:
+        """Note it."""
+
+
 class SilenceWatch:
     """Follows the topics that have a longest gap in a contract. Thread safe.
 
     Its times are steady ones, so that a clock that is set is no silence.
+
+    Args:
+        contract: The contract; None for no topics.
+        now: Returns the present time, ns. A simulation may begin again with an earlier one.
+        note: Called with a silence that has begun, and again when it is over, and the id of
+            its mark.
+
+    Attributes:
+        breaches: Silences so far.
+        interval_s: Seconds between two looks, so that a silence is told within twice its limit.
     """
 
-    def __init__(self, contract: Contract) -> None:
-        rules = contract.topics.items()
+    def __init__(self, contract: Contract | None, now: Callable[[], int], note: Note) -> None:
+        rules = [] if contract is None else contract.topics.items()
         self._limits = {n: r.longest_gap for n, r in rules if r.longest_gap is not None}
         self._optional = {name for name, rule in rules if rule.optional}
+        self._now = now
+        self._note = note
         self._last: dict[str, int] = {}
         self._begin: int | None = None
-        self._now = 0
-        self._reported: set[str] = set()
+        self._looked = 0
+        self._noted: dict[str, str] = {}  # ids of marks, by topics that are silent
         self._over: list[Silence] = []
         self._lock = threading.Lock()
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self.breaches = 0
         shortest = min(self._limits.values(), default=0) / 1e9
         self.interval_s = max(min(shortest / 4, _MAX_INTERVAL_S), 1e-3)
-        """Seconds between two looks, so that a silence is told within twice its limit."""
+
+    def start(self) -> None:
+        """Look in a thread, if there are topics."""
+        if self._limits:
+            self._thread.start()
+
+    def stop(self, ended_at: int) -> None:
+        """End all silences when the recording ended, ns."""
+        self._ended.set()
+        if self._thread.is_alive():
+            self._thread.join()
+        self.look(ended_at, is_end=True)
+
+    def _run(self) -> None:
+        while not self._ended.wait(self.interval_s):
+            self.look(self._now())
 
     def take(self, topic: str, time: int) -> None:
         """A message was stored, at a time, ns."""
@@ -72,34 +110,40 @@ class SilenceWatch:
                 self._over.append(Silence(topic, last, time, limit))
             self._last[topic] = max(last, time)
 
-    def look(self, now: int, *, is_end: bool = False) -> tuple[list[Silence], list[Silence]]:
-        """The silences that have begun since the last look, and those that have ended.
+    def look(self, now: int, *, is_end: bool = False) -> None:
+        """Note the silences that have begun since the last look, and those that have ended.
 
         Args:
-            now: Current time, ns. A simulation may begin again with an earlier one.
+            now: The present time, ns.
             is_end: True if the recording ends now, and with it all silences.
         """
         with self._lock:
             over, self._over = self._over, []
-            if now < self._now:
+            if now < self._looked:
                 self._last = {topic: min(last, now) for topic, last in self._last.items()}
-            self._now = now
+            self._looked = now
             lasting = [
                 Silence(topic, last, now, self._limits[topic])
                 for topic, last in self._last.items()
                 if now - last > self._limits[topic]
             ]
-        begun = []
         for one in over:
-            if one.topic in self._reported:
-                self._reported.remove(one.topic)
-            else:
-                begun.append(one)
-        begun += [one for one in lasting if one.topic not in self._reported]
-        self._reported.update(one.topic for one in lasting)
-        return begun, over + lasting if is_end else over
+            self._note(one, self._mark_of(one), is_over=True)
+            del self._noted[one.topic]
+        for one in lasting:
+            mark = self._mark_of(one)
+            if is_end:
+                self._note(one, mark, is_over=True)
+
+    def _mark_of(self, one: Silence) -> str:
+        """The id of its mark; notes that it has begun, if that is new."""
+        if one.topic not in self._noted:
+            self.breaches += 1
+            self._noted[one.topic] = new_random()
+            self._note(one, self._noted[one.topic], is_over=False)
+        return self._noted[one.topic]
 
     @property
     def silent(self) -> Sequence[str]:
         """Topics that are silent, as of the last look."""
-        return sorted(self._reported)
+        return sorted(self._noted)

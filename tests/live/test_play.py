@@ -23,9 +23,9 @@ import pytest
 
 import hybridlog as hl
 from hybridlog.contract import Contract, TopicRules
+from hybridlog.follow.triggers import Trigger
 from hybridlog.live import ring
 from hybridlog.live.recorder import Recorder, RecorderOptions
-from hybridlog.live.triggers import Trigger
 from hybridlog.maintenance.edit import mark_now
 from hybridlog.maintenance.retention import MIN_SEGMENT
 from hybridlog.maintenance.sizes import disk_bytes

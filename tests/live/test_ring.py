@@ -12,6 +12,8 @@ import pytest
 
 import hybridlog as hl
 from hybridlog.entries import summary_by, summary_of, topic_types
+from hybridlog.follow import child
+from hybridlog.follow.triggers import Trigger
 from hybridlog.live import incidents
 from hybridlog.live import ring as ring_module
 from hybridlog.live.recorder import RecorderOptions
@@ -158,6 +160,23 @@ def test_what_is_pinned_stays(plain: hl.Store) -> None:
     during = plain.topic("/scan").during(plain.topic(MARKS).windows())
     assert during.count() == len(around)
     plain.unpin(*(pin["id"] for pin in entry.pins))
+
+
+def test_nothing_goes_before_triggers_have_seen_it(
+    plain: hl.Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    start = child._START
+    monkeypatch.setattr(child, "_START", f"import time; time.sleep(2); {start}")
+    robot = Robot(plain, triggers=[Trigger.of("/scan: id == 120")])
+    robot.run(1.5)
+    assert ids(plain)[0] == 0
+    while not robot.recorder.look().let_go:
+        robot.run(0.2)
+    assert ids(plain)[0] > 0
+    robot.stop()
+    (mark,) = plain.topic(MARKS)
+    at = mark.fields["end"]
+    assert 120 in [m.fields["id"] for m in plain.topic("/scan") if m.log_time_ns <= at]
 
 
 def test_latched_messages_in_force_stay(plain: hl.Store) -> None:

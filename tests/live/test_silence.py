@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import random
 from collections import defaultdict
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -13,7 +12,7 @@ import hybridlog as hl
 from hybridlog.contract import Contract, TopicRules
 from hybridlog.contract.judge import broken
 from hybridlog.live.recorder import Recorder, RecorderOptions
-from hybridlog.live.silence import SilenceWatch
+from hybridlog.live.silence import Silence, SilenceWatch
 from hybridlog.live.sources.replay import ReplaySource
 from hybridlog.record.marks import MARKS
 from tests.across.test_check import write_mcap
@@ -125,55 +124,62 @@ def test_real_logs_have_one_verdict(name: str, tmp_path: Path) -> None:
         assert {one.topic for one in broken(store.judge(contract, label))} == silent
 
 
+class Watch(SilenceWatch):
+    """Looks when it is told, and returns what it notes."""
+
+    def __init__(self, **topics: TopicRules) -> None:
+        self.begun: list[tuple[str, int, int]] = []
+        self.over: list[tuple[str, int, int]] = []
+        super().__init__(Contract(topics), lambda: 0, self.note)
+
+    def note(self, one: Silence, mark: str, *, is_over: bool) -> None:
+        (self.over if is_over else self.begun).append((one.topic, one.begin, one.end))
+
+    def seen(self, now: int, *, is_end: bool = False) -> tuple[object, object]:
+        self.begun, self.over = [], []
+        self.look(now, is_end=is_end)
+        return sorted(self.begun), self.over
+
+
 def test_a_silence_is_told_within_twice_its_limit() -> None:
     rng = random.Random(1)
     for _ in range(50):
         limit = rng.randrange(10 * MS, 2 * SECOND)
-        watch = SilenceWatch(Contract({"/a": TopicRules(longest_gap=limit)}))
+        watch = Watch(a=TopicRules(longest_gap=limit))
         begin = rng.randrange(10**18)
-        watch.take("/a", begin)
+        watch.take("a", begin)
         now, step = begin + rng.randrange(limit), int(watch.interval_s * 1e9)
-        told: list[int] = []
-        while not told and now < begin + 3 * limit:
-            told = [now for _ in watch.look(now)[0]]
+        while not watch.begun and now < begin + 3 * limit:
+            watch.look(now)
             now += step
-        assert told
-        assert begin + limit < told[0] <= begin + 2 * limit
+        assert begin + limit < now - step <= begin + 2 * limit
+        assert watch.breaches == 1
 
 
 def test_each_silence_is_told_once_and_ends_once() -> None:
-    watch = SilenceWatch(
-        Contract({n: TopicRules(longest_gap=10, optional=n == "/o") for n in ("/a", "/b", "/o")})
-    )
-    take: Callable[[str, int], None] = watch.take
-    take("/other", 100)
-    assert watch.look(110) == ([], [])
-    begun, over = watch.look(111)
-    assert ([one.topic for one in sorted(begun)], over) == (["/a", "/b"], [])
-    assert watch.look(150) == ([], [])
-    assert watch.silent == ["/a", "/b"]
-    take("/a", 160)
-    begun, over = watch.look(161)
-    assert (begun, [(one.begin, one.end) for one in over]) == ([], [(100, 160)])
-    take("/a", 175)  # between two looks
-    take("/a", 170)  # late, and not before
-    begun, over = watch.look(176)
-    assert [(one.begin, one.end) for one in begun] == [(160, 175)]
-    assert begun == over
-    take("/o", 176)  # optional, and late
-    begun, over = watch.look(176)
-    assert [(one.topic, one.begin, one.end) for one in begun] == [("/o", 100, 176)]
-    begun, over = watch.look(177, is_end=True)
-    assert (begun, [(one.topic, one.begin, one.end) for one in over]) == ([], [("/b", 100, 177)])
+    rule = TopicRules(longest_gap=10)
+    watch = Watch(a=rule, b=rule, o=TopicRules(longest_gap=10, optional=True))
+    watch.take("other", 100)
+    assert watch.seen(110) == ([], [])
+    assert watch.seen(111) == ([("a", 100, 111), ("b", 100, 111)], [])
+    assert watch.seen(150) == ([], [])
+    assert watch.silent == ["a", "b"]
+    watch.take("a", 160)
+    assert watch.seen(161) == ([], [("a", 100, 160)])
+    watch.take("a", 175)  # between two looks
+    watch.take("a", 170)  # late, and not before
+    assert watch.seen(176) == ([("a", 160, 175)], [("a", 160, 175)])
+    watch.take("o", 176)  # optional, and late
+    assert watch.seen(176) == ([("o", 100, 176)], [("o", 100, 176)])
+    assert watch.seen(177, is_end=True) == ([], [("b", 100, 177)])
 
 
 def test_a_simulation_that_begins_again_is_watched_on() -> None:
-    watch = SilenceWatch(Contract({"/a": TopicRules(longest_gap=10)}))
-    watch.take("/a", 1000)
-    assert watch.look(1005) == ([], [])
-    assert watch.look(3) == ([], [])
-    begun, _ = watch.look(14)
-    assert [(one.topic, one.begin, one.end) for one in begun] == [("/a", 3, 14)]
+    watch = Watch(a=TopicRules(longest_gap=10))
+    watch.take("a", 1000)
+    assert watch.seen(1005) == ([], [])
+    assert watch.seen(3) == ([], [])
+    assert watch.seen(14) == ([("a", 3, 14)], [])
 
 
 def test_the_command_tells_marks_runs_a_command_and_judges(tmp_path: Path) -> None:

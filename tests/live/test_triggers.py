@@ -6,15 +6,20 @@ import json
 import struct
 import time
 from collections.abc import Callable
+from operator import itemgetter
 
 import pytest
 
 import hybridlog as hl
+from hybridlog.follow import child
+from hybridlog.follow.triggers import Trigger
+from hybridlog.live.policy import priority_rule, throttle_rule
 from hybridlog.live.recorder import RecorderOptions
-from hybridlog.live.triggers import Trigger, Triggers
+from hybridlog.query.topics import matcher
 from hybridlog.record.marks import MARKS
 from hybridlog_storage.errors import TopicError, UsageError, WhereError
 from hybridlog_storage.messages import Channel, Schema
+from tests.limits import Limit
 from tests.live.speaker import Recorded, scan, scan_channel, text, text_channel
 from tests.waiting import wait_for
 
@@ -103,6 +108,8 @@ def test_what_a_person_marks_and_pins_is_stored_at_once(store: hl.Store) -> None
         ("re:(: x", TopicError),
         ("/a: x >", WhereError),
         ("/a: _meta.seq > 1", WhereError),
+        ('/a: {"x": 1}', WhereError),
+        ("/a: /b: x > 1", WhereError),
     ],
 )
 def test_a_trigger_that_is_none(text: str, error: type[Exception]) -> None:
@@ -110,41 +117,51 @@ def test_a_trigger_that_is_none(text: str, error: type[Exception]) -> None:
         Trigger.of(text)
 
 
-def test_a_trigger_that_can_never_fire_is_told(store: hl.Store) -> None:
-    recorded = robot(
-        store, "/scan: nope == 1", '/scan: near == "x"', "/nowhere: a == 1", "/scan: near > 1"
-    )
-    for number in range(4):
-        recorded.speaker.say(scan_channel(), scan(number, 10))
+def test_a_trigger_that_can_never_fire_is_told_before_the_first_message(store: hl.Store) -> None:
+    recorded = robot(store, "/scan: nope == 1", '/scan: near == "x"', "/scan: near > 1")
+    recorded.recorder.expect(scan_channel())
+    wait_for(lambda: len(recorded.said) == 2)
+    for line, where in zip(recorded.said, ("nope == 1", 'near == "x"'), strict=True):
+        assert f"trigger '/scan: {where}' can never fire on /scan: " in line
+    assert "there is no field nope" in recorded.said[0]
+    recorded.speaker.say(scan_channel(), scan(4, 10))
     recorded.recorder.stop()
-    said = "\n".join(recorded.said)
-    assert "'/scan: nope == 1' can never fire on /scan: " in said
-    assert "there is no field nope" in said
-    assert """'/scan: near == "x"' can never fire on /scan: """ in said
-    assert "no topic matched the trigger '/nowhere: a == 1'" in said
-    assert said.count("near > 1") == 1  # that it was marked
-    assert said.count("can never fire") == 2
+    assert len(recorded.said) == 3
 
 
-def test_a_trigger_that_can_never_fire_is_told_before_the_first_message() -> None:
-    wrong, nowhere = "/scan: nope == 1", "/nowhere: a == 1"
-    said: list[str] = []
-    triggers = Triggers([Trigger.of(wrong)], said.append)
-    triggers.expect(scan_channel())
-    (line,) = said
-    assert "can never fire on /scan" in line
-    said.clear()
-    triggers = Triggers([Trigger.of(nowhere), Trigger.of("/scan")], said.append, settle_s=0)
-    triggers.look([])
-    assert not said
-    for _ in range(2):
-        triggers.look(["/scan", "/odom"])
-    assert said == [f"no topic matches the trigger {nowhere!r} so far"]
-    triggers.look(["/nowhere"])
-    triggers.close()
-    assert len(said) == 1
+def test_what_names_no_topic_is_told_once_others_have_come(store: hl.Store, limit: Limit) -> None:
+    limit(settled_topics_s=0.0)
+    options = RecorderOptions(
+        reserve_bytes=0,
+        triggers=[Trigger.of("/nowhere: a == 1"), Trigger.of("/scan: near > 1")],
+        throttles=[throttle_rule("/cam", "5Hz"), throttle_rule("scan", "500Hz")],
+        priorities=[priority_rule("b\udcff", "low")],
+        matcher=matcher(["/scan", "/odom"]),
+    )
+    recorded = Recorded(store, options)
+    recorded.recorder.look()
+    assert recorded.said == []
+    assert recorded.recorder.wants("/scan", "")
+    recorded.speaker.say(scan_channel(), scan(0, 10))
+    for _ in range(3):
+        recorded.recorder.look()
+    names = ["'/odom'", "'/cam' of --throttle", "'b\\xff' of --priority"]
+    names.append("the trigger '/nowhere: a == 1'")
+    assert recorded.said == [f"no topic fits {name} so far" for name in names]
+    assert recorded.recorder.unfitting() == names
+    recorded.recorder.stop()
 
 
+FIRES = {
+    "a == 7": [1, 3],
+    "a[35] == 7": [3],
+    "a != 7": [0, 2],
+    "a < 1": [0, 2, 3],
+    "a.max >= 7": [1, 3],
+    "a.n >= 2": [2, 3],
+    "id == 18364758544493064721": [1],
+    "id > 18364758544493064721": [2],
+}
 WIDE = Schema("test_msgs/Wide", "ros1msg", b"uint64 id\nfloat64[] a\n")
 
 
@@ -161,28 +178,48 @@ WIDE = Schema("test_msgs/Wide", "ros1msg", b"uint64 id\nfloat64[] a\n")
         ),
     ],
 )
-@pytest.mark.parametrize(
-    ("where", "fires"),
-    [
-        ("a == 7", [1, 3]),
-        ("a[35] == 7", [3]),
-        ("a != 7", [0, 2]),
-        ("a < 1", [0, 2, 3]),
-        ("a.max >= 7", [1, 3]),
-        ("a.n >= 2", [2, 3]),
-        ("id == 18364758544493064721", [1]),
-        ("id > 18364758544493064721", [2]),
-    ],
-)
 def test_a_trigger_fires_on_whole_and_exact_messages(
-    channel: Channel,
-    spell: Callable[[int, list[float]], bytes],
-    where: str,
-    fires: list[int],
+    store: hl.Store, channel: Channel, spell: Callable[[int, list[float]], bytes]
 ) -> None:
     arrays = [[0.5], [7.0], [0.5] * 40, [*[0.5] * 35, 7.0, 8.0]]
     numbers = [1, 18364758544493064721, 18364758544493064722, 2]
-    triggers = Triggers([Trigger.of(f"/wide: {where}")], lambda _: None)
+    recorded = robot(store, *(f"/wide: {where}" for where in FIRES))
+    start = time.time_ns()
     for index, (number, array) in enumerate(zip(numbers, arrays, strict=True)):
-        fired = [*triggers.fired(channel, spell(number, array))]
-        assert fired == ([f"/wide: {where}"] if index in fires else [])
+        recorded.speaker.say(channel, spell(number, array), start + index * SECOND)
+    (report,) = recorded.recorder.stop()
+    found: dict[str, list[int]] = {}
+    for mark in sorted(report.entry.marks, key=itemgetter("time")):
+        found.setdefault(mark["text"], []).append((mark["time"] - start) // SECOND)
+    assert found == {f"/wide: {where}": fires for where, fires in FIRES.items()}
+
+
+def test_a_follower_that_is_killed_misses_nothing(store: hl.Store) -> None:
+    recorded = robot(store, "/scan: id in (1, 3, 5)")
+    follower = recorded.recorder._follower
+    assert follower is not None
+    start, pids = time.time_ns(), set()
+    for number in range(6):
+        recorded.speaker.say(scan_channel(), scan(number, 10), start + number * SECOND)
+        if number in {1, 3}:
+            wait_for(lambda hits=number // 2: len(recorded.said) > hits)
+            assert follower._process is not None
+            pids.add(follower._process.pid)
+            follower._process.kill()
+    (report,) = recorded.recorder.stop()
+    assert len(pids) == 2
+    times = sorted((mark["time"] - start) // SECOND for mark in report.entry.marks)
+    assert times == [1, 3, 5]
+
+
+def test_a_follower_that_cannot_work_is_given_up(
+    store: hl.Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(child, "_PAUSE_S", 0.0)
+    monkeypatch.setattr(child, "_START", "raise SystemExit")
+    recorded = robot(store, "/scan")
+    wait_for(lambda: recorded.said)
+    assert recorded.said == ["triggers are evaluated no more: their process ends again and again"]
+    recorded.speaker.say(scan_channel(), scan(0, 10))
+    (report,) = recorded.recorder.stop()
+    assert (report.entry.messages, report.entry.marks) == (1, [])

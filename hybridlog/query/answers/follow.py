@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
@@ -29,7 +29,7 @@ from hybridlog_storage.stopping import pause, safe_point
 if TYPE_CHECKING:
     from hybridlog.message import Message
     from hybridlog.query.chunk_columns import Chunk
-    from hybridlog.query.chunk_scan import MessageRun, ScanPlan
+    from hybridlog.query.chunk_scan import MessageRun
     from hybridlog.query.counters import Counters
     from hybridlog.query.question import Part, Question, Span
     from hybridlog.session import Asked, Session
@@ -39,7 +39,88 @@ if TYPE_CHECKING:
 _EVERY_S: Final = 0.25
 
 
-class Following(Planner, Iterator["Message"]):
+class Arrivals(Planner):
+    """The messages of running recordings that have come since the last look.
+
+    Args:
+        session: The open store.
+        question: About recordings by their ids.
+        counters: Count what is read.
+        takes: Tells whether a topic that appears later is part of the question.
+
+    Attributes:
+        question: As above, with the topics so far.
+        read: Chunks that were read, by recording and segment.
+        sealed: Numbers of the segments that were read to their end, by recording.
+    """
+
+    def __init__(
+        self, session: Session, question: Question, counters: Counters, takes: Callable[[str], bool]
+    ) -> None:
+        super().__init__(session, question, counters)
+        self._ranges = RangeResolver(session, replace(question, bounds=None))
+        self._rows = self._arrived = _Arrived(session, counters)
+        self._takes = takes
+        self._bounds: dict[str, Span] = {}
+        recordings = question.recordings or ()
+        self.read = {one: Counter[int]() for one in recordings}
+        self.sealed: dict[str, set[int]] = {one: set() for one in recordings}
+        self._marks: set[str] = set()  # ids of those that were read
+
+    def look(self, session: Session) -> tuple[Iterator[MessageRun], bool]:
+        """The messages that have come since the last look, and whether more will."""
+        self.session = self._arrived.session = session
+        places = session.chosen(self.question)
+        snapshot = session.snapshot()
+        new = [t for t in snapshot.topics_at(places) if t not in self.question.topics]
+        topics = (*self.question.topics, *filter(self._takes, new))
+        self.question = replace(self.question, topics=topics)
+        summaries = [snapshot.summaries[place] for place in places.tolist()]
+        parts: list[Part] = []
+        for one in summaries:
+            entry = session.entry_of(one)
+            if self.question.bounds and one.span is not None and one.id not in self._bounds:
+                # The beginning that a time may be relative to is known now.
+                self._bounds[one.id] = RangeResolver(session, self.question).bounds_in(one)
+            bounds = self._bounds.get(one.id)
+            self._arrived.chunks[one.id] = chunks = [*self._arrivals(entry, bounds)]
+            parts += self.parts_in(one, bounds, None) if chunks else ()
+        self._counted.clear()
+        return ChunkScan(self.plan(parts), session).runs(), any(map(self._goes_on, summaries))
+
+    def _goes_on(self, one: RecordingSummary) -> bool:
+        """True if more messages of the question may come."""
+        bounds = self._bounds.get(one.id)
+        is_past = False
+        if bounds is not None and one.span is not None and self.question.clock == "log":
+            is_past = one.span[1] - flush_interval_ns(one) >= bounds[1]
+        return one.status == "open" and not is_past
+
+    def _arrivals(self, entry: RecordingEntry, bounds: Span | None) -> Iterator[Chunk]:
+        """The chunks that have come since the last call, and may have messages in bounds."""
+        clock = self.question.clock
+        read, sealed = self.read[entry.id], self.sealed[entry.id]
+        sealed &= _sealed(entry)
+        timed = [c.id for c in entry.channels if c.has_publish_time]
+        for segment in sorted((_sealed(entry) | entry.flushed.keys()) - {*sealed, MARKS_SEGMENT}):
+            flushed = entry.flushed.get(segment)
+            table = flushed.table if flushed else self.session.chunk_table(entry, segment)
+            columns = ChunkColumns(segment, table)
+            is_new = columns.number >= read[segment]
+            yield from columns.chunks(is_new & columns.within(bounds, clock, timed=timed))
+            read[segment] = len(table.chunks)
+            if flushed is None:
+                sealed.add(segment)
+                del read[segment]
+        if entry.marks:
+            entry = without(entry, self._marks)
+            self.session.show(entry)
+            self._marks.update(mark["id"] for mark in entry.marks)
+            columns = ChunkColumns(MARKS_SEGMENT, entry.flushed[MARKS_SEGMENT].table)
+            yield from columns.chunks(columns.within(bounds, clock, timed=timed))
+
+
+class Following(Arrivals, Iterator["Message"]):
     """The messages of running recordings as they come; waits for the next one.
 
     Args:
@@ -47,9 +128,6 @@ class Following(Planner, Iterator["Message"]):
         question: The question; without a time range, about what is flushed from now on.
         counters: Count what is read.
         names: The topics as they were written; globs take topics that appear later.
-
-    Attributes:
-        question: The recordings that are followed, and the topics so far.
 
     Raises:
         UsageError: No recording of the question is running, or it asks for what is not known
@@ -76,17 +154,10 @@ class Following(Planner, Iterator["Message"]):
         ids = tuple(entry.id for entry in running)
         named = question.names_recording or len(running) > 1
         question = replace(question, recordings=ids, names_recording=named)
-        super().__init__(session, question, counters)
+        super().__init__(session, question, counters, later(names))
         self._source = source
-        self._ranges = RangeResolver(session, replace(question, bounds=None))
-        self._rows = self._arrived = _Arrived(session, counters)
-        self._takes = later(names)
-        self._bounds: dict[str, Span] = {}
-        self._read = {one: Counter[int]() for one in ids}  # chunks, by segment
-        self._sealed: dict[str, set[int]] = {one: set() for one in ids}  # segments read as such
-        self._marks: set[str] = set()  # ids of those that were read
         for entry in running if question.bounds is None else ():
-            self._sealed[entry.id] |= _sealed(entry)
+            self.sealed[entry.id] |= _sealed(entry)
             _ = [*self._arrivals(entry, None)]
         _ = self.examples, self.ranks  # of this moment
         self._messages = (
@@ -101,62 +172,12 @@ class Following(Planner, Iterator["Message"]):
         goes_on = True
         while goes_on:
             started = time.monotonic()
-            self.session = self._arrived.session = self._source.now().again()
-            plan, goes_on = self._look()
-            for run in ChunkScan(plan, self.session).runs():
+            runs, goes_on = self.look(self._source.now().again())
+            for run in runs:
                 yield run
                 safe_point()
             if goes_on:
                 pause(max(_EVERY_S - (time.monotonic() - started), 0))
-
-    def _look(self) -> tuple[ScanPlan, bool]:
-        """The plan for what has come since the last look, and whether more will."""
-        places = self.session.chosen(self.question)
-        snapshot = self.session.snapshot()
-        new = [t for t in snapshot.topics_at(places) if t not in self.question.topics]
-        topics = (*self.question.topics, *filter(self._takes, new))
-        self.question = replace(self.question, topics=topics)
-        summaries = [snapshot.summaries[place] for place in places.tolist()]
-        parts: list[Part] = []
-        for one in summaries:
-            entry = self.session.entry_of(one)
-            if self.question.bounds and one.span is not None and one.id not in self._bounds:
-                # The beginning that a time may be relative to is known now.
-                self._bounds[one.id] = RangeResolver(self.session, self.question).bounds_in(one)
-            bounds = self._bounds.get(one.id)
-            self._arrived.chunks[one.id] = chunks = [*self._arrivals(entry, bounds)]
-            parts += self.parts_in(one, bounds, None) if chunks else ()
-        self._counted.clear()
-        return self.plan(parts), any(map(self._goes_on, summaries))
-
-    def _goes_on(self, one: RecordingSummary) -> bool:
-        """True if more messages of the question may come."""
-        bounds = self._bounds.get(one.id)
-        is_past = False
-        if bounds is not None and one.span is not None and self.question.clock == "log":
-            is_past = one.span[1] - flush_interval_ns(one) >= bounds[1]
-        return one.status == "open" and not is_past
-
-    def _arrivals(self, entry: RecordingEntry, bounds: Span | None) -> Iterator[Chunk]:
-        """The chunks that have come since the last call, and may have messages in bounds."""
-        clock = self.question.clock
-        read, sealed = self._read[entry.id], self._sealed[entry.id]
-        timed = [c.id for c in entry.channels if c.has_publish_time]
-        for segment in sorted((_sealed(entry) | entry.flushed.keys()) - {*sealed, MARKS_SEGMENT}):
-            flushed = entry.flushed.get(segment)
-            table = flushed.table if flushed else self.session.chunk_table(entry, segment)
-            columns = ChunkColumns(segment, table)
-            is_new = columns.number >= read[segment]
-            yield from columns.chunks(is_new & columns.within(bounds, clock, timed=timed))
-            read[segment] = len(table.chunks)
-            if flushed is None:
-                sealed.add(segment)
-        if entry.marks:
-            entry = without(entry, self._marks)
-            self.session.show(entry)
-            self._marks.update(mark["id"] for mark in entry.marks)
-            columns = ChunkColumns(MARKS_SEGMENT, entry.flushed[MARKS_SEGMENT].table)
-            yield from columns.chunks(columns.within(bounds, clock, timed=timed))
 
 
 class _Arrived(Rows):
@@ -178,7 +199,9 @@ class _Arrived(Rows):
         return self.count_in_chunks(parts)
 
     def _scan(self, part: Part, indexes: dict[int, int]) -> RecordingScan:
-        return RecordingScan(part.recording, indexes, part.bounds, self.chunks[part.recording.id])
+        new = self.chunks[part.recording.id]
+        chunks = [chunk for chunk in new if not indexes.keys().isdisjoint(chunk.place.channels)]
+        return RecordingScan(part.recording, indexes, part.bounds, chunks)
 
 
 def _sealed(entry: RecordingEntry) -> set[int]:

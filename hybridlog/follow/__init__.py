@@ -1,0 +1,1 @@
+"""What follows a recording beside its recorder, in a process of its own."""
