@@ -150,11 +150,8 @@ def summary(state: RecorderState) -> str:
 
 
 def _index(state: RecorderState) -> str:
-    if state.index_failure:
-        return f"index {state.lag} behind: {_in_short(state.index_failure)}"
-    if state.late:
-        return f"index {state.late} behind"
-    return "index within seconds" if state.lag else "index up to date"
+    why = f": {_in_short(state.index_failure)}" if state.index_failure else ""
+    return f"index {state.lag} behind{why}" if state.lag or why else "index up to date"
 
 
 def _in_short(reason: str) -> str:

@@ -102,9 +102,9 @@ def _record(choices: RecordChoices) -> None:
                 sources = [held.enter_context(source) for source in sources_of(choices)]
             notify_service("STOPPING=1", "STATUS=writing what is left")
             if not quiet:
-                lag = output.counted(last.late, "message")
-                wait = f", and waiting for MongoDB, which lacks {lag}" if last.late else ""
-                output.note(f"hybridlog: writing what is left{wait}; Ctrl-C leaves at once")
+                lag = output.counted(last.lag, "message")
+                lacks = f" ({lag} for MongoDB)" if last.lag else ""
+                output.note(f"hybridlog: writing what is left{lacks}; Ctrl-C leaves at once")
             reports += recorder.stop(stop.follower_s)
             while recovery.is_alive() and not stop.wait(_RECOVERY_POLL_S):
                 pass

@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-import math
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from hybridlog.arrays import is_video_type
 from hybridlog.cli import output
 from hybridlog.cli.ls import with_misfits
 from hybridlog.cli.options import parse_tags
 from hybridlog.cli.progress import Bar
 from hybridlog.cli.record_choices import RecordChoices, matchers, opened_to_record, segment_settings
-from hybridlog.cli.record_summary import fields_of, ratio, row_of
-from hybridlog.cli.render import Column, bytes_of, numbers, print_fields, print_table
+from hybridlog.cli.record_summary import COLUMNS, fields_of, row_of
+from hybridlog.cli.render import print_fields, print_table
 from hybridlog.cli.signals import if_stopped
 from hybridlog.cli.watching import watch
 from hybridlog.query.answers.completeness import coverage
@@ -249,8 +246,7 @@ class LogRecorder:
         self._current: Path | None = None
         self._recorded = self._known = self._failed = 0
         self._exit_code = 0
-        # Those that are shown at the end.
-        self._reports: list[tuple[Path, RecordReport]] = []
+        self._rows: list[dict[str, Any]] = []  # those that are shown at the end
         self._summaries: list[dict[str, Any]] = []
 
     @contextmanager
@@ -340,9 +336,10 @@ class LogRecorder:
         self._recorded += 1
         for error in _problems(path, report, quiet=self._choices.quiet):
             self._exit_code = self._exit_code or error.exit_code
-        self._summarise(_summary(path, report))
+        row = row_of(report, path)
+        self._summarise(row)
         if self._logs:
-            self._reports.append((path, report))
+            self._rows.append(row)
         elif not self._choices.as_json and not self._choices.quiet:
             entry = report.entry
             output.say(
@@ -390,10 +387,8 @@ class LogRecorder:
         if choices.as_json and self._summaries:
             one = len(choices.paths) == 1 and not self._is_search
             output.print_json(self._summaries[0] if one else self._summaries)
-        elif len(self._reports) == 1 and not choices.as_json and not choices.quiet:
-            _print_one(*self._reports[0])
-        elif self._reports and not choices.as_json and not choices.quiet:
-            _print_several([report for _, report in self._reports])
+        elif self._rows and not choices.as_json and not choices.quiet:
+            _print(self._rows)
         if self._is_search and not choices.quiet:
             output.note(
                 f"{output.counted(self._recorded, 'log')} recorded, {self._known} in the store "
@@ -401,58 +396,13 @@ class LogRecorder:
             )
 
 
-def _summary(path: Path, report: RecordReport) -> dict[str, Any]:
-    entry = report.entry
-    return {
-        "path": str(path),
-        "id": entry.id,
-        **row_of(report),
-        "topics": len({c.topic for c in entry.channels}),
-        "messages_unreadable": sum(c.stats.unreadable for c in entry.channels),
-        "messages_surplus": sum(c.stats.surplus for c in entry.channels),
-        "messages_skipped": report.skipped,
-        "attachments": entry.attachments,
-        "attachments_left_out": report.attachments_left_out,
-        "metadata_records": entry.metadata_records,
-        "messages_latched": report.latched,
-        "bytes_in": entry.source["bytes"],
-        "ratio": round(entry.source["bytes"] / (entry.stored_bytes or math.inf), 3),
-        "damage": [{**asdict(d), "file": str(d.file)} for d in report.damage],
-        "not_indexed": {c.topic: c.unindexed for c in entry.channels if c.unindexed is not None},
-    }
-
-
-def _print_one(path: Path, report: RecordReport) -> None:
-    entry = report.entry
-    messages, attachments = str(entry.messages), str(entry.attachments or "")
-    if report.skipped:
-        messages += f" ({report.skipped} left out)"
-    if report.latched:
-        videos = any(is_video_type(one.type) for one in entry.channels)
-        what = "latched or frames of video" if videos else "latched"
-        messages += f"; {report.latched} of them {what}, from before the time range"
-    if report.attachments_left_out:
-        attachments = f"{entry.attachments} ({report.attachments_left_out} left out)"
-    print_fields(fields_of(report, path, messages, entry.source["bytes"], attachments))
-
-
-def _print_several(reports: Sequence[RecordReport]) -> None:
-    rows = [_summary(Path(), report) for report in reports]
-    summed = ("messages", "bytes_in", "bytes_stored", "messages_indexed", "seconds")
-    total = {name: sum(row[name] for row in rows) for name in summed}
-    topics = len({c.topic for report in reports for c in report.entry.channels})
-    print_table(_COLUMNS, [*rows, {"recording": "total", "topics": topics, **total}])
-
-
-_COLUMNS = [
-    Column("recording"),
-    *numbers("topics", "messages"),
-    bytes_of("bytes in", "bytes_in", order=1),
-    bytes_of("stored", "bytes_stored"),
-    Column("ratio", lambda row: ratio(row["bytes_in"], row["bytes_stored"]), "right"),
-    Column("indexed", "messages_indexed", "right"),
-    Column("time", lambda row: f"{row['seconds']:.2f} s", "right"),
-]
+def _print(rows: Sequence[Mapping[str, Any]]) -> None:
+    if len(rows) == 1:
+        print_fields(fields_of(rows[0]))
+        return
+    summed = [key for key, value in rows[0].items() if isinstance(value, int | float)]
+    total = {key: sum(row[key] for row in rows) for key in summed}
+    print_table(COLUMNS, [*rows, {**total, "recording": "total", "path": "", "topics": None}])
 
 
 def _problems(path: Path, report: RecordReport, *, quiet: bool) -> Iterator[HybridlogError]:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import click
 
 from hybridlog.cli import output
 from hybridlog.cli.app import DIFFERENT
-from hybridlog.cli.render import print_fields
+from hybridlog.cli.render import Column, bytes_of, numbers, print_fields
 from hybridlog.query.answers.completeness import line_of
 from hybridlog.record.losses import Cause
 from hybridlog.wording import listed
@@ -32,42 +32,66 @@ if TYPE_CHECKING:
 _MAX_ROWS = 10  # of the ledger; `losses` prints all
 
 
-def row_of(report: RecordReport) -> dict[str, Any]:
+def row_of(report: RecordReport, path: object) -> dict[str, Any]:
     """What is told in JSON of each recording."""
-    entry = report.entry
+    entry, seconds = report.entry, report.elapsed_s
     return {
+        "path": str(path),
+        "kind": entry.source["kind"],
+        "id": entry.id,
         "recording": entry.name,
         "status": entry.status,
+        "topics": len({c.topic for c in entry.channels}),
         "messages": entry.messages,
         "messages_indexed": report.indexed,
+        "messages_unreadable": sum(c.stats.unreadable for c in entry.channels),
+        "messages_surplus": sum(c.stats.surplus for c in entry.channels),
+        "messages_skipped": report.skipped,
+        "messages_latched": report.latched,
+        "attachments": entry.attachments,
+        "attachments_left_out": report.attachments_left_out,
+        "metadata_records": entry.metadata_records,
+        "bytes_in": entry.source["bytes"],
         "bytes_stored": entry.stored_bytes,
-        "seconds": round(report.elapsed_s, 3),
+        "seconds": round(seconds, 3),
+        "damage": [{**asdict(d), "file": str(d.file)} for d in report.damage],
+        "not_indexed": {c.topic: c.unindexed for c in entry.channels if c.unindexed is not None},
     }
 
 
-def fields_of(
-    report: RecordReport, source: object, messages: str, bytes_in: int, attachments: str = ""
-) -> list[tuple[str, object]]:
+def _source(row: Mapping[str, Any]) -> str:
+    return f"{row['path']} ({row['kind']})" if row["path"] else ""
+
+
+def _ratio(row: Mapping[str, Any]) -> str:
+    return f"{row['bytes_in'] / (row['bytes_stored'] or math.inf):.2f}"
+
+
+def _rate(row: Mapping[str, Any]) -> str:
+    return f"{row['messages'] / (row['seconds'] or math.inf):,.0f}"
+
+
+COLUMNS: Final = [
+    Column("recording"),
+    Column("source", _source, order=1),
+    *numbers("topics", "messages"),
+    Column("left out", "messages_skipped", "right", varies=True),
+    Column("from before", "messages_latched", "right", varies=True),
+    Column("attachments", side="right", varies=True),
+    bytes_of("bytes in", "bytes_in", order=3),
+    bytes_of("stored", "bytes_stored"),
+    Column("ratio", _ratio, "right"),
+    Column("indexed", "messages_indexed", "right"),
+    Column("time", lambda row: f"{row['seconds']:.2f} s", "right"),
+    Column("messages/s", _rate, "right", order=2),
+]
+"""Of the rows of `row_of`."""
+
+
+def fields_of(row: Mapping[str, Any]) -> list[tuple[str, object]]:
     """What is told to people of one recording."""
-    entry = report.entry
-    rate = entry.messages / report.elapsed_s if report.elapsed_s else 0.0
-    return [
-        ("recording", entry.name),
-        ("source", f"{source} ({entry.source['kind']})"),
-        ("topics", len({c.topic for c in entry.channels})),
-        ("messages", messages),
-        *([("attachments", attachments)] if attachments else []),
-        ("bytes in", output.size(bytes_in)),
-        ("bytes stored", output.size(entry.stored_bytes)),
-        ("ratio", ratio(bytes_in, entry.stored_bytes)),
-        ("messages indexed", report.indexed),
-        ("time", f"{report.elapsed_s:.2f} s ({rate:,.0f} messages/s)"),
-    ]
-
-
-def ratio(bytes_in: int, bytes_stored: int) -> str:
-    """Bytes that came in divided by bytes stored."""
-    return f"{bytes_in / (bytes_stored or math.inf):.2f}"
+    cells = [(one, one.cell(row)) for one in COLUMNS]
+    return [(one.name, cell) for one, cell in cells if not (one.varies and cell == "0")]
 
 
 @dataclass(slots=True)
@@ -172,8 +196,8 @@ def closing_fields(
         unreached: Addresses of sources that never answered.
     """
     entry = report.entry
-    messages = f"{entry.messages} of {state.messages} received"
-    fields = fields_of(report, entry.source["path"], messages, state.stored_bytes)
+    row = {**row_of(report, entry.source["path"]), "bytes_in": state.stored_bytes}
+    fields = [*fields_of(row), ("received", state.messages)]
     if state.let_go:
         fields.append(("let go", f"{state.let_go}, by the ring"))
     if unreached:
@@ -201,7 +225,7 @@ def _summary(reports: Sequence[RecordReport], state: RecorderState, reason: str)
         "ended": reason,
         "recordings": [
             {
-                **row_of(report),
+                **row_of(report, report.entry.source["path"]),
                 "tags": report.entry.tags,
                 "losses": report.entry.end.get("losses", []),
             }

@@ -33,14 +33,11 @@ from hybridlog.live.policy import (
     first_fit,
     retention,
 )
-from hybridlog.live.recording import (
-    LiveOptions,
-    indexed_within_s,
-)
+from hybridlog.live.recording import LiveOptions
 from hybridlog.live.ring import GROUPS, Ring
 from hybridlog.live.silence import RULE, Silence, SilenceWatch
 from hybridlog.live.state import RecorderState, StateFile
-from hybridlog.live.statistics import Lateness, Tally, TopicRates
+from hybridlog.live.statistics import Tally, TopicRates
 from hybridlog.maintenance.edit import change, remove_if
 from hybridlog.maintenance.keep import RetentionThread
 from hybridlog.maintenance.retention import Rules
@@ -196,7 +193,6 @@ class Recorder:
         self._started = time.monotonic()
         self._looked = self._written_at = self._started
         self._written = 0
-        self._lateness = Lateness(indexed_within_s(options.flush_interval_s))
         self._stored_bytes = 0
         self._lost: dict[tuple[str, Cause], int] = {}
         self._clock_marks: list[tuple[str, Mapping[str, str], int]] = []
@@ -386,7 +382,7 @@ class Recorder:
             for topic, rate in rates
             if rate.tallies or topic in self._present
         ]
-        lag, (stored, stored_bytes) = self._target.lag, self._target.stored
+        stored, stored_bytes = self._target.stored
         failure = self._target.index_failure
         state = RecorderState(
             self.name,
@@ -396,8 +392,7 @@ class Recorder:
             stored,
             lost,
             self._target.filled,
-            lag,
-            self._lateness.late(now, stored, lag),
+            self._target.lag,
             "" if failure is None else str(failure),
             shutil.disk_usage(self._directory.path).free,
             stored_bytes,

@@ -552,11 +552,6 @@ def _index_interval_s(flush_interval_s: float) -> float:
     return min(_INDEX_INTERVALS * flush_interval_s, INTERVAL_S)
 
 
-def indexed_within_s(flush_interval_s: float) -> float:
-    """Seconds in which an index that keeps up receives a message."""
-    return flush_interval_s + _index_interval_s(flush_interval_s) + _INDEXING_S
-
-
 def _batch(messages: deque[_Message]) -> LooseBatch:
     channel, log_time, publish_time, sequence, payloads = zip(*messages, strict=True)
     return LooseBatch(

@@ -42,7 +42,6 @@ class RecorderState:
         lost: Messages lost so far, by cause, as far as they can be counted.
         filled: Used share of the memory budget, 0 to 1.
         lag: Messages that are not indexed yet.
-        late: Of these, the overdue ones: they wait longer than messages of slow topics do.
         index_failure: The error that stopped the index; empty while it works.
         free_bytes: Free space of the disk.
         stored_bytes: Payload bytes stored so far.
@@ -66,7 +65,6 @@ class RecorderState:
     lost: Mapping[str, int]
     filled: float
     lag: int
-    late: int
     index_failure: str
     free_bytes: int
     stored_bytes: int

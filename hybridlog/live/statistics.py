@@ -138,30 +138,3 @@ class TopicRates:
                 deviation = math.sqrt(max(squares / count - (total / count) ** 2, 0.0)) / 1e6
                 worst = deviation if worst is None else max(worst, deviation)
         return worst
-
-
-class Lateness:
-    """Counts the messages that the index should contain by now, and does not.
-
-    Args:
-        within_s: Seconds in which an index that keeps up receives a message.
-    """
-
-    def __init__(self, within_s: float) -> None:
-        self._within_s = within_s
-        self._seen: deque[tuple[float, int]] = deque()
-
-    def late(self, now: float, stored: int, lag: int) -> int:
-        """Number of messages that are overdue in the index.
-
-        Args:
-            now: Monotonic clock, seconds.
-            stored: Messages stored so far.
-            lag: Number of these that are not in the index.
-        """
-        self._seen.append((now, stored))
-        due = now - self._within_s
-        while len(self._seen) > 1 and self._seen[1][0] <= due:
-            self._seen.popleft()
-        at, expected = self._seen[0]
-        return max(expected - (stored - lag), 0) if at <= due else 0

@@ -22,21 +22,23 @@ pytestmark = pytest.mark.mongo
 def test_the_closing_table(logs: Path, tmp_path: Path) -> None:
     done = run("record", logs / "small.bag", "--store", tmp_path / "s")
     seen = read_bag(logs / "small.bag")
-    table = dict(line.split(None, 1) for line in done.lines if not line.startswith(("bytes", "me")))
+    table = dict(
+        line.split(None, 1) for line in done.lines if not line.startswith(("bytes", "left"))
+    )
     assert table["recording"] == "small"
     assert table["topics"] == str(len({m.topic for m in seen}))
-    for line in ("messages", "messages indexed"):
-        assert f"{line:<16}  {len(seen)}" in done.lines
+    assert table["messages"].strip() == table["indexed"].strip() == str(len(seen))
     assert [line.split("  ")[0] for line in done.lines] == [
         "recording",
         "source",
         "topics",
         "messages",
         "bytes in",
-        "bytes stored",
+        "stored",
         "ratio",
-        "messages indexed",
+        "indexed",
         "time",
+        "messages/s",
     ]
     assert done.err == ""
 
@@ -48,7 +50,6 @@ def test_json_is_exact(logs: Path, tmp_path: Path) -> None:
     assert done["messages"] == done["messages_indexed"] == len(seen)
     assert done["bytes_in"] == (logs / "small.bag").stat().st_size
     assert done["bytes_stored"] == stored
-    assert done["ratio"] == pytest.approx(done["bytes_in"] / stored, abs=1e-3)
     assert done["damage"] == []
     assert not misfit(done, schema_of(["record"]))
 
@@ -94,7 +95,9 @@ def test_a_slice_has_latched_messages_in_front(logs: Path, tmp_path: Path) -> No
     inside = [m for m in seen if m.topic == "/odom" and start <= m.log_time < start + 10**8]
     with hl.open(tmp_path / "s", create=True):
         done = run(*asked, *between, store=tmp_path / "s")
-        assert f"{len(inside) + 1} ({len(seen) - len(inside) - 1} left out); 1 of them" in done.out
+        told = {name: cells for name, *cells in map(str.split, done.lines)}
+        assert (told["messages"], told["from"]) == ([str(len(inside) + 1)], ["before", "1"])
+        assert told["left"] == ["out", str(len(seen) - len(inside) - 1)]
         found = run(*asked, *between, "--no-latched", "--json", store=tmp_path / "s").json
         assert (found["messages"], found["messages_latched"]) == (len(inside), 0)
         # A range without messages is refused, although a latched message is in force.
