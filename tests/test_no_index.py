@@ -125,8 +125,9 @@ def test_as_a_command(tmp_path: Path, log: Path) -> None:
     arguments = ("record", log, "--no-index", "signal[23]", "--no-index", "nothing", "--json")
     done = run(*arguments, store=place)
     assert "no topic fits 'nothing'" in done.err
-    assert done.json["messages_indexed"] == 40
-    assert done.json["not_indexed"] == dict.fromkeys(LEFT_OUT, "recorded with --no-index")
+    (told,) = done.json
+    assert told["messages_indexed"] == 40
+    assert told["not_indexed"] == dict.fromkeys(LEFT_OUT, "recorded with --no-index")
     channels = run("info", "log", "--json", store=place).json[0]["channels"]
     shown = {channel["topic"]: channel["not_indexed"] for channel in channels}
     assert [name for name in FOUR if shown[name]] == LEFT_OUT

@@ -24,11 +24,7 @@ _SLOW = 0.8  # of the expected rate: below it the rate is shown as a warning
 
 
 class LiveTable:
-    """The table; a context manager that removes it at the end.
-
-    Args:
-        error: Draw it on standard error, else on standard output.
-    """
+    """The table; a context manager that removes it at the end."""
 
     def __init__(self, *, error: bool = True) -> None:
         from rich.live import Live

@@ -16,11 +16,6 @@ class Bar:
     """A bar with rate and remaining time; a context manager that removes it.
 
     It appears at the first progress, on a terminal. Elsewhere there is nothing.
-
-    Args:
-        label: Name of the work.
-        total: Approximate number of bytes; None if unknown, 0 if each part tells its own.
-        quiet: No bar, as for --quiet and --json.
     """
 
     def __init__(self, label: str, total: int | None = 0, *, quiet: bool = False) -> None:

@@ -218,10 +218,6 @@ def matchers(choices: RecordChoices) -> tuple[TopicMatcher | None, TopicMatcher 
 def segment_settings(choices: RecordChoices, chunk_size: int = DEFAULT_CHUNK) -> SegmentSettings:
     """Chunks and compression.
 
-    Args:
-        choices: The parameters.
-        chunk_size: Bytes of a chunk if the user does not say.
-
     Raises:
         UsageError: Chunks would be too large.
     """

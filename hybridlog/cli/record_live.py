@@ -286,11 +286,7 @@ class _Display:
 
 
 def notify_service(*assignments: str) -> None:
-    """Send assignments such as `READY=1` to the service manager; does nothing without one.
-
-    Args:
-        assignments: As `sd_notify(3)` describes them; no line breaks.
-    """
+    """Send assignments such as `READY=1` to the service manager; does nothing without one."""
     address = os.environ.get("NOTIFY_SOCKET", "")
     if address[:1] not in {"/", "@"}:
         return

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -113,12 +114,6 @@ def _find(choices: RecordChoices) -> tuple[list[LogSet], Found | None]:
 
     logs: list[LogSet] = []
     walked: Found | None = None
-    if choices.paths and all(map(_is_topic, choices.paths)):
-        topics = " ".join(f"-t {path}" for path in choices.paths)
-        raise UsageError(
-            f"There is no file {choices.paths[0]}. To record topics of a running robot: "
-            f"`hybridlog record --ros2 {topics}`."
-        )
     for path in choices.paths:
         found = find_logs(path) if path.is_dir() else Found()
         print_stores(found.stores)
@@ -130,12 +125,6 @@ def _find(choices: RecordChoices) -> tuple[list[LogSet], Found | None]:
         logs += found.logs
         walked.problems += found.problems
     return logs, walked
-
-
-def _is_topic(path: Path) -> bool:
-    """True if a path does not exist and looks like the name of a topic."""
-    is_near = path.parent.exists() and path.parent != Path("/")
-    return path.is_absolute() and not (path.suffix or is_near or path.exists())
 
 
 def print_stores(stores: Iterable[Path]) -> None:
@@ -227,11 +216,6 @@ def _outside(source: Source, between: tuple[int, int]) -> TimeError:
 class LogRecorder:
     """Records logs with the options of the command; what came of them is told at the end.
 
-    Args:
-        choices: The options.
-        logs: The logs to record; without any, each is reported at once, as there is no end.
-        is_search: Whether logs are looked for in directories, so that known ones are no error.
-
     Raises:
         UsageError: An option is wrong.
     """
@@ -244,10 +228,9 @@ class LogRecorder:
         self._logs, self._is_search = logs, is_search
         self._unfinished = [log.path for log in logs]
         self._current: Path | None = None
-        self._recorded = self._known = self._failed = 0
+        self._counts: Counter[str] = Counter()  # of what came of logs
         self._exit_code = 0
         self._rows: list[dict[str, Any]] = []  # those that are shown at the end
-        self._summaries: list[dict[str, Any]] = []
 
     @contextmanager
     def opened(self) -> Iterator[Store]:
@@ -277,12 +260,9 @@ class LogRecorder:
                 if not self._is_search:
                     self.fail(piece.path, error)
                 else:
-                    self._current = None
-                    self._known += 1
-                    self._summarise({"path": str(piece.path), "known": str(error)})
+                    self._tell({"path": str(piece.path), "known": str(error)}, "known")
             except (SourceError, UsageError) as error:
                 self.fail(piece.path, error)
-        # All of it is stored, or reported as left out.
         if log.path in self._unfinished:
             self._unfinished.remove(log.path)
 
@@ -332,15 +312,10 @@ class LogRecorder:
         return report
 
     def _add(self, path: Path, report: RecordReport) -> None:
-        self._current = None
-        self._recorded += 1
         for error in _problems(path, report, quiet=self._choices.quiet):
             self._exit_code = self._exit_code or error.exit_code
-        row = row_of(report, path)
-        self._summarise(row)
-        if self._logs:
-            self._rows.append(row)
-        elif not self._choices.as_json and not self._choices.quiet:
+        self._tell(row_of(report, path), "recorded")
+        if not self._logs and not self._choices.as_json and not self._choices.quiet:
             entry = report.entry
             output.say(
                 f"{entry.name}: {output.counted(entry.messages, 'message')}, "
@@ -353,21 +328,23 @@ class LogRecorder:
         Raises:
             HybridlogError: It is of the only log.
         """
-        self._current = None
         if len(self._logs) == 1 and not self._is_search:
+            self._current = None
             self._unfinished.clear()
             raise error
         output.note(f"hybridlog: {error}")
-        self._failed += 1
         self._exit_code = self._exit_code or error.exit_code
         about = {} if path is None else {"path": str(path)}
-        self._summarise({**about, "error": str(error), "exit_code": error.exit_code})
+        self._tell({**about, "error": str(error), "exit_code": error.exit_code}, "error")
 
-    def _summarise(self, summary: dict[str, Any]) -> None:
+    def _tell(self, row: dict[str, Any], what: str) -> None:
+        """Show what came of a log: at the end, if there is one."""
+        self._current = None
+        self._counts[what] += 1
         if self._logs:
-            self._summaries.append(summary)
+            self._rows.append(row)
         elif self._choices.as_json:
-            output.print_json_line(summary)
+            output.print_json_line(row)
 
     def _on_stop(self) -> str:
         """The effect of stopping now on the recordings."""
@@ -376,29 +353,28 @@ class LogRecorder:
             left[:1] = [self._current]
         what = str(left[0]) if len(left) == 1 else output.counted(len(left), "log")
         parts = [f"Nothing of {what} is stored."] if left else []
-        if self._recorded:
+        if stored := self._counts["recorded"]:
             before = " before" if left else ""
-            parts.append(f"{output.counted(self._recorded, 'recording')} stored{before}.")
+            parts.append(f"{output.counted(stored, 'recording')} stored{before}.")
         return " ".join(parts)
 
     def _show(self) -> None:
         """Print the finished recordings, and what became of the others."""
-        choices = self._choices
-        if choices.as_json and self._summaries:
-            one = len(choices.paths) == 1 and not self._is_search
-            output.print_json(self._summaries[0] if one else self._summaries)
-        elif self._rows and not choices.as_json and not choices.quiet:
-            _print(self._rows)
+        choices, counts = self._choices, self._counts
+        if choices.as_json and self._rows:
+            output.print_json(self._rows)
+        elif not choices.as_json and not choices.quiet:
+            _print([row for row in self._rows if "messages" in row])
         if self._is_search and not choices.quiet:
             output.note(
-                f"{output.counted(self._recorded, 'log')} recorded, {self._known} in the store "
-                f"already, {self._failed} not recorded."
+                f"{output.counted(counts['recorded'], 'log')} recorded, {counts['known']} in the "
+                f"store already, {counts['error']} not recorded."
             )
 
 
 def _print(rows: Sequence[Mapping[str, Any]]) -> None:
-    if len(rows) == 1:
-        print_fields(fields_of(rows[0]))
+    if len(rows) < 2:
+        print_fields([pair for row in rows for pair in fields_of(row)])
         return
     summed = [key for key, value in rows[0].items() if isinstance(value, int | float)]
     total = {key: sum(row[key] for row in rows) for key in summed}

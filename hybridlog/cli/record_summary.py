@@ -96,12 +96,7 @@ def fields_of(row: Mapping[str, Any]) -> list[tuple[str, object]]:
 
 @dataclass(slots=True)
 class LiveSummary:
-    """The summary of a recorder that has stopped.
-
-    Attributes:
-        state: Of the recorder, at its end.
-        broken: The rules of the contract that the recording breaks.
-    """
+    """The summary of a recorder that has stopped."""
 
     reports: Sequence[RecordReport]
     recorder: Recorder
@@ -188,13 +183,7 @@ class LiveSummary:
 def closing_fields(
     report: RecordReport, state: RecorderState, unreached: Sequence[str]
 ) -> list[tuple[str, object]]:
-    """What is told to people of a robot's recording.
-
-    Args:
-        report: Result of the recording.
-        state: Of the recorder, at its end.
-        unreached: Addresses of sources that never answered.
-    """
+    """What is told to people of a robot's recording."""
     entry = report.entry
     row = {**row_of(report, entry.source["path"]), "bytes_in": state.stored_bytes}
     fields = [*fields_of(row), ("received", state.messages)]

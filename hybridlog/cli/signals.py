@@ -35,12 +35,7 @@ _consequences: list[str | Callable[[], str]] = []
 
 
 class Stopped(BaseException):
-    """A signal stopped the command.
-
-    Attributes:
-        number: The signal.
-        consequence: What became of the unfinished work, for people.
-    """
+    """A signal stopped the command."""
 
     def __init__(self, number: int) -> None:
         super().__init__(number)
@@ -55,11 +50,7 @@ class Stopped(BaseException):
 
 @contextlib.contextmanager
 def if_stopped(consequence: str | Callable[[], str]) -> Iterator[None]:
-    """Say what it means when the block is stopped.
-
-    Args:
-        consequence: What becomes of the unfinished work, or a function that says so then.
-    """
+    """Say what it means when the block is stopped."""
     _consequences.append(consequence)
     try:
         yield
@@ -114,11 +105,7 @@ def handled(
 
 @contextlib.contextmanager
 def ended_by_signal(end: Callable[[], object]) -> Iterator[None]:
-    """Let the first signal end a server, with exit code 0; a second one ends the process.
-
-    Args:
-        end: Ends the server soon.
-    """
+    """Let the first signal end a server, with exit code 0; a second one ends the process."""
 
     def stop(_: int) -> None:
         restore()

@@ -39,8 +39,7 @@ class Follower:
         store: Address of the store.
         recording: Id of the recording.
         triggers: The triggers.
-        around_ns: Hits of one trigger that are nearer than this may come as one.
-        hit: Called with the text of a trigger, and the log times of its first and last message.
+        hit: Called with the text of a trigger, and the log time of a message.
         say: Shows a line to the user.
 
     Attributes:
@@ -53,14 +52,13 @@ class Follower:
         store: str,
         recording: str,
         triggers: Sequence[Trigger],
-        around_ns: int,
         *,
-        hit: Callable[[str, int, int], object],
+        hit: Callable[[str, int], object],
         say: Callable[[str], None],
     ) -> None:
         self.judged: Collection[int] | None = () if triggers else None
         self._triggers = triggers
-        self._task = store, recording, [one.text for one in triggers], around_ns
+        self._task = store, recording, [one.text for one in triggers]
         self._read: object = None
         self._why = "their process ends again and again"
         self._hit = hit
@@ -136,7 +134,9 @@ class Follower:
                 continue
             kind, *values = control.recv()
             if kind == "hit":
-                self._hit(*values)
+                text, times = values
+                for time in times:
+                    self._hit(text, time)
             elif kind == "read":
                 (self._read,) = values
                 self.judged = values[0][1]

@@ -7,14 +7,12 @@ import signal
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
-
-import numpy as np
 
 import hybridlog
 from hybridlog.follow.triggers import Trigger
@@ -27,8 +25,6 @@ from hybridlog.schema.codecs import codec_for
 from hybridlog_storage.errors import DefinitionError, HybridlogError, WhereError
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from hybridlog_storage.messages import Channel
 
 _EVERY_S: Final = 0.25
@@ -45,8 +41,8 @@ def serve(handle: int) -> None:
     with suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text(_FIRST_TO_GO, "ascii")
     with Connection(handle) as control, suppress(EOFError, ConnectionError):
-        address, recording, texts, around_ns, read = control.recv()
-        watch = _Watch(control, [Trigger.of(text) for text in texts], around_ns)
+        address, recording, texts, read = control.recv()
+        watch = _Watch(control, [Trigger.of(text) for text in texts])
         threading.Thread(target=watch.hear, daemon=True).start()
         try:
             watch.run(address, recording, read)
@@ -57,20 +53,11 @@ def serve(handle: int) -> None:
 
 
 class _Watch:
-    """Evaluates triggers.
+    """Evaluates triggers, and tells a recorder."""
 
-    Args:
-        control: The recorder.
-        triggers: The triggers.
-        around_ns: Hits of one trigger that are nearer than this are told as one.
-    """
-
-    def __init__(
-        self, control: Connection[Any, Any], triggers: Sequence[Trigger], around_ns: int
-    ) -> None:
+    def __init__(self, control: Connection[Any, Any], triggers: Sequence[Trigger]) -> None:
         self._control = control
         self._triggers = triggers
-        self._around_ns = around_ns
         self._lock = threading.Lock()
 
     def tell(self, *what: object) -> None:
@@ -125,8 +112,7 @@ class _Watch:
             for trigger, one in zip(self._triggers, watched, strict=True):
                 runs, goes_on = one.look(session)
                 for run in runs:
-                    for first, last in _spans(run.batch.log_time, self._around_ns):
-                        self.tell("hit", trigger.text, first, last)
+                    self.tell("hit", trigger.text, run.batch.log_time.tolist())
             now = dict(watched[0].read[recording]), frozenset(watched[0].sealed[recording])
             if now != read:
                 read = now
@@ -137,11 +123,3 @@ class _Watch:
 
 def _takes(trigger: Trigger, topic: str) -> bool:
     return topic != MARKS and trigger.fits(topic)  # which it makes itself
-
-
-def _spans(times: NDArray[np.int64], around_ns: int) -> Iterator[tuple[int, int]]:
-    """First and last of the times that lie near each other, ns."""
-    times = np.sort(times)
-    ends = np.flatnonzero(np.diff(times) > around_ns)
-    for first, last in zip([0, *(ends + 1)], [*ends, -1], strict=True) if len(times) else ():
-        yield int(times[first]), int(times[last])

@@ -1,7 +1,7 @@
-"""Incidents: what a trigger, a signal or a person names while it is recorded.
+"""Marks that a recorder sets: of triggers and signals, of silences, of a clock that was set.
 
-An incident is a mark and a pin of the same time in the recording's manifest. Hits of one name
-whose times touch are one incident.
+A hit of a trigger or signal is an incident: a mark and a pin of the same time in the recording's
+manifest. Hits of one name whose times touch are one incident.
 """
 
 from __future__ import annotations
@@ -24,24 +24,24 @@ _EVERY_S: Final = 0.1
 _PROLONGED_S: Final = 1.0  # between two changes that only prolong incidents
 
 
-class Hit(NamedTuple):
-    """Something happened.
+class Moment(NamedTuple):
+    """What is marked.
 
     Attributes:
-        text: What.
-        tags: Tags of its mark.
-        begin: Steady time from which on messages are marked and pinned, ns.
-        end: Steady time up to which they are.
+        text: Text of the mark.
+        tags: Its tags.
+        begin: Steady time from which on it lasts, ns.
+        end: Steady time up to which it lasts; None for a moment, or if that is to come.
     """
 
     text: str
     tags: Mapping[str, str]
     begin: int
-    end: int
+    end: int | None = None
 
 
 class Incidents:
-    """Marks and pins hits on a thread of its own, and lets what is too old for a ring go.
+    """Marks and pins on a thread of its own, and lets what is too old for a ring go.
 
     Nothing goes before the hits that came until then are pinned. What fails is tried again.
 
@@ -71,8 +71,10 @@ class Incidents:
         self._ring = ring
         self._say = say
         self._set_by = 0
-        self._last: dict[str, tuple[str, Hit]] = {}  # by text, with its id
-        self._new: dict[str, Hit] = {}  # by id, not written yet
+        self._last: dict[str, tuple[str, int, int]] = {}  # id, begin and end of hits, by text
+        self._hits: dict[str, Moment] = {}  # by id
+        self._new: dict[str, Moment] = {}  # by id, not written yet
+        self._written: set[str] = set()  # ids
         self._is_urgent = False
         self._written_at = 0.0
         self._lock = threading.Lock()
@@ -90,66 +92,73 @@ class Incidents:
         if self._thread.is_alive():
             self._thread.join()
 
-    def hit(self, hit: Hit) -> str:
-        """Take a hit, which is written soon; waits for nothing. Returns the id of its mark."""
+    def hit(self, text: str, begin: int, end: int) -> None:
+        """Mark and pin what lies between two steady times, ns, soon; waits for nothing."""
         with self._lock:
-            key, last = self._last.get(hit.text, ("", hit))
-            if key and last.begin <= hit.end and hit.begin <= last.end:
-                hit = hit._replace(begin=min(last.begin, hit.begin), end=max(last.end, hit.end))
+            key, last_begin, last_end = self._last.get(text, ("", begin, end))
+            if key and last_begin <= end and begin <= last_end:
+                begin, end = min(last_begin, begin), max(last_end, end)
             else:
                 key = new_random()
                 self.count += 1
                 self._is_urgent = True
-            self._last[hit.text] = key, hit
-            self._new[key] = hit
-        return key
+            self._last[text] = key, begin, end
+            self._hits[key] = self._new[key] = Moment(text, {"trigger": text}, begin, end)
+
+    def note(self, key: str, moment: Moment) -> None:
+        """Mark something soon, by an id of its own; with the same id again it has another end."""
+        with self._lock:
+            self._new[key] = moment
+            self._is_urgent = True
 
     def write(self) -> bool:
-        """Mark and pin all hits so far; returns whether there were new ones.
+        """Mark and pin all so far; returns whether there was anything new.
 
         Raises:
             StoreError: The manifest cannot be written.
         """
         with self._writing:
             with self._lock:
-                hits, self._is_urgent = dict(self._new), False
-            if not hits:
+                new, self._is_urgent = dict(self._new), False
+            if not new:
                 return False
-            pins = {key: self._pin(key, hit) for key, hit in hits.items()}
-            marks = {key: self._mark(key, hit) for key, hit in hits.items()}
-            fresh: list[Mark] = []
+            marks = {key: self._mark(key, one) for key, one in new.items()}
+            pins = {
+                key: Pin(key, *self._log_times(one), reason=one.text)
+                for key, one in new.items()
+                if key in self._hits
+            }
 
             def how(now: Manifest) -> Manifest:
                 before = {pin.id: pin for pin in now.pins}
-                fresh[:] = [mark for key, mark in marks.items() if key not in before]
                 told = tuple(marks.get(mark.id, mark) for mark in now.marks)
                 now = replace(now, pins=(*(before | pins).values(),), marks=told)
-                for mark in fresh:
-                    now = with_mark(now, mark)
+                known = self._written.union(mark.id for mark in told)
+                for key, mark in marks.items():
+                    if key not in known:
+                        now = with_mark(now, mark)
                 return now
 
             self._change(how)
             self._written_at = time.monotonic()
+            fresh = pins.keys() - self._written
+            self._written.update(marks)
             with self._lock:
-                self._new = {k: hit for k, hit in self._new.items() if hits.get(k) != hit}
-        for mark in fresh:
+                self._new = {k: one for k, one in self._new.items() if new.get(k) != one}
+        for mark in (mark for key, mark in marks.items() if key in fresh):
             self._say(f"{mark.text!r} {PINNED} from {format_time(mark.time)} on")
         return True
 
-    def _pin(self, key: str, hit: Hit) -> Pin:
-        return Pin(key, *self._log_times(hit), reason=hit.text)
-
-    def _mark(self, key: str, hit: Hit) -> Mark:
-        begin, end = self._log_times(hit)
+    def _mark(self, key: str, one: Moment) -> Mark:
+        begin, end = self._log_times(one)
         first = self._first()
         # A mark from before the first message would become the beginning of the recording.
         begin = min(max(begin, 0, begin if first is None else first), end)
-        return Mark(key, begin, hit.text, dict(hit.tags), end)
+        return Mark(key, begin, one.text, dict(one.tags), None if one.end is None else end)
 
-    def _log_times(self, hit: Hit) -> tuple[int, int]:
-        if self._clock is None:
-            return hit.begin, hit.end
-        return self._clock.log_times(hit.begin, hit.end)
+    def _log_times(self, one: Moment) -> tuple[int, int]:
+        end = one.begin if one.end is None else one.end
+        return (one.begin, end) if self._clock is None else self._clock.log_times(one.begin, end)
 
     def _run(self) -> None:
         is_over = False
@@ -171,4 +180,4 @@ class Incidents:
         if self._clock is not None and self._clock.set_by != self._set_by:
             self._set_by = self._clock.set_by
             with self._lock:
-                self._new.update(self._last.values())
+                self._new.update({key: self._hits[key] for key, *_ in self._last.values()})

@@ -124,11 +124,7 @@ class Throttle:
         self._last = 0
 
     def lets_through(self, received: int) -> bool:
-        """Tells whether a message is stored.
-
-        Args:
-            received: Its receive time, ns since the epoch.
-        """
+        """Tells whether a message is stored."""
         if received < self._last - self._interval:
             self._due = self._reset  # the clock was set back
         self._last = received

@@ -21,7 +21,7 @@ from hybridlog.entries import text as as_text
 from hybridlog.entries import with_said
 from hybridlog.follow.child import Follower
 from hybridlog.live.clocks import CLOCK, MachineClock, SimulatedTime
-from hybridlog.live.incidents import Hit, Incidents
+from hybridlog.live.incidents import Incidents, Moment
 from hybridlog.live.memory import resident_bytes
 from hybridlog.live.policy import (
     PAYLOAD_STRIDE,
@@ -54,8 +54,7 @@ from hybridlog_storage.errors import (
     StoreError,
     UsageError,
 )
-from hybridlog_storage.manifest import Mark, new_random, with_mark
-from hybridlog_storage.manifest import replace as replaced
+from hybridlog_storage.manifest import new_random
 from hybridlog_storage.manifests import MANIFESTS
 from hybridlog_storage.messages import REDUCED, Channel, left_channel
 
@@ -66,7 +65,6 @@ if TYPE_CHECKING:
     from hybridlog.query.topics import TopicMatcher
     from hybridlog.record.recorder import RecordReport
     from hybridlog.store import Store
-    from hybridlog_storage.manifest import Manifest
 
 _MAX_REPORTS = 1000
 _MAX_CACHED = 4096  # channel objects that are found without comparing their content
@@ -195,7 +193,7 @@ class Recorder:
         self._written = 0
         self._stored_bytes = 0
         self._lost: dict[tuple[str, Cause], int] = {}
-        self._clock_marks: list[tuple[str, Mapping[str, str], int]] = []
+        self._clock_marks: list[Moment] = []
         self._newest = max(store.summaries(), key=attrgetter("created"), default=None)
         self._silence = SilenceWatch(options.contract, self._now, self._note_silence)
         self._settled_at = 0.0
@@ -211,8 +209,7 @@ class Recorder:
             self._directory.address,
             self._target.id,
             options.triggers,
-            sum(self._around),
-            hit=self._fire_between,
+            hit=lambda text, time: self.fire(text, self._passed(time)),
             say=self.say,
         )
         ring_s = options.ring_s
@@ -424,39 +421,15 @@ class Recorder:
             text: Its name.
             steady: When it was, as a steady time, ns; None for now.
         """
-        at = self._now() if steady is None else steady
-        self._fire(text, at, at)
-
-    def _fire_between(self, text: str, first: int, last: int) -> None:
-        """The same for the messages of a trigger between two log times, ns."""
-        if self._simulated is None:
-            first, last = self._clock.steady_before(first), self._clock.steady_before(last)
-        self._fire(text, first, last)
-
-    def _fire(self, text: str, first: int, last: int) -> None:
-        text, (before, after) = as_text(text), self._around
-        self._incidents.hit(Hit(text, {"trigger": text}, first - before, last + after))
-
-    @property
-    def _around(self) -> tuple[int, int]:
-        """What is pinned before and after a trigger, ns."""
         options = self._options
         before = options.before_s if options.before_s is not None else options.ring_s or 0.0
-        return round(before * 1e9), round(options.after_s * 1e9)
+        at = self._now() if steady is None else steady
+        begin, end = at - round(before * 1e9), at + round(options.after_s * 1e9)
+        self._incidents.hit(as_text(text), begin, end)
 
-    def _mark(self, mark: Mark) -> None:
-        """Set a mark, or give one of its id another end."""
-
-        def how(now: Manifest) -> Manifest:
-            if any(one.id == mark.id for one in now.marks):
-                marks = tuple(mark if one.id == mark.id else one for one in now.marks)
-                return replaced(now, marks=marks)
-            return with_mark(now, mark)
-
-        try:
-            self._directory.manifests.change(self._target.id, how)
-        except HybridlogError as error:
-            self.say(f"{mark.text!r} cannot be marked: {error}")
+    def _passed(self, log_time: int) -> int:
+        """The last time that had a log time, as a steady time, ns."""
+        return log_time if self._simulated is not None else self._clock.steady_before(log_time)
 
     def _is_marked(self, recording: str) -> bool:
         with suppress(StoreError):
@@ -477,9 +450,8 @@ class Recorder:
         if not is_over:
             self._say(f"{one.text} ({RULE} of the contract)")
         tags = {"cause": CONTRACT, "rule": RULE, "topic": one.topic}
-        begin = self._clock.log_time(one.begin)
-        end = max(begin, self._clock.log_time(one.end)) if is_over else None
-        self._mark(Mark(mark, begin, one.text, tags, end))
+        end = one.end if is_over else None
+        self._incidents.note(mark, Moment(one.text, tags, one.begin, end))
 
     def unfitting(self) -> list[str]:
         """Options that name topics of which none has come, in words."""
@@ -794,19 +766,18 @@ class Recorder:
             where = "forward" if jump.by > 0 else "back"
             tags = {"set_by_ns": str(jump.by)}
             text = f"the clock of this machine was set {where} by {by}"
-            self._note_clock(text, tags, jump.at + jump.set_by)
+            self._note_clock(text, tags, jump.at)
         self._mark_clock()
 
     def _note_clock(self, text: str, tags: Mapping[str, str], at: int) -> None:
-        """Report that the clock of this machine was set, or is to be, at a log time, ns."""
+        """Report that the clock of this machine was set, or is to be, at a steady time, ns."""
         self._say(f"{text}; log times are those of the clock")
-        self._clock_marks.append((text, {"cause": CLOCK_SET, **tags}, at))
+        self._clock_marks.append(Moment(text, {"cause": CLOCK_SET, **tags}, at))
 
     def _mark_clock(self) -> None:
         """Mark what is noted of the clock; alone it makes no recording."""
         while self._clock_marks and self._recorded_by_content and not self._over.is_set():
-            text, tags, at = self._clock_marks.pop(0)
-            self._mark(Mark(new_random(), at, text, dict(tags)))
+            self._incidents.note(new_random(), self._clock_marks.pop(0))
 
 
 def _cause_of(error: HybridlogError) -> Cause:

@@ -57,11 +57,7 @@ class Ring:
         self._kept: set[int] = set()  # must stay, as long as no other group is sealed
 
     def due(self, now: float) -> set[int]:
-        """The groups whose time is over.
-
-        Args:
-            now: The time, by `time.monotonic`.
-        """
+        """The groups whose time is over."""
         sealed = self._recording.sealed
         if sealed != self._seen:
             logs = self._directory.manifests.read(self._recording.id).logs.values()

@@ -31,31 +31,7 @@ _MAX_BYTES: Final = 1 << 26
 
 @dataclass(frozen=True, slots=True)
 class RecorderState:
-    """State of a recorder at one time.
-
-    Attributes:
-        name: Name of the recorder: that of its recording.
-        elapsed_s: Seconds since its start.
-        topics: Topics with publishers or messages, by name.
-        messages: Messages received so far.
-        stored: Messages in chunks, or on their way to the disk.
-        lost: Messages lost so far, by cause, as far as they can be counted.
-        filled: Used share of the memory budget, 0 to 1.
-        lag: Messages that are not indexed yet.
-        index_failure: The error that stopped the index; empty while it works.
-        free_bytes: Free space of the disk.
-        stored_bytes: Payload bytes stored so far.
-        stalled_s: Seconds for which received messages have waited for longer than the flush
-            interval, and nothing was written; 0 while writing goes on.
-        incidents: What was marked and pinned so far.
-        let_go: Messages that the ring has let go; None without a ring.
-        taken: Messages that are stored or will be, by topic.
-        silent: Topics that are silent for longer than the contract allows.
-        breaches: Such silences so far.
-        clock_set_s: Seconds by which the clock of this machine was set since the start.
-        memory_bytes: Memory of the recorder's process; 0 where that is unknown.
-        sim_time: Time of `/clock`, ns, 0 before it comes; None for the clock of the machine.
-    """
+    """State of a recorder at one time; `docs/live.md` says what each field is."""
 
     name: str
     elapsed_s: float
@@ -98,10 +74,6 @@ class StateFile:
     """The file with the state of a recorder.
 
     Files that killed recorders have left are removed.
-
-    Args:
-        directory: The store.
-        recording: Id of its recording.
     """
 
     def __init__(self, directory: StoreDirectory, recording: str) -> None:

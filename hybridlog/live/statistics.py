@@ -18,16 +18,7 @@ _NS = 1e9
 
 @dataclass(slots=True)
 class Tally:
-    """Counters of one channel; one thread at a time updates them.
-
-    Attributes:
-        messages: Received so far.
-        payload_bytes: Received so far.
-        last: Receive time of the last message, ns since the epoch; 0 before the first.
-        gaps: Sum of the times between messages since the last look, ns.
-        squares: Sum of their squares, ns².
-        counted: Number of these times.
-    """
+    """Counters of one channel; one thread at a time updates them. Times in ns."""
 
     messages: int = 0
     payload_bytes: int = 0
@@ -50,21 +41,7 @@ class Tally:
 
 @dataclass(frozen=True, slots=True)
 class TopicState:
-    """Statistics of a topic at one time.
-
-    Attributes:
-        topic: Its name.
-        type: Its type.
-        messages: Received so far.
-        payload_bytes: Received so far.
-        hz: Messages a second since the previous look.
-        expected_hz: Median rate of the last minute; None for a new topic.
-        bytes_per_s: Payload bytes a second since the previous look.
-        jitter_ms: Standard deviation of the time between messages, None for too few.
-        silent_s: Seconds since the last message, None before the first.
-        thinned: Messages dropped by a throttle.
-        lost: Messages lost otherwise, as far as they can be counted.
-    """
+    """Statistics of a topic at one time."""
 
     topic: str
     type: str
@@ -81,13 +58,7 @@ class TopicState:
 
 @dataclass(slots=True)
 class TopicRates:
-    """Turns the counters of a topic into rates.
-
-    Attributes:
-        topic: Its name.
-        type: Its type.
-        tallies: Counters, one per channel.
-    """
+    """Turns the counters of a topic into rates."""
 
     topic: str
     type: str
@@ -97,14 +68,7 @@ class TopicRates:
     _usual: deque[float] = field(default_factory=lambda: deque(maxlen=_RATES))
 
     def look(self, elapsed_s: float, now: int, *, thinned: int, lost: int) -> TopicState:
-        """The topic's statistics since the last call.
-
-        Args:
-            elapsed_s: Seconds since the last call.
-            now: Current time, ns, by the clock of log times.
-            thinned: Messages dropped by a throttle so far.
-            lost: Messages lost otherwise so far.
-        """
+        """The topic's statistics since the last call."""
         messages = sum(tally.messages for tally in self.tallies)
         size = sum(tally.payload_bytes for tally in self.tallies)
         hz = (messages - self._messages) / elapsed_s

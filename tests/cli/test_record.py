@@ -44,14 +44,14 @@ def test_the_closing_table(logs: Path, tmp_path: Path) -> None:
 
 
 def test_json_is_exact(logs: Path, tmp_path: Path) -> None:
-    done = run("record", logs / "small.bag", "--store", tmp_path / "s", "--json").json
+    done = run("record", logs / "small.bag", "--store", tmp_path / "s", "--json").json[0]
     seen = read_bag(logs / "small.bag")
     stored = sum(p.stat().st_size for p in places.folder(tmp_path / "s", "small").glob("*.mcap"))
     assert done["messages"] == done["messages_indexed"] == len(seen)
     assert done["bytes_in"] == (logs / "small.bag").stat().st_size
     assert done["bytes_stored"] == stored
     assert done["damage"] == []
-    assert not misfit(done, schema_of(["record"]))
+    assert not misfit([done], schema_of(["record"]))
 
 
 def test_choices(logs: Path, tmp_path: Path) -> None:
@@ -98,7 +98,7 @@ def test_a_slice_has_latched_messages_in_front(logs: Path, tmp_path: Path) -> No
         told = {name: cells for name, *cells in map(str.split, done.lines)}
         assert (told["messages"], told["from"]) == ([str(len(inside) + 1)], ["before", "1"])
         assert told["left"] == ["out", str(len(seen) - len(inside) - 1)]
-        found = run(*asked, *between, "--no-latched", "--json", store=tmp_path / "s").json
+        found = run(*asked, *between, "--no-latched", "--json", store=tmp_path / "s").json[0]
         assert (found["messages"], found["messages_latched"]) == (len(inside), 0)
         # A range without messages is refused, although a latched message is in force.
         first = min(m.log_time for m in inside)
@@ -156,7 +156,7 @@ def test_a_log_that_gives_nothing_makes_no_store(tmp_path: Path) -> None:
 def test_a_damaged_log_says_where(logs: Path, tmp_path: Path) -> None:
     done = run("record", logs / "torn.bag", "--json", store=tmp_path / "s", code=4)
     assert "torn.bag is damaged" in done.err
-    (damage,) = done.json["damage"]
+    (damage,) = done.json[0]["damage"]
     assert damage["file"].endswith("torn.bag")
     assert 0 < damage["offset"] <= (logs / "torn.bag").stat().st_size
     run("verify", store=tmp_path / "s")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import random
+import re
 import struct
 import sys
 from collections.abc import Callable, Iterable, Iterator
