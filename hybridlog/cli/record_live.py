@@ -94,7 +94,7 @@ def _record(choices: RecordChoices) -> None:
                 else:
                     recovery.start()
                 with display.table(), _pinned_by_signal(recorder):
-                    last = _watch(recorder, stop, display)
+                    _watch(recorder, stop, display)
                 if stop.is_set or not recorder.is_full:
                     break
                 reports += recorder.stop(_FOLLOWER_S)
@@ -102,9 +102,7 @@ def _record(choices: RecordChoices) -> None:
                 sources = [held.enter_context(source) for source in sources_of(choices)]
             notify_service("STOPPING=1", "STATUS=writing what is left")
             if not quiet:
-                lag = output.counted(last.lag, "message")
-                lacks = f" ({lag} for MongoDB)" if last.lag else ""
-                output.note(f"hybridlog: writing what is left{lacks}; Ctrl-C leaves at once")
+                output.note("hybridlog: writing what is left; Ctrl-C leaves at once")
             reports += recorder.stop(stop.follower_s)
             while recovery.is_alive() and not stop.wait(_RECOVERY_POLL_S):
                 pass
@@ -204,13 +202,11 @@ def _recover(choices: RecordChoices, store: Store) -> None:
         output.note(f"hybridlog: earlier recordings are not recovered yet: {error}")
 
 
-def _watch(recorder: Recorder, stop: Flag, display: _Display) -> RecorderState:
-    while True:
-        state = recorder.look()
-        display.state(state)
-        if stop.is_set or recorder.wait(0):
-            return state
+def _watch(recorder: Recorder, stop: Flag, display: _Display) -> None:
+    display.state(recorder.look())
+    while not (stop.is_set or recorder.wait(0)):
         stop.wait(_STATE_S)
+        display.state(recorder.look())
 
 
 @contextmanager

@@ -15,7 +15,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -44,6 +44,7 @@ from tests.cli.within import answer
 from tests.independent import read
 from tests.limits import Limit
 from tests.live.speaker import Speaker, text, text_channel
+from tests.waiting import wait_for
 
 pytestmark = pytest.mark.mongo
 
@@ -366,6 +367,47 @@ def test_a_ring_keeps_the_end_and_what_is_pinned(logs: Path, tmp_path: Path) -> 
     assert [pin["reason"] for pin in told["pins"]] == ["bump", "SIGUSR1"]
     run("export", tmp_path / "part.mcap", "--split-by", "mark", "-q", store=store)
     assert len([*tmp_path.glob("part-*.mcap")]) == 2
+
+
+def follower_of(recorder: subprocess.Popen[str]) -> Path | None:
+    """Its place in /proc."""
+    for place in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):
+            parent = re.search(r"(?m)^PPid:\t(\d+)$", (place / "status").read_text())
+            is_child = parent is not None and int(parent[1]) == recorder.pid
+            if is_child and b"hybridlog.follow" in (place / "cmdline").read_bytes():
+                return place
+    return None
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_triggers_have_a_process_that_ends_with_the_recorder(
+    logs: Path, tmp_path: Path, number: int
+) -> None:
+    store = tmp_path / "store"
+    words = ("--replay", logs / "robot.bag", "--mongo", "none", "--flush-interval", "100ms")
+    nobody = {"NOTIFY_SOCKET": str(tmp_path / "nobody")}
+    with recorder(store, *words, "--trigger", "/imu/data", **nobody) as process:
+        until_it_speaks(process)
+        wait_for(lambda: follower_of(process))
+        place = follower_of(process)
+        assert place is not None
+        wait_for(lambda: (place / "oom_score_adj").read_text() == "500\n")
+        assert b"NOTIFY_SOCKET" not in (place / "environ").read_bytes()
+        if number == signal.SIGTERM:
+            report, _ = end_and_hear(process, number)
+            assert report["exit_code"] == 0
+        else:
+            process.kill()
+            process.wait()
+        wait_for(lambda: not place.exists())
+    if number == signal.SIGTERM:
+        pins = run("info", "--json", store=store).json[0]["pins"]
+        times = [
+            json.loads(line)["log_time_ns"]
+            for line in run("fetch", "imu/data", "-F", "jsonl", store=store).lines
+        ]
+        assert {(pin["from"], pin["to"] - 1) for pin in pins} == {(time, time) for time in times}
 
 
 @pytest.mark.parametrize(

@@ -129,6 +129,8 @@ class Robot:
         os.writev = lambda *words: self.write(writev, *words)  # type: ignore[assignment]
         os.pwritev = lambda *words: self.write(pwritev, *words)  # type: ignore[assignment]
         self.recorder.start()
+        if self.part == "box":  # a ring waits for its triggers
+            wait_for(lambda: self.recorder._follower._read is not None)
         events: list[tuple[float, Any]] = [
             (0.3, self.pin),
             (0.4, self.mark),
