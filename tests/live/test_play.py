@@ -81,7 +81,7 @@ class Robot:
         self.is_full = False
         contract = Contract({"/points": TopicRules(longest_gap=round(seconds / 20 * SECOND))})
         options = RecorderOptions(
-            part, reserve_bytes=0, flush_interval_s=FLUSH_S, contract=contract
+            name=part, reserve_bytes=0, flush_interval_s=FLUSH_S, contract=contract
         )
         if part == "box":
             self.speed = speed / SLOWER
