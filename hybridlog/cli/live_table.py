@@ -4,23 +4,17 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Final, Self
 
 from hybridlog.cli import output
+from hybridlog.cli.render import Column, table_lines
 from hybridlog.cli.signals import restore_echo, stop_echo
 from hybridlog.record.losses import Cause
 
 if TYPE_CHECKING:
-    from rich.console import Group
-    from rich.text import Text
-
     from hybridlog.live.state import RecorderState
-    from hybridlog.live.statistics import TopicState
 
-_HEADINGS = ("Hz", "usual", "MB/s", "jitter ms", "messages", "thinned", "lost")
-_SPARE = ("jitter ms", "usual", "MB/s", "thinned")  # left out first where there is little room
 _SHORT = 60  # characters of a reason
-_SLOW = 0.8  # of the expected rate: below it the rate is shown as a warning
 
 
 class LiveTable:
@@ -52,26 +46,24 @@ class LiveTable:
 
     def show(self, state: RecorderState, below: Sequence[str] = ()) -> None:
         """Draw a state, with lines below it."""
+        from rich.text import Text
+
         size = self._live.console.size
-        found = drawn(state, width=size.width, height=size.height - 1, below=below)
-        self._live.update(found, refresh=True)
+        lines = drawn(state, width=size.width, height=size.height - 1, below=below)
+        self._live.update(Text("\n".join(lines), overflow="crop", no_wrap=True), refresh=True)
 
 
 def drawn(
     state: RecorderState, *, width: int, height: int | None = None, below: Sequence[str] = ()
-) -> Group:
-    """A state as a table of topics, with lines below it.
+) -> list[str]:
+    """A state as the lines of a table of topics, with others below it.
 
     Args:
         state: The state.
         width: Columns of the terminal; the less important columns are left out if it is narrow.
         height: Lines of the terminal; None for all topics.
-        below: The lines.
+        below: The others.
     """
-    from rich.console import Group
-    from rich.table import Table
-    from rich.text import Text
-
     # Broken between its parts only.
     whole = summary(state).replace(" ", "\N{NO-BREAK SPACE}").replace("·\N{NO-BREAK SPACE}", "· ")
     ends = [line.replace("\N{NO-BREAK SPACE}", " ") for line in textwrap.wrap(whole, width)]
@@ -84,42 +76,35 @@ def drawn(
         topics = sorted(topics, key=lambda t: (-t.lost, -t.bytes_per_s, t.topic))[: rows - 1]
     shown = {topic.topic for topic in topics}
     topics = [topic for topic in state.topics if topic.topic in shown]
-    columns, room = _columns(topics, width)
-    table = Table(box=None, pad_edge=False, header_style="")  # few bytes, over a slow line
-    table.add_column("topic", no_wrap=True)
-    for heading in columns:
-        table.add_column(heading, justify="right", no_wrap=True)
-    for topic, *cells in zip(topics, *columns.values(), strict=True):
-        table.add_row(Text(_cut(output.printable(topic.topic), room)), *cells)
-    lines: list[Table | Text] = [table]
+    name = Column("topic", lambda topic: _cut(output.printable(topic.topic), width // 2), "whole")
+    lines = table_lines(
+        [name, *(one for one in _COLUMNS if any(map(one.cell, topics)))], topics, width
+    )
     if len(topics) < len(state.topics):
-        more = output.counted(len(state.topics) - len(topics), "more topic")
-        lines.append(Text(f"… and {more}"))
-    lines.extend(Text(line, style="bold") for line in ends)
-    lines.extend(map(Text, below))
-    return Group(*lines)
+        lines.append(f"… and {output.counted(len(state.topics) - len(topics), 'more topic')}")
+    return [*lines, *ends, *below]
 
 
-def _columns(topics: Sequence[TopicState], width: int) -> tuple[dict[str, list[Text]], int]:
-    """Cells by heading, as many as leave room for the names of the topics, and that room."""
-    rows = [_cells(topic) for topic in topics]
-    columns = {heading: [row[n] for row in rows] for n, heading in enumerate(_HEADINGS)}
-    longest = max((len(output.printable(topic.topic)) for topic in topics), default=0)
-    # Without any value first.
-    for spare in (*sorted(_SPARE, key=lambda name: any(map(len, columns[name]))), None):
-        taken = (2 + max(len(name), 0, *map(len, cells)) for name, cells in columns.items())
-        room = max(width - sum(taken), 4)
-        if spare is None or room >= min(longest, width // 2):
-            break
-        del columns[spare]
-    return columns, room
+def _optional(value: float | None) -> str:
+    return "" if value is None else f"{value:.1f}"
+
+
+_COLUMNS: Final = [
+    Column("Hz", lambda topic: f"{topic.hz:.1f}", "right"),
+    Column("usual", lambda topic: _optional(topic.expected_hz), "right", order=2),
+    Column("MB/s", lambda topic: f"{topic.bytes_per_s / 1e6:.2f}", "right", order=3),
+    Column("jitter ms", lambda topic: _optional(topic.jitter_ms), "right", order=1),
+    Column("messages", lambda topic: topic.messages, "right"),
+    Column("thinned", lambda topic: topic.thinned or "", "right", order=4),
+    Column("lost", lambda topic: topic.lost or "", "right"),
+]
 
 
 def _cut(name: str, room: int) -> str:
     """A name without its middle if it is too long: both ends tell topics apart."""
     if len(name) <= room:
         return name
-    end = 2 * room // 3
+    end = room // 2
     return f"{name[: max(room - end - 1, 0)]}…{name[-end:]}"
 
 
@@ -155,18 +140,3 @@ def _in_short(reason: str) -> str:
     line = output.printable(reason.partition("\n")[0])
     sentence = line.partition(". ")[0].rstrip(".")
     return sentence if len(sentence) <= _SHORT else f"{sentence[: _SHORT - 1]}…"
-
-
-def _cells(topic: TopicState) -> list[Text]:
-    from rich.text import Text
-
-    slow = topic.expected_hz is not None and topic.hz < _SLOW * topic.expected_hz
-    return [
-        Text(f"{topic.hz:.1f}", style="yellow" if slow else ""),
-        Text("" if topic.expected_hz is None else f"{topic.expected_hz:.1f}"),
-        Text(f"{topic.bytes_per_s / 1e6:.2f}"),
-        Text("" if topic.jitter_ms is None else f"{topic.jitter_ms:.1f}"),
-        Text(str(topic.messages)),
-        Text(str(topic.thinned), style="dim") if topic.thinned else Text(),
-        Text(str(topic.lost), style="red") if topic.lost else Text(),
-    ]

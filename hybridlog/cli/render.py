@@ -75,6 +75,7 @@ class _Shape:
     columns: Sequence[Column]
     widths: list[int]
     short: bool
+    width: int | None = None
     folds: bool = False
 
     def cells(self, rows: Iterable[Any]) -> list[list[str]]:
@@ -101,6 +102,8 @@ class _Shape:
     def room(self) -> int:
         """Columns of the terminal that the table leaves; files and pipes have room for all."""
         taken = sum(self.widths) + 2 * (len(self.widths) - 1)
+        if self.width is not None:
+            return self.width - taken
         return screen_width() - taken if sys.stdout.isatty() else 0
 
     def narrow(self, rows: Sequence[Sequence[str]]) -> bool:
@@ -123,19 +126,28 @@ class _Shape:
         return True
 
 
-def _shape(columns: Sequence[Column], block: Sequence[Any]) -> _Shape | None:
-    """The widest table that fits the terminal; None if none does."""
+def _shape(
+    columns: Sequence[Column], block: Sequence[Any], width: int | None = None
+) -> _Shape | None:
+    """The widest table that fits a width, or the terminal; None if none does."""
     order = sorted((one for one in columns if one.order), key=lambda one: one.order)
     for without in range(len(order) + 1):
         left = [one for one in columns if one not in order[:without]]
         for short in (False, True):
-            found = _Shape(left, [len(one.name) for one in left], short)
+            found = _Shape(left, [len(one.name) for one in left], short, width)
             cells = found.cells(block)
             if found.room() >= 0:
                 return found
         if found.narrow(cells):
             return found
     return None
+
+
+def table_lines(columns: Sequence[Column], rows: Sequence[Any], width: int) -> list[str]:
+    """The lines of a table, headings first; they are cut where no table fits the width."""
+    shape = _shape(columns, rows, width) or _Shape(columns, [0] * len(columns), short=True)
+    cells = [[one.name for one in shape.columns], *shape.cells(rows)]
+    return [cut(line, width) for line in chain.from_iterable(map(shape.lines, cells))]
 
 
 def print_table(

@@ -79,8 +79,8 @@ def top_command(given: _Given) -> None:
             elif table is not None:
                 table.show(state, _lines(values))
             else:
-                console = output.console()
-                console.print(drawn(state, width=console.width, below=_lines(values)))
+                for line in drawn(state, width=output.screen_width(), below=_lines(values)):
+                    output.say(line)
             if given.once or not (given.as_json or on_screen):
                 return
         if not given.as_json:
