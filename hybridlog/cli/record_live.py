@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 _MIN_CHUNK: Final = 1 << 19
 _STATE_S = 1.0
 _RECOVERY_POLL_S = 0.05
-_FOLLOWER_S: Final = 5.0
+_TRIGGERS_S: Final = 5.0
 """To wait for triggers where a service manager, or another recording, waits."""
 
 
@@ -52,9 +52,9 @@ class _Stop(Flag):
     number: int = signal.SIGINT
 
     @property
-    def follower_s(self) -> float | None:
+    def triggers_s(self) -> float | None:
         """Seconds to wait for triggers; a person can press Ctrl-C again instead."""
-        return None if self.number == signal.SIGINT else _FOLLOWER_S
+        return None if self.number == signal.SIGINT else _TRIGGERS_S
 
 
 def record_live(choices: RecordChoices) -> None:
@@ -97,13 +97,13 @@ def _record(choices: RecordChoices) -> None:
                     _watch(recorder, stop, display)
                 if stop.is_set or not recorder.is_full:
                     break
-                reports += recorder.stop(_FOLLOWER_S)
+                reports += recorder.stop(_TRIGGERS_S)
                 options, full = recorder.rest, recorder.name
                 sources = [held.enter_context(source) for source in sources_of(choices)]
             notify_service("STOPPING=1", "STATUS=writing what is left")
             if not quiet:
                 output.note("hybridlog: writing what is left; Ctrl-C leaves at once")
-            reports += recorder.stop(stop.follower_s)
+            reports += recorder.stop(stop.triggers_s)
             while recovery.is_alive() and not stop.wait(_RECOVERY_POLL_S):
                 pass
         rules, results = options.contract, []

@@ -12,9 +12,8 @@ import click
 from hybridlog.cli import output
 from hybridlog.cli.app import DIFFERENT
 from hybridlog.cli.render import Column, bytes_of, numbers, print_fields
-from hybridlog.query.answers.completeness import line_of
-from hybridlog.record.losses import Cause
-from hybridlog.wording import listed
+from hybridlog.query.answers.completeness import coverage, line_of
+from hybridlog.record.losses import Cause, losses_of
 from hybridlog_storage.errors import (
     DatabaseError,
     DiskFullError,
@@ -130,7 +129,13 @@ class LiveSummary:
         if not self.reports:
             output.note("Nothing was stored.")
             return
-        fields = closing_fields(self.reports[-1], self.state, self.unreached)
+        report, state = self.reports[-1], self.state
+        entry = report.entry
+        row = {**row_of(report, entry.source["path"]), "bytes_in": state.stored_bytes}
+        fields = [*fields_of(row), ("received", state.messages)]
+        fields.append(("coverage", coverage(entry, losses_of(entry))))
+        if state.let_go:
+            fields.append(("let go", f"{state.let_go}, by the ring"))
         if self.recorder.reason:
             fields.append(("ended", self.recorder.reason))
         print_fields(fields)
@@ -178,35 +183,6 @@ class LiveSummary:
         if Cause.UNREADABLE in state.lost:
             return SourceDamagedError.exit_code
         return DIFFERENT if self.broken else 0
-
-
-def closing_fields(
-    report: RecordReport, state: RecorderState, unreached: Sequence[str]
-) -> list[tuple[str, object]]:
-    """What is told to people of a robot's recording."""
-    entry = report.entry
-    row = {**row_of(report, entry.source["path"]), "bytes_in": state.stored_bytes}
-    fields = [*fields_of(row), ("received", state.messages)]
-    if state.let_go:
-        fields.append(("let go", f"{state.let_go}, by the ring"))
-    if unreached:
-        fields.append(("lost", f"unknown, never reached: {', '.join(unreached)}"))
-    elif not state.lost.keys() - {Cause.THROTTLE.value}:
-        fields.append(("lost", "nothing"))
-    for cause, count in sorted(state.lost.items()):
-        losses = [row for row in entry.end.get("losses", []) if row["cause"] == cause]
-        named = listed(sorted({row["topic"] or "any" for row in losses}), 3)
-        what = "thinned out" if cause == Cause.THROTTLE else f"lost: {cause}"
-        fields.append((what, f"{_number(count, losses)} ({named})"))
-    return fields
-
-
-def _number(known: int, losses: Sequence[Mapping[str, Any]]) -> str:
-    """The number of lost messages, as far as it is known."""
-    if not known:
-        return "unknown"
-    is_more = any(row["count"] is None for row in losses)
-    return f"at least {known}" if is_more else str(known)
 
 
 def _summary(reports: Sequence[RecordReport], state: RecorderState, reason: str) -> dict[str, Any]:

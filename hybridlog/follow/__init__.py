@@ -1,1 +1,1 @@
-"""What follows a recording beside its recorder, in a process of its own."""
+"""Brings what is derived of recordings up to date; evaluates triggers beside a live recorder."""

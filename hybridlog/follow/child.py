@@ -27,7 +27,7 @@ _PAUSE_S: Final = 1.0
 _TOLD_TO_MANAGERS: Final = {"NOTIFY_SOCKET", "WATCHDOG_PID", "WATCHDOG_USEC"}
 
 
-class Follower:
+class TriggerProcess:
     """Evaluates triggers on what a recording has flushed, by a process that ends with this one.
 
     Without triggers there is no process.

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 
 from hybridlog.entries import text as as_text
 from hybridlog.entries import with_said
-from hybridlog.follow.child import Follower
+from hybridlog.follow.child import TriggerProcess
 from hybridlog.live.clocks import CLOCK, MachineClock, SimulatedTime
 from hybridlog.live.incidents import Incidents, Moment
 from hybridlog.live.memory import resident_bytes
@@ -205,7 +205,7 @@ class Recorder:
         self._target = store.start(options.name, self._of_recording())
         self.name = self._target.name
         self._says = StateFile(store.directory, self._target.id)
-        self._follower = follower = Follower(
+        self._triggers = triggers = TriggerProcess(
             self._directory.address,
             self._target.id,
             options.triggers,
@@ -214,7 +214,7 @@ class Recorder:
         )
         ring_s = options.ring_s
         self._ring = (
-            None if ring_s is None else Ring(self._directory, self._target, ring_s, follower)
+            None if ring_s is None else Ring(self._directory, self._target, ring_s, triggers)
         )
         self._incidents = Incidents(
             partial(self._directory.manifests.change, self._target.id),
@@ -262,13 +262,13 @@ class Recorder:
                 recording is removed.
         """
         try:
-            self._follower.start()
+            self._triggers.start()
             for source in self._sources:
                 source.start(self._sink)
         except BaseException:
             for source in self._sources:
                 source.stop()
-            self._follower.stop()
+            self._triggers.stop()
             self._says.remove()
             self._target.abort()
             raise
@@ -284,14 +284,14 @@ class Recorder:
         """Wait for the end for at most so long; returns True once it has come."""
         return self._over.wait(seconds)
 
-    def stop(self, follower_s: float | None = None) -> list[RecordReport]:
+    def stop(self, triggers_s: float | None = None) -> list[RecordReport]:
         """Stop the sources; flush, index and seal everything; then wait for the triggers.
 
         The recording is removed if no source was ever reached and no message came, or if the
         disk had no room for any.
 
         Args:
-            follower_s: Seconds to wait until triggers have seen all; None for as long as it takes.
+            triggers_s: Seconds to wait until triggers have seen all; None for as long as it takes.
 
         Returns:
             A report for each recording.
@@ -316,19 +316,19 @@ class Recorder:
         ):
             report = self._target.close()
         else:
-            self._follower.stop()
+            self._triggers.stop()
             self._target.abort()
             return []
-        self._judge_last(report, follower_s)
+        self._judge_last(report, triggers_s)
         if self._target.cut_off:
             self._refuse(Cause.DISK, "the disk was full")
             for topic, count in self._target.cut_off.items():
                 self._count_lost(topic, Cause.DISK, count)
         return [report]
 
-    def _judge_last(self, report: RecordReport, follower_s: float | None) -> None:
+    def _judge_last(self, report: RecordReport, triggers_s: float | None) -> None:
         """Wait until triggers have seen the ended recording, and mark and pin what they found."""
-        if not self._follower.finish(follower_s):
+        if not self._triggers.finish(triggers_s):
             self.say("triggers have not seen the last messages: that takes too long")
         try:
             if self._incidents.write():
@@ -445,7 +445,7 @@ class Recorder:
         """A log time, ns, if the clock of this machine had never been set."""
         return log_time if self._simulated is not None else self._clock.steady(log_time)
 
-    def _note_silence(self, one: Silence, mark: str, *, is_over: bool) -> None:
+    def _note_silence(self, one: Silence, mark: str, is_over: bool) -> None:  # noqa: FBT001
         """Tell a silence that begins, and mark it from its beginning on; later its end."""
         if not is_over:
             self._say(f"{one.text} ({RULE} of the contract)")
@@ -505,7 +505,7 @@ class Recorder:
             too_many = self._expected > _MAX_EXPECTED
         if not too_many:
             self._target.expect(channel)
-            self._follower.expect(channel)
+            self._triggers.expect(channel)
 
     def take(
         self,

@@ -16,7 +16,7 @@ from hybridlog.maintenance.retention import is_pinned
 from hybridlog.query.latching import depth_of, publisher_of
 
 if TYPE_CHECKING:
-    from hybridlog.follow.child import Follower
+    from hybridlog.follow.child import TriggerProcess
     from hybridlog.live.recording import LiveRecording
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.manifest import File, Manifest
@@ -33,7 +33,7 @@ class Ring:
         directory: The store.
         recording: The recording, which this process makes.
         span_s: Seconds after its end when a group goes.
-        follower: Triggers that must have seen a group before it goes; None without any.
+        triggers: Triggers that must have seen a group before it goes; None without any.
 
     Attributes:
         messages: Messages that have gone.
@@ -44,13 +44,13 @@ class Ring:
         directory: StoreDirectory,
         recording: LiveRecording,
         span_s: float,
-        follower: Follower | None = None,
+        triggers: TriggerProcess | None = None,
     ) -> None:
         self.messages = 0
         self._directory = directory
         self._recording = recording
         self._span_s = span_s + _LATE_S
-        self._follower = follower
+        self._triggers = triggers
         self._seen = 0
         self._ended: dict[int, float] = {}  # when each group was first seen sealed
         self._files: dict[int, set[int]] = {}  # their numbers, by group
@@ -68,7 +68,7 @@ class Ring:
                 self._files[log.group].add(log.number)
             self._seen, self._kept = sealed, set()
         old = {group for group, at in self._ended.items() if now - at >= self._span_s}
-        judged = None if self._follower is None else self._follower.judged
+        judged = None if self._triggers is None else self._triggers.judged
         if judged is not None:
             old = {group for group in old if self._files[group].issubset(judged)}
         return old - self._kept

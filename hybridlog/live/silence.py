@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 from hybridlog.query.times import format_duration
 from hybridlog_storage.manifest import new_random
@@ -37,11 +37,7 @@ class Silence(NamedTuple):
         return f"{self.topic}: no message for more than {format_duration(self.limit)}"
 
 
-class Note(Protocol):
-    """What is called with a silence and the id of its mark."""
-
-    def __call__(self, one: Silence, mark: str, *, is_over: bool) -> None:
-        """Note it."""
+Note: TypeAlias = Callable[[Silence, str, bool], None]
 
 
 class SilenceWatch:
@@ -52,8 +48,8 @@ class SilenceWatch:
     Args:
         contract: The contract; None for no topics.
         now: Returns the present time, ns. A simulation may begin again with an earlier one.
-        note: Called with a silence that has begun, and again when it is over, and the id of
-            its mark.
+        note: Called with a silence that has begun, the id of its mark, and False; and with
+            True when it is over.
 
     Attributes:
         breaches: Silences so far.
@@ -128,19 +124,19 @@ class SilenceWatch:
                 if now - last > self._limits[topic]
             ]
         for one in over:
-            self._note(one, self._mark_of(one), is_over=True)
+            self._note(one, self._mark_of(one), True)
             del self._noted[one.topic]
         for one in lasting:
             mark = self._mark_of(one)
             if is_end:
-                self._note(one, mark, is_over=True)
+                self._note(one, mark, True)
 
     def _mark_of(self, one: Silence) -> str:
         """The id of its mark; notes that it has begun, if that is new."""
         if one.topic not in self._noted:
             self.breaches += 1
             self._noted[one.topic] = new_random()
-            self._note(one, self._noted[one.topic], is_over=False)
+            self._note(one, self._noted[one.topic], False)
         return self._noted[one.topic]
 
     @property

@@ -158,13 +158,11 @@ def choose(directory: StoreDirectory, named: Sequence[str]) -> list[str]:
             "recordings there."
         )
     names = running(directory)
-    if named:
-        return list(dict.fromkeys(_resolve(name, names) for name in named))
     if not names:
         raise UsageError("No recorder runs on this store; start one with `hybridlog record`.")
-    if len(names) > 1:
+    if not named and len(names) > 1:
         raise UsageError(f"Several recorders run; name one of {', '.join(names.values())}.")
-    return [*names]
+    return list(dict.fromkeys(_resolve(name, names) for name in named)) or [*names]
 
 
 def _resolve(name: str, recorders: Mapping[str, str]) -> str:
@@ -173,21 +171,16 @@ def _resolve(name: str, recorders: Mapping[str, str]) -> str:
     Raises:
         UsageError: No recorder matches, or several do.
     """
-    fitting = (
-        [one for one, known in recorders.items() if name in {one, known}]
-        or [one for one, known in recorders.items() if name and known.startswith(name)]
-        or [
-            one
-            for one in recorders
-            if name and (one.startswith(name) or one[-16:].startswith(name))
-        ]
-    )
-    if len(fitting) > 1:
-        found = ", ".join(recorders[one] for one in fitting)
-        raise UsageError(f"{name!r} is ambiguous: it may be {found}.")
-    if not fitting:
-        known = ", ".join(recorders.values()) or "none"
-        raise UsageError(f"No running recorder matches {name!r}; running: {known}.")
+    whole = [one for one, known in recorders.items() if name in {one, known}]
+    named = [one for one, known in recorders.items() if name and known.startswith(name)]
+    begun = [
+        one for one in recorders if name and name in {one[: len(name)], one[-16:][: len(name)]}
+    ]
+    fitting = whole or named or begun
+    if len(fitting) != 1:
+        what = "is ambiguous" if fitting else "is no running recorder"
+        known = ", ".join(recorders[one] for one in fitting or recorders)
+        raise UsageError(f"{name!r} {what}: name one of {known}.")
     return fitting[0]
 
 

@@ -391,7 +391,7 @@ def test_visitors(store: hl.Store) -> None:
     assert choose(store.directory, [one.recorder.name]) == choose(store.directory, [name]) == [name]
     with pytest.raises(UsageError, match="Several recorders"):
         choose(store.directory, [])
-    with pytest.raises(UsageError, match="No running recorder matches"):
+    with pytest.raises(UsageError, match="is no running recorder"):
         choose(store.directory, ["nothing"])
     one.speaker.say(text_channel(), text("a"))
     one.recorder.look()

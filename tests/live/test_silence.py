@@ -132,7 +132,7 @@ class Watch(SilenceWatch):
         self.over: list[tuple[str, int, int]] = []
         super().__init__(Contract(topics), lambda: 0, self.note)
 
-    def note(self, one: Silence, mark: str, *, is_over: bool) -> None:
+    def note(self, one: Silence, mark: str, is_over: bool) -> None:
         (self.over if is_over else self.begun).append((one.topic, one.begin, one.end))
 
     def seen(self, now: int, *, is_end: bool = False) -> tuple[object, object]:

@@ -196,16 +196,16 @@ def test_a_trigger_fires_on_whole_and_exact_messages(
 
 def test_a_follower_that_is_killed_misses_nothing(store: hl.Store) -> None:
     recorded = robot(store, "/scan: id in (1, 3, 5)")
-    follower = recorded.recorder._follower
-    assert follower is not None
+    triggers = recorded.recorder._triggers
+    assert triggers is not None
     start, pids = time.time_ns(), set()
     for number in range(6):
         recorded.speaker.say(scan_channel(), scan(number, 10), start + number * SECOND)
         if number in {1, 3}:
             wait_for(lambda hits=number // 2: len(recorded.said) > hits)
-            assert follower._process is not None
-            pids.add(follower._process.pid)
-            follower._process.kill()
+            assert triggers._process is not None
+            pids.add(triggers._process.pid)
+            triggers._process.kill()
     (report,) = recorded.recorder.stop()
     assert len(pids) == 2
     times = sorted((mark["time"] - start) // SECOND for mark in report.entry.marks)
