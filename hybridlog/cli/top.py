@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import signal
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -46,7 +45,7 @@ class _Given(InStore, AsJson):
 
 @command(_Given)
 def top_command(given: _Given) -> None:
-    """Watch a running recorder, until it ends or Ctrl-C.
+    """Watch a running recorder, until it ends, or Ctrl-C or SIGTERM.
 
     Without a terminal, and without --json, the state is shown once.
     """
@@ -62,14 +61,12 @@ def top_command(given: _Given) -> None:
     (recorder,) = choose(directory, [] if given.recording is None else [given.recording])
     name = recorder
     on_screen = not given.as_json and sys.stdout.isatty() and not given.once
-    with _ended_by_ctrl_c(), at_safe_points(), ExitStack() as held:
+    with suppress(Stopped), at_safe_points(), ExitStack() as held:
         opened = None
         if fields:
             opened = held.enter_context(given.opened())
         table = held.enter_context(LiveTable(error=False)) if on_screen else None
         for state in states(directory, recorder, _EVERY_S):
-            if state is None:
-                continue  # it has just started
             name = state.name
             values = []
             if opened is not None:
@@ -85,16 +82,6 @@ def top_command(given: _Given) -> None:
                 return
         if not given.as_json:
             output.note(f"{name} has ended.")
-
-
-@contextmanager
-def _ended_by_ctrl_c() -> Iterator[None]:
-    """Ctrl-C ends the command with exit code 0: it interrupts no work."""
-    try:
-        yield
-    except Stopped as stopped:
-        if stopped.number != signal.SIGINT:
-            raise
 
 
 def _field(text: str) -> tuple[str, str]:

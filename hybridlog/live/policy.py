@@ -11,15 +11,13 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import Final
 
 from hybridlog.query.topics import TopicMatcher, matcher
 from hybridlog_storage.errors import UsageError
 
 SMALL_BYTES = 4096
 """Messages up to this payload size stay whole: reducing them saves next to nothing."""
-
-PAYLOAD_STRIDE = 5
-"""A topic under pressure keeps one payload in so many."""
 
 _RATE = re.compile(r"(\d+(?:\.\d+)?)\s*(?:hz)?", re.IGNORECASE)
 _HIGHEST_HZ = 1e6
@@ -33,33 +31,8 @@ class Priority(IntEnum):
     HIGH = 2
 
 
-class Retention(IntEnum):
-    """The parts of a message that are stored: all, all of every nth message, or fields only."""
-
-    ALL = 0
-    EVERY_NTH = 1
-    FIELDS = 2
-
-
-# Shares of the budget above which a priority keeps one payload in `PAYLOAD_STRIDE`, then none.
-_THRESHOLDS = {
-    Priority.LOW: (0.50, 0.70),
-    Priority.NORMAL: (0.70, 0.85),
-    Priority.HIGH: (0.85, 0.95),
-}
-
-
-def retention(priority: Priority, filled: float) -> Retention:
-    """The parts of large messages that are stored.
-
-    Args:
-        priority: Priority of their topic.
-        filled: Used share of the memory budget.
-    """
-    thin, none = _THRESHOLDS[priority]
-    if filled < thin:
-        return Retention.ALL
-    return Retention.EVERY_NTH if filled < none else Retention.FIELDS
+WHOLE_BELOW: Final = {Priority.LOW: 0.5, Priority.NORMAL: 0.7, Priority.HIGH: 0.9}
+"""Shares of the budget above which large messages of a priority keep their fields only."""
 
 
 @dataclass(frozen=True, slots=True)

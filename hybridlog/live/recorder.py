@@ -24,14 +24,12 @@ from hybridlog.live.clocks import CLOCK, MachineClock, SimulatedTime
 from hybridlog.live.incidents import Incidents, Moment
 from hybridlog.live.memory import resident_bytes
 from hybridlog.live.policy import (
-    PAYLOAD_STRIDE,
     SMALL_BYTES,
+    WHOLE_BELOW,
     Priority,
-    Retention,
     Rule,
     Throttle,
     first_fit,
-    retention,
 )
 from hybridlog.live.recording import LiveOptions
 from hybridlog.live.ring import GROUPS, Ring
@@ -143,8 +141,6 @@ class _RecordedChannel:
     throttle: Throttle | None
     priority: Priority
     reduced: Channel | None = None
-    thinned: int = 0
-    retention: Retention = Retention.ALL
     is_complete: bool = False
 
 
@@ -530,10 +526,7 @@ class Recorder:
         if self._refused is not None:
             self._lose(recorded, *self._refused, received)
             return
-        whole = True
-        if size > SMALL_BYTES:
-            found = retention(recorded.priority, self._target.filled)
-            whole = found is Retention.ALL or self._keeps_payload(recorded, found)
+        whole = size <= SMALL_BYTES or self._target.filled < WHOLE_BELOW[recorded.priority]
         number = 0 if sequence is None else sequence % _SEQUENCES
         try:
             if whole and self._target.write(
@@ -659,20 +652,6 @@ class Recorder:
             self._end(f"the limit of {'messages' if self._left == 0 else 'bytes'} is reached")
         return True
 
-    def _keeps_payload(self, recorded: _RecordedChannel, found: Retention) -> bool:
-        """Tells whether a message of a topic under pressure keeps its payload."""
-        if recorded.retention is not found:
-            recorded.retention = found
-            what = "one payload in five" if found is Retention.EVERY_NTH else "fields only"
-            self.say(
-                f"{recorded.channel.topic}: messages come faster than the disk writes; stored "
-                f"meanwhile: {what} (see the loss ledger)"
-            )
-        if found is Retention.FIELDS:
-            return False
-        recorded.thinned += 1
-        return recorded.thinned % PAYLOAD_STRIDE == 1
-
     def _store_fields(
         self,
         recorded: _RecordedChannel,
@@ -695,6 +674,10 @@ class Recorder:
             wait=False,
         ):
             self._silence.take(recorded.channel.topic, self._steady(received))
+            self.say(
+                f"{recorded.channel.topic}: messages come faster than the disk writes; of some "
+                "only the fields are stored (see the loss ledger)"
+            )
             self._lose(recorded, Cause.DEGRADE, "payload dropped, fields stored", received)
         else:
             self._lose_for_room(recorded, received)

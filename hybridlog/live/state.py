@@ -127,16 +127,12 @@ def running(directory: StoreDirectory) -> dict[str, str]:
     return {one.id: one.name for one in sorted(found, key=attrgetter("created"))}
 
 
-def states(
-    directory: StoreDirectory, recording: str, every_s: float
-) -> Iterator[RecorderState | None]:
-    """Poll the state of a recorder until it ends; None before it has said one."""
+def states(directory: StoreDirectory, recording: str, every_s: float) -> Iterator[RecorderState]:
+    """Poll the state of a recorder until it ends."""
     while directory.is_recorded(recording):
         started = time.monotonic()
-        state: RecorderState | None = None
-        with suppress(StoreError):
-            state = read(directory.path, recording)
-        yield state
+        with suppress(StoreError):  # it has just started
+            yield read(directory.path, recording)
         pause(max(every_s - (time.monotonic() - started), 0))
 
 

@@ -11,11 +11,9 @@ from hypothesis import strategies as st
 
 from hybridlog.live.policy import (
     Priority,
-    Retention,
     Throttle,
     first_fit,
     priority_rule,
-    retention,
     throttle_rule,
 )
 from hybridlog_storage.errors import TopicError, UsageError
@@ -64,16 +62,6 @@ def test_a_clock_that_is_set_back_does_not_silence_a_topic() -> None:
     assert throttle.lets_through(10 * SECOND)
     assert not throttle.lets_through(10 * SECOND + 1000)
     assert throttle.lets_through(11 * SECOND)
-
-
-@given(filled=st.floats(0, 2))
-def test_who_has_the_higher_priority_never_keeps_less(filled: float) -> None:
-    low, normal, high = (retention(priority, filled) for priority in Priority)
-    assert low >= normal >= high
-    if filled < 0.5:
-        assert low is Retention.ALL
-    if filled >= 0.95:
-        assert high is Retention.FIELDS
 
 
 def test_rules() -> None:
