@@ -45,7 +45,6 @@ _WAKE_BYTES = 4 << 20  # queued bytes that wake the writing thread: a batch has 
 _TICK_S = 0.1  # interval of the writing thread when little comes
 _FLUSH_AT = 0.95  # share of the flush interval after which chunks are closed
 _INDEX_INTERVALS = 4  # flush intervals between two passes of the index
-_INDEXING_S = 2.0  # time to pack, write, convert and send the documents of a chunk
 _MAX_NS = 1 << 63
 _SOURCE = {"path": "", "kind": "live", "profile": "", "bytes": 0}
 LIVE_SETTINGS = SegmentSettings(segment_size=1 << 30, segment_span_s=600.0)
