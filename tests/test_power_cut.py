@@ -14,6 +14,7 @@ from hybridlog_storage.disk import files
 from hybridlog_storage.errors import HybridlogError, SegmentError
 from hybridlog_storage.manifest import Manifest, replace
 from hybridlog_storage.messages import Channel, Schema
+from hybridlog_storage.segments.chunk import PackedChunk
 from hybridlog_storage.segments.segment_writer import RecordingWriter, SegmentSettings
 from tests import places
 from tests.power import PowerCut
@@ -51,10 +52,10 @@ class Run:
     def go(self, monkeypatch: pytest.MonkeyPatch) -> None:
         tell = RecordingWriter._publish
 
-        def told(writer: RecordingWriter, chunk: object, stored: object) -> None:
+        def told(writer: RecordingWriter, chunk: PackedChunk) -> None:
             if not self.power.is_off:
-                self.written.append(len(stored.batch))  # type: ignore[attr-defined]
-            tell(writer, chunk, stored)  # type: ignore[arg-type]
+                self.written.append(len(chunk.batch))
+            tell(writer, chunk)
 
         with monkeypatch.context() as patch:
             patch.setattr(files, "system", self.power)

@@ -11,7 +11,7 @@ import pytest
 from mcap.writer import Writer
 
 import hybridlog as hl
-from hybridlog.query.answers import field_statistics
+from hybridlog.query.answers import statistics
 from hybridlog.query.rows import Rows
 from tests import places
 from tests.calls import Calls
@@ -65,7 +65,7 @@ def test_a_condition_on_another_topic_reads_each_chunk_once(stores: dict[int, Pa
 def test_statistics_of_many_topics_are_planned_together(
     stores: dict[int, Path], calls: Calls
 ) -> None:
-    planners, planned = calls(field_statistics, "Planner"), []
+    planners, planned = calls(statistics, "Planner"), []
     looked = calls(Rows, "_find")
     for count, path in stores.items():
         planners.clear()

@@ -158,6 +158,8 @@ def _moments(
     Without a column `recording`, the recording is known if a single one was read. A row that
     lies in no recording has neither.
     """
+    if not times:
+        return [], []
     known = [entry.name for entry in read.recordings.values()]
     named = names or [known[0] if len(known) == 1 else None] * len(times)
     entries = {}
