@@ -8,7 +8,9 @@ waits for a disk or a database.
 
 from __future__ import annotations
 
+import threading
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Protocol, Self
 
 from hybridlog.record.losses import Cause, Loss
@@ -154,6 +156,34 @@ class LiveSource(ABC):
     def __exit__(self, *_: object) -> None:
         """Stop."""
         self.stop()
+
+
+class ThreadedSource(LiveSource):
+    """A source with a thread of its own, which ends soon after `_stopping` is set."""
+
+    def __init__(self) -> None:
+        self._stopping = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def _begin(self, sink: Sink, run: Callable[[], None]) -> None:
+        """Call a function in the thread; the recorder does not wait for it after an error."""
+
+        def guarded() -> None:
+            try:
+                run()
+            except BaseException as error:
+                if not self._stopping.is_set():
+                    sink.ended(f"the {self.kind} source failed: {one_line(repr(error))}")
+                raise
+
+        name = f"hybridlog-{self.kind}"
+        self._thread = threading.Thread(target=guarded, name=name, daemon=True)
+        self._thread.start()
+
+    def _join(self, seconds: float | None = None) -> None:
+        """Wait for the end of the thread."""
+        if self._thread is not None and self._thread is not threading.current_thread():
+            self._thread.join(seconds)
 
 
 _MAX_LENGTH = 400

@@ -11,14 +11,13 @@ Messages that lie farther out of order, as in concatenated logs, are sent when t
 from __future__ import annotations
 
 import math
-import threading
 import time
 from collections.abc import Iterator
 from itertools import count
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from hybridlog.formats.log_set import open_source
-from hybridlog.live.sources.base import Cause, LiveSource, Loss, Sink
+from hybridlog.live.sources.base import Cause, Loss, Sink, ThreadedSource
 from hybridlog_storage.errors import SourceError, UsageError
 
 if TYPE_CHECKING:
@@ -45,7 +44,7 @@ class _Message(NamedTuple):
     payload: bytes
 
 
-class ReplaySource(LiveSource):
+class ReplaySource(ThreadedSource):
     """Plays any log that hybridlog reads.
 
     Messages have their original publish time, if the channel has one, and sequence number;
@@ -69,11 +68,10 @@ class ReplaySource(LiveSource):
                 f"a log cannot be played at speed {speed:g}; give a number above zero, 1 for "
                 "real time"
             )
+        super().__init__()
         self.address = str(path)
         self._path = path
         self._speed = speed
-        self._stop = threading.Event()
-        self._thread: threading.Thread | None = None
         self._source: Source
         self._sink: Sink
         self._is_late = False
@@ -98,25 +96,18 @@ class ReplaySource(LiveSource):
             SourceError: The file is not a readable log.
         """
         self._source, self._sink = open_source(self._path), sink
-        self._thread = threading.Thread(target=self._run, name="hybridlog-replay", daemon=True)
-        self._thread.start()
+        self._begin(sink, self._run)
 
     def stop(self) -> None:
         """Stop, even in a pause. All messages that are due have been sent."""
-        self._stop.set()
-        if self._thread is not None and self._thread is not threading.current_thread():
-            self._thread.join(_JOIN_S)
+        self._stopping.set()
+        self._join(_JOIN_S)
 
     def _run(self) -> None:
         """Play the log to its end, or until it is stopped."""
-        try:
-            with self._source:
-                self._play()
-        except BaseException as error:
-            if not self._stop.is_set():
-                self._sink.ended(f"{self.address}: playing failed ({error!r})")
-            raise
-        if not self._stop.is_set():
+        with self._source:
+            self._play()
+        if not self._stopping.is_set():
             for topic in self._present:
                 self._sink.topic_gone(topic)
             self._sink.ended(self._failure)
@@ -135,7 +126,7 @@ class ReplaySource(LiveSource):
                 newest = message.log_time
                 self._check_lateness(-pause)
             self._send(message)
-            if self._stop.is_set():
+            if self._stopping.is_set():
                 return
 
     def _messages(self) -> Iterator[_Message]:
@@ -145,10 +136,10 @@ class ReplaySource(LiveSource):
         size = 0
         try:
             for batch in self._source.batches():
-                if self._stop.is_set():
+                if self._stopping.is_set():
                     return
                 self._source.extras.clear()
-                self._begin()
+                self._tell_news()
                 columns = (
                     *(batch.log_time, batch.channel, batch.publish_time, batch.sequence),
                     *(batch.offset, batch.offset + batch.length),
@@ -169,12 +160,12 @@ class ReplaySource(LiveSource):
                 del waiting[:out]
         except SourceError as error:
             self._failure = str(error)
-        self._begin()
+        self._tell_news()
         yield from waiting
 
     # Channels and damage.
 
-    def _begin(self) -> None:
+    def _tell_news(self) -> None:
         """Tell the channels and the damage that the last read has found."""
         for channel in self._source.channels[len(self._channels) :]:
             self._channels.append(self._add(channel))
@@ -216,7 +207,7 @@ class ReplaySource(LiveSource):
                 f"{self.address}: the log has no message until {moment / 1e9:.3f} s since the "
                 f"epoch; that takes {pause:.0f} s, less at a higher speed"
             )
-        return self._stop.wait(min(max(pause, _MIN_PAUSE_S), _MAX_PAUSE_S))
+        return self._stopping.wait(min(max(pause, _MIN_PAUSE_S), _MAX_PAUSE_S))
 
     def _check_lateness(self, behind: float) -> None:
         if behind > _LATE_S and not self._is_late:

@@ -167,7 +167,7 @@ def play_by(
 ) -> None:
     with monkeypatch.context() as patch, ReplaySource(path, speed=speed) as source:
         patch.setattr(replay, "time", clock)
-        source._stop = clock
+        source._stopping = clock
         source.start(heard)
         heard.until(lambda h: h.ends)
 

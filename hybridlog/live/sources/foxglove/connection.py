@@ -54,14 +54,6 @@ class Client:
 
     def run(self) -> None:
         """Connect, read and reconnect until stopped."""
-        try:
-            self._run()
-        except BaseException as error:
-            if not self._stop.is_set():
-                self._sink.ended(f"{self._address.shown}: reading failed ({error!r})")
-            raise
-
-    def _run(self) -> None:
         failures = 0
         while not self._stop.is_set():
             began = time.monotonic()

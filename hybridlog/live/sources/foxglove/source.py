@@ -18,17 +18,16 @@ in another century.
 
 from __future__ import annotations
 
-import threading
 from typing import Final
 
-from hybridlog.live.sources.base import LiveSource, Sink
+from hybridlog.live.sources.base import Sink, ThreadedSource
 from hybridlog.live.sources.foxglove.protocol import parse_address, without_user
 from hybridlog_storage.errors import MissingDependencyError
 
 _JOIN_S: Final = 5.0
 
 
-class FoxgloveSource(LiveSource):
+class FoxgloveSource(ThreadedSource):
     """A client of one Foxglove WebSocket server. TLS certificates are checked.
 
     It reconnects with growing pauses. After that the server's channels may have other
@@ -42,11 +41,10 @@ class FoxgloveSource(LiveSource):
     kind = "Foxglove"
 
     def __init__(self, url: str) -> None:
+        super().__init__()
         self._url = url
         self.address = without_user(url)
         self.was_reached = False
-        self._stop = threading.Event()
-        self._thread: threading.Thread | None = None
 
     def check(self) -> None:
         """Check the address.
@@ -70,9 +68,7 @@ class FoxgloveSource(LiveSource):
             raise MissingDependencyError(
                 "recording from Foxglove needs picows: pip install 'hybridlog[foxglove]'"
             ) from error
-        client = Client(sink, address, self._stop, self._reached)
-        self._thread = threading.Thread(target=client.run, name="hybridlog-foxglove", daemon=True)
-        self._thread.start()
+        self._begin(sink, Client(sink, address, self._stopping, self._reached).run)
 
     def _reached(self) -> None:
         self.was_reached = True
@@ -83,6 +79,5 @@ class FoxgloveSource(LiveSource):
         A hanging look-up of a host name may keep the thread alive longer; it then ends
         without calling the sink.
         """
-        self._stop.set()
-        if self._thread is not None and self._thread is not threading.current_thread():
-            self._thread.join(_JOIN_S)
+        self._stopping.set()
+        self._join(_JOIN_S)

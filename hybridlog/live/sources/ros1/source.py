@@ -12,7 +12,7 @@ import secrets
 import threading
 from typing import TYPE_CHECKING, Final
 
-from hybridlog.live.sources.base import LiveSource, PeerError, one_line
+from hybridlog.live.sources.base import PeerError, ThreadedSource
 from hybridlog.live.sources.network import Endpoint, Network, endpoint_of
 from hybridlog.live.sources.ros1.graph import Graph, Master
 from hybridlog.live.sources.ros1.reader import Reader
@@ -30,7 +30,7 @@ _DEFAULT_URI: Final = "http://localhost:11311"
 _DEFAULT_PORT: Final = 11311
 
 
-class Ros1Source(LiveSource):
+class Ros1Source(ThreadedSource):
     """Subscribes to topics of a ROS 1 system, whatever their type.
 
     Each connection to a publisher is a channel with the fields of its header, as in a bag.
@@ -58,6 +58,7 @@ class Ros1Source(LiveSource):
         max_message_bytes: int = 1 << 30,
         poll_s: float = 1.0,
     ) -> None:
+        super().__init__()
         self.address = master_uri or os.environ.get("ROS_MASTER_URI") or _DEFAULT_URI
         self.was_reached = False
         self.caller = f"/hybridlog_{os.getpid()}_{secrets.token_hex(4)}"
@@ -65,8 +66,6 @@ class Ros1Source(LiveSource):
         self._poll_s = poll_s
         self._lock = threading.Lock()
         self._end: Callable[[BaseException | None], None] | None = None
-        self._is_stopped = False
-        self._thread: threading.Thread | None = None
 
     def check(self) -> None:
         """Checks the address.
@@ -82,20 +81,16 @@ class Ros1Source(LiveSource):
         Raises:
             UsageError: The master's address is invalid.
         """
-        endpoint = self._endpoint()
-        self._thread = threading.Thread(
-            target=self._run, args=(sink, f"http://{endpoint}/"), name="ros1", daemon=True
-        )
-        self._thread.start()
+        uri = f"http://{self._endpoint()}/"
+        self._begin(sink, lambda: asyncio.run(self._follow(sink, uri)))
 
     def stop(self) -> None:
         """Passes on the messages received so far, and takes back all registrations."""
         with self._lock:
-            self._is_stopped = True
+            self._stopping.set()
             if self._end is not None:
                 self._end(None)
-        if self._thread is not None:
-            self._thread.join()
+        self._join()
 
     def _endpoint(self) -> Endpoint:
         try:
@@ -107,14 +102,6 @@ class Ros1Source(LiveSource):
 
     def _reached(self) -> None:
         self.was_reached = True
-
-    def _run(self, sink: Sink, uri: str) -> None:
-        """The thread of the event loop."""
-        try:
-            asyncio.run(self._follow(sink, uri))
-        except BaseException as error:
-            sink.ended(f"the ROS 1 source failed: {one_line(repr(error))}")
-            raise
 
     async def _follow(self, sink: Sink, uri: str) -> None:
         """Runs all tasks until the source is stopped or one of them fails."""
@@ -144,7 +131,7 @@ class Ros1Source(LiveSource):
             task.add_done_callback(finished)
 
         with self._lock:
-            if self._is_stopped:
+            if self._stopping.is_set():
                 return
             self._end = end
         try:

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import os
 import time
-from threading import Event, Lock, Thread
+from threading import Lock
 from typing import TYPE_CHECKING
 
-from hybridlog.live.sources.base import LiveSource, one_line
+from hybridlog.live.sources.base import ThreadedSource, one_line
 from hybridlog.live.sources.ros2.child.wire import WireError
 from hybridlog.live.sources.ros2.overrides import read_overrides
 from hybridlog.live.sources.ros2.process import ChildError, Process, launch
@@ -30,7 +30,7 @@ _STABLE_S = 30.0
 _HAND_OVER_S = 3.0
 
 
-class Ros2Source(LiveSource):
+class Ros2Source(ThreadedSource):
     """Records the topics of a ROS 2 domain.
 
     Args:
@@ -49,16 +49,15 @@ class Ros2Source(LiveSource):
         qos_overrides: Path | None = None,
         domain_id: int | None = None,
     ) -> None:
+        super().__init__()
         domain = os.environ.get("ROS_DOMAIN_ID") or "0"
         self.address = f"domain {domain if domain_id is None else domain_id}"
         self._python = python
         self._overrides = qos_overrides
         self._domain_id = domain_id
-        self._stopping = Event()
         self._lock = Lock()
         self._child: Process | None = None
         self._settings: dict[str, object] = {}
-        self._thread: Thread | None = None
         self._outages: dict[str, int] = {}
 
     def check(self) -> None:
@@ -81,10 +80,8 @@ class Ros2Source(LiveSource):
             MissingDependencyError: As `check`.
         """
         self.check()
-        self._thread = Thread(
-            target=self._run, args=(self._child, sink, self._settings), name="ros2", daemon=True
-        )
-        self._thread.start()
+        child, settings = self._child, self._settings
+        self._begin(sink, lambda: self._supervise(child, sink, settings))
 
     def _launched(self) -> tuple[Process, dict[str, object]]:
         """A new child and its settings."""
@@ -111,23 +108,12 @@ class Ros2Source(LiveSource):
             if child is not None:
                 child.end()
             return
-        if child is None:
-            self._thread.join()
-            return
-        child.end_input()
-        self._thread.join(_HAND_OVER_S)
-        if self._thread.is_alive():
-            child.kill()
-        self._thread.join()
-
-    def _run(self, child: Process | None, sink: Sink, settings: dict[str, object]) -> None:
-        """Reads from children until the source is stopped."""
-        try:
-            self._supervise(child, sink, settings)
-        except Exception as error:
-            # An error of our own; the recorder must not wait for this source.
-            sink.ended(f"the ROS 2 source failed: {error!r}")
-            raise
+        if child is not None:
+            child.end_input()
+            self._join(_HAND_OVER_S)
+            if self._thread.is_alive():
+                child.kill()
+        self._join()
 
     def _supervise(self, child: Process | None, sink: Sink, settings: dict[str, object]) -> None:
         """Reads from one child after the other."""
