@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from hybridlog_storage.segments.chunk import PackedChunk, StoredChunk
+from hybridlog_storage.segments.open_chunk import OpenChunk
 from hybridlog_storage.segments.segment_file import SegmentFile
 from hybridlog_storage.segments.segment_writer import RecordingWriter
 
@@ -24,14 +25,26 @@ class NotingWriter(RecordingWriter):
     ) -> None:
         super().__init__(directory, recording, *args, **options)
         self.chunks = chunks
+        self._held: dict[int, tuple[PackedChunk, OpenChunk]] = {}
+
+    def _pack(self, chunk: OpenChunk) -> PackedChunk:
+        packed = super()._pack(chunk)
+        self._held[id(packed)] = packed, chunk
+        return packed
 
     def _create(self, group: int | None) -> SegmentFile:
         segment = super()._create(group)
 
-        def noted(own: Sequence[PackedChunk]) -> list[StoredChunk]:
-            stored = SegmentFile.append_chunks(segment, own)
-            self.chunks += stored
-            return stored
+        def noted(own: Sequence[PackedChunk]) -> None:
+            before = segment.chunks
+            SegmentFile.append_chunks(segment, own)
+            rows = segment.table.build().chunks[["offset", "length", "trailer"]].tolist()[before:]
+            for number, packed in enumerate(own, before):
+                offset, length, trailer = rows[number - before]
+                batch, seq = self._held.pop(id(packed))[1].laid_out()
+                place = {"offset": offset, "length": length, "trailer": trailer}
+                about = {"segment": segment.number, "number": number}
+                self.chunks.append(StoredChunk(**about, **place, batch=batch, seq=seq))
 
         segment.append_chunks = noted  # type: ignore[method-assign]
         return segment

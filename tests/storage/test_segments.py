@@ -257,9 +257,8 @@ def test_chunks_that_wait_are_written_together(tmp_path: Path, calls: Calls) -> 
     go_on = threading.Event()
     together: list[int] = []
 
-    def noted(stored: list[StoredChunk], *_: object) -> list[StoredChunk]:
-        together.append(len(stored))
-        return stored
+    def noted(_: None, __: SegmentFile, own: Sequence[object]) -> None:
+        together.append(len(own))
 
     calls.change(SegmentFile, "append_chunks", noted)
     calls(SegmentFile, "append_chunks", lambda *_: go_on.wait(60) or pytest.fail("waited in vain"))

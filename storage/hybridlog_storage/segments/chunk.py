@@ -28,8 +28,7 @@ class PackedChunk:
     """A closed chunk, compressed and indexed, ready for the file.
 
     Attributes:
-        batch: Its messages over the uncompressed content; `channel` holds channel ids.
-        seq: int64[n], arrival numbers.
+        size: Bytes of its content before compression.
         head: The chunk record up to the compressed content.
         data: The compressed content.
         head_crc: CRC-32 of the head.
@@ -39,8 +38,7 @@ class PackedChunk:
         parts: `PART`[c], statistics of each channel in the chunk.
     """
 
-    batch: Batch
-    seq: NDArray[np.int64]
+    size: int
     head: bytes
     data: Buffer
     head_crc: int
@@ -75,8 +73,7 @@ def pack(
     for index in indexes.values():
         indexes_crc = crc32(index, indexes_crc)
     return PackedChunk(
-        batch=batch,
-        seq=seq,
+        size=len(batch.buffer),
         head=head,
         data=data,
         head_crc=crc32(head),

@@ -31,7 +31,7 @@ from hybridlog_storage.manifest import File, Part
 from hybridlog_storage.mcap.mcap_content import RECORD_HEAD, ChunkHead, chunk_head_of
 from hybridlog_storage.messages import EXPIRED_IDS, schema_hash
 from hybridlog_storage.segments.attachments import Attachment
-from hybridlog_storage.segments.chunk import PackedChunk, StoredChunk
+from hybridlog_storage.segments.chunk import PackedChunk
 from hybridlog_storage.segments.chunk_table import ChunkTable, TableBuilder
 from hybridlog_storage.segments.segment_format import (
     ARRIVAL_HEAD,
@@ -295,37 +295,25 @@ class SegmentFile:
         padding = self._padding(chunk.data, at, len(chunk.head))
         return at + len(padding) + len(chunk.head) + len(chunk.data) + trailer
 
-    def append_chunks(self, chunks: Sequence[PackedChunk]) -> list[StoredChunk]:
+    def append_chunks(self, chunks: Sequence[PackedChunk]) -> None:
         """Append chunks with their message indexes and arrival numbers in one write."""
         parts: list[Buffer] = []
-        stored: list[StoredChunk] = []
+        places: list[tuple[int, int]] = []
         at = self.position
         for chunk in chunks:
             padding = self._padding(chunk.data, at, len(chunk.head))
             offset = at + len(padding)
-            length = len(chunk.head) + len(chunk.data)
             arrivals = arrival_record(offset, chunk.head_crc, chunk.indexes_crc, chunk.arrivals)
             trailer = sum(map(len, chunk.indexes.values())) + len(arrivals)
             parts += [padding, chunk.head, chunk.data, *chunk.indexes.values(), arrivals]
-            at = offset + length + trailer
-            stored.append(
-                StoredChunk(
-                    segment=self.number,
-                    number=self.chunks + len(stored),
-                    offset=offset,
-                    length=length,
-                    trailer=trailer,
-                    batch=chunk.batch,
-                    seq=chunk.seq,
-                )
-            )
+            at = offset + len(chunk.head) + len(chunk.data) + trailer
+            places.append((offset, trailer))
         self._append(parts)
-        for chunk, place in zip(chunks, stored, strict=True):
+        for chunk, (offset, trailer) in zip(chunks, places, strict=True):
             sizes = {channel: len(data) for channel, data in chunk.indexes.items()}
             head = chunk_head_of(chunk.head)
             assert head is not None
-            self.note_chunk(place.offset, place.trailer, head, sizes, chunk.parts)
-        return stored
+            self.note_chunk(offset, trailer, head, sizes, chunk.parts)
 
     def note_chunk(
         self,

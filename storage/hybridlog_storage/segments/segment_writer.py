@@ -518,7 +518,7 @@ class RecordingWriter:
         for channel_id, messages, last in rows:
             self.written[channel_id] += messages
             self._last_times[channel_id] = last
-        self.stored_bytes += len(chunk.batch.buffer)
+        self.stored_bytes += chunk.size
         if self._on_written is not None:
             self._on_written()
 
