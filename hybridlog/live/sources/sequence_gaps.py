@@ -27,15 +27,11 @@ class SequenceGap(NamedTuple):
         missing: Number of messages.
         first: Receive time of the message before them, ns since the epoch.
         last: Receive time of the message after them.
-        before: Sequence number of the message before them.
-        after: Sequence number of the message after them.
     """
 
     missing: int
     first: int
     last: int
-    before: int
-    after: int
 
 
 class SequenceGapDetector:
@@ -110,8 +106,7 @@ class SequenceGapDetector:
             missing = (number - self.expected) % MODULUS
             self._trusted = self._trusted and missing <= self._max_gap
             if self._trusted:
-                before = (self.expected - 1) % MODULUS
-                self._wait(SequenceGap(missing, first, last, before, number))
+                self._wait(SequenceGap(missing, first, last))
             else:
                 self.waiting.clear()
         self._start = number
@@ -153,9 +148,7 @@ class SequenceGapDetector:
 
 def joined_gap(gaps: list[SequenceGap]) -> SequenceGap:
     """One gap that spans several, the oldest first; at least one."""
-    first, last = gaps[0], gaps[-1]
-    missing = sum(gap.missing for gap in gaps)
-    return SequenceGap(missing, first.first, last.last, first.before, last.after)
+    return SequenceGap(sum(gap.missing for gap in gaps), gaps[0].first, gaps[-1].last)
 
 
 def has_sequence_numbers(channel: Channel) -> bool:

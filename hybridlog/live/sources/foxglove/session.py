@@ -327,7 +327,7 @@ class Session(WSListener):
         """Notes messages that a publisher counted and that never came, in one row."""
         if gaps:
             gap = joined_gap(gaps)
-            detail = f"header.seq went from {gap.before} to {gap.after}"
+            detail = "numbers are missing in header.seq"
             self._sink.lost(Loss(topic, Cause.TRANSPORT, gap.missing, gap.first, gap.last, detail))
 
     def end(self, *, is_stopped: bool) -> None:
