@@ -7,6 +7,7 @@ times without a predicate come from chunk tables and message indexes.
 
 from __future__ import annotations
 
+import re
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
     from hybridlog.schema.left import LeftFields
     from hybridlog.session import Session
 
+_MARK = re.compile(r"[.\[]")
 _WHOLE = 32  # elements; longer arrays are summaries in tables
 _IN_FULL = SINGLE - {"uint8", "byte", "char"}  # elements of arrays in tables with arrays
 
@@ -588,26 +590,24 @@ def _decided(part: Part, rows: TableRows) -> NDArray[np.bool_]:
 
 
 def _holds(found: Tabled, fields: Collection[str] | None) -> bool:
-    """True if a table holds these fields in full: no array that may be a summary.
-
-    Args:
-        found: The part and its table.
-        fields: Paths of the fields; None for all.
-    """
+    """True if a table holds some fields, or all, in full: no array that may be a summary."""
     types = found.part.field_types
     if types is None:
         return fields is not None and not fields
-    for path in types if fields is None else fields:
-        below = [p for p in types if p == path or p.startswith((f"{path}.", f"{path}["))]
-        if not below:
+    above = {path[: mark.start()] for path in types for mark in _MARK.finditer(path)}
+    below = [*types]
+    if fields is not None:
+        begins = tuple(f"{field}{mark}" for field in fields for mark in ".[")
+        below = [path for path in types if path in fields or path.startswith(begins)]
+        if not all(field in above or field in types for field in fields):
             return False
-        for name in below:
-            inner = any(other.startswith((f"{name}.", f"{name}[")) for other in types)
-            kind, width, element = types[name], width_of(types[name]), element_of(types[name])
-            is_short = width is not None and width <= _WHOLE and element in SINGLE
-            is_full = found.table.has_arrays and (element in _IN_FULL or (inner and element))
-            if not (kind in SINGLE or is_short or is_full) and not (inner and element is None):
-                return False
+    for name in below:
+        kind, width, element = types[name], width_of(types[name]), element_of(types[name])
+        is_short = width is not None and width <= _WHOLE and element in SINGLE
+        has_fields = name in above
+        is_full = found.table.has_arrays and (element in _IN_FULL or (has_fields and element))
+        if not (kind in SINGLE or is_short or is_full) and not (has_fields and element is None):
+            return False
     return True
 
 

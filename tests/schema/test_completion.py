@@ -10,7 +10,6 @@ import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from hybridlog.schema import completion
-from hybridlog.schema.codec import plain_message
 from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.completion import completed
 from hybridlog.schema.definition import parse_definition, typestore
@@ -131,7 +130,9 @@ def test_a_message_that_is_empty_has_no_fields() -> None:
         assert codec_for(found).paths() == []
     own = cdr("p/msg/T", Schema("p/msg/T", "ros2msg", b"# nothing\nuint8 A=1\n"))
     assert completed(own, [b"\0\1\0\0\0"]) is own
-    assert plain_message(codec_for(own), b"\0\1\0\0\0\0\0\0") == {}
+    payload = b"\0\1\0\0\0\0\0\0"
+    found = codec_for(own).columns(payload, np.zeros(1, np.int64), np.array([len(payload)]))
+    assert found.plain(whole=False) == [{}]
     (group,) = groups_of(codec_for(own), b"\0\1\0\0\5\0\0\0hallo")
     assert group.error is not None
     assert "8 bytes left over: the definition has no fields" in group.error

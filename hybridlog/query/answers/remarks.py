@@ -53,20 +53,15 @@ def about_names(question: Question) -> Iterator[str]:
             yield f"{topic} was asked, not {listed(found, _MAX_NAMES)}; '**{tail}' takes all."
 
 
-def _channels(session: Session, question: Question) -> Iterator[RecordedChannel]:
-    """The channels of the question with messages, of its first recordings."""
-    summaries = session.look(question.recordings).summaries
-    for place in session.chosen(question)[:_MAX_RECORDINGS].tolist():
-        for channel in session.channels_of(session.entry_of(summaries[place]), {*question.topics}):
-            if channel.stats.messages:
-                yield channel
-
-
 def _about_stamps(session: Session, question: Question) -> Iterator[str]:
     """Header stamps of another epoch than the log times, and messages without a stamp."""
     is_noted = False
     missing = 0
-    for channel in _channels(session, question):
+    summaries = session.look(question.recordings).summaries
+    places = session.chosen(question)[:_MAX_RECORDINGS].tolist()
+    entries = (session.entry_of(summaries[place]) for place in places)
+    topics = {*question.topics}
+    for channel in (one for entry in entries for one in session.channels_of(entry, topics)):
         stats = channel.stats
         if channel.recording.is_decoded:
             missing += stats.messages - stats.stamped

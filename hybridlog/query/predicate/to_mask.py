@@ -318,16 +318,7 @@ class _Columns(_Messages):
             return list(self._reach(start, parts, ()))
         if not self._types.known:
             raise _UnfitError  # a message may have a field of that name
-        return [self._statistic(array, stat) for array in self._reach(start, parts[:-1], ())]
-
-    def _statistic(self, leaves: _Leaves, stat: Stat) -> _Leaves:
-        """A statistic of arrays whose types are known."""
-        if leaves.is_summary:
-            if leaves.values.type.get_field_index(stat) < 0:
-                raise _UnfitError
-            values, rows = _some(leaves.values, leaves.rows, _valid(leaves.values))
-            return _Leaves(pc.struct_field(values, stat), rows, is_element=True)
-        return _computed(leaves, stat)
+        return [_statistic(array, stat) for array in self._reach(start, parts[:-1], ())]
 
     def _reach(
         self,
@@ -455,19 +446,14 @@ def _at_place(values: pa.Array, rows: Rows, place: int) -> _Leaves:
     return _Leaves(pc.list_element(values, place), rows, is_element=True)
 
 
-def _computed(leaves: _Leaves, stat: Stat) -> _Leaves:
-    """A statistic of lists, equal to that of their summaries in the index."""
+def _statistic(leaves: _Leaves, stat: Stat) -> _Leaves:
+    """A statistic of arrays whose types are known, equal to that in the index."""
     values, rows = _some(leaves.values, leaves.rows, _valid(leaves.values))
-    kind = values.type
-    if pa.types.is_null(kind):
-        return _Leaves(pa.nulls(0), rows[:0])
-    if not is_array(kind):
-        raise _UnfitError
-    if stat != "n" and is_list(kind):
-        elements = values.flatten()
-        if elements.null_count or (is_time(elements.type) and elements.type.unit != "ns"):
-            raise _UnfitError
-    found = statistic(values, stat)
+    if leaves.is_summary:
+        has = values.type.get_field_index(stat) >= 0
+        found = pc.struct_field(values, stat) if has else None
+    else:
+        found = statistic(values, stat) if is_array(values.type) else None
     if found is None:
         raise _UnfitError
     return _Leaves(found, rows, is_element=True)

@@ -197,7 +197,10 @@ def _number(text: str, word: re.Match[str]) -> tuple[Token, int]:
     if _HEX.fullmatch(written) or _INTEGER.fullmatch(written):
         value = int(written, 16 if written[:2] in {"0x", "0X"} else 10)
     elif _FLOAT.fullmatch(written):
-        value = _finite(text, at, float(written))
+        value = float(written)
+        if value == float("inf"):
+            problem = "the number is too large for a double; write inf if that is meant"
+            raise error_at(text, at, problem)
     else:
         kind = "time"
         try:
@@ -207,12 +210,6 @@ def _number(text: str, word: re.Match[str]) -> tuple[Token, int]:
                 text, at, f"{written!r} is neither a number nor a duration such as 500ms"
             ) from None
     return Token(kind, written, at, number=value), word.end()
-
-
-def _finite(text: str, at: int, number: float) -> float:
-    if number == float("inf"):
-        raise error_at(text, at, "the number is too large for a double; write inf if that is meant")
-    return number
 
 
 def _path(text: str, first: re.Match[str]) -> tuple[Token, int]:
