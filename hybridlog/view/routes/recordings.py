@@ -29,13 +29,8 @@ _MAX_PARTS: Final = 64
 """Parts of a coverage bar that are told apart."""
 
 
-def _start(summary: RecordingSummary) -> int:
-    """Log time of the beginning, ns; until a message is flushed, when it was made."""
-    return summary.extent[0] if summary.span else summary.created
-
-
 _KEYS: Final[Mapping[str, Callable[[RecordingSummary], Any]]] = {
-    "start": _start,
+    "start": start_of,
     "name": lambda one: one.name,
     "duration": lambda one: one.extent[1] - one.extent[0],
     "topics": lambda one: one.topic_count,
@@ -119,7 +114,7 @@ def _row(context: Context, summary: RecordingSummary) -> dict[str, Any]:
         "name": summary.name,
         "tags": summary.tags,
         "status": summary.status,
-        "start": str(_start(summary)),
+        "start": str(start_of(summary)),
         "duration": end - begin,
         "topics": summary.topic_count,
         "messages": summary.messages,
