@@ -15,14 +15,13 @@ from hybridlog.query.counters import Counters
 from hybridlog.record.losses import losses_of
 from hybridlog.schema.states import encoding_of, shown_channels
 from hybridlog.view.context import Context, extent, route, start_of
+from hybridlog_storage.manifest import MAX_MARKS
 
 if TYPE_CHECKING:
     from hybridlog.view.context import RequestParams
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.summary import RecordingSummary
 
-MAX_MARKS: Final = 10_000
-"""Marks of a recording that are shown, the first of them."""
 _MAX_ROWS: Final = 200
 _MAX_CONDITIONS: Final = 16
 _MAX_PARTS: Final = 64
