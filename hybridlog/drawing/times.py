@@ -57,6 +57,27 @@ class Lane:
         rows = np.arange(0, len(self.times) - 1, 1 + len(self.times) // _SAMPLED)
         return usual_period(self.times[rows + 1] - self.times[rows])
 
+    def gaps(self, edges: NDArray[np.int64], whole: Span, period: float) -> NDArray[np.intp]:
+        """Runs of pixels without messages that last longer than is usual.
+
+        A gap that a picture shows is one of the recording, but for how exact its ends are; one
+        that is shorter than two pixels may not be shown.
+
+        Args:
+            edges: int64[p + 1], ns.
+            whole: Log time `[begin, end)` of the recording, ns.
+            period: The usual time from one message to the next, ns; 0 if unknown.
+
+        Returns:
+            intp[n, 2], first pixel and the one behind the last.
+        """
+        is_outside = (edges[1:] <= whole[0]) | (edges[:-1] >= whole[1])
+        is_empty = np.concatenate([[False], (self.counts(edges) == 0) & ~is_outside, [False]])
+        runs = np.flatnonzero(is_empty[1:] != is_empty[:-1]).reshape(-1, 2)
+        begin, end = np.clip(edges, *whole)[runs].T
+        found: NDArray[np.intp] = runs[(end - begin > GAP_PERIODS * period) & (period > 0)]
+        return found
+
 
 def evenly(span: tuple[int, int], pixels: int) -> NDArray[np.int64]:
     """Edges of parts of a span, ns; the lengths of parts differ by one nanosecond at most."""
@@ -114,28 +135,6 @@ def lane_of(
 
 def _sorted(parts: Iterable[NDArray[np.int64]]) -> NDArray[np.int64]:
     return placed(np.sort(np.concatenate([np.empty(0, np.int64), *parts]), kind="stable"))
-
-
-def gaps(counts: NDArray[np.int64], edges: NDArray[np.int64], period: float) -> NDArray[np.intp]:
-    """Runs of pixels without messages that last longer than is usual.
-
-    A gap that a picture shows is one of the recording, but for how exact its ends are; one
-    that is shorter than two pixels may not be shown.
-
-    Args:
-        counts: int64[p], messages of a topic by pixel.
-        edges: int64[p + 1], ns.
-        period: The usual time from one message to the next, ns; 0 if unknown.
-
-    Returns:
-        intp[n, 2], first pixel and the one behind the last.
-    """
-    if period <= 0:
-        return np.empty((0, 2), np.intp)
-    is_empty = np.concatenate([[False], counts == 0, [False]])
-    runs = np.flatnonzero(is_empty[1:] != is_empty[:-1]).reshape(-1, 2)
-    is_long = edges[runs[:, 1]] - edges[runs[:, 0]] > GAP_PERIODS * period
-    return runs[is_long]
 
 
 MAX_MATCHES: Final = 20_000_000

@@ -137,7 +137,7 @@ def _table_blocks(planner: Planner, part: Part, values: Iterator[Values]) -> Ite
         rows = len(found.log_time)
         planner.counters.messages += rows
         names = {"topic": part.topic, "recording": part.recording.name}
-        own = {name: _text(names[name], rows) for name in _own(planner)}
+        own = {name: text_column(names[name], rows) for name in _own(planner)}
         own |= _tags_of(part.recording, tag_columns(planner.question.tags), rows)
         yield Block(part.topic, found.log_time, found.seq + rank, own, found.records.cast(kind), 0)
 
@@ -172,6 +172,7 @@ class Decoder:
 
     Attributes:
         channels: The channels of the messages that are read now; at first examples of all.
+        own: Names of the built-in columns.
 
     Raises:
         DefinitionError: a channel has no definition to derive columns from.
@@ -182,7 +183,7 @@ class Decoder:
         self.channels: Sequence[RecordedChannel] = ()
         self._counters = planner.counters
         self._chosen = planner.question.fields
-        self._own = _own(planner)
+        self.own = _own(planner)
         self._tags = tag_columns(planner.question.tags)
         self._ranks = {key: rank << _SEQ_BITS for key, rank in planner.ranks.items()}
         self._fields: list[frozenset[str] | None] = []
@@ -192,7 +193,7 @@ class Decoder:
         """Continue with messages of these channels."""
         if channels is not self.channels:
             self.channels = channels
-            self._fields = [_to_decode(self._chosen, channel, self._own) for channel in channels]
+            self._fields = [_to_decode(self._chosen, channel, self.own) for channel in channels]
 
     def empty(self) -> Iterator[Block]:
         """A block without rows for each example: columns exist even without messages."""
@@ -223,7 +224,7 @@ class Decoder:
         channel = self.channels[number]
         records, good = decoded.arrow(), decoded.rows
         stamps = None
-        if "stamp" in self._own:
+        if "stamp" in self.own:
             stamps = stamp_array(records)
             records = _without_stamp(records, self._chosen)
         if len(good) < len(batch):
@@ -256,7 +257,7 @@ class Decoder:
     ) -> dict[str, pa.Array[Any]]:
         """Built-in columns of messages of one channel, without the log time."""
         channel = self.channels[number]
-        own = {name: _own_column(name, channel, batch, seq, stamps) for name in self._own}
+        own = {name: _own_column(name, channel, batch, seq, stamps) for name in self.own}
         return own | _tags_of(channel.recording, self._tags, len(batch))
 
 
@@ -282,9 +283,9 @@ def _own_column(
 ) -> pa.Array[Any]:
     rows = len(batch)
     if name == "topic":
-        return _text(channel.channel.topic, rows)
+        return text_column(channel.channel.topic, rows)
     if name == "recording":
-        return _text(channel.recording.name, rows)
+        return text_column(channel.recording.name, rows)
     if name == "seq":
         return numbers(seq)
     if name == "sequence":
@@ -301,12 +302,13 @@ def _tags_of(
     """Columns with tags of a recording, by name; null where it lacks the tag."""
     values = {name: recording.tags.get(key) for name, key in tags.items()}
     return {
-        name: pa.nulls(rows, pa.string()) if value is None else _text(value, rows)
+        name: pa.nulls(rows, pa.string()) if value is None else text_column(value, rows)
         for name, value in values.items()
     }
 
 
-def _text(text: str, rows: int) -> pa.Array[Any]:
+def text_column(text: str, rows: int) -> pa.Array[Any]:
+    """A column of the same text."""
     text = text.encode("utf-8", "replace").decode()
     return pa.repeat(pa.scalar(text, pa.string()), rows)
 

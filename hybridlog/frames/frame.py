@@ -35,16 +35,15 @@ _NOTHING: NDArray[Any] = np.empty(0)
 
 def frame_of(table: pa.Table) -> pd.DataFrame:
     """A frame of an Arrow table, with its column `log_time` as the index."""
-    names = [name for name in table.column_names if name != "log_time"]
-    data = {name: _array(table[name]) for name in names}
     index = pd.DatetimeIndex(_times(table["log_time"]), name="log_time", copy=False)
-    return pd.DataFrame(data, index=index, copy=False)
+    return frame_of_table(table.drop_columns("log_time"), index)
 
 
-def frame_of_table(table: pa.Table) -> pd.DataFrame:
-    """A frame of all columns of an Arrow table, with row numbers as the index."""
+def frame_of_table(table: pa.Table, index: pd.Index | None = None) -> pd.DataFrame:
+    """A frame of all columns of an Arrow table; the index is row numbers, if none is given."""
     data = {name: _array(table.column(place)) for place, name in enumerate(table.column_names)}
-    return pd.DataFrame(data, index=pd.RangeIndex(table.num_rows), copy=False)
+    index = pd.RangeIndex(table.num_rows) if index is None else index
+    return pd.DataFrame(data, index=index, copy=False)
 
 
 def _array(column: pa.ChunkedArray[Any]) -> Any:

@@ -9,7 +9,7 @@ import pyarrow as pa
 
 from hybridlog.formats.answer import Line
 from hybridlog.formats.jsonl import json_line, json_rows
-from hybridlog.frames.answer import Block, Decoder
+from hybridlog.frames.answer import Block, Decoder, text_column
 from hybridlog.frames.columns import flat, summary_array, with_summaries
 from hybridlog.frames.names import arranged, free_name, summary_of
 from hybridlog.index.indexing import rows_by_channel
@@ -18,15 +18,10 @@ from hybridlog.schema.arrow_objects import below, values_array
 from hybridlog.schema.arrow_types import plain_values
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
-
-    import numpy as np
-    from numpy.typing import NDArray
+    from collections.abc import Iterator, Sequence
 
     from hybridlog.query.chunk_scan import MessageRun
     from hybridlog.query.planner import Planner
-    from hybridlog.schema.codec import Decoded
-    from hybridlog_storage.messages import Batch
 
 
 def lines(planner: Planner) -> Iterator[list[Line]]:
@@ -47,74 +42,54 @@ def lines(planner: Planner) -> Iterator[list[Line]]:
 def _lines_of(run: MessageRun, decoder: Decoder, planner: Planner) -> list[Line]:
     """The lines of a run, in its order."""
     found: list[Line | None] = [None] * len(run.batch)
+    fields = planner.question.fields
     for number, rows in rows_by_channel(run.batch.channel):
-        channel = decoder.channels[number]
         batch, seq = run.batch.take(rows), run.seq[rows]
         decoded = decoder.decoded(number, batch)
-        if decoded.is_typed:
+        good = decoded.rows
+        if decoded.is_typed or "stamp" in decoder.own:
             block = decoder.block(number, batch, seq, decoded)
-            made = _of_columns(block, channel.channel.topic, planner.question.fields)
+            own = block.own
         else:
-            firsts = _firsts(decoder, number, batch, seq, decoded)
-            made = _of_objects(firsts, decoded.plain(), planner.question.fields)
-        for row, line in zip(rows[decoded.rows].tolist(), made, strict=True):
+            block, own = None, decoder.own_columns(number, batch.take(good), seq[good])
+        topic = text_column(decoder.channels[number].channel.topic, len(good))
+        firsts = {"log_time_ns": pa.array(batch.log_time[good]), "topic": topic}
+        firsts |= {name: array for name, array in own.items() if name not in firsts}
+        if block is not None and decoded.is_typed:
+            made = _of_columns(firsts, block, fields)
+        else:
+            made = _of_objects(firsts, decoded.plain(), fields)
+        for row, line in zip(rows[good].tolist(), made, strict=True):
             found[row] = line
     return [line for line in found if line is not None]
 
 
-def _of_columns(block: Block, topic: str, fields: Sequence[str] | None) -> Iterator[Line]:
-    """Lines of messages that all have every field."""
-    times = pa.array(block.log_time)
-    columns: dict[str, pa.Array[Any]] = {"log_time_ns": times, "topic": _repeated(topic, times)}
-    own = {name: array for name, array in block.own.items() if name not in columns}
-    columns |= own
+def _of_columns(
+    columns: dict[str, pa.Array[Any]], block: Block, fields: Sequence[str] | None
+) -> Iterator[Line]:
+    """Lines of messages that all have every field; they begin with built-in columns."""
     leaves = with_summaries(flat(block.records), fields, block.summaries)
-    for path in _by_fields(leaves, fields):
+    for path in arranged([*leaves], fields):
         columns[free_name(path, columns)] = leaves[path]
-    yield from json_rows(structs(columns, len(times)))
-
-
-def _by_fields(names: Iterable[str], fields: Sequence[str] | None) -> list[str]:
-    return arranged(list(names), fields)
-
-
-def _repeated(text: str, rows: pa.Array[Any]) -> pa.Array[Any]:
-    return pa.repeat(pa.scalar(text.encode("utf-8", "replace").decode(), pa.string()), len(rows))
-
-
-def _firsts(
-    decoder: Decoder, number: int, batch: Batch, seq: NDArray[np.int64], decoded: Decoded
-) -> list[dict[str, Any]]:
-    """The beginnings of the lines of messages: the built-in columns."""
-    good = decoded.rows
-    own = decoder.own_columns(number, batch.take(good), seq[good])
-    if "stamp" in own:
-        own = dict(decoder.block(number, batch, seq, decoded).own)
-    topic = decoder.channels[number].channel.topic
-    names = ("log_time_ns", "topic", *(name for name in own if name != "topic"))
-    columns = [plain_values(own[name]) for name in names[2:]]
-    times = batch.log_time[good].tolist()
-    return [
-        dict(zip(names, values, strict=True))
-        for values in zip(times, [topic] * len(times), *columns, strict=True)
-    ]
+    yield from json_rows(structs(columns, len(block.log_time)))
 
 
 def _of_objects(
-    firsts: Sequence[Mapping[str, Any]],
+    firsts: Mapping[str, pa.Array[Any]],
     messages: Sequence[Mapping[str, Any]],
     fields: Sequence[str] | None,
 ) -> Iterator[Line]:
-    """Lines of messages with different fields."""
+    """Lines of messages with different fields; they begin with built-in columns."""
     wanted = None
     if fields is not None:
         wanted = [path.replace("[]", "").split(".") for path in fields]
-    for first, message in zip(firsts, messages, strict=True):
-        row = dict(first)
+    columns = zip(*map(plain_values, firsts.values()), strict=True)
+    for values, message in zip(columns, messages, strict=True):
+        row = dict(zip(firsts, values, strict=True))
         leaves = _flat(_chosen(message, wanted))
         if fields is not None:
             _summarise(leaves, fields)
-        for path in _by_fields(leaves, fields):
+        for path in arranged([*leaves], fields):
             row[free_name(path, row)] = leaves[path]
         yield json_line(row)
 

@@ -19,13 +19,7 @@ from hybridlog.snapshot import UNFINISHED
 from hybridlog.sql.columns import OWN, ViewColumn, merged, sql_type, view_columns
 from hybridlog.sql.names import ViewNames
 from hybridlog.sql.pieces import TopicOfRecording
-from hybridlog.sql.plan import (
-    Chooser,
-    Plan,
-    RecordingChooser,
-    in_window,
-    within_source,
-)
+from hybridlog.sql.plan import Chooser, Plan, RecordingChooser, in_window, within
 from hybridlog_storage.catalog import ChannelStats
 
 if TYPE_CHECKING:
@@ -194,7 +188,7 @@ class TopicView:
                 holds = in_window(where, window)
                 plans[window] = Plan(self.schema, self._columns, columns, holds, reading)
             if summary.id not in self._choosers:
-                spans = [within_source(source) for source in recording.sources]
+                spans = [within(source.span) for source in recording.sources]
                 self._choosers[summary.id] = Chooser(self.schema, spans)
             reading.remarks.add(recording)
             for place in self._choosers[summary.id].chosen(plans[window].where):

@@ -39,6 +39,7 @@ if TYPE_CHECKING:
 
     from hybridlog.columns.column_file import TablePart
     from hybridlog.columns.topic_table import TopicTable
+    from hybridlog.query.question import Span
     from hybridlog.schema.codec import Decoded
     from hybridlog.session import Session
     from hybridlog_storage.catalog import RecordingEntry
@@ -181,7 +182,7 @@ class TopicOfRecording:
         if gone:
             fields = self.session.expired_fields(self.entry, self.topic, gone)
             found += [_FieldRows(self, fields, part) for part in fields.parts]
-        return sorted(found, key=lambda one: (one.first is not None, one.first or 0))
+        return sorted(found, key=lambda one: (one.span is not None, (one.span or (0, 0))[0]))
 
     @lazy
     def places(self) -> dict[tuple[int, int], ChunkPlace]:
@@ -245,8 +246,7 @@ class _TableRows:
     """A row group of a table.
 
     Attributes:
-        first: Least log time, ns; None if unknown.
-        last: Greatest log time, ns; None if unknown.
+        span: Least and greatest log time, ns; None if unknown.
         is_whole: True if it has all arrays; else some may be summaries.
         has_summaries: True if it has summaries of all arrays that it has in full.
         has_points: True if it has the points of clouds.
@@ -258,11 +258,9 @@ class _TableRows:
         self._source = source
         self._table = table
         self._part = part
-        is_known = part.first > FIRST
+        self.span = (part.first, part.last) if part.first > FIRST else None
         self.has_summaries = table.has_arrays
         self.has_points = table.points is not None
-        self.first = part.first if is_known else None
-        self.last = part.last if is_known else None
 
     def kinds(self, paths: Paths) -> Sequence[Any]:
         """Types of the fields that it holds, at least at some paths."""
@@ -307,7 +305,7 @@ class _ChunkRows:
         source: TopicOfRecording,
         segment: int,
         place: ChunkPlace,
-        span: tuple[int, int],
+        span: Span,
         channels: Sequence[RecordedChannel],
     ) -> None:
         self._channels = channels
@@ -315,7 +313,7 @@ class _ChunkRows:
         self._source = source
         self._segment = segment
         self._place = place
-        self.first, self.last = span
+        self.span: Span | None = span
 
     def kinds(self, paths: Paths) -> Sequence[Any]:
         return self._kinds

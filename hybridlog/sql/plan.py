@@ -145,16 +145,16 @@ class RecordingChooser:
         """An expression that holds for all rows of some recordings."""
         names = self._names[group.start : group.stop]
         spans = [span for span in self._spans[group.start : group.stop] if span is not None]
-        within = pc.scalar(True)
+        is_inside = within(None)
         if len(spans) == len(group):
-            within = _within((min(first for first, _ in spans), max(last for _, last in spans)))
+            is_inside = within((min(first for first, _ in spans), max(last for _, last in spans)))
         recording, low, high = pc.field("recording"), min(names), max(names)
         if low == high:
-            return (recording == low) & within
-        return (recording >= low) & (recording <= high) & within
+            return (recording == low) & is_inside
+        return (recording >= low) & (recording <= high) & is_inside
 
 
-def _within(span: tuple[int, int] | None) -> Any:
+def within(span: tuple[int, int] | None) -> Any:
     """An expression that holds for the log times of a span, both ends included."""
     if span is None:
         return pc.scalar(True)
@@ -173,12 +173,6 @@ def in_window(where: Any, window: tuple[int, int] | None) -> Any:
     if end < END:  # a range without an end holds the last time, too
         inside &= pc.field("t") < end
     return inside if where is None else inside & where
-
-
-def within_source(source: RowSource) -> Any:
-    """An expression that holds for all rows of a source."""
-    known = source.first is not None and source.last is not None
-    return _within((source.first, source.last) if known else None)  # type: ignore[arg-type]
 
 
 class Plan:

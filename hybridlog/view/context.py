@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from hybridlog.query.query import Query
     from hybridlog.store import Store
     from hybridlog_storage.catalog import RecordingEntry
+    from hybridlog_storage.summary import RecordingSummary
 
 
 MAX_WORKING: Final = 4
@@ -136,7 +137,7 @@ class _Looks:
                 self._took = self._looked - begun
 
 
-def start_of(recording: RecordingEntry) -> int:
+def start_of(recording: RecordingEntry | RecordingSummary) -> int:
     """The time that offsets count from, ns: of the first message, else of the recording."""
     span = recording.span
     return recording.created if span is None else span[0]
@@ -326,6 +327,11 @@ class RequestParams:
     def __init__(self, parameters: QueryParams, tag: str | None = None) -> None:
         self._parameters = parameters
         self.tag = tag
+
+    @property
+    def encoded(self) -> str:
+        """All of them, for another URL."""
+        return str(self._parameters)
 
     def has(self, name: str) -> bool:
         """True if a parameter is given."""

@@ -19,7 +19,6 @@ from hypothesis import strategies as st
 
 import hybridlog as hl
 from hybridlog.drawing.series import series
-from hybridlog.drawing.times import gaps as silent
 from hybridlog.drawing.times import lane_of
 from hybridlog.query import periods
 from hybridlog.query.answers.statistics import _Running
@@ -161,11 +160,10 @@ def test_bursts_are_no_gaps(tmp_path: Path) -> None:
         for pixels in (20_000, 1000, 200):
             (line,) = series(query, ["v"], pixels=pixels)
             assert int(np.isnan(line.least).sum()) == 1, pixels
-        period = lane_of(store.session, store.entry("a"), "/burst").period()
-        assert period == 97 * MS
+        lane = lane_of(store.session, store.entry("a"), "/burst")
+        assert lane.period() == 97 * MS
         edges = np.linspace(span[0], span[1], 5000).astype(np.int64)
-        counts = np.histogram(times, edges)[0]
-        found = silent(counts, edges, period)
+        found = lane.gaps(edges, span, lane.period())
         assert len(found) == 1
         assert silence[0] <= edges[found[0, 0]] < edges[found[0, 1]] <= silence[1]
 

@@ -234,7 +234,7 @@ def test_a_question_after_a_change_keeps_what_was_read(stores: dict[int, Path]) 
 
 
 def test_sql_of_a_day_tests_groups_of_recordings(stores: dict[int, Path], calls: Calls) -> None:
-    made = calls(plan, "_within")
+    made = calls(plan, "within")
     with hl.open(stores[MANY], mongo="none") as store:
         asked = f"select count(*) from pose where t >= {day(4)[0]} and t < {day(4)[1]}"
         cost = cost_of(store, lambda: store.sql(asked).rows())

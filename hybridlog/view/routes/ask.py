@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import closing, suppress
-from operator import attrgetter
 from typing import TYPE_CHECKING, Any, Final
 
 from hybridlog.drawing.times import Match, Matches
@@ -81,11 +80,10 @@ def _matches(context: Context, question: PageQuestion) -> Matches:
     state = recording.status, recording.messages, frozenset(recording.digests.items())
     key = recording.id, state, (question.topics, question.where, question.within)
     with held(context.matching):  # a second client that asks the same waits
-        cache = context.store.shared.cache
-        return cache.made("matches", *key, make=lambda: Matches(question.query()), size_of=_size)
-
-
-_size: Callable[[Matches], int] = attrgetter("size")
+        made = context.store.shared.cache.made
+        return made(
+            "matches", *key, make=lambda: Matches(question.query()), size_of=lambda one: one.size
+        )
 
 
 def completion(context: Context, params: RequestParams) -> dict[str, Any]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import base64
 from typing import TYPE_CHECKING, Any, Final
-from urllib.parse import urlencode
 
 from starlette.responses import FileResponse
 
@@ -54,7 +53,7 @@ def manifest(context: Context, params: RequestParams) -> dict[str, Any]:
     schemas: dict[Schema, int] = {}
     topics = [_topic(channel, schemas) for channel in channels_of(query) if not channel.is_reduced]
     source = {
-        "url": f"data?{urlencode(_parameters(params))}",
+        "url": f"data?{params.encoded}",
         "id": fingerprint(query),
         "topics": [dict(topic) for topic in dict.fromkeys(topics)],
         "schemas": [_schema(schema, number) for schema, number in schemas.items()],
@@ -89,18 +88,6 @@ def _time(params: RequestParams, name: str, default: str) -> str:
     """A time as on the command line; the plus of `+10s` is a space in a URL."""
     text = params.text(name, default, longest=64)
     return f"+{text[1:]}" if text.startswith(" ") else text
-
-
-def _parameters(params: RequestParams) -> list[tuple[str, str]]:
-    """The parameters, for another URL."""
-    several = {"recording": MAX_RECORDINGS, "topic": MAX_TOPICS, "where": _MAX_PREDICATES}
-    found = [
-        (name, value)
-        for name, most in several.items()
-        for value in params.texts(name, most=most, longest=MAX_TEXT)
-    ]
-    times = (("begin", "start"), ("end", "end"))
-    return found + [(name, _time(params, name, default)) for name, default in times]
 
 
 def _name(context: Context, query: Query) -> str:

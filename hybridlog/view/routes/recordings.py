@@ -15,27 +15,21 @@ from hybridlog.query.counters import Counters
 from hybridlog.record.losses import losses_of
 from hybridlog.schema.states import encoding_of, shown_channels
 from hybridlog.view.context import Context, extent, route, start_of
+from hybridlog_storage.manifest import MAX_MARKS
 
 if TYPE_CHECKING:
     from hybridlog.view.context import RequestParams
     from hybridlog_storage.catalog import RecordingEntry
     from hybridlog_storage.summary import RecordingSummary
 
-MAX_MARKS: Final = 10_000
-"""Marks of a recording that are shown, the first of them."""
 _MAX_ROWS: Final = 200
 _MAX_CONDITIONS: Final = 16
 _MAX_PARTS: Final = 64
 """Parts of a coverage bar that are told apart."""
 
 
-def _start(summary: RecordingSummary) -> int:
-    """Log time of the beginning, ns; until a message is flushed, when it was made."""
-    return summary.extent[0] if summary.span else summary.created
-
-
 _KEYS: Final[Mapping[str, Callable[[RecordingSummary], Any]]] = {
-    "start": _start,
+    "start": start_of,
     "name": lambda one: one.name,
     "duration": lambda one: one.extent[1] - one.extent[0],
     "topics": lambda one: one.topic_count,
@@ -119,7 +113,7 @@ def _row(context: Context, summary: RecordingSummary) -> dict[str, Any]:
         "name": summary.name,
         "tags": summary.tags,
         "status": summary.status,
-        "start": str(_start(summary)),
+        "start": str(start_of(summary)),
         "duration": end - begin,
         "topics": summary.topic_count,
         "messages": summary.messages,

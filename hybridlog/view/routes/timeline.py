@@ -9,7 +9,7 @@ import numpy as np
 
 from hybridlog.drawing.series import fields_of
 from hybridlog.drawing.series import series as read_series
-from hybridlog.drawing.times import aligned, gaps, lane_of
+from hybridlog.drawing.times import aligned, lane_of
 from hybridlog.query.answers.infer_fields import SAMPLE
 from hybridlog.query.asked import field_types
 from hybridlog.view.context import Context, extent, packed_response, route, start_of
@@ -54,10 +54,10 @@ def timeline(context: Context, params: RequestParams) -> Response:
     arrays: dict[str, NDArray[Any]] = {}
     for number, topic in enumerate(topics):
         lane = lane_of(context.store.session, recording, topic)
-        counts, period = lane.counts(edges), lane.period()
-        silent = gaps(*_within(counts, edges, extent(recording)), period)
+        period = lane.period()
         lanes.append({"exact": lane.exact, "period": period})
-        arrays |= {f"counts {number}": _small(counts), f"gaps {number}": silent.astype(np.uint32)}
+        silent = lane.gaps(edges, extent(recording), period).astype(np.uint32)
+        arrays |= {f"counts {number}": _small(lane.counts(edges)), f"gaps {number}": silent}
     head = {
         "start": str(start),
         "begin": int(edges[0]) - start,
@@ -65,14 +65,6 @@ def timeline(context: Context, params: RequestParams) -> Response:
         "lanes": lanes,
     }
     return packed_response(head, arrays)
-
-
-def _within(
-    counts: NDArray[np.int64], edges: NDArray[np.int64], whole: tuple[int, int]
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Bins cut to the time of a recording; those outside are not empty."""
-    is_outside = (edges[1:] <= whole[0]) | (edges[:-1] >= whole[1])
-    return np.where(is_outside, 1, counts), np.clip(edges, *whole)
 
 
 def _small(counts: NDArray[np.int64]) -> NDArray[Any]:
