@@ -157,8 +157,6 @@ class OpenStore(Shared):
                 self._mend(time.monotonic() + seconds)
 
     def _mend(self, until: float) -> None:
-        from hybridlog.follow.follower import make_tables
-
         repairs = self.repairs
         known = self.now().snapshot().summaries
         died = [one.id for one in known if one.status == "unfinished"]
@@ -174,6 +172,8 @@ class OpenStore(Shared):
         for recording, topics in by_recording.items():
             entry = session.entry_if_there(recording)
             if entry is not None:
+                from hybridlog.follow.follower import make_tables
+
                 try:
                     problem = make_tables(
                         self.directory, self.catalog, entry, topics=topics, until=until

@@ -517,7 +517,7 @@ class Session:
         self, recording: RecordingEntry, channels: Collection[int], span: tuple[int, int]
     ) -> NDArray[np.void]:
         """The `ChunkColumns.parts` that may lie in a range `[begin, end)` of log time, ns."""
-        found = [np.empty(0, PARTS)]
+        found = [np.empty(0, np.dtype(PARTS))]
         for number, first, last in recording.spans_with(channels):
             if min(first, END - 1) < span[1] and last >= span[0]:
                 rows = self._chunk_columns(recording, number, channels).parts

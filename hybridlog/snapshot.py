@@ -34,14 +34,14 @@ def _order(one: RecordingSummary) -> tuple[bool, tuple[int, int], str, str]:
     return one.span is None, one.span or (0, 0), one.name, one.id
 
 
-_COLUMNS = np.dtype([("begin", "i8"), ("end", "i8"), ("is_open", "?"), ("set", np.intp)])
+_COLUMNS = [("begin", "i8"), ("end", "i8"), ("is_open", "?"), ("set", "i8")]
 
 
 def _columns_of(summaries: Sequence[RecordingSummary], topics: Iterable[str]) -> NDArray[np.void]:
     """Columns of a snapshot, a row for each recording; `set` is the number of its topics."""
     numbers = {digest: number for number, digest in enumerate(topics)}
     rows = [(*one.extent, one.status in UNFINISHED, numbers[one.topics]) for one in summaries]
-    return np.array(rows, _COLUMNS)
+    return np.array(rows, np.dtype(_COLUMNS))
 
 
 class Snapshot:

@@ -44,9 +44,7 @@ class Chunk(NamedTuple):
         return self.place.number
 
 
-PARTS = np.dtype(
-    [(name, "i8") for name in ("segment", "chunk", "channel", "messages", "first", "last")]
-)
+PARTS = [(name, "i8") for name in ("segment", "chunk", "channel", "messages", "first", "last")]
 
 
 class ChunkColumns:
@@ -68,7 +66,7 @@ class ChunkColumns:
         self._table = table
         ids = table.parts["channel"]
         self._rows = np.flatnonzero(np.isin(ids, ids if channels is None else [*channels]))
-        self.parts: NDArray[np.void] = np.empty(len(self._rows), PARTS)
+        self.parts: NDArray[np.void] = np.empty(len(self._rows), np.dtype(PARTS))
         self.parts["segment"] = segment
         numbers = np.repeat(np.arange(len(table.chunks)), table.chunks["parts"])
         self.parts["chunk"] = numbers[self._rows]

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from hybridlog.frames.names import is_summary
 from hybridlog.query.chunk_scan import ChunkKey, ChunkScan, RecordingScan, ScanPlan
 from hybridlog.query.predicate.tree import is_meta
 from hybridlog.record.losses import lost_spans
@@ -536,6 +535,8 @@ def _within(part: Part, segments: Collection[int]) -> Part:
 
 def summaries_in(fields: Collection[str] | None, types: Mapping[str, str] | None) -> set[str]:
     """The paths among some fields that are summaries of arrays."""
+    from hybridlog.frames.names import is_summary  # a count needs no frames
+
     return {path for path in fields or () if is_summary(path, types or {})}
 
 

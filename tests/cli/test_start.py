@@ -235,7 +235,6 @@ def test_paths_are_checked_by_the_library() -> None:
     ("words", "hint"),
     [
         ("fech", "Did you mean 'fetch'?"),
-        ("record /scan /lidar/points", ": `hybridlog record --ros2 -t /scan -t /lidar/points`."),
         ("fetch --betwee", "'--between'"),
         ("check robot", "robot is a recording: -r robot."),
         ("fetch robot", "\nrobot is a recording: -r robot.\n"),
