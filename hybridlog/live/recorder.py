@@ -79,24 +79,7 @@ _SLOW_WRITE_S = 2.0  # to pack and write a chunk, on a disk that is busy
 
 @dataclass(frozen=True, slots=True)
 class RecorderOptions(LiveOptions):
-    """Options of a recorder, and of its recording.
-
-    Attributes:
-        name: Name of the recording.
-        matcher: Selects topics; None for all.
-        throttles: Maximum rates of topics, Hz by log time; the first matching rule applies.
-        priorities: Priorities of topics under pressure; the first matching rule applies.
-        duration_s: Stop after this time.
-        max_messages: Stop after this number of messages.
-        max_bytes: Stop after this number of payload bytes.
-        reserve_bytes: Stop when the disk has less free space.
-        ring_s: Seconds after which messages go that no pin touches; None to keep all.
-        triggers: Conditions on messages, which are marked and pinned.
-        before_s: Seconds before a trigger or signal that are pinned; None for those of the ring.
-        after_s: Seconds after it.
-        use_sim_time: Log times are those of `/clock`.
-        contract: Topics that are silent for longer than it allows are told and marked.
-    """
+    """Options of a recorder, and of its recording; the first rule that fits a topic applies."""
 
     name: str = "live"
     matcher: TopicMatcher | None = None
@@ -396,12 +379,7 @@ class Recorder:
         return waited if waited > _SLOW_WRITE_S else 0.0
 
     def fire(self, text: str, steady: int | None = None) -> None:
-        """Mark and pin what is around a trigger or signal; waits for nothing.
-
-        Args:
-            text: Its name.
-            steady: When it was, as a steady time, ns; None for now.
-        """
+        """Mark and pin what is around a steady time, ns, or now; waits for nothing."""
         options = self._options
         before = options.before_s if options.before_s is not None else options.ring_s or 0.0
         at = self._now() if steady is None else steady
