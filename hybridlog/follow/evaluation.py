@@ -107,6 +107,9 @@ class _Watch:
                 runs, goes_on = one.look(session)
                 for run in runs:
                     self.tell("hit", trigger.text, run.batch.log_time.tolist())
+            if counters.unreadable:
+                counters.unreadable = 0
+                self.tell("say", "triggers do not see messages that cannot be read, or lack arrays")
             now = dict(watched[0].read[recording]), frozenset(watched[0].sealed[recording])
             if now != read:
                 read = now

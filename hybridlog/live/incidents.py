@@ -103,7 +103,9 @@ class Incidents:
         """
         with self._writing:
             with self._lock:
-                new, self._is_urgent = dict(self._new), False
+                has_begun = self._first() is not None  # a note alone makes no recording
+                new = {k: one for k, one in self._new.items() if has_begun or k in self._hits}
+                self._is_urgent = self._is_urgent and not has_begun
             if not new:
                 return False
             marks = {key: self._mark(key, one) for key, one in new.items()}

@@ -171,7 +171,6 @@ class Recorder:
         self._looked = self._written_at = self._started
         self._written = 0
         self._stored_bytes = 0
-        self._clock_marks: list[Moment] = []
         self._newest = max(store.summaries(), key=attrgetter("created"), default=None)
         self._silence = SilenceWatch(options.contract, self._now, self._note_silence)
         self._settled_at = 0.0
@@ -280,7 +279,6 @@ class Recorder:
         ended_at = self._now() if self._ended_at is None else self._ended_at
         for source in self._sources:
             source.stop()
-        self._mark_clock()
         self._over.set()
         self._silence.stop(ended_at)
         if self._simulated is not None:
@@ -716,17 +714,11 @@ class Recorder:
             tags = {"set_by_ns": str(jump.by)}
             text = f"the clock of this machine was set {where} by {by}"
             self._note_clock(text, tags, jump.at)
-        self._mark_clock()
 
     def _note_clock(self, text: str, tags: Mapping[str, str], at: int) -> None:
         """Report that the clock of this machine was set, or is to be, at a steady time, ns."""
         self._say(f"{text}; log times are those of the clock")
-        self._clock_marks.append(Moment(text, {"cause": CLOCK_SET, **tags}, at))
-
-    def _mark_clock(self) -> None:
-        """Mark what is noted of the clock; alone it makes no recording."""
-        while self._clock_marks and self._recorded_by_content and not self._over.is_set():
-            self._incidents.note(new_random(), self._clock_marks.pop(0))
+        self._incidents.note(new_random(), Moment(text, {"cause": CLOCK_SET, **tags}, at))
 
 
 def _cause_of(error: HybridlogError) -> Cause:
