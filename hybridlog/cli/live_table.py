@@ -56,14 +56,7 @@ class LiveTable:
 def drawn(
     state: RecorderState, *, width: int, height: int | None = None, below: Sequence[str] = ()
 ) -> list[str]:
-    """A state as the lines of a table of topics, with others below it.
-
-    Args:
-        state: The state.
-        width: Columns of the terminal; the less important columns are left out if it is narrow.
-        height: Lines of the terminal; None for all topics.
-        below: The others.
-    """
+    """A state as the lines of a table of topics, with others below it."""
     # Broken between its parts only.
     whole = summary(state).replace(" ", "\N{NO-BREAK SPACE}").replace("·\N{NO-BREAK SPACE}", "· ")
     ends = [line.replace("\N{NO-BREAK SPACE}", " ") for line in textwrap.wrap(whole, width)]

@@ -151,19 +151,15 @@ def check_new_store(choices: RecordChoices, logs: Sequence[LogSet]) -> None:
 
     if os.path.lexists(store_path(choices.store) / NAME):
         return
-    first: SourceError | None = None
+    problems: list[SourceError] = []
     for log in logs:
         try:
             log.open().close()
-        except SourceError as error:
-            first = first or error
-        else:
             break
-    else:
-        if first is not None and len(logs) == 1:
-            raise first
-        if first is not None:
-            raise SourceError(f"None of the {len(logs)} paths can be read. {first}")
+        except SourceError as error:
+            problems.append(error)
+    if problems and len(problems) == len(logs):
+        raise problems[0]
     if is_uri(choices.mongo):
         # The new store stores the URI, so it has to be right.
         from hybridlog_storage.mongo.database import Database

@@ -12,7 +12,7 @@ import click
 from hybridlog.cli import output
 from hybridlog.cli.app import DIFFERENT
 from hybridlog.cli.render import Column, bytes_of, numbers, print_fields
-from hybridlog.query.answers.completeness import coverage, line_of
+from hybridlog.query.answers.completeness import coverage, in_words
 from hybridlog.record.losses import Cause, losses_of
 from hybridlog_storage.errors import (
     DatabaseError,
@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from hybridlog.live.sources.base import LiveSource
     from hybridlog.live.state import RecorderState
     from hybridlog.record.recorder import RecordReport
-
-_MAX_ROWS = 10  # of the ledger; `losses` prints all
 
 
 def row_of(report: RecordReport, path: object) -> dict[str, Any]:
@@ -165,11 +163,8 @@ class LiveSummary:
             for row in report.entry.end.get("losses", [])
             if row["cause"] == Cause.UNREADABLE
         ]
-        for row in rows[:_MAX_ROWS]:
-            yield line_of(row)
-        if len(rows) > _MAX_ROWS:
-            more = output.counted(len(rows) - _MAX_ROWS, "more place")
-            yield f"and {more} that could not be read; `hybridlog info --losses` lists them"
+        if rows:
+            yield f"{in_words(rows)} that cannot be read; `hybridlog info --losses` lists them"
         yield from (output.not_indexed(one) for one in self.reports if one.failure is not None)
 
     def _exit_code(self) -> int:

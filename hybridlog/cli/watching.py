@@ -31,15 +31,7 @@ def watch(
     pause_s: float = 2.0,
     report: Callable[[HybridlogError], None] = lambda error: output.note(str(error)),
 ) -> None:
-    """Look at a store or directories again and again; a signal ends this normally.
-
-    Args:
-        place: What is looked at, for the person.
-        look: Acts on what has changed since its last call and prints that; yields problems. If
-            it fails because a place or a database is away, it is called again, later.
-        pause_s: Seconds between two looks.
-        report: Called once with a problem, as long as it lasts.
-    """
+    """Call `look`, which acts and yields problems, again and again; a signal ends this normally."""
     if isinstance(sys.stdout, io.TextIOWrapper):  # a file and a pipe show each line at once
         sys.stdout.reconfigure(line_buffering=True)
     told: set[str] = set()

@@ -85,13 +85,7 @@ class _Watch:
                         self.tell("say", f"{never}: {error}")
 
     def run(self, address: str, recording: str, read: Any) -> None:
-        """Evaluate what the recording has, and what comes, until it ends.
-
-        Args:
-            address: The store.
-            recording: Id of the recording.
-            read: What was read by a process before; None for nothing.
-        """
+        """Evaluate what a recording has and gets, until it ends, but for what was read before."""
         store = hybridlog.open(address, mongo="none", read_only=True)
         session, counters = store.shared.now(), Counters()
         watched = [
@@ -113,6 +107,9 @@ class _Watch:
                 runs, goes_on = one.look(session)
                 for run in runs:
                     self.tell("hit", trigger.text, run.batch.log_time.tolist())
+            if counters.unreadable:
+                counters.unreadable = 0
+                self.tell("say", "triggers do not see messages that cannot be read, or lack arrays")
             now = dict(watched[0].read[recording]), frozenset(watched[0].sealed[recording])
             if now != read:
                 read = now

@@ -15,13 +15,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Trigger:
-    """A condition on messages.
-
-    Attributes:
-        text: As the user wrote it.
-        fits: Tells whether a topic matches.
-        predicate: Condition for a message; None for any message.
-    """
+    """A condition on messages of topics; without a predicate any of them fires it."""
 
     text: str
     fits: TopicMatcher

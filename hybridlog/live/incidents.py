@@ -25,14 +25,7 @@ _PROLONGED_S: Final = 1.0  # between two changes that only prolong incidents
 
 
 class Moment(NamedTuple):
-    """What is marked.
-
-    Attributes:
-        text: Text of the mark.
-        tags: Its tags.
-        begin: Steady time from which on it lasts, ns.
-        end: Steady time up to which it lasts; None for a moment, or if that is to come.
-    """
+    """What is marked: from one steady time to another, ns, or at one, or with an end to come."""
 
     text: str
     tags: Mapping[str, str]
@@ -43,17 +36,8 @@ class Moment(NamedTuple):
 class Incidents:
     """Marks and pins on a thread of its own, and lets what is too old for a ring go.
 
-    Nothing goes before the hits that came until then are pinned. What fails is tried again.
-
-    Args:
-        change: Changes the manifest of the recording.
-        clock: The clock of log times; None for a simulation, whose times are all steady.
-        first: Returns the log time of the first message; None before it.
-        ring: Lets files go; None to keep all of them.
-        say: Shows a line to the user, each text once.
-
-    Attributes:
-        count: Number of incidents.
+    Nothing goes before the hits that came until then are pinned. What fails is tried again. Without
+    a clock, as of a simulation, log times are steady.
     """
 
     def __init__(
@@ -119,7 +103,9 @@ class Incidents:
         """
         with self._writing:
             with self._lock:
-                new, self._is_urgent = dict(self._new), False
+                has_begun = self._first() is not None  # a note alone makes no recording
+                new = {k: one for k, one in self._new.items() if has_begun or k in self._hits}
+                self._is_urgent = self._is_urgent and not has_begun
             if not new:
                 return False
             marks = {key: self._mark(key, one) for key, one in new.items()}

@@ -37,13 +37,7 @@ WHOLE_BELOW: Final = {Priority.LOW: 0.5, Priority.NORMAL: 0.7, Priority.HIGH: 0.
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """A setting for the topics that match a pattern.
-
-    Attributes:
-        pattern: As the user wrote it.
-        fits: Tells whether a topic matches.
-        value: A rate in Hz, or a `Priority`.
-    """
+    """A setting for the topics that match a pattern: a rate in Hz, or a `Priority`."""
 
     pattern: str
     fits: TopicMatcher

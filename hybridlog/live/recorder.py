@@ -79,24 +79,7 @@ _SLOW_WRITE_S = 2.0  # to pack and write a chunk, on a disk that is busy
 
 @dataclass(frozen=True, slots=True)
 class RecorderOptions(LiveOptions):
-    """Options of a recorder, and of its recording.
-
-    Attributes:
-        name: Name of the recording.
-        matcher: Selects topics; None for all.
-        throttles: Maximum rates of topics, Hz by log time; the first matching rule applies.
-        priorities: Priorities of topics under pressure; the first matching rule applies.
-        duration_s: Stop after this time.
-        max_messages: Stop after this number of messages.
-        max_bytes: Stop after this number of payload bytes.
-        reserve_bytes: Stop when the disk has less free space.
-        ring_s: Seconds after which messages go that no pin touches; None to keep all.
-        triggers: Conditions on messages, which are marked and pinned.
-        before_s: Seconds before a trigger or signal that are pinned; None for those of the ring.
-        after_s: Seconds after it.
-        use_sim_time: Log times are those of `/clock`.
-        contract: Topics that are silent for longer than it allows are told and marked.
-    """
+    """Options of a recorder, and of its recording; the first rule that fits a topic applies."""
 
     name: str = "live"
     matcher: TopicMatcher | None = None
@@ -188,7 +171,6 @@ class Recorder:
         self._looked = self._written_at = self._started
         self._written = 0
         self._stored_bytes = 0
-        self._clock_marks: list[Moment] = []
         self._newest = max(store.summaries(), key=attrgetter("created"), default=None)
         self._silence = SilenceWatch(options.contract, self._now, self._note_silence)
         self._settled_at = 0.0
@@ -297,7 +279,6 @@ class Recorder:
         ended_at = self._now() if self._ended_at is None else self._ended_at
         for source in self._sources:
             source.stop()
-        self._mark_clock()
         self._over.set()
         self._silence.stop(ended_at)
         if self._simulated is not None:
@@ -396,12 +377,7 @@ class Recorder:
         return waited if waited > _SLOW_WRITE_S else 0.0
 
     def fire(self, text: str, steady: int | None = None) -> None:
-        """Mark and pin what is around a trigger or signal; waits for nothing.
-
-        Args:
-            text: Its name.
-            steady: When it was, as a steady time, ns; None for now.
-        """
+        """Mark and pin what is around a steady time, ns, or now; waits for nothing."""
         options = self._options
         before = options.before_s if options.before_s is not None else options.ring_s or 0.0
         at = self._now() if steady is None else steady
@@ -738,17 +714,11 @@ class Recorder:
             tags = {"set_by_ns": str(jump.by)}
             text = f"the clock of this machine was set {where} by {by}"
             self._note_clock(text, tags, jump.at)
-        self._mark_clock()
 
     def _note_clock(self, text: str, tags: Mapping[str, str], at: int) -> None:
         """Report that the clock of this machine was set, or is to be, at a steady time, ns."""
         self._say(f"{text}; log times are those of the clock")
-        self._clock_marks.append(Moment(text, {"cause": CLOCK_SET, **tags}, at))
-
-    def _mark_clock(self) -> None:
-        """Mark what is noted of the clock; alone it makes no recording."""
-        while self._clock_marks and self._recorded_by_content and not self._over.is_set():
-            self._incidents.note(new_random(), self._clock_marks.pop(0))
+        self._incidents.note(new_random(), Moment(text, {"cause": CLOCK_SET, **tags}, at))
 
 
 def _cause_of(error: HybridlogError) -> Cause:

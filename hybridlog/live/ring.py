@@ -27,17 +27,7 @@ _LATE_S: Final = 1.0  # a signal may come so long after what it is about
 
 
 class Ring:
-    """Lets the oldest groups of a recording go.
-
-    Args:
-        directory: The store.
-        recording: The recording, which this process makes.
-        span_s: Seconds after its end when a group goes.
-        triggers: Triggers that must have seen a group before it goes; None without any.
-
-    Attributes:
-        messages: Messages that have gone.
-    """
+    """Lets the oldest groups of a recording go, once triggers have seen them."""
 
     def __init__(
         self,

@@ -139,11 +139,6 @@ def states(directory: StoreDirectory, recording: str, every_s: float) -> Iterato
 def choose(directory: StoreDirectory, named: Sequence[str]) -> list[str]:
     """The ids of recordings that recorders write; without names, the only one.
 
-    Args:
-        directory: The store.
-        named: Names by the user: id or name of a recording, the beginning of one, or that of
-            the digits of its id.
-
     Raises:
         UsageError: No recorder runs, several run and no name is given, or a name matches
             none or several.
