@@ -234,37 +234,6 @@ def columns_of(codec: Codec, batch: Batch, fields: Collection[str] | None = None
     return codec.columns(batch.buffer, batch.offset, batch.length, fields)
 
 
-def readable(decoded: Decoded) -> Decoded:
-    """The same of one message.
-
-    Raises:
-        PayloadError: The payload does not fit its definition.
-    """
-    if decoded.unreadable:
-        raise PayloadError(f"the payload cannot be read: {decoded.unreadable[0].reason}")
-    return decoded
-
-
-def plain_message(
-    codec: Codec, payload: Buffer, names: Collection[str] | None = None
-) -> dict[str, object]:
-    """One message as plain values, for predicates; empty if nothing can be decoded.
-
-    Args:
-        codec: Its codec.
-        payload: The serialized message.
-        names: Fields of the top level that are needed, at least; None for all.
-
-    Raises:
-        PayloadError: The payload does not fit its definition.
-    """
-    if not codec.indexed:
-        return {}
-    size = np.array([memoryview(payload).nbytes], np.int64)
-    decoded = codec.columns(payload, np.zeros(1, np.int64), size, names)
-    return readable(decoded).plain(whole=False)[0]
-
-
 def stamps_of(codec: Codec, batch: Batch) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
     """Decode the header stamps of messages of one channel.
 

@@ -18,7 +18,7 @@ from bson.int64 import Int64
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hybridlog.schema.codec import Codec, plain_message
+from hybridlog.schema.codec import Codec
 from hybridlog.schema.codecs import codec_for
 from hybridlog_storage.errors import DefinitionError, PayloadError
 from hybridlog_storage.messages import Channel, Schema
@@ -90,7 +90,7 @@ def test_arrays_without_elements() -> None:
     payload = struct.pack("<BI2bh", 7, 2, 1, 2, -3)
     inner = [{"z": [], "w": 1}, {"z": [], "w": 2}]
     wanted = {"a": [], "b": 7, "c": [], "d": [], "e": [], "f": inner, "g": [], "h": -3}
-    assert plain_message(codec, payload) == wanted
+    assert index_fields(codec, payload) == wanted
     for count in (1, 20):
         length = np.full(count, len(payload))
         found = codec.columns(payload * count, np.arange(count) * len(payload), length)

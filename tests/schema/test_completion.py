@@ -10,14 +10,13 @@ import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from hybridlog.schema import completion
-from hybridlog.schema.codec import plain_message
 from hybridlog.schema.codecs import codec_for
 from hybridlog.schema.completion import completed
 from hybridlog.schema.definition import parse_definition, typestore
 from hybridlog_storage.errors import DefinitionError
 from hybridlog_storage.messages import REPLACED, SUPPLIED, Channel, Schema
 from tests.calls import Calls
-from tests.indexed import groups_of
+from tests.indexed import groups_of, index_fields
 from tests.ros_values import ROS1, message_of, same
 
 DIFFERENT = [
@@ -131,7 +130,7 @@ def test_a_message_that_is_empty_has_no_fields() -> None:
         assert codec_for(found).paths() == []
     own = cdr("p/msg/T", Schema("p/msg/T", "ros2msg", b"# nothing\nuint8 A=1\n"))
     assert completed(own, [b"\0\1\0\0\0"]) is own
-    assert plain_message(codec_for(own), b"\0\1\0\0\0\0\0\0") == {}
+    assert index_fields(codec_for(own), b"\0\1\0\0\0\0\0\0") == {}
     (group,) = groups_of(codec_for(own), b"\0\1\0\0\5\0\0\0hallo")
     assert group.error is not None
     assert "8 bytes left over: the definition has no fields" in group.error
