@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias, cast
 import numpy as np
 
 from hybridlog.query.times import format_time
-from hybridlog.schema.codec import columns_of, readable
+from hybridlog.schema.codec import columns_of
 from hybridlog.schema.column import Records
 from hybridlog.schema.states import State
-from hybridlog_storage.errors import HybridlogError
+from hybridlog_storage.errors import HybridlogError, PayloadError
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -226,7 +226,10 @@ class Documents:
             DefinitionError: There is no definition to read it by.
         """
         codec = self._channels[int(self._batch.channel[row])].codec
-        return readable(columns_of(codec, self._batch.take(slice(row, row + 1))))
+        decoded = columns_of(codec, self._batch.take(slice(row, row + 1)))
+        if decoded.unreadable:
+            raise PayloadError(f"the payload cannot be read: {decoded.unreadable[0].reason}")
+        return decoded
 
     def refuse(self, row: int) -> NoReturn:
         """Refuse a payload that is gone.

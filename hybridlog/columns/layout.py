@@ -105,22 +105,14 @@ def _described(column: Any) -> list[Any]:
     return [names, "struct", inner]
 
 
-def table_schema(message_encoding: str, schema: str | None, metadata: Mapping[str, str]) -> str:
-    """Hash of everything that determines the columns of a channel: 64 hexadecimal digits.
+def table_schema_of(channel: Channel) -> str:
+    """What determines the columns of a channel: its original encoding, and the hash of its schema.
 
     Args:
-        message_encoding: Encoding of the channel.
-        schema: Hash of its schema, if any.
-        metadata: Metadata of the channel; a reduced one names its original encoding there.
+        channel: The channel; a reduced one names its original encoding in its metadata.
     """
-    encoding = encoding_of(message_encoding, metadata)
-    return hashlib.sha256(f"{encoding}:{schema or ''}".encode()).hexdigest()
-
-
-def table_schema_of(channel: Channel) -> str:
-    """The hash of `table_schema` for a channel."""
-    schema = schema_hash(channel.schema) if channel.schema is not None else None
-    return table_schema(channel.message_encoding, schema, channel.metadata)
+    schema = "" if channel.schema is None else schema_hash(channel.schema)
+    return f"{encoding_of(channel.message_encoding, channel.metadata)}:{schema}"
 
 
 def topics_of(entry: RecordingEntry) -> set[str]:

@@ -28,10 +28,10 @@ from hybridlog.columns.layout import (
     Section,
     TopicCounts,
     parts_folder,
-    table_schema,
     type_prefix,
 )
 from hybridlog.columns.topic_table import TopicTable
+from hybridlog.schema.states import encoding_of
 from hybridlog_storage.cache import Cache
 from hybridlog_storage.errors import StoreError
 from hybridlog_storage.messages import EXPIRED_IDS, MARKS_CHANNEL
@@ -266,7 +266,7 @@ class Tables:
     def can_have(self, recording: RecordingEntry, topic: str) -> bool:
         """True if a topic has a table when all is well: only with one definition."""
         found = {
-            table_schema(channel.message_encoding, channel.schema, channel.metadata)
+            (encoding_of(channel.message_encoding, channel.metadata), channel.schema)
             for channel in self._channels_of(recording, topic)
             if channel.stats.messages
         }

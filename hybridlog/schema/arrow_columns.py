@@ -37,7 +37,7 @@ def array_of(column: Column) -> pa.Array[Any]:
     values = array_of(column.values)
     # Parquet cannot hold lists of a fixed length of 0.
     if column.width and isinstance(column.values, Scalars):
-        return fixed_lists(values, column.width, len(column))
+        return pa.FixedSizeListArray.from_arrays(values, column.width)
     return lists(values, column.offset)
 
 
@@ -88,12 +88,6 @@ def lists(
         kind, places = pa.list_(values.type), offset.astype(np.int32)
     buffers = [_validity(missing), pa.py_buffer(places)]
     return pa.Array.from_buffers(kind, len(offset) - 1, buffers, children=[values])
-
-
-def fixed_lists(values: pa.Array[Any], width: int, rows: int) -> pa.Array[Any]:
-    """Lists of one length."""
-    kind = pa.list_(values.type, width)
-    return pa.Array.from_buffers(kind, rows, [None], children=[values])
 
 
 def _strings(strings: Strings) -> pa.Array[Any]:

@@ -234,17 +234,6 @@ def columns_of(codec: Codec, batch: Batch, fields: Collection[str] | None = None
     return codec.columns(batch.buffer, batch.offset, batch.length, fields)
 
 
-def readable(decoded: Decoded) -> Decoded:
-    """The same of one message.
-
-    Raises:
-        PayloadError: The payload does not fit its definition.
-    """
-    if decoded.unreadable:
-        raise PayloadError(f"the payload cannot be read: {decoded.unreadable[0].reason}")
-    return decoded
-
-
 def stamps_of(codec: Codec, batch: Batch) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
     """Decode the header stamps of messages of one channel.
 

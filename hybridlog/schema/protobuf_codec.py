@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
 _MAX_DEPTH = 32
 _MAX_PATHS = 10_000
+_PART = 256  # messages made plain together: each key of their maps is a column
 
 _STANDARD = frozenset(
     f"google/protobuf/{name}.proto"
@@ -113,14 +114,19 @@ class _Messages(Objects):
         """The fields that are set, or that do not track whether they are."""
         from hybridlog.schema.arrow_types import plain_values
 
-        return plain_values(self.arrow(), partial(document_cells, typed=True, whole=whole))
+        cells = partial(document_cells, typed=True, whole=whole)
+        parts = (slice(at, at + _PART) for at in range(0, len(self.values), _PART))
+        return [one for part in parts for one in plain_values(self._arrow(part), cells)]
 
     def arrow(self) -> pa.StructArray:
         """Arrays of the types that the definition names."""
+        return self._arrow(slice(None))
+
+    def _arrow(self, rows: slice) -> pa.StructArray:
         from hybridlog.schema.arrow_protobuf import messages_array
 
         assert self.descriptor is not None
-        return messages_array(self.descriptor, self.values, self.wanted())
+        return messages_array(self.descriptor, self.values[rows], self.wanted())
 
 
 def _message_class(schema: Schema) -> type[Message]:

@@ -161,7 +161,7 @@ class _Typesdict:
     def __init__(self, owner: str) -> None:
         self.types: Typesdict = {}
         self._owner = owner
-        self._names: dict[MessageType | Instant, str] = {}
+        self._names: dict[MessageType, str] = {}
         self._unrolled = 0
 
     def add(self, message: MessageType) -> str:
@@ -181,18 +181,6 @@ class _Typesdict:
             free, number = f"{name}_{number}", number + 1
         return free
 
-    def _instant(self, instant: Instant) -> str:
-        if instant not in self._names:
-            name = self._free(f"builtin_interfaces/msg/{instant.kind.capitalize()}")
-            seconds = "int32" if instant.signed_seconds else "uint32"
-            nanoseconds = "int32" if instant.signed_nanoseconds else "uint32"
-            self.types[name] = (
-                [],
-                [("sec", _base(seconds)), ("nanosec", _base(nanoseconds))],
-            )
-            self._names[instant] = name
-        return self._names[instant]
-
     def _describe(self, field: FieldType) -> FieldDesc:
         from rosbags.interfaces import Nodetype
 
@@ -201,7 +189,9 @@ class _Typesdict:
         if isinstance(field, Text):
             return _base("string")
         if isinstance(field, Instant):
-            return (Nodetype.NAME, self._instant(field))
+            parts = {"sec": field.signed_seconds, "nanosec": field.signed_nanoseconds}
+            fields = ((name, Primitive("", "i4" if own else "u4")) for name, own in parts.items())
+            field = MessageType(f"builtin_interfaces/{field.kind.capitalize()}", tuple(fields))
         if isinstance(field, MessageType):
             return (Nodetype.NAME, self.add(field))
         return self._describe_array(field)

@@ -256,14 +256,12 @@ class FrameTree:
             block = np.arange(begin, min(begin + _BLOCK, len(times)))
             for rows, upwards in self._paths(given, times, block, ()):
                 for own, downwards in self._paths(wanted, times, rows, ()):
-                    self._fill(
-                        made,
-                        missing,
-                        times=times,
-                        rows=own,
-                        ways=(upwards, downwards),
-                        hold=hold,
-                    )
+                    used = _until_common(upwards, downwards)
+                    if used is None:
+                        missing[f"no way between {given} and {wanted}"] += len(own)
+                        continue
+                    found = self._between(used, times[own], hold, missing)
+                    made.translation[own], made.rotation[own] = found.translation, found.rotation
         return Lookup(made.translation, made.rotation, times, dict(missing))
 
     def latest(self, target: str, source: str) -> int:
@@ -354,37 +352,24 @@ class FrameTree:
         for place in np.unique(parent):
             yield from self._paths(one.parents[place], times, rows[parent == place], way)
 
-    def _fill(
-        self,
-        made: Transform,
-        missing: Counter[str],
-        *,
-        times: Times,
-        rows: Places,
-        ways: tuple[Way, Way],
-        hold: int,
-    ) -> None:
-        """Work out the transforms of the times that share both ways."""
-        used = _until_common(*ways)
-        if used is None:
-            missing[f"no way between {ways[0][0]} and {ways[1][0]}"] += len(rows)
-            return
-        at = times[rows]
+    def _between(
+        self, ways: tuple[Way, Way], at: Times, hold: int, missing: Counter[str]
+    ) -> Transform:
+        """The transforms at times that share both ways; counts those that are missing."""
         parts = []
-        for way in used:
-            part = identity(len(rows))
+        for way in ways:
+            part = identity(len(at))
             for name in way:
                 part = self.frames[name].pose_at(at, hold) @ part
             parts.append(part)
-        up, down = parts
-        found = down.inverse() @ up
-        made.translation[rows], made.rotation[rows] = found.translation, found.rotation
+        found = parts[1].inverse() @ parts[0]
         left = ~found.is_known
-        for name in (*used[0], *used[1]):
+        for name in (*ways[0], *ways[1]):
             for why, where in self.frames[name].why_not(at, hold):
                 if number := int((left & where).sum()):
                     missing[why] += number
                 left &= ~where
+        return found
 
 
 def _until_common(upwards: Way, downwards: Way) -> tuple[Way, Way] | None:
