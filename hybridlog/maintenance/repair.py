@@ -38,6 +38,7 @@ from hybridlog_storage.manifest import replace
 from hybridlog_storage.mongo.index_state import IndexState
 from hybridlog_storage.segments.gone_log import open_log
 from hybridlog_storage.segments.recovery import rebuild_summary
+from hybridlog_storage.segments.segment_reader import SegmentReader
 from hybridlog_storage.settings import EMBEDDED, is_uri, read_settings, write_settings
 
 if TYPE_CHECKING:
@@ -117,13 +118,11 @@ def _repair_one(directory: StoreDirectory, report: RepairReport, recording: str)
     done, path = _manifest(directory, report, recording), directory.recording(recording)
     inventory = take_inventory(directory, recording)
     for number, log in inventory.logs.items():
-        is_there = inventory.listing.sealed.get(number) == log.name
-        with suppress(StoreError):  # what is left of it is told
-            if (
-                is_there
-                and number not in inventory.summaries
-                and rebuild_summary(path / log.name, log.digest)
-            ):
+        if inventory.listing.sealed.get(number) != log.name:
+            continue
+        with suppress(StoreError), SegmentReader(path / log.name, number) as reader:
+            # What is left of it is told.
+            if reader.digest() != log.digest and rebuild_summary(path / log.name, log.digest):
                 done.append(Repaired(inventory.name, log.name, "its summary was rebuilt"))
     return done
 
