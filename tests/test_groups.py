@@ -216,7 +216,7 @@ def test_a_trusted_file_of_somebody_else_counts_for_nothing(place: Path) -> None
     assert ann.python("-c", script).lines == ["True"]
     (ann.home / "state").chmod(0o755)
     ask = "from hybridlog.index import consent; print(consent.is_trusted('a', 'mongodb://h/x'))"
-    file = ann.home / "state/hybridlog/trusted.jsonl"
+    (file,) = (ann.home / "state/hybridlog/trusted").iterdir()
     os.chown(file, 0, 0)
     file.chmod(0o644)
     assert ann.python("-c", ask).lines == ["False"]

@@ -55,7 +55,6 @@ FOLDERS = {
 MONGOD_FILES = (
     "users.lock",
     "keeper.lock",
-    "alive.lock",
     "mongod.log",
     "data/mongod.lock",
     "data/WiredTiger",

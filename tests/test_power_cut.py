@@ -54,7 +54,7 @@ class Run:
 
         def told(writer: RecordingWriter, chunk: PackedChunk) -> None:
             if not self.power.is_off:
-                self.written.append(len(chunk.batch))
+                self.written.append(int(chunk.parts["messages"].sum()))
             tell(writer, chunk)
 
         with monkeypatch.context() as patch:

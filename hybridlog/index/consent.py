@@ -2,15 +2,15 @@
 
 A store may come from somebody else, and its `hybridlog.toml` may name any server. So the URI
 in it is used only if this user created the store with it, or has named it by `--mongo`. That is
-remembered outside all stores, in `$XDG_STATE_HOME/hybridlog/trusted.jsonl`.
+remembered outside all stores, by an empty file of this user in `$XDG_STATE_HOME/hybridlog/trusted`.
 """
 
 from __future__ import annotations
 
-import json
 import os
 import stat
 from contextlib import suppress
+from hashlib import sha256
 from typing import TYPE_CHECKING, Final
 
 from hybridlog_storage.disk import durability, files
@@ -23,8 +23,7 @@ if TYPE_CHECKING:
 
     from hybridlog_storage.settings import StoreSettings
 
-_NAME: Final = "trusted.jsonl"
-_LIMIT: Final = 16 << 20  # bytes
+_FOLDER: Final = "trusted"
 
 
 def trusted_uri(settings: StoreSettings, store: Path, named: str | None = None) -> str:
@@ -55,14 +54,10 @@ def trusted_uri(settings: StoreSettings, store: Path, named: str | None = None) 
 
 
 def is_trusted(store_id: str, uri: str) -> bool:
-    """True if this user has named a server for a store.
-
-    A file that is missing, or that other users may write, trusts none.
-    """
+    """True if this user has named a server for a store."""
     with suppress(OSError, StoreError):
-        path = state_directory() / _NAME
-        lines = files.read_file(path, _LIMIT).splitlines() if _is_own(path) else ()
-        return _line(store_id, uri) in lines
+        about = files.status(_mark(store_id, uri))
+        return stat.S_ISREG(about.st_mode) and about.st_uid == os.geteuid()
     return False
 
 
@@ -71,35 +66,25 @@ def trust(store_id: str, uri: str) -> None:
 
     Args:
         store_id: The store.
-        uri: The server; it is stored without its password.
+        uri: The server.
 
     Raises:
         StoreError: That cannot be stored.
     """
     if is_trusted(store_id, uri):
         return
-    path = state_directory() / _NAME
+    path = _mark(store_id, uri)
     try:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        with suppress(FileNotFoundError):
-            if not _is_own(path):
-                files.unlink(path)
-        file = files.open_file(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
-        with os.fdopen(file, "wb") as appended:
-            # What stands before may be cut.
-            appended.write(b"\n" + _line(store_id, uri) + b"\n")
+        os.close(files.open_file(path, os.O_WRONLY | os.O_CREAT, 0o600))
     except OSError as error:
         raise durability.explain(error, path, "remembering trusted servers in") from error
 
 
-def _is_own(path: Path) -> bool:
-    """True if only this user may write a file."""
-    about = files.status(path)
-    return about.st_uid == os.geteuid() and not stat.S_IMODE(about.st_mode) & 0o022
-
-
-def _line(store_id: str, uri: str) -> bytes:
-    return json.dumps([store_id, without_password(uri)]).encode()
+def _mark(store_id: str, uri: str) -> Path:
+    """The file that says so; nothing is in it."""
+    name = sha256(f"{store_id} {without_password(uri)}".encode("utf-8", "surrogatepass"))
+    return state_directory() / _FOLDER / name.hexdigest()
 
 
 def state_directory() -> Path:

@@ -2,13 +2,13 @@
 
 It listens on a unix socket that only its owner can reach and on no TCP port. The first
 process that needs it starts a keeper (`mongod_keeper.py`). The keeper starts mongod and
-ends it after the last process has ended. Locks on three files in the directory hold all
+ends it after the last process has ended. Locks on two files in the directory hold all
 state, and the kernel releases the locks of killed processes:
 
 * `users.lock`, shared: held by every process that uses mongod. The keeper ends mongod only
   while it holds this lock exclusively.
-* `keeper.lock`: held by the process that starts a keeper, and inherited by the keeper.
-* `alive.lock`: also inherited by mongod, so it is free only when mongod has ended, too.
+* `keeper.lock`: held by the process that starts a keeper, and inherited by the keeper and by
+  mongod, so it is free only when both have ended.
 
 A process locks `users.lock` before it looks for a mongod, so the mongod that it finds
 cannot be ended under it.
@@ -254,7 +254,8 @@ class EmbeddedMongod:
                 if not _try_lock(keeper, fcntl.LOCK_EX):
                     if _answers(path):
                         return f"mongodb://{quote(path, safe='')}/?directConnection=true"
-                elif self._launch(path, keeper, has_started=has_started):
+                else:
+                    self._launch(path, keeper, has_started=has_started)
                     began, has_started = time.monotonic(), True
             finally:
                 os.close(keeper)
@@ -265,22 +266,15 @@ class EmbeddedMongod:
                 )
             time.sleep(0.01)
 
-    def _launch(self, path: str, keeper: int, *, has_started: bool) -> bool:
+    def _launch(self, path: str, keeper: int, *, has_started: bool) -> None:
         """Start a keeper, which starts mongod.
 
         Args:
             path: The socket.
-            keeper: The open and locked `keeper.lock`; the new keeper inherits the lock.
+            keeper: The open and locked `keeper.lock`; keeper and mongod inherit the lock.
             has_started: Whether one was started already, and has ended.
-
-        Returns:
-            False if an earlier mongod still has to end: its keeper was killed, so the kernel
-            asked it to.
         """
-        alive = self._open("alive.lock")
         try:
-            if not _try_lock(alive, fcntl.LOCK_EX):
-                return False
             program = find_mongod()
             _refuse_odd_files(self._directory)
             _make_folder(self.data)
@@ -291,21 +285,18 @@ class EmbeddedMongod:
                 self.damage = "; ".join(_telling_lines(log))
             elif has_started:
                 raise self._failure(log)
-            self._spawn(program, path, keeper, alive)
+            self._spawn(program, path, keeper)
         except OSError as error:
             raise _directory_error(self._directory, error) from error
-        finally:
-            os.close(alive)
-        return True
 
-    def _spawn(self, program: Path, path: str, keeper: int, alive: int) -> None:
+    def _spawn(self, program: Path, path: str, keeper: int) -> None:
         if not sys.executable:
             raise DatabaseError(
                 f"This Python does not know its own executable, so it cannot start the keeper of "
                 f"mongod. {_OTHER_WAYS}"
             )
         script = str(Path(__file__).with_name("mongod_keeper.py"))
-        own = [script, str(alive), str(self._linger_s), path]
+        own = [script, str(keeper), str(self._linger_s), path]
         log = files.open_file(self.log, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o600)
         try:
             subprocess.run(  # noqa: S603 - our own script and interpreter
@@ -314,7 +305,7 @@ class EmbeddedMongod:
                 stdout=log,
                 stderr=log,
                 cwd=self._directory,
-                pass_fds=(keeper, alive),
+                pass_fds=(keeper,),
                 start_new_session=True,  # Ctrl-C in a terminal must end one user, not all
                 check=True,
                 timeout=START_LIMIT_S,

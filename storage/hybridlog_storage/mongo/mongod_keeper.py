@@ -4,12 +4,10 @@
 standard library, so it starts fast and stays small. It outlives the process that started
 it: mongod belongs to all processes on a store, not to the first one.
 
-    python -I -S mongod_keeper.py ALIVE_FD LINGER_S SOCKET MONGOD ARGUMENT...
+    python -I -S mongod_keeper.py LOCK_FD LINGER_S SOCKET MONGOD ARGUMENT...
 
-It runs in the directory of mongod, with the log as standard output, and inherits two open,
-locked files. The lock on the first means that a keeper is running; it ends with this process.
-mongod inherits the second, ALIVE_FD, so its lock means that mongod has not ended, even after
-its keeper was killed.
+It runs in the directory of mongod, with the log as standard output, and inherits an open,
+locked file, which mongod inherits in turn: its lock means that one of both has not ended.
 """
 
 from __future__ import annotations
@@ -42,11 +40,11 @@ CONNECTED = b"03"
 _PR_SET_PDEATHSIG = 1
 
 
-def main(alive: int, linger_s: float, socket: str, command: list[str]) -> int:
+def main(lock: int, linger_s: float, socket: str, command: list[str]) -> int:
     """Run mongod until it is unused; return the exit status of this process.
 
     Args:
-        alive: Descriptor whose lock mongod shares.
+        lock: Descriptor whose lock mongod shares.
         linger_s: Seconds for which mongod runs after its last use.
         socket: Its unix socket.
         command: mongod and its arguments.
@@ -56,7 +54,7 @@ def main(alive: int, linger_s: float, socket: str, command: list[str]) -> int:
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         signal.signal(number, lambda got, _frame: end_signals.append(got))
     try:
-        mongod = _start(alive, command)
+        mongod = _start(lock, command)
     except OSError as error:
         _say(f"cannot run {command[0]}: {error}")
         return 1
@@ -78,7 +76,7 @@ def main(alive: int, linger_s: float, socket: str, command: list[str]) -> int:
     return 0
 
 
-def _start(alive: int, command: list[str]) -> subprocess.Popen[bytes]:
+def _start(lock: int, command: list[str]) -> subprocess.Popen[bytes]:
     _raise_limits()
     _empty_long_log()
     # C, since mongod does not start under a locale that is not installed, and ssh passes
@@ -89,7 +87,7 @@ def _start(alive: int, command: list[str]) -> subprocess.Popen[bytes]:
         command,
         stdin=subprocess.DEVNULL,
         env=environment,
-        pass_fds=(alive,),
+        pass_fds=(lock,),
         preexec_fn=_die_with(os.getpid()),  # noqa: PLW1509 - there are no threads
     )
 
@@ -206,5 +204,5 @@ if __name__ == "__main__":
     # has to reap it.
     if os.fork():
         os._exit(0)
-    given_alive, given_linger, given_socket, *given = sys.argv[1:]
-    sys.exit(main(int(given_alive), float(given_linger), given_socket, given))
+    given_lock, given_linger, given_socket, *given = sys.argv[1:]
+    sys.exit(main(int(given_lock), float(given_linger), given_socket, given))
