@@ -376,17 +376,15 @@ class Session:
             self._resolved[names] = found
         return found
 
-    def topics_of(self, recordings: Sequence[str]) -> list[str]:
-        """Names of all topics of some recordings, sorted.
-
-        Args:
-            recordings: Ids; those that are not there are passed over.
-        """
+    def topics_of(self, recordings: Sequence[str] | None) -> list[str]:
+        """Names of all topics of the recordings with some ids, or of all, sorted."""
         snapshot = self.look(recordings)
+        if recordings is None:
+            return snapshot.topics
         places = [snapshot.by_id[one] for one in recordings if one in snapshot.by_id]
         return snapshot.topics_at(np.array(places, np.intp))
 
-    def resolve_in(self, names: Sequence[str], recordings: Sequence[str]) -> list[str]:
+    def resolve_in(self, names: Sequence[str], recordings: Sequence[str] | None) -> list[str]:
         """The topics of some recordings that patterns match."""
         known = self.topics_of(recordings)
         snapshot = self.look(recordings)

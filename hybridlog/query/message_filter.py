@@ -13,7 +13,6 @@ from hybridlog.query.predicate.to_mask import mask_of_objects, to_mask
 from hybridlog.query.predicate.tree import Predicate, is_meta
 from hybridlog.schema.arrow_columns import structs
 from hybridlog.schema.codec import columns_of
-from hybridlog.schema.left import LeftFields
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -76,6 +75,8 @@ class MessageFilter:
         times = batch.log_time[rows], seq[rows], batch.publish_time[rows]
         lacking = np.zeros(len(rows), np.bool_)
         if channel.is_reduced:
+            from hybridlog.schema.left import LeftFields
+
             assert isinstance(decoded.records, LeftFields)
             lacking = decoded.records.lacking() if fields else lacking
             mask = None  # of some arrays only summaries are left

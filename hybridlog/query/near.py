@@ -14,7 +14,7 @@ from hybridlog.query.predicate.tree import And, Near, Node, Not, Or, nodes, spel
 from hybridlog.query.question import Question
 from hybridlog.query.ranges import RangeResolver
 from hybridlog.query.times import TIME_LIMIT
-from hybridlog.query.topics import namesakes, resolve
+from hybridlog.query.topics import namesakes
 from hybridlog_storage.errors import WhereError
 
 if TYPE_CHECKING:
@@ -46,13 +46,8 @@ def question_about(
         after: Longest time after it.
     """
     recordings = question.recordings
-    if recordings is None:
-        known = session.look(None).topics
-        topics = resolve([topic], known)
-    else:
-        known = session.topics_of(recordings)
-        topics = session.resolve_in([topic], recordings)
-    others = namesakes([topic], known)
+    topics = session.resolve_in([topic], recordings)
+    others = namesakes([topic], session.topics_of(recordings))
     found = Question(*session.having(topics, recordings), namesakes=others)
     if question.is_unbounded or not question.is_by_log_time:
         return found

@@ -273,7 +273,6 @@ class Rows:
     ) -> Iterator[tuple[Values, LeftFields | None]]:
         """Fields of the matching messages, of a table or decoded, and what is left of them."""
         from hybridlog.schema.arrow_types import converted
-        from hybridlog.schema.left import LeftFields, without_lacking
 
         rest: Part | None = part
         if found is not None:
@@ -291,11 +290,14 @@ class Rows:
         for channel, run in self._by_channel(self.plan([rest])) if rest is not None else ():
             decoded = columns_of(channel.codec, run.batch, wanted)
             self._counters.unreadable += len(run.batch) - len(decoded.rows)
-            decoded, lacking = without_lacking(decoded, arrays.difference(fields or ()))
-            if lacking:
+            left: LeftFields | None = None
+            if channel.is_reduced:
+                from hybridlog.schema.left import LeftFields, without_lacking
+
+                decoded, lacking = without_lacking(decoded, arrays.difference(fields or ()))
                 self._counters.leave_out(lacking, channel.state)
+                left = decoded.records if isinstance(decoded.records, LeftFields) else None
             good = decoded.rows
-            left = decoded.records if isinstance(decoded.records, LeftFields) else None
             yield Values(run.batch.log_time[good], run.seq[good], decoded.arrow()), left
 
     # Tables.

@@ -15,9 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from hybridlog.query.answers.lost import completeness_of, flush_interval_ns
 from hybridlog.query.intervals import MAX_PIECES, Intervals
-from hybridlog.query.latching import depth_of
 from hybridlog.query.periods import GAP_PERIODS, mean_rate, usual_period
 from hybridlog.query.planner import Planner
 from hybridlog.query.question import field_types
@@ -327,6 +325,9 @@ class Regularity:
 
     def check(self) -> list[TopicCheck]:
         """Regularity of topics, the worst first; see `Query.check`."""
+        from hybridlog.query.answers.lost import completeness_of
+        from hybridlog.query.latching import depth_of
+
         session, question = self._session, self._question
         lost: dict[tuple[str, str], list[int | None]] = defaultdict(list)
         for row in completeness_of(session, question).rows:
@@ -408,6 +409,8 @@ _Columns = tuple["Times", "Times", "Times", "NDArray[np.float64]"]
 
 def _end(summary: RecordingSummary, span: Span) -> int:
     """End of a span; in an open recording, other topics may be flushed later than this one."""
+    from hybridlog.query.answers.lost import flush_interval_ns
+
     late = flush_interval_ns(summary) if summary.status == "open" else 0
     return max(span[0], span[1] - late)
 
