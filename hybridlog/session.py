@@ -507,7 +507,7 @@ class Session:
         try:
             return self.catalog.table(recording, number)
         except CatalogError:
-            self._check_same(recording, number)
+            self._check_same(recording, number, reads=False)
             read_again(self.directory, self.catalog, recording)
             return self.catalog.table(recording, number)
 
@@ -617,7 +617,7 @@ class Session:
             self._check_same(self.entry(recording), number)
             raise
 
-    def _check_same(self, entry: RecordingEntry, number: int) -> None:
+    def _check_same(self, entry: RecordingEntry, number: int, *, reads: bool = True) -> None:
         """See whether a segment that cannot be read is another file by now.
 
         Raises:
@@ -632,6 +632,9 @@ class Session:
         now: RecordingEntry | None = self.shared.now().entry_if_there(entry.id)
         if now is None:
             raise gone(entry.name)
+        is_there = str(number) in now.digests or number in now.flushed
+        if reads and not is_there and not self._has_let_go(entry.id, number):
+            return  # it is lost, which who reads it is told
         if _file_in(now, number) != _file_in(entry, number):
             self._entries[entry.id] = now
             raise _changed(entry)
