@@ -75,8 +75,7 @@ def _record(choices: RecordChoices) -> None:
     # Wrong options are found before a store is made.
     options = recorder_options(choices)
     sources = sources_of(choices)
-    quiet = choices.quiet
-    display = _Display(as_json=choices.as_json, quiet=quiet)
+    display = _Display(as_json=choices.as_json)
     reports: list[RecordReport] = []
     with ExitStack() as held:
         for source in sources:
@@ -101,8 +100,7 @@ def _record(choices: RecordChoices) -> None:
                 options, full = recorder.rest, recorder.name
                 sources = [held.enter_context(source) for source in sources_of(choices)]
             notify_service("STOPPING=1", "STATUS=writing what is left")
-            if not quiet:
-                output.note("hybridlog: writing what is left; Ctrl-C leaves at once")
+            output.remarks(["hybridlog: writing what is left; Ctrl-C leaves at once"])
             reports += recorder.stop(stop.triggers_s)
             while recovery.is_alive() and not stop.wait(_RECOVERY_POLL_S):
                 pass
@@ -110,7 +108,7 @@ def _record(choices: RecordChoices) -> None:
         if rules is not None:
             results = [one for each in reports for one in store.judge(rules, each.entry.id)]
         ending = LiveSummary(reports, recorder, recorder.look(), sources, options, broken(results))
-        ending.print_and_exit(as_json=choices.as_json, quiet=quiet)
+        ending.print_and_exit(as_json=choices.as_json)
 
 
 def recorder_options(choices: RecordChoices) -> RecorderOptions:
@@ -244,11 +242,10 @@ def _pinned_by_signal(recorder: Recorder) -> AbstractContextManager[object]:
 class _Display:
     """Shows the progress: a table on a terminal, JSON for scripts."""
 
-    def __init__(self, *, as_json: bool, quiet: bool) -> None:
+    def __init__(self, *, as_json: bool) -> None:
         self._as_json = as_json
-        self._quiet = quiet
         self._table: LiveTable | None = None
-        if not as_json and not quiet and sys.stderr.isatty():
+        if output.has_bars() and sys.stderr.isatty():
             self._table = LiveTable()
 
     def table(self) -> AbstractContextManager[object]:
@@ -259,7 +256,7 @@ class _Display:
         """Print a message of the recorder at once."""
         from hybridlog.live.incidents import PINNED
 
-        if self._quiet and PINNED in text:  # no problem
+        if output.is_quiet() and PINNED in text:  # no problem
             return
         if self._table is not None:
             self._table.note(text)

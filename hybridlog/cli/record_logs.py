@@ -55,7 +55,7 @@ def record_logs(choices: RecordChoices) -> None:
     with (
         recorder.opened() as store,
         at_safe_points(),
-        Bar(_what(logs), total, quiet=choices.quiet) as bar,
+        Bar(_what(logs), total) as bar,
     ):
         for problem in walked.problems if walked is not None else ():
             recorder.fail(None, problem)
@@ -308,10 +308,10 @@ class LogRecorder:
         return report
 
     def _add(self, path: Path, report: RecordReport) -> None:
-        for error in _problems(path, report, quiet=self._choices.quiet):
+        for error in _problems(path, report):
             self._exit_code = self._exit_code or error.exit_code
         self._tell(row_of(report, path), "recorded")
-        if not self._logs and not self._choices.as_json and not self._choices.quiet:
+        if not self._logs and not self._choices.as_json and not output.is_quiet():
             entry = report.entry
             output.say(
                 f"{entry.name}: {output.counted(entry.messages, 'message')}, "
@@ -359,13 +359,12 @@ class LogRecorder:
         choices, counts = self._choices, self._counts
         if choices.as_json and self._rows:
             output.print_json(self._rows)
-        elif not choices.as_json and not choices.quiet:
+        elif not choices.as_json and not output.is_quiet():
             _print([row for row in self._rows if "messages" in row])
-        if self._is_search and not choices.quiet:
-            output.note(
-                f"{output.counted(counts['recorded'], 'log')} recorded, {counts['known']} in the "
-                f"store already, {counts['error']} not recorded."
-            )
+        if self._is_search:
+            recorded = output.counted(counts["recorded"], "log")
+            left = f"{counts['known']} in the store already, {counts['error']} not recorded"
+            output.remarks([f"{recorded} recorded, {left}."])
 
 
 def _print(rows: Sequence[Mapping[str, Any]]) -> None:
@@ -377,11 +376,11 @@ def _print(rows: Sequence[Mapping[str, Any]]) -> None:
     print_table(COLUMNS, [*rows, {**total, "recording": "total", "path": "", "topics": None}])
 
 
-def _problems(path: Path, report: RecordReport, *, quiet: bool) -> Iterator[HybridlogError]:
+def _problems(path: Path, report: RecordReport) -> Iterator[HybridlogError]:
     """Print problems; gives an error for each that sets the exit code."""
     for channel in report.entry.channels:
-        if channel.is_indexed and channel.reason is not None and not quiet:
-            output.note(f"{channel.topic}: not indexed beyond time: {channel.reason}")
+        if channel.is_indexed and channel.reason is not None:
+            output.remarks([f"{channel.topic}: not indexed beyond time: {channel.reason}"])
         if channel.stats.unreadable:
             output.note(
                 f"{channel.topic}: {output.unfit(channel.stats.unreadable)}; stored, without "
@@ -392,8 +391,7 @@ def _problems(path: Path, report: RecordReport, *, quiet: bool) -> Iterator[Hybr
             f"{path}: {output.counted(report.latched_left_out, 'latched message')} from before "
             "the time range did not fit in memory."
         )
-    if not quiet:
-        output.notes((*output.surpluses(report.entry.channels), *report.remarks))
+    output.remarks((*output.surpluses(report.entry.channels), *report.remarks))
     for damage in report.damage:
         place = "" if damage.offset is None else f" at byte {damage.offset}"
         count = damage.messages_lost

@@ -107,18 +107,17 @@ class LiveSummary:
         """Addresses of sources that never answered."""
         return [source.address for source in self.sources if not source.was_reached]
 
-    def print_and_exit(self, *, as_json: bool, quiet: bool) -> None:
+    def print_and_exit(self, *, as_json: bool) -> None:
         """Print it; exits with the code of the worst problem, if there is one."""
         code = self._exit_code()
         if as_json:
             summary = _summary(self.reports, self.state, self.recorder.reason)
             summary["broken"] = [asdict(one) for one in self.broken]
             output.print_json_line({"report": {**summary, "exit_code": code}})
-        elif not quiet:
+        elif not output.is_quiet():
             self._print()
-        if not quiet:
-            output.notes(self._remarks())
-        for line in self._errors(is_reason_shown=not (as_json or quiet)):
+        output.remarks(self._remarks())
+        for line in self._errors(is_reason_shown=not (as_json or output.is_quiet())):
             output.note(f"hybridlog: {line}")
         if code:
             raise click.exceptions.Exit(code)

@@ -101,12 +101,7 @@ class Contract:
 
 
 class _Reader:
-    """Checks the values of a contract.
-
-    Args:
-        name: Name of the file.
-        lines: Lines of the keys, as of `parse_yaml`.
-    """
+    """Checks the values of a contract."""
 
     def __init__(self, name: str, lines: Mapping[tuple[int, object], int]) -> None:
         self._name = name

@@ -30,21 +30,11 @@ _TOLD_TO_MANAGERS: Final = {"NOTIFY_SOCKET", "WATCHDOG_PID", "WATCHDOG_USEC"}
 class TriggerProcess:
     """Evaluates triggers on what a recording has flushed, by a process that ends with this one.
 
-    Without triggers there is no process.
+    Without triggers there is no process. `judged` has the numbers of the sealed files that were
+    read; it is None without triggers, or when the process is given up.
 
     When it ends before the recording, as for want of memory, it is started again, and goes on
     where it was.
-
-    Args:
-        store: Address of the store.
-        recording: Id of the recording.
-        triggers: The triggers.
-        hit: Called with the text of a trigger, and the log time of a message.
-        say: Shows a line to the user.
-
-    Attributes:
-        judged: Numbers of the sealed files that were read; None without triggers, or when
-            it is given up.
     """
 
     def __init__(
@@ -79,11 +69,7 @@ class TriggerProcess:
             self._channels.append(channel)
 
     def finish(self, wait_s: float | None) -> bool:
-        """Wait until what the ended recording has is read; False if that takes longer.
-
-        Args:
-            wait_s: Seconds; None for as long as it takes.
-        """
+        """Wait until what the ended recording has is read; False if that takes longer."""
         if self._triggers:
             self._thread.join(wait_s)
         is_late = self._thread.is_alive()

@@ -17,14 +17,7 @@ _MAX_INTERVAL_S: Final = 0.5
 
 
 class Silence(NamedTuple):
-    """A time without a message of a topic that is longer than its rule allows.
-
-    Attributes:
-        topic: Full name.
-        begin: Time of the last message before it, or the beginning of the recording, ns.
-        end: Time of the next message, or the end of the recording, ns.
-        limit: The longest time that is allowed, ns.
-    """
+    """A time from message to message of a topic that is longer than its limit, ns."""
 
     topic: str
     begin: int
@@ -38,22 +31,13 @@ class Silence(NamedTuple):
 
 
 Note: TypeAlias = Callable[[Silence, str, bool], None]
+"""Called with a silence that has begun, the id of its mark, and False; with True at its end."""
 
 
 class SilenceWatch:
     """Follows the topics that have a longest gap in a contract. Thread safe.
 
     Its times are steady ones, so that a clock that is set is no silence.
-
-    Args:
-        contract: The contract; None for no topics.
-        now: Returns the present time, ns. A simulation may begin again with an earlier one.
-        note: Called with a silence that has begun, the id of its mark, and False; and with
-            True when it is over.
-
-    Attributes:
-        breaches: Silences so far.
-        interval_s: Seconds between two looks, so that a silence is told within twice its limit.
     """
 
     def __init__(self, contract: Contract | None, now: Callable[[], int], note: Note) -> None:
@@ -72,6 +56,7 @@ class SilenceWatch:
         self._thread = threading.Thread(target=self._run, daemon=True)
         self.breaches = 0
         shortest = min(self._limits.values(), default=0) / 1e9
+        # So that a silence is told within twice its limit.
         self.interval_s = max(min(shortest / 4, _MAX_INTERVAL_S), 1e-3)
 
     def start(self) -> None:
