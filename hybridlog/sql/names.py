@@ -64,7 +64,8 @@ class ViewNames:
 
     def named(self, query: str) -> list[str]:
         """Names in the text of a query, in any role; all for statements that list views."""
-        words = {(quoted.replace('""', '"') or plain).casefold() for quoted, plain in _words(query)}
+        found: list[tuple[str, str]] = _WORD.findall(query)
+        words = {(quoted.replace('""', '"') or plain).casefold() for quoted, plain in found}
         if not words.isdisjoint(_LISTING):
             return list(self)
         return [name for name in self if name.casefold() in words]
@@ -78,10 +79,6 @@ def quoted(name: str) -> str:
 def written(name: str) -> str:
     """A name as people write it in SQL: in quotes only where it needs them."""
     return name if PLAIN.fullmatch(name) else quoted(name)
-
-
-def _words(query: str) -> list[tuple[str, str]]:
-    return _WORD.findall(query)
 
 
 def _short_names(topic: str) -> Iterator[str]:
