@@ -173,7 +173,9 @@ class OpenStore(Shared):
             entry = session.entry_if_there(recording)
             if entry is not None:
                 from hybridlog.follow.follower import make_tables
+                from hybridlog.maintenance.tables import missing
 
+                topics.update(missing(self.directory, entry, self.tables))
                 try:
                     problem = make_tables(
                         self.directory, self.catalog, entry, topics=topics, until=until

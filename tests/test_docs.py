@@ -1095,16 +1095,16 @@ def check_fields(message: Told, document: dict[str, Any]) -> None:
 
 def check_state(second: FormatReader, database: Any, recordings: Mapping[str, Recording]) -> None:
     """By the section "State of the index"."""
-    mark = database["hybridlog.store"].find_one({"_id": "store"})
-    assert mark.pop("made")
-    assert mark == {"_id": "store", "store": second.store_id, "place": "embedded"}
-    entries = {r["_id"]: r for r in database["hybridlog.recordings"].find()}
-    assert entries.keys() == recordings.keys()
-    for key, entry in entries.items():
+    owner = database["hybridlog.store"].find_one({"_id": "store"})
+    assert owner.pop("made")
+    assert owner == {"_id": "store", "store": second.store_id, "place": "embedded"}
+    states = {r.pop("_id"): r for r in database["hybridlog.recordings"].find()}
+    assert states.keys() == recordings.keys()
+    for key, state in states.items():
         recording = recordings[key]
-        digests = {str(number): segment.digest for number, segment in recording.segments.items()}
-        assert entry.pop("made")
-        assert entry == {"_id": key, "id": recording.path.name, "segments": digests}
+        digests = {str(number): one.digest for number, one in recording.segments.items()}
+        assert state.pop("made")
+        assert state == {"id": recording.path.name, "segments": digests}
 
 
 def test_the_specification_names_what_there_is() -> None:
