@@ -204,7 +204,8 @@ def _of_fields(
 ) -> Iterator[Difference]:
     """A difference for each field whose statistics are not the same.
 
-    A number of values that is that of the messages is told by those.
+    A number of values that is that of the messages is told by those. What is shown alike is
+    the same: sums of one set of values depend on their order.
     """
     for field in sorted({*a, *b}):
         if field not in a or field not in b:
@@ -215,7 +216,8 @@ def _of_fields(
         for name in _STATISTICS:
             one, other = (getattr(side[field], name) for side in (a, b))
             share = _share(one, other)
-            if share > tolerance and (name, (one, other)) != ("count", messages):
+            is_shown = _worded(name, one) != _worded(name, other)
+            if share > tolerance and is_shown and (name, (one, other)) != ("count", messages):
                 names.append(name)
                 shares.append(share)
         if names:
