@@ -441,11 +441,11 @@ class _Planning:
             self._groups()
 
     def _groups(self) -> None:
-        """Let whole groups of ended recordings go, the oldest first, until enough is free."""
+        """Let whole groups of recordings go, the oldest first, until enough is free."""
         reason = f"{self._reason(_SEGMENTS_FROM, 1.0)}, and no payloads are left to go"
         need = self._short(_TOPICS_FROM, _TOPICS_BELOW)
         found: dict[tuple[bool, int, int, str, int], list[_Piece]] = {}
-        held = [one for one in self._others if one.is_ended and one.id not in self._gone]
+        held = [one for one in self._others if one.id not in self._gone]
         for one in held:
             for number in {segment.group for segment in one.segments}:
                 own = [_Piece(one, s) for s in one.segments if s.group == number]
@@ -459,8 +459,8 @@ class _Planning:
                 need -= size
         for one in held:
             if groups := chosen.get(one.id):
-                is_whole = groups.keys() == {s.group for s in one.segments} and not one.pins
-                numbers = () if is_whole else tuple(groups)
+                is_whole = one.is_ended and groups.keys() == {s.group for s in one.segments}
+                numbers = () if is_whole and not one.pins else tuple(groups)
                 self._step(Step(one.name, one.id, (), (), sum(groups.values()), reason, numbers))
 
     def _short(self, share: float, times: float) -> float:
