@@ -181,7 +181,7 @@ def test_the_first_log_of_a_group_stays() -> None:
 
 
 def test_whole_groups_go_the_oldest_first() -> None:
-    """When no payloads are left to go; not those that a pin touches."""
+    """When no payloads are left to go; not those that a pin touches, or that are recorded."""
     first = [sealed(n, 50 - n, CAMERA, group=n) for n in range(3)]
     rules = {"quota": "100MB"}
     (step,) = made(rules, held("old", *first), used=96 * MB).steps
@@ -191,8 +191,11 @@ def test_whole_groups_go_the_oldest_first() -> None:
     assert (step.groups, step.bytes) == ((1, 2), 16 * MB)
     (step,) = made(rules, held("old", *first), used=120 * MB).steps
     assert (step.segments, step.groups, step.bytes) == ((), (), 24 * MB)
-    (running,) = made(rules, held("old", *first, ended=False), used=120 * MB).steps
-    assert running.groups == (0, 1, 2)  # by its recorder: others plan none of its segments
+    running = held("old", *first, ended=False)
+    assert made(rules, running, used=120 * MB).steps == []
+    urgent = Rules(quota=100 * MB, is_urgent=True)
+    (step,) = plan([running], urgent, used=120 * MB, free=10**12, now=NOW).steps
+    assert step.groups == (0, 1, 2)
 
 
 def test_a_topic_that_shares_its_log_goes_with_it() -> None:

@@ -441,11 +441,18 @@ class _Planning:
             self._groups()
 
     def _groups(self) -> None:
-        """Let whole groups of recordings go, the oldest first, until enough is free."""
+        """Let whole groups go, the oldest first, until enough is free.
+
+        Those of a recording in progress only while its writer waits.
+        """
         reason = f"{self._reason(_SEGMENTS_FROM, 1.0)}, and no payloads are left to go"
         need = self._short(_TOPICS_FROM, _TOPICS_BELOW)
         found: dict[tuple[bool, int, int, str, int], list[_Piece]] = {}
-        held = [one for one in self._others if one.id not in self._gone]
+        held = [
+            one
+            for one in self._others
+            if one.id not in self._gone and (one.is_ended or self._rules.is_urgent)
+        ]
         for one in held:
             for number in {segment.group for segment in one.segments}:
                 own = [_Piece(one, s) for s in one.segments if s.group == number]
