@@ -299,7 +299,7 @@ def test_a_recorder_is_visited(logs: Path, tmp_path: Path) -> None:
         assert "/imu/data" in shown
         assert "messages/s" in shown
         run("mark", "x", "--pin", "1s", "2s", "--at", "+1s", store=store, code=2)
-        assert "is no running recorder" in run("mark", "x", "-r", "b", store=store, code=2).err
+        assert "is no running recorder" in run("mark", "x", "-r", "zz", store=store, code=2).err
         assert complete(f"mark x --store {store} -r fi") == ["first drive"]
         assert_it_is_told_as_it_is(store)
         assert_ctrl_c_leaves_top(store)
