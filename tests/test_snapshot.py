@@ -240,7 +240,7 @@ def test_a_store_without_a_catalog_is_listed_by_its_manifests(tmp_path: Path, ca
         store.edit("run 3", note="seen")
         wanted, entries = store.summaries(), [one.messages for one in store.recordings()]
     (path / CATALOG).unlink()
-    opened, written = calls(SegmentReader, "_open"), calls(Cells, "write")
+    opened, written = calls(SegmentReader, "_records"), calls(Cells, "write")
     with hl.open(path, mongo="none") as store:
         assert store.summaries() == wanted
         assert (len(opened), len(written), store.topics()) == (0, 1, ["/hybridlog/marks", "/n"])
