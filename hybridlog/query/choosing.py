@@ -40,12 +40,7 @@ _GLOB = frozenset("*?[")
 
 
 class Chosen(NamedTuple):
-    """The recordings that satisfy a choice.
-
-    Attributes:
-        summaries: The recordings in short, oldest first.
-        problem: The reason why there is none, with a cure; empty if there are any.
-    """
+    """The recordings of a choice, oldest first; the `problem` is why there is none, or empty."""
 
     summaries: list[RecordingSummary]
     problem: str

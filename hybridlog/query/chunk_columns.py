@@ -22,15 +22,7 @@ if TYPE_CHECKING:
 
 
 class Chunk(NamedTuple):
-    """A chunk to read for some channels.
-
-    Attributes:
-        segment: Number of its segment.
-        place: Its position there.
-        first: Least log time of these channels in it, ns.
-        last: Greatest log time of these channels in it, ns.
-        messages: Number of their messages.
-    """
+    """A chunk to read for some channels: number of their messages, first and last log time, ns."""
 
     segment: int
     place: ChunkPlace
@@ -104,13 +96,10 @@ class ChunkColumns:
         *,
         timed: Collection[int] = (),
     ) -> NDArray[np.bool_]:
-        """True for chunks that may have messages in a time range.
+        """True for chunks that may have messages in `[begin, end)`, ns, of a clock.
 
-        Args:
-            bounds: `[begin, end)`, ns; None for all times.
-            clock: `log`, `publish` or `header`: the time that `bounds` refers to; header stamps
-                are unknown here, so every chunk may hold any.
-            timed: Ids of channels with publish times.
+        No bounds are all times. Header stamps are unknown here, so every chunk may hold any;
+        channels in `timed` have publish times.
         """
         is_unknown = clock == "header" or (clock == "publish" and self._table.is_flushed)
         if bounds is None or is_unknown or not len(self.number):
@@ -126,8 +115,7 @@ class ChunkColumns:
     def before(self, latest: int) -> Iterator[tuple[Chunk, int]]:
         """Chunks that begin by a time, ns, the latest first.
 
-        Yields:
-            A chunk, and the greatest log time that it or any later one may hold.
+        With each comes the greatest log time that it or any later one may hold.
         """
         order, first, last_by = self._by_first
         for place in reversed(range(bisect_right(first, latest))):
@@ -145,14 +133,9 @@ class ChunkColumns:
 
 
 def log_bounds(bounds: tuple[int, int], stats: Collection[ChannelStats]) -> tuple[int, int] | None:
-    """The range of log time in which messages with header stamps in a range lie.
+    """The range of log time, ns, in which messages with header stamps in a range lie; None for all.
 
-    Args:
-        bounds: `[begin, end)`, ns, of header stamps.
-        stats: Statistics of the channels, which are decoded.
-
-    Returns:
-        `[begin, end)`, ns; None for all times.
+    `stats` are decoded statistics of the channels.
     """
     begin, end = bounds
     known = [one for one in stats if one.skew_min is not None]

@@ -52,12 +52,10 @@ class RecordingScan:
     """The part of one recording to read.
 
     Attributes:
-        recording: The recording.
         channels: Index of each wanted channel in the plan's channels, by channel id.
         bounds: `[begin, end)`, ns, of the plan's clock; None for all times.
         chunks: The chunks that may hold it, asked for with these channels.
-        windows: int64[n, 2], `[begin, end)` of log time, apart and in order; None for all
-            times.
+        windows: int64[n, 2], `[begin, end)` of log time, apart and in order; None for all times.
     """
 
     recording: RecordingEntry
@@ -87,7 +85,6 @@ class MessageRun:
     Attributes:
         batch: The messages; `channel` is the index of each message's channel in `channels`.
         seq: int64[n], arrival numbers in their recordings.
-        channels: The channels of the plan that they were read by.
     """
 
     batch: Batch
@@ -104,11 +101,8 @@ class ScanPlan:
     """Everything to read, in order.
 
     Attributes:
-        channels: Every channel that is read.
-        scans: The part of each recording to read.
-        clock: The clock of the bounds.
-        filters: Decides on each message of a channel, by index of the channel, but for those
-            in some segments.
+        filters: Decides on each message of a channel, by index of the channel, but for those in
+            some segments.
         offsets: Payload offsets of the other messages that are wanted, by chunk; int64[k].
         is_chosen: Only messages with offsets, or which a filter accepts, are wanted.
         reverse: Latest message first.
@@ -158,13 +152,7 @@ def with_payloads(run: MessageRun, counters: Counters) -> MessageRun:
 
 
 class ChunkScan:
-    """Executes a plan.
-
-    Args:
-        plan: What to read.
-        session: The store at the moment of the plan.
-        ahead: True to read ahead; unnecessary for a caller that takes few messages.
-    """
+    """Executes a plan; reading `ahead` is unnecessary for a caller that takes few messages."""
 
     def __init__(
         self,

@@ -75,14 +75,7 @@ class IndexReader:
         self._counters = counters
 
     def found(self, parts: Sequence[Part]) -> Found:
-        """The parts with predicates that columns and messages decide.
-
-        Raises:
-            DatabaseError: MongoDB is unavailable.
-            IndexChangedError: other processes remove documents all the time.
-            TopicError: a topic was recorded without index documents.
-            WhereError: MongoDB does not understand a filter, or index documents cannot tell.
-        """
+        """The parts with predicates that columns and messages decide."""
         predicate = _predicate(parts[0])
         asks_fields = any(node.asks_fields for node in predicate.filters)
         own: list[Filter] = [node.to_filter() for node in predicate.filters]
@@ -243,11 +236,7 @@ class _Asked:
 
 
 def keys_of(batch: bytes) -> NDArray[np.uint64]:
-    """uint64[n, 3]: log time, recording and arrival number of documents that have only `_id`.
-
-    Raises:
-        StoreError: A document is not one of hybridlog's.
-    """
+    """uint64[n, 3]: log time, recording and arrival number of documents that have only `_id`."""
     if len(batch) % _KEY.itemsize == 0:
         found = np.frombuffer(batch, _KEY)
         if (found["head"] == _HEAD).all():

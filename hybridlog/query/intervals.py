@@ -163,7 +163,6 @@ class Intervals:
         return isinstance(other, Intervals) and self._value() == other._value()
 
     def __hash__(self) -> int:
-        """Hash of the intervals."""
         return hash(self._value())
 
     def _value(self) -> tuple[object, ...]:
@@ -400,11 +399,7 @@ class Intervals:
 def joined(rows: NDArray[np.int64]) -> NDArray[np.int64]:
     """Intervals of one recording, those that overlap or touch joined, empty ones dropped.
 
-    Args:
-        rows: int64[n, 3]: begin, end, messages; ordered by begin.
-
-    Returns:
-        Joined intervals in the same form, with the sum of their messages.
+    Rows are int64[n, 3]: begin, end, messages, of which joined ones have the sum; ordered by begin.
     """
     rows = rows[rows[:, 1] > rows[:, 0]]
     if not len(rows):
@@ -431,20 +426,12 @@ def holding(
     max_gap: int | None,
     before: int = 0,
 ) -> NDArray[np.int64]:
-    """The intervals in which a state holds, from the state at each message.
+    """The intervals in which a state holds, int64[k, 3]: begin, end, messages.
 
-    A message determines the state from its log time until the next message, and for at
-    most `max_gap`. Of messages with the same log time, the last one counts.
-
-    Args:
-        time: int64[n], log times, ns, ascending.
-        holds: bool[n], the state at each message.
-        end: End of the recording, ns; not before any message.
-        max_gap: Longest time for which a message is valid, ns; None for any.
-        before: Number of messages, the first ones, that do not count as messages.
-
-    Returns:
-        int64[k, 3], begin, end, messages.
+    Each message determines the state, `holds`, from its log time (`time`, ns, ascending) until the
+    next message or the end of the recording, and for at most `max_gap` ns, None for any. Of
+    messages with the same log time, the last one counts. The first ones, as many as `before`, do
+    not count as messages.
     """
     if not len(time):
         return np.empty((0, 3), np.int64)
@@ -461,14 +448,10 @@ def holding(
 
 
 def changing(time: NDArray[np.int64], pause: int) -> NDArray[np.int64]:
-    """Steps (messages that differ from the one before) grouped into changes.
+    """Steps (messages that differ from the one before) grouped into int64[k, 3]: begin, end, steps.
 
-    Args:
-        time: int64[n], log times of the steps, ns, ascending.
-        pause: Longest time between two steps of one change, ns.
-
-    Returns:
-        int64[k, 3], begin, end, steps.
+    `time` has log times of the steps, ns, ascending; `pause` is the longest one within a change,
+    ns.
     """
     if not len(time):
         return np.empty((0, 3), np.int64)

@@ -126,16 +126,13 @@ class _Held(NamedTuple):
 class LatchedFront:
     """Holds the last messages of each publisher from before a slice until the log has ended.
 
-    A log may be out of order, so only its end shows which messages are the last ones. Their
-    log time becomes that of the slice's beginning. Messages of their channels with that very
-    log time are held, too: of equal log times, the one that arrived last is current.
+    A log may be out of order, so only its end shows which messages are the last ones. Their log
+    time becomes that of the slice's beginning, unless they keep their `original_times`. Messages of
+    their channels with that very log time are held, too: of equal log times, the one that arrived
+    last is current.
 
     Of video, the frames from the last key frame before the slice on are held, to which its first
     frames refer; none without such a key frame.
-
-    Args:
-        begin: Log time of the beginning, ns.
-        original_times: The messages keep their log time.
 
     Attributes:
         messages: Number of latched messages from before the slice.
@@ -159,16 +156,11 @@ class LatchedFront:
     def split(
         self, batch: Batch, inside: NDArray[np.bool_], channels: Sequence[Channel]
     ) -> tuple[Batch, NDArray[np.bool_]]:
-        """Take the messages to hold from a batch.
+        """Take the messages to hold from the next ones of the log.
 
-        Args:
-            batch: The next messages of the log, of the wanted topics.
-            inside: bool[n], True for messages of the slice.
-            channels: The log's channels.
-
-        Returns:
-            The batch and bool[n], True for messages to write at once. Among them are messages
-            from before the slice of publishers that keep all of theirs.
+        `inside` is true for those of the slice. Returns the batch and bool[n], true for messages to
+        write at once. Among them are messages from before the slice of publishers that keep all of
+        theirs.
         """
         for channel in channels[len(self._depths) :]:
             self._depths.append(KEEP_ALL - 1 if is_video(channel) else depth_of(channel))

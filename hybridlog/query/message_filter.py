@@ -26,9 +26,9 @@ class Matches(NamedTuple):
     """The outcome for some messages.
 
     Attributes:
-        holds: bool[n], True where the predicate holds.
-        unreadable: Number of messages that the predicate could not test, because they
-            do not fit their definition, or lack arrays.
+        holds: bool[n], true where the predicate holds.
+        unreadable: Number of messages that the predicate could not test, because they do not fit
+            their definition, or lack arrays.
         expired: Number of those that lack arrays, since their payloads are gone.
     """
 
@@ -40,9 +40,7 @@ class Matches(NamedTuple):
 class MessageFilter:
     """Decides one predicate on decoded messages. Thread safe.
 
-    Args:
-        predicate: The condition.
-        types: Types of the fields by path; None where no definition fixes them.
+    Without types of the fields by path, no definition fixes them.
     """
 
     def __init__(self, predicate: Predicate, types: Mapping[str, str] | None) -> None:
@@ -54,13 +52,7 @@ class MessageFilter:
         self._fields -= {"_meta"}
 
     def matches(self, channel: RecordedChannel, batch: Batch, seq: NDArray[np.int64]) -> Matches:
-        """Decide on messages of one channel.
-
-        Args:
-            channel: Their channel.
-            batch: The messages.
-            seq: int64[n], their arrival numbers.
-        """
+        """Decide on messages of one channel; `seq` are their arrival numbers."""
         holds = np.zeros(len(batch), np.bool_)
         times = batch.log_time, seq, batch.publish_time
         if not self._fields:  # what a message itself provides can be asked of any
@@ -129,15 +121,7 @@ def meta_array(
     seq: NDArray[np.int64],
     publish_time: pa.Array[Any] | NDArray[np.int64] | None,
 ) -> pa.StructArray:
-    """The records with a field `_meta` of the values that a message itself provides.
-
-    Args:
-        records: n rows.
-        channel: The channel of the messages.
-        log_time: int64[n], ns.
-        seq: int64[n], arrival numbers.
-        publish_time: int64[n], ns; None when unknown.
-    """
+    """The records with a field `_meta` of what a message itself provides; times in ns."""
     import pyarrow as pa
 
     rows = len(log_time)

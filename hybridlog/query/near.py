@@ -38,12 +38,7 @@ def question_about(
 ) -> Question:
     """The question about another topic, in the same recordings and only where it matters.
 
-    Args:
-        session: The open store.
-        question: The question whose messages are wanted.
-        topic: The other topic, as written.
-        before: Longest time of a wanted message before one of the other topic.
-        after: Longest time after it.
+    Wanted messages are at most `before` in front of one of the other topic, and `after` behind it.
     """
     recordings = question.recordings
     topics = session.resolve_in([topic], recordings)
@@ -79,10 +74,8 @@ def split_own(node: Node) -> tuple[list[Node], list[Node]]:
 def intervals_of(node: Node, windows: Windows, whole: Intervals) -> Intervals:
     """The log time in which a condition on other topics holds.
 
-    Args:
-        node: The condition.
-        windows: Gives the intervals around the messages of a topic.
-        whole: All log time of the recordings asked about.
+    `windows` gives the intervals around the messages of a topic, `whole` is all log time asked
+    about.
     """
     if isinstance(node, Near):
         return windows(node).merged()

@@ -17,10 +17,8 @@ _SAMPLED: Final = 1_000_000  # steps that are kept at least, of more a random sh
 def usual_period(steps: NDArray[np.int64]) -> float:
     """The usual period of a topic, ns, also of one whose messages come in bursts; 0 if unknown.
 
-    Nine of ten steps are no longer, and one long step among few does not count.
-
-    Args:
-        steps: int64[n], times from one message to the next, ns.
+    Nine of ten steps (ns, from one message to the next) are no longer, and one long step among few
+    does not count.
     """
     return float(np.quantile(steps, 0.9, method="lower")) if len(steps) else 0.0
 

@@ -17,12 +17,7 @@ if TYPE_CHECKING:
 
 
 class Piece(NamedTuple):
-    """A part of a question.
-
-    Attributes:
-        name: That of its recording, number and text, as a name of a file: `run-002-docking`.
-        query: The question about it.
-    """
+    """A part of a question, with the name of its recording, number and text: `run-002-docking`."""
 
     name: str
     query: Query
@@ -31,9 +26,7 @@ class Piece(NamedTuple):
 def pieces(query: Query, how: str) -> Iterator[Piece]:
     """The parts of a question, in the order of recordings and times.
 
-    Args:
-        query: The whole question.
-        how: `recording`, `mark`, or a predicate, with `TOPIC: ` in front or about the one topic.
+    They are by `recording`, `mark`, or a predicate with `TOPIC: ` in front or about the one topic.
     """
     if how == "recording":
         names = _files_of(query)

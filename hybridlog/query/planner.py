@@ -286,12 +286,7 @@ class Planner:
         return found
 
     def not_indexed(self) -> tuple[tuple[str, int], ...]:
-        """Number of messages, in the range, that the index lacks, by name of their recording.
-
-        Raises:
-            DatabaseError: MongoDB is unavailable.
-            IndexChangedError: other processes remove documents all the time.
-        """
+        """Number of messages, in the range, that the index lacks, by name of their recording."""
         parts = self.parts()
         return self._lacking(self._index.documents(parts)) if parts else ()
 
@@ -343,14 +338,7 @@ class Planner:
 
 
 class MatchTimes(NamedTuple):
-    """Some messages of one topic of one recording, in order of log time and arrival.
-
-    Attributes:
-        recording: The recording.
-        topic: Full name.
-        log_time: int64[n], ns since the epoch.
-        seq: int64[n], arrival numbers, each once in a recording.
-    """
+    """Some messages of one topic of one recording, in order of log time (ns) and arrival number."""
 
     recording: RecordingEntry
     topic: str

@@ -36,8 +36,6 @@ class Question:
         recordings: Ids of recordings; None for every recording that has a topic.
         bounds: Time range `[begin, end)` as given; None for all times.
         clock: The clock that `bounds` refers to.
-        predicate: Condition on the fields of a message; None for no condition.
-        limit: Maximum number of messages in the answer; None for no limit.
         every: Take every n-th message of each topic.
         reverse: Latest message first.
         fields: Field paths for tables; None for all.
@@ -81,15 +79,7 @@ class Question:
 
 @dataclass(frozen=True)
 class RecordedChannel:
-    """One channel of one recording.
-
-    Attributes:
-        recording: The recording.
-        channel_id: Its id in the recording.
-        channel: Topic, type and metadata.
-        stats: Statistics of its messages.
-        reason: The reason why the catalog knows no fields of them; None if it does.
-    """
+    """One channel of one recording; `reason` is why the catalog knows no fields of it, or None."""
 
     recording: RecordingEntry
     channel_id: int
@@ -105,11 +95,7 @@ class RecordedChannel:
         return codec_for(self.channel)
 
     def arrow_type(self, fields: Collection[str] | None = None) -> Any:
-        """Arrow type of its messages, as far as a definition fixes it.
-
-        Args:
-            fields: Only these fields; None for all.
-        """
+        """Arrow type of its messages, or of some fields, as far as a definition fixes it."""
         none = np.empty(0, np.int64)
         return self.codec.columns(b"", none, none, fields).arrow().type
 
@@ -134,15 +120,10 @@ class Part:
     """The part of a question for one topic of one recording.
 
     Attributes:
-        recording: The recording.
-        topic: Full name of the topic.
-        channels: The topic's channels.
         bounds: `[begin, end)` of `clock`, ns; None for all times.
-        clock: The clock of `bounds`.
         windows: int64[n, 2], `[begin, end)` of log time, disjoint, in order; None for all times.
-        predicate: Condition on the fields; None for no condition.
-        undecodable: Further channels of the topic, whose messages the predicate cannot test
-            because they have no fields.
+        undecodable: Further channels of the topic, whose messages the predicate cannot test because
+            they have no fields.
     """
 
     recording: RecordingEntry

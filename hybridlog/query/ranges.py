@@ -37,7 +37,6 @@ class Resolved(NamedTuple):
     """The share of a question that one recording has.
 
     Attributes:
-        summary: The recording.
         bounds: `[begin, end)` on the question's clock, ns; None for all times.
         windows: int64[n, 2], `[begin, end)` of log time, disjoint, in order; None for all times.
     """
@@ -50,15 +49,10 @@ class Resolved(NamedTuple):
 class Ranges(Sequence[Resolved]):
     """The recordings that a question asks, oldest first; each is made when it is needed.
 
-    Args:
-        snapshot: All recordings.
-        places: Positions of the recordings.
-        shared: Bounds of all of them, as of `Resolved`.
-        each: Bounds of each of them, if they differ.
-        during: Intervals of the question; None without.
+    Their bounds, as of `Resolved`, are `shared` by all, or those of `each`.
 
     Attributes:
-        places: intp[n], positions of the recordings.
+        places: intp[n], positions of the recordings in the snapshot.
         first: int64[n], log time from which on each recording may have messages, ns.
         last: int64[n], log time after which it has none, ns.
     """
@@ -119,11 +113,7 @@ class RangeResolver:
         return Ranges(snapshot, places, shared, each, question.during)
 
     def _check_begin(self, first: NDArray[np.int64]) -> None:
-        """Refuse a range that begins at an early time, far before any message.
-
-        Args:
-            first: Log times of the first messages of the recordings, ns.
-        """
+        """Refuse a range that begins far before any first message of the recordings, ns."""
         assert self._question.bounds is not None
         begin, _ = self._question.bounds
         if self._question.clock == "log" and is_early(begin) and len(first):

@@ -56,7 +56,7 @@ class MatchColumns(NamedTuple):
     Attributes:
         log_time: int64[n], ns.
         seq: int64[n], arrival numbers; 0 where only times are read.
-        holds: bool[n], True where the message matches.
+        holds: bool[n], true where the message matches.
     """
 
     log_time: NDArray[np.int64]
@@ -65,13 +65,7 @@ class MatchColumns(NamedTuple):
 
 
 class Values(NamedTuple):
-    """Fields of matching messages, in order of log time and arrival.
-
-    Attributes:
-        log_time: int64[n], ns.
-        seq: int64[n], arrival numbers.
-        records: n rows, nested as the message is.
-    """
+    """Fields of matching messages, nested as these are, in order of log time (ns) and arrival."""
 
     log_time: NDArray[np.int64]
     seq: NDArray[np.int64]
@@ -82,7 +76,6 @@ class Tabled(NamedTuple):
     """A part of a question that has a table.
 
     Attributes:
-        table: The table.
         part: The part in the segments that the table covers.
         rest: The part in other segments, whose messages are all later; None if there is none.
         segments: Numbers of the segments that it covers; None for all.
@@ -108,12 +101,7 @@ class Rows:
     # The rule.
 
     def tabled(self, part: Part, fields: Collection[str] | None = ()) -> Tabled | None:
-        """The part with its table, if that holds the fields and decides the predicate.
-
-        Args:
-            part: The part.
-            fields: Paths of the fields that are wanted; None for all.
-        """
+        """The part with its table, if that has the fields (None: all) and decides the predicate."""
         if part not in self._tabled:
             self._tabled[part] = self._confirmed(part)
         found = self._tabled[part]
@@ -303,12 +291,7 @@ class Rows:
     # Tables.
 
     def _count_of(self, found: Tabled) -> tuple[int, int]:
-        """Number of matching and of unreadable messages in a table.
-
-        Raises:
-            UndecidedError: Its columns cannot decide.
-            StoreError: They are damaged.
-        """
+        """Number of matching and of unreadable messages in a table, if its columns can decide."""
         part = found.part
         if part not in self._counts:
             matched = unreadable = 0
@@ -362,15 +345,8 @@ class Rows:
     ) -> Iterator[tuple[TableRows, NDArray[np.bool_]]]:
         """Rows of the part's time in its table, with the outcome for each.
 
-        Args:
-            found: The part and its table.
-            fields: Fields to read.
-            own: Columns of the table itself.
-            whole: All rows of its file, in place of its table.
-
-        Raises:
-            UndecidedError: The columns cannot decide.
-            StoreError: The table is damaged.
+        `own` are columns of the table itself; `whole` are all rows of its file, in place of its
+        table. An `UndecidedError` says that the columns cannot decide.
         """
         part, table = found.part, whole or found.table
         spans = None if part.is_unbounded else [(a, b) for a, b in part.log_windows.tolist()]
@@ -492,11 +468,7 @@ class Rows:
     # Times alone.
 
     def _count_by_time(self, part: Part) -> int:
-        """Number of messages in the windows of a part.
-
-        Raises:
-            SegmentError: A segment cannot be read, or is damaged in a part that is needed.
-        """
+        """Number of messages in the windows of a part."""
         if not part.is_by_log_time:
             return self.count_in_chunks([part])
         edges = part.log_windows.ravel()
@@ -507,11 +479,7 @@ class Rows:
         return int(held["messages"][is_whole & (low % 2 == 1)].sum()) + len(times)
 
     def _times(self, part: Part, held: NDArray[np.void]) -> NDArray[np.int64]:
-        """Log times in the windows of a part that some parts of chunks have, sorted.
-
-        Raises:
-            SegmentError: As for `_count_by_time`.
-        """
+        """Log times in the windows of a part that some parts of chunks have, sorted."""
         found = [np.empty(0, np.int64)]
         for segment, chunk, channel in held[["segment", "chunk", "channel"]].tolist():
             reader = self.session.segment(part.recording.id, segment)
@@ -522,7 +490,7 @@ class Rows:
         return time[inside(time, part.log_windows)]
 
     def _held(self, part: Part) -> NDArray[np.void]:
-        """What chunks hold of a part."""
+        """Messages of a part in chunks, as of `Session.parts`."""
         windows = part.log_windows
         span = (int(windows[0, 0]), int(windows[-1, 1])) if len(windows) else (0, 0)
         ids = [channel.channel_id for channel in part.channels]
@@ -552,11 +520,7 @@ def filter_of(part: Part) -> MessageFilter | None:
 
 
 def places_of(references: Any) -> NDArray[np.int64]:
-    """Segment, chunk and payload offset of messages: int64[n, 3].
-
-    Args:
-        references: The column `ref` of a table.
-    """
+    """Segment, chunk and payload offset of messages, int64[n, 3], from a table's column `ref`."""
     columns = [references.field(n).to_numpy(zero_copy_only=False) for n in ("seg", "chunk", "off")]
     return np.stack(columns, axis=1).astype(np.int64)
 
@@ -564,12 +528,7 @@ def places_of(references: Any) -> NDArray[np.int64]:
 def offsets_by_chunk(
     recording: str, places: NDArray[np.int64]
 ) -> dict[ChunkKey, NDArray[np.int64]]:
-    """Payload offsets of messages by chunk, sorted.
-
-    Args:
-        recording: Id of the recording.
-        places: As of `places_of`, in any order.
-    """
+    """Payload offsets of messages by chunk, sorted; places are as of `places_of`, in any order."""
     places = places[np.lexsort((places[:, 2], places[:, 1], places[:, 0]))]
     edges = np.flatnonzero(np.any(places[1:, :2] != places[:-1, :2], axis=1)) + 1
     return {

@@ -20,18 +20,10 @@ if TYPE_CHECKING:
 def rows_differ(
     column: pa.Array[Any], one: Rows, other: Rows, tolerance: float = 0.0
 ) -> NDArray[np.bool_]:
-    """Compare rows of a column with other rows of it.
+    """True where rows of a column, possibly nested, differ from other rows of it.
 
-    NaN equals NaN, -0 equals 0, and null equals only null. Lists of different lengths differ.
-
-    Args:
-        column: The column, possibly nested.
-        one: intp[n], rows.
-        other: intp[n], the rows to compare them with.
-        tolerance: Numbers are equal if they differ by at most this.
-
-    Returns:
-        bool[n], True where they differ.
+    NaN equals NaN, -0 equals 0, and null equals only null; numbers are equal if they differ by at
+    most the tolerance. Lists of different lengths differ.
     """
     kind = column.type
     if isinstance(kind, pa.BaseExtensionType):  # JSON text

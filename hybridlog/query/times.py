@@ -107,16 +107,11 @@ _DATETIME64_UNITS = {
 def parse_time(text: TimeLike, *, start: int | None, end: int | None) -> int:
     """One time, in nanoseconds since the epoch.
 
-    Args:
-        text: A time in one of the forms of this module's table, an int (nanoseconds since
-            the epoch), a float (seconds since the epoch, by its shortest decimal form), a
-            `datetime` or `pandas.Timestamp` (naive: UTC), a `date`, or a `numpy.datetime64`.
-        start: Origin of `+5s`, nanoseconds; None without a recording.
-        end: Origin of `-10s`, nanoseconds: one past the last message, which makes
-            `[start, end)` the whole recording.
-
-    Raises:
-        TimeError: not a time, outside of 64 bits, or relative without a recording.
+    It is in one of the forms of this module's table, an int (nanoseconds since the epoch), a float
+    (seconds since the epoch, by its shortest decimal form), a `datetime` or `pandas.Timestamp`
+    (naive: UTC), a `date`, or a `numpy.datetime64`. `+5s` counts from `start`, `-10s` from `end`,
+    one past the last message, which makes `[start, end)` the whole recording; both are None without
+    one.
     """
     if isinstance(text, str):
         return _checked(_parse_text(text, start, end), text)
@@ -160,16 +155,10 @@ def is_early(time: TimeLike | None) -> TypeGuard[str]:
 def parse_range(
     begin: TimeLike | None, stop: TimeLike | None, *, start: int | None, end: int | None
 ) -> tuple[int, int]:
-    """A half-open range `[begin, stop)` in nanoseconds.
+    """A half-open range `[begin, stop)` in nanoseconds, not empty.
 
-    Args:
-        begin: First time of the range; None for `start`, or -2**63 if that is unknown.
-        stop: First time after the range; None for `end`, or 2**63 - 1.
-        start: First log time, for relative times.
-        end: One past the last log time, for relative times.
-
-    Raises:
-        TimeError: `begin` or `stop` is no time, or the range is empty.
+    Without a begin it is from `start` or -2**63, without a stop until `end` or 2**63 - 1; relative
+    times count from these, the first log time and one past the last.
     """
     low, high = BEGIN if start is None else start, END if end is None else end
     if begin is not None:
@@ -186,15 +175,10 @@ def parse_range(
 
 
 def parse_duration(text: DurationLike) -> int:
-    """A duration in nanoseconds, not negative.
+    """A duration in nanoseconds, not negative, less than 2**63.
 
-    Args:
-        text: `5s`, `1m30s`, `2h`, `500ms`, `250us`, `100ns`, `1d`, `2y` (730 days). Units are in
-            descending order, each number may have a fraction; one without unit is seconds,
-            less than ten million.
-
-    Raises:
-        TimeError: not a duration, negative, finer than a nanosecond, or 2**63 or more.
+    `5s`, `1m30s`, `2h`, `500ms`, `250us`, `100ns`, `1d`, `2y` (730 days): units are in descending
+    order, each number may have a fraction; one without unit is seconds, less than ten million.
     """
     if isinstance(text, str):
         ns = _duration(text.strip()) if len(text) <= _LONGEST_TEXT else None

@@ -35,12 +35,8 @@ _NOTHING = r"[^\x00-\x{10FFFF}]"
 def resolve(patterns: Sequence[str], topics: Collection[str]) -> list[str]:
     """The topics that the patterns match, in the order of the patterns, without duplicates.
 
-    A short name is compared with case first, then without, and must match one topic.
-    A glob or `re:` returns all its topics in alphabetical order.
-
-    Args:
-        patterns: Patterns of the user; without any, the result is empty.
-        topics: All existing topics.
+    A short name is compared with case first, then without, and must match one topic. A glob or
+    `re:` returns all its topics in alphabetical order. Without patterns there are none.
     """
     known = sorted(set(topics))
     found: dict[str, None] = {}
@@ -79,11 +75,8 @@ def _namesakes(pattern: str, topics: Collection[str]) -> list[str]:
 class TopicMatcher:
     """Tests each topic as it appears, if the topics are not known in advance.
 
-    A short name matches every topic that ends with it, case-sensitively.
-
-    Args:
-        include: Patterns; none means all topics.
-        exclude: Patterns of topics to leave out of the included ones.
+    A short name matches every topic that ends with it, case-sensitively. No pattern to `include`
+    means all topics; those to `exclude` are left out of the included ones.
     """
 
     def __init__(self, include: Sequence[str] = (), exclude: Sequence[str] = ()) -> None:
