@@ -64,7 +64,6 @@ class ViewColumn:
     """A column of a view, or a field inside one.
 
     Attributes:
-        name: Its name in SQL.
         source: Path of the field in the messages.
         kind: Type of the field, as codecs give it.
         type: Its type in SQL.
@@ -90,12 +89,9 @@ class ViewColumn:
             yield from column.leaves(path)
 
     def values(self, fields: Fields, rows: int, missing: Callable[[tuple[str, ...]], Any]) -> Any:
-        """Its values.
+        """Its values, from those of the fields that are no structs, in their SQL types.
 
-        Args:
-            fields: Finds the values of the fields that are no structs, in their SQL types.
-            rows: Number of rows.
-            missing: Returns the mask of messages without the struct at a path, or None.
+        `missing` returns the mask of messages without the struct at a path, or None.
         """
         if not self.inner:
             found = fields(self)
@@ -232,14 +228,9 @@ _SQL_TYPES: Final[Sequence[tuple[Callable[[Any], bool], Callable[[Any], Any]]]] 
 
 
 def fitted(array: Any, kind: Any) -> Any:
-    """Values of a field in the type that SQL has for it.
+    """Values of a field, as a codec or a table gives them, in the type that SQL has for it.
 
-    Args:
-        array: The values, as a codec or a table gives them.
-        kind: Type of the field.
-
-    Raises:
-        UnfitValueError: the type does not represent a value.
+    An `UnfitValueError` says that the type does not represent one.
     """
     target = sql_type(kind)
     if array.type == target and kind != pa.json_():

@@ -24,12 +24,9 @@ def word_before(text: str) -> str:
 
 
 def candidates(connection: SqlConnection, line: str, text: str) -> list[str]:
-    """Views, columns, fields and words that begin with a text, sorted.
+    """Views, columns, fields and words that begin with a text, such as `pose.po`, sorted.
 
-    Args:
-        connection: Knows views and columns.
-        line: The statement so far; columns are those of the views in it.
-        text: The word that is being typed, such as `pose.po`.
+    Columns are those of the views in the line, the statement so far.
     """
     names = connection.names()
     words = {word.casefold() for word in PLAIN.findall(line)}

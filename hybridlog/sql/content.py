@@ -37,21 +37,11 @@ _SAMPLED: Final = 20  # recordings that tell how many messages a topic has
 class StoreContent:
     """Recordings and views of a store at one moment. Thread safe.
 
-    Args:
-        session: The open store.
-        scope: The recordings and times of this question alone, whatever its topics.
-
     Attributes:
-        session: The open store.
-        scope: The recordings and times.
+        scope: The recordings and times of this question alone, whatever its topics.
         snapshot: All recordings of the store.
         summaries: Those of the scope, oldest first.
         names: Names of the views.
-
-    Raises:
-        TopicError: A recording does not exist any more.
-        TimeError: The range of time is empty, or outside all recordings.
-        ChangedError: A ring has just let files go.
     """
 
     def __init__(self, session: Session, scope: Question) -> None:
@@ -110,13 +100,7 @@ class StoreContent:
 
 
 class TopicView:
-    """The view of a topic: its columns, and the rows that a query reads.
-
-    Attributes:
-        topic: Full name.
-        schema: All columns.
-        size: Number of rows, nearly.
-    """
+    """The view of a topic: its columns, and rows for a query; `size` is nearly their number."""
 
     def __init__(self, content: StoreContent, topic: str) -> None:
         self.topic = topic
@@ -173,13 +157,7 @@ class TopicView:
     def rows(
         self, columns: Sequence[str], where: Any, reading: Reading
     ) -> Iterator[pa.RecordBatch]:
-        """Rows for a query.
-
-        Args:
-            columns: Names of the columns.
-            where: Expression that holds for all of them; None for all rows.
-            reading: Collects what is read.
-        """
+        """Rows for a query: those columns, where an expression holds (None for all)."""
         plans: dict[Span | None, Plan] = {}
         for number in self._chooser.chosen(where):
             summary = self._summaries[number]
@@ -242,12 +220,7 @@ _MARKS: Final = pa.schema(
 
 
 def store_table(name: str, content: StoreContent) -> pa.Table:
-    """One of the tables about a store.
-
-    Args:
-        name: `recordings`, `topics`, `losses` or `marks`.
-        content: The store.
-    """
+    """One of the tables about a store: `recordings`, `topics`, `losses` or `marks`."""
     if name == "recordings":
         return recordings_table(content.summaries)
     rows, schema = _TABLES[name]

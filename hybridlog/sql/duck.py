@@ -50,11 +50,7 @@ os.environ.setdefault("MIMALLOC_ARENA_EAGER_COMMIT", "0")
 
 
 def duckdb() -> Any:
-    """The package.
-
-    Raises:
-        MissingDependencyError: it is not installed.
-    """
+    """The package, or a `MissingDependencyError`."""
     try:
         return import_module("duckdb")
     except ImportError as error:
@@ -62,17 +58,10 @@ def duckdb() -> Any:
 
 
 def open_duckdb(memory: int) -> Any:
-    """DuckDB in memory, which reads nothing but what is registered.
+    """DuckDB in memory (at most so many bytes), which reads nothing but what is registered.
 
-    Files, extensions, other databases and variables of Python are out of its reach, and no
-    query can change its settings.
-
-    Args:
-        memory: Limit of its memory, bytes.
-
-    Raises:
-        MissingDependencyError: it is not installed.
-        UsageError: the limit is too low.
+    Files, extensions, other databases and variables of Python are out of its reach, and no query
+    can change its settings.
     """
     if memory < MIN_MEMORY:
         raise UsageError(f"SQL needs at least {MIN_MEMORY >> 20} MiB of memory.")
@@ -85,15 +74,7 @@ def open_duckdb(memory: int) -> Any:
 
 @contextmanager
 def explained(memory: int) -> Iterator[None]:
-    """Turn errors of DuckDB into ours.
-
-    Args:
-        memory: Limit of DuckDB's memory, bytes.
-
-    Raises:
-        UsageError: the query is refused.
-        ResourceError: it needs more memory.
-    """
+    """Turn errors of DuckDB into ours; `memory` is its limit, bytes."""
     package = duckdb()
     try:
         yield
@@ -114,9 +95,7 @@ def explained(memory: int) -> Iterator[None]:
 def shortage_of(error: Exception, memory: int) -> ResourceError | None:
     """The error to raise for one of DuckDB, Arrow or the system that means too little memory.
 
-    Args:
-        error: That error.
-        memory: Limit of DuckDB's memory, bytes.
+    `memory` is the limit of DuckDB's memory, bytes.
     """
     is_short = isinstance(error, MemoryError | duckdb().OutOfMemoryException)
     if not is_short and not any(text in str(error) for text in _SHORTAGES):
@@ -134,10 +113,8 @@ def _first_line(error: Exception) -> str:
 class Worker:
     """Runs calls of one connection in a thread, so that Ctrl-C and timeouts interrupt them.
 
-    Args:
-        cursor: The connection.
-        timeout: Seconds for all calls; None for no limit.
-        stopped: Once it is set, calls end with an error.
+    The timeout is seconds for all calls, None for no limit. Once `stopped` is set, they end with an
+    error.
     """
 
     def __init__(self, cursor: Any, timeout: float | None, stopped: threading.Event) -> None:
@@ -148,12 +125,7 @@ class Worker:
         self._until = None if timeout is None else time.monotonic() + timeout
 
     def run(self, call: Callable[[], _T]) -> _T:
-        """The result of a call.
-
-        Raises:
-            HybridlogError: the time is over.
-            ResourceError: it was stopped.
-        """
+        """The result of a call; an error when the time is over, or it was stopped."""
         with at_safe_points():
             future: Future[_T] = self._pool.submit(call)
             try:
@@ -199,13 +171,9 @@ def private_bytes() -> int:
 
 @contextmanager
 def limited_memory(memory: int) -> Iterator[int]:
-    """Limit what this process takes from now on, where the system can.
+    """Limit what this process takes from now on, where the system can; yields the limit, bytes.
 
-    Args:
-        memory: Limit of DuckDB's memory, bytes; `OWN_MEMORY` is on top of it.
-
-    Yields:
-        Bytes that it may have in all.
+    `OWN_MEMORY` is on top of DuckDB's memory.
     """
     before, hard = resource.getrlimit(resource.RLIMIT_DATA)
     wanted = private_bytes() + memory + OWN_MEMORY

@@ -128,12 +128,7 @@ class SqlEngine:
 class SqlConnection:
     """Runs queries one after the other. Not thread safe.
 
-    Args:
-        engine: The engine.
-        cursor: A connection of DuckDB.
-        memory: Limit of its memory, bytes.
-        scope: The recordings and times that views and tables show.
-        only_reads: Statements other than queries are refused.
+    `memory` is the limit of DuckDB's, bytes. One that `only_reads` refuses all but queries.
 
     Attributes:
         stopped: Set it in any thread to end the query that runs, and all later ones.
@@ -170,11 +165,7 @@ class SqlConnection:
         return list(self.content.names)
 
     def check(self, text: str) -> None:
-        """Check that the answer of a query lacks nothing, by the views that it may read.
-
-        Raises:
-            IncompleteError: Messages are lost, or not written yet.
-        """
+        """Check that the answer of a query lacks nothing, by the views that it may read."""
         content = self.content
         named = (content.names.topic(name) for name in content.names.named(text))
         topics = {topic for topic in named if topic is not None}
@@ -267,14 +258,9 @@ class SqlConnection:
 
 
 class SqlAnswer:
-    """The answer of a query. It is computed whenever it is asked for, as one of these.
+    """The answer of a query, computed whenever it is asked for; its connection must be open then.
 
-    Args:
-        connection: The connection, open as long as the answer is used.
-        text: The statement.
-        params: Values of its parameters.
-        usage: Paths that it names.
-        timeout: Seconds that it may take; None for no limit.
+    The timeout is in seconds, None for no limit.
 
     Attributes:
         columns: Names of the columns.
@@ -351,17 +337,9 @@ class SqlAnswer:
         return self._computed(self._table)
 
     def first(self, rows: int, size: int) -> tuple[pa.Table, bool]:
-        """The first rows of a query; the others are not computed.
+        """The first rows of a query, and whether there are more; the others are not computed.
 
-        Args:
-            rows: Greatest number of rows.
-            size: Bytes after which no further row is taken.
-
-        Returns:
-            The rows, and whether there are more.
-
-        Raises:
-            ResourceError: it needs more memory or time than it may.
+        No further row is taken after so many bytes.
         """
         taken: list[pa.RecordBatch] = []
         room, bytes_taken = rows, 0

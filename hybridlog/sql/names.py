@@ -22,11 +22,7 @@ _LISTING: Final = frozenset({
 
 
 class ViewNames:
-    """The names of the views of some topics. DuckDB ignores case, and so do these.
-
-    Attributes:
-        views: Name of the view of each topic, by topic.
-    """
+    """The names of the views of some topics, `views` by topic. DuckDB ignores case, so do these."""
 
     def __init__(self, topics: Iterable[str]) -> None:
         # Of names that differ in case, the one in lower case stays as it is.

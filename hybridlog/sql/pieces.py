@@ -56,14 +56,7 @@ Paths = Collection[str] | None
 
 @dataclass(slots=True)
 class ScanCounts:
-    """Counts of what was read for a query.
-
-    Attributes:
-        files: Paths of the files that were read.
-        groups: Files and numbers of the row groups that were read.
-        chunks: Chunks that were read.
-        payload_bytes: Bytes of payloads that were decoded.
-    """
+    """Counts of what was read for a query: groups of rows by file and number, bytes decoded."""
 
     files: set[str] = field(default_factory=set)
     groups: set[tuple[str, int]] = field(default_factory=set)
@@ -91,7 +84,6 @@ class Rows(NamedTuple):
     Attributes:
         own: Columns of the table itself, by name; with `state` unless all are whole.
         records: Fields of the messages; arrays may be summaries.
-        size: Number of messages.
     """
 
     own: Mapping[str, Any]

@@ -48,7 +48,6 @@ class Remarks:
         absent: Messages without fields, by topic and state.
         undefined: Topics without fields, with the reason.
         recordings: Recordings that were read, by id.
-        topics: Topics that were read.
     """
 
     absent: Counter[tuple[str, State]] = field(default_factory=Counter)
@@ -67,14 +66,7 @@ class Remarks:
 
 @dataclass(slots=True)
 class Reading:
-    """One execution of a query: what it reads and finds.
-
-    Attributes:
-        usage: Paths that the query names.
-        counts: What was read.
-        remarks: What the answer may lack.
-        error: The first error while rows were read.
-    """
+    """One execution of a query: what it reads, finds and may lack, and the first error in that."""
 
     usage: Usage = EVERYTHING
     counts: ScanCounts = field(default_factory=ScanCounts)
@@ -85,9 +77,7 @@ class Reading:
 class Chooser:
     """Chooses parts that may have rows for which an expression holds.
 
-    Args:
-        schema: Columns of the expression.
-        guarantees: An expression for each part that holds for all of its rows.
+    The guarantee of each part is an expression that holds for all of its rows.
     """
 
     def __init__(self, schema: Any, guarantees: Sequence[Any]) -> None:
@@ -112,10 +102,7 @@ class Chooser:
 class RecordingChooser:
     """Chooses recordings as `Chooser` chooses parts: first groups of them, then among these.
 
-    Args:
-        schema: Columns of the expression.
-        names: Name of each recording.
-        spans: First and last log time of each, ns; None if unknown.
+    Spans are first and last log time of each, ns; None if unknown.
     """
 
     def __init__(
@@ -176,18 +163,7 @@ def in_window(where: Any, window: tuple[int, int] | None) -> Any:
 
 
 class Plan:
-    """Reads some columns of a topic.
-
-    Args:
-        schema: All columns of the view.
-        fields: Columns of fields by name.
-        columns: Names of the columns to return.
-        where: Expression that holds for all rows; None for all.
-        reading: Collects what is read.
-
-    Attributes:
-        where: The expression.
-    """
+    """Reads some columns of a topic, where the expression `where` holds (None for all rows)."""
 
     def __init__(
         self,
@@ -350,12 +326,7 @@ def _is_absent(leaf: ViewColumn, source: RowSource) -> bool:
 
 
 def _paths(leaves: Collection[ViewColumn], *, summaries: bool = False) -> list[str] | None:
-    """Dotted paths of fields; None if a name has a dot itself.
-
-    Args:
-        leaves: Columns of the fields.
-        summaries: True for the paths of the numbers of summaries, in place of their arrays.
-    """
+    """Dotted paths of fields, or of numbers of their summaries; None if a name has a dot itself."""
     if any("." in name or "[" in name for leaf in leaves for name in leaf.source):
         return None
     found: dict[str, None] = {}

@@ -63,7 +63,7 @@ class TopicDataset(ds.Dataset, PyArrowDatasetSource):  # type: ignore[misc] # wi
 
 @dataclass
 class _Scanner:
-    """What DuckDB takes for a scanner."""
+    """Taken for a scanner by DuckDB."""
 
     reader: pa.RecordBatchReader
 

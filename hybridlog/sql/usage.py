@@ -24,21 +24,13 @@ _FUNCTIONS: Final = frozenset({"range", "generate_series", "unnest"})
 
 @dataclass(frozen=True, slots=True)
 class Usage:
-    """Paths named in a query.
-
-    Attributes:
-        chains: Each named path, from wherever it begins: view, column or field.
-    """
+    """Paths named in a query, from wherever each begins: view, column or field."""
 
     chains: frozenset[Path] | None = None
     """None if anything may be used."""
 
     def uses(self, path: Path) -> bool:
-        """True if the query may use a field.
-
-        Args:
-            path: Column, and fields in it, folded.
-        """
+        """True if the query may use a field: its column, and fields in it, folded."""
         if self.chains is None:
             return True
         for chain in self.chains:
@@ -55,11 +47,9 @@ EVERYTHING: Final = Usage()
 
 
 def usage_of(tree: str, views: Collection[str]) -> Usage:
-    """The paths that a query names.
+    """The paths that a query, as `json_serialize_sql` gives it, names.
 
-    Args:
-        tree: The query as `json_serialize_sql` gives it.
-        views: Folded names of views whose columns are known.
+    `views` are folded names of views whose columns are known.
     """
     found = json.loads(tree)
     if found.get("error", True):
