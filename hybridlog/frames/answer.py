@@ -51,11 +51,7 @@ FIXED = {"ros1", "cdr"}
 
 
 def to_arrow(planner: Planner) -> pa.Table:
-    """The whole answer as an Arrow table, in order.
-
-    Raises:
-        DefinitionError: a topic has no definition to derive columns from.
-    """
+    """The whole answer as an Arrow table, in order."""
     question = planner.question
     groups = _groups(planner, planner.parts(), in_order=not question.returns_all)
     return _table([block for group in groups for block in group], question)
@@ -66,10 +62,7 @@ def _groups(
 ) -> Iterator[Iterable[Block]]:
     """The blocks of an answer, those that overlap in time together; the first have no rows.
 
-    Args:
-        planner: Planner of the question.
-        parts: Parts that tables may answer; None to read messages.
-        in_order: The groups are in order.
+    Tables may answer the parts; without any, messages are read.
     """
     decoder = Decoder(planner)
     yield decoder.empty()
@@ -85,11 +78,8 @@ def _groups(
 def stream(planner: Planner, *, at_once: bool = False) -> Iterator[pa.Table]:
     """The answer in order, in tables of bounded size; at least one, possibly empty.
 
-    The type of a column may differ between tables if no definition fixes it.
-
-    Args:
-        planner: Planner of the question.
-        at_once: True for a table of the columns, and one of what is read at a time.
+    The type of a column may differ between tables if no definition fixes it. With `at_once` there
+    is a table of the columns, then one of what is read at a time.
     """
     question = planner.question
     part = None if question.reverse else planner.only_part()
@@ -173,9 +163,6 @@ class Decoder:
     Attributes:
         channels: The channels of the messages that are read now; at first examples of all.
         own: Names of the built-in columns.
-
-    Raises:
-        DefinitionError: a channel has no definition to derive columns from.
     """
 
     def __init__(self, planner: Planner) -> None:
@@ -355,7 +342,6 @@ class Block(NamedTuple):
     """Decoded messages of one topic.
 
     Attributes:
-        topic: Topic of the messages.
         log_time: int64[n], ns.
         order: int64[n], order of messages with the same log time.
         own: Built-in columns without the log time, n rows each.
@@ -380,21 +366,15 @@ def table_of(
 ) -> pa.Table:
     """The table of some blocks, sorted by log time and order; the list is empty afterwards.
 
-    Nested messages become dotted columns (`pose.position.x`). A column that a block lacks
-    is null there. A column whose type changes gets the common exact type
-    (`schema/arrow_types.py`). Messages of a topic are converted to one type before they are
-    flattened, which makes the table independent of the division into chunks.
+    Nested messages become dotted columns (`pose.position.x`); `fields` are their paths, None for
+    all. A column that a block lacks is null there. A column whose type changes gets the common
+    exact type (`schema/arrow_types.py`). Messages of a topic are converted to one type before they
+    are flattened, which makes the table independent of the division into chunks. `tags` are keys of
+    tags, by the names of their columns.
 
-    Args:
-        blocks: The blocks.
-        fields: Requested paths; None for all fields.
-        tags: Keys of tags, by the names of their columns.
-
-    Returns:
-        The first column is `log_time`, timestamp[ns, UTC]. Numbers keep their wire
-        type; times are timestamp[ns, UTC], durations duration[ns], strings string,
-        arrays fixed_size_list if the definition fixes their length and list
-        otherwise.
+    The first column is `log_time`, timestamp[ns, UTC]. Numbers keep their wire type; times are
+    timestamp[ns, UTC], durations duration[ns], strings string, arrays fixed_size_list if the
+    definition fixes their length and list otherwise.
     """
     blocks.sort(key=_beginning)
     order = _order(blocks)

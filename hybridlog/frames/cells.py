@@ -25,12 +25,9 @@ UNITS: Final = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
 
 
 def cells(table: pa.Table, *, exact: bool = False, most: int = MAX_CELL) -> list[list[str]]:
-    """The rows of a table, a short text for each value; empty for a null.
+    """The rows of a table, a text for each value, of `most` characters; empty for a null.
 
-    Args:
-        table: The table.
-        exact: Numbers with all digits that tell them apart, not with six.
-        most: Characters of a text.
+    `exact` numbers have all digits that tell them apart, not six.
     """
     columns = [[_cell(value, exact=exact, most=most) for value in each] for each in table.columns]
     return [list(row) for row in zip(*columns, strict=True)]
@@ -107,13 +104,12 @@ def _cut(text: str, most: int) -> str:
 
 
 def shown(table: pa.Table, most: int) -> dict[str, Any]:
-    """A table for people, as plain values.
+    """A table for people, as plain values by name.
 
-    Returns:
-        `columns`, pairs of the name and whether it is a number; `columns_left_out`, their
-        number; `rows`, texts; `times`, the log time of each row, ns since 1970, the last one of
-        its microsecond where only a timestamp tells it, and `recordings`, the name of its
-        recording: both empty without such columns.
+    `columns` are pairs of the name and whether it is a number, `columns_left_out` their number;
+    `rows`, texts; `times`, the log time of each row, ns since 1970, the last one of its microsecond
+    where only a timestamp tells it, and `recordings`, the name of its recording: both empty without
+    such columns.
     """
     first = table.select(range(min(table.num_columns, most)))
     return {

@@ -72,14 +72,10 @@ def with_summaries(
     requested: Collection[str] | None,
     known: Mapping[str, pa.Array[Any]] = MappingProxyType({}),
 ) -> dict[str, pa.Array[Any]]:
-    """The leaves with the requested summaries (`ranges.min`).
+    """The leaves, by dotted path, with the requested summaries (`ranges.min`).
 
-    An array of which only summaries are requested is left out.
-
-    Args:
-        leaves: By dotted path.
-        requested: Requested paths; None for all fields.
-        known: Summaries of arrays that are not there.
+    None requests all fields. An array of which only summaries are requested is left out; `known`
+    are those of arrays that are not there.
     """
     wanted = [path.replace("[]", "") for path in requested or ()]
     found = {}

@@ -104,14 +104,8 @@ def _is_plain(chunk: pa.Array[Any]) -> bool:
 def _fill(cells: NDArray[Any], chunk: pa.Array[Any], shared: NDArray[Any] | None) -> NDArray[Any]:
     """Fill in the arrays of a chunk; equal ones, such as covariances, share one array.
 
-    Args:
-        cells: Receives the arrays.
-        chunk: Lists of numbers.
-        shared: The array that all rows so far are equal to, empty if they differ; None
-            at first.
-
-    Returns:
-        The value of `shared` for the next chunk.
+    `shared` is what all rows so far are equal to, empty if they differ, None at first; it is
+    returned for the next chunk.
     """
     values = chunk.flatten().to_numpy(zero_copy_only=False)
     values.flags.writeable = False
@@ -162,11 +156,7 @@ def _string_dtype() -> Any:
 
 
 def to_polars(table: pa.Table) -> Any:
-    """A polars frame of a table.
-
-    Raises:
-        MissingDependencyError: polars is not installed.
-    """
+    """A polars frame of a table."""
     try:
         import polars as pl
     except ImportError as error:

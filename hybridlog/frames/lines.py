@@ -27,11 +27,8 @@ if TYPE_CHECKING:
 def lines(planner: Planner) -> Iterator[list[Line]]:
     """The messages of an answer in order, in batches: one JSON object for each message.
 
-    It has `log_time_ns`, `topic`, `recording` if there are several, and the fields of the
-    message, with dotted names for those of nested messages.
-
-    Raises:
-        DefinitionError: a topic has no definition to read its messages with.
+    It has `log_time_ns`, `topic`, `recording` if there are several, and the fields of the message,
+    with dotted names for those of nested messages.
     """
     decoder = Decoder(planner)
     for run in planner.runs():

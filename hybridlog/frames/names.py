@@ -30,12 +30,9 @@ SUMMARIES = ("n", "min", "max", "mean")
 
 
 def own_columns(requested: Sequence[str] | None, defined: Collection[str]) -> list[str]:
-    """The built-in columns among the requested names.
+    """The built-in columns among the requested names; None requests all fields.
 
-    Args:
-        requested: Names given to `fields`; None for all fields.
-        defined: Paths in the definitions of the topics. A name among them is the
-            field, unless it is reserved.
+    A name in the definitions of the topics is the field, unless it is reserved.
     """
     names = dict.fromkeys(requested or ())
     return [n for n in names if n in RESERVED or (n in OPTIONAL and n not in defined)]
@@ -68,14 +65,9 @@ def free_name(path: str, taken: Collection[str]) -> str:
 def arranged(
     names: Sequence[str], fields: Sequence[str] | None, tags: Collection[str] = ()
 ) -> list[str]:
-    """Column names in the order in which their fields were requested.
+    """Column names in the order in which their fields were requested; None for all.
 
     Columns that were not requested come first: log time, topic, recording, tags.
-
-    Args:
-        names: Names of columns.
-        fields: Requested paths; None for all fields.
-        tags: Names of columns of tags.
     """
     if fields is None:
         return list(names)
