@@ -276,12 +276,7 @@ class _Partner:
         self._is_last = True
 
     def enter(self, recording: str, end: int | None) -> None:
-        """Go on with the messages of another recording.
-
-        Args:
-            recording: Its id.
-            end: Time that all rows are before, by the log clock, ns; None if unknown.
-        """
+        """Go on with another recording; rows are before `end` (log clock, ns; None: unknown)."""
         self._recording, self._end = recording, end
         self._reason = self._reader.elsewhere(recording) or self._why
         self._lost = self._reader.lost(recording)
@@ -343,12 +338,9 @@ class _Partner:
     def add(
         self, columns: dict[str, Any], times: NDArray[np.int64], empty: Counter[tuple[str, str]]
     ) -> None:
-        """Add the columns of the messages that belong to decided times, with their distance.
+        """Add the columns of the messages that belong to decided times, ns, with their distance.
 
-        Args:
-            columns: Those of the rows, by name.
-            times: int64[n], ns.
-            empty: Numbers of rows without a message or a value, by name and reason.
+        `empty` counts rows without a message or a value, by name and reason.
         """
         known = self._times if len(self._times) else times
         found = match(times, self._times, self._how, self._tolerance)

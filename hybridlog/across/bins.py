@@ -42,11 +42,7 @@ _GRID_ROWS = 65_536
 
 
 class Bins:
-    """A topic beside regular times: gives what its messages say until the next time.
-
-    Raises:
-        UsageError: a field has no single number.
-    """
+    """A topic beside regular times: gives what its messages say until the next time."""
 
     def __init__(self, reader: TopicReader, grid: RegularTimes, how: str) -> None:
         self._reader = reader
@@ -74,9 +70,7 @@ class Bins:
     ) -> None:
         """Add the number of messages, and their fields, from each time to the next.
 
-        Args:
-            columns: Those of the rows, by name.
-            times: int64[n], ns, of the grid; not before those of the last call.
+        The times are ns, of the grid, and not before those of the last call.
         """
         made = _Rows(self._how, len(times))
         made.add(self._none, np.empty(0, np.int64))
@@ -108,9 +102,6 @@ def with_numbers(session: Session, question: Question, how: str) -> Question:
     """The question for the fields, or the requested ones, that are single numbers, also times.
 
     Times have no mean. The same question where all values count, or no definition fixes the fields.
-
-    Raises:
-        UsageError: a requested field has none.
     """
     known = session.field_types(question.topics, question.recordings)
     if known is None or how not in _OF_NUMBERS:
@@ -141,11 +132,7 @@ def _no_number(field: str, topic: str) -> UsageError:
 
 
 class _Rows:
-    """The columns of some bins.
-
-    Attributes:
-        messages: int64[size], messages in each bin.
-    """
+    """The columns of some bins; `messages` counts those in each."""
 
     def __init__(self, how: str, size: int) -> None:
         self._how = how
@@ -157,12 +144,7 @@ class _Rows:
         self._given = 0
 
     def add(self, table: pa.Table, row: NDArray[np.int64]) -> None:
-        """Add messages, which are not before those that were added.
-
-        Args:
-            table: Their fields.
-            row: int64[n], ascending, the bin of each.
-        """
+        """Add messages, not before those that were added; `row` is the bin of each, ascending."""
         begins = run_starts(row)
         bins, counts = row[begins], np.diff(np.append(begins, len(row)))
         if self._how in _OF_NUMBERS:
@@ -257,16 +239,7 @@ def _values_of(column: Any, how: str) -> tuple[NDArray[Any], NDArray[np.bool_]] 
 class RegularTimes:
     """Regular times as rows: from the beginning of each recording, or of the asked range.
 
-    Args:
-        session: The open store.
-        question: The question whose recordings and range count.
-        step: Time between two rows, ns.
-
-    Attributes:
-        step: The step.
-
-    Raises:
-        UsageError: the step is zero.
+    The recordings and the range of the question count; the step is in ns, not zero.
     """
 
     def __init__(self, session: Session, question: Question, step: int) -> None:

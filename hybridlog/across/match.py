@@ -47,8 +47,8 @@ class Matched(NamedTuple):
     Attributes:
         before: int64[n], row of the message; -1 where none is near enough.
         after: int64[n], row of the other one; equal to `before` if that decides alone.
-        distance: int64[n], time of the message minus the time, ns; of the farther one of two.
-            0 where there is none.
+        distance: int64[n], time of the message minus the time, ns; of the farther one of two. 0
+            where there is none.
     """
 
     before: NDArray[np.int64]
@@ -61,15 +61,11 @@ def match(
 ) -> Matched:
     """The messages that belong to some times.
 
-    `asof` finds the last message not after a time, of equal times the last one. `nearest`
-    finds that one or the first one after the time, and the earlier one if both are equally
-    near. `interpolate` finds both, and a message of exactly that time alone.
-
-    Args:
-        times: int64[n], ns; `UNKNOWN` matches nothing.
-        rows: int64[m], times of the messages, ns, ascending.
-        how: Which of them.
-        tolerance: Greatest distance, ns; None for any.
+    `asof` finds the last message not after a time, of equal times the last one. `nearest` finds
+    that one or the first one after the time, and the earlier one if both are equally near.
+    `interpolate` finds both, and a message of exactly that time alone. All times are ns, `rows`
+    those of the messages, ascending; `UNKNOWN` matches nothing. Without a tolerance, any distance
+    is near enough.
     """
     if not len(rows):
         nothing = np.full(len(times), -1, np.int64)
@@ -102,24 +98,17 @@ def match(
 
 
 def quaternion_paths(known: Mapping[str, str] | None) -> list[str]:
-    """Paths of the quaternions among fields.
-
-    Args:
-        known: Types of all fields, by path; None if no definition fixes them.
-    """
+    """Paths of the quaternions among fields of known types; None if no definition fixes them."""
     return [path for path, kind in (known or {}).items() if kind in QUATERNIONS]
 
 
 def interpolated(
     before: pa.Table, after: pa.Table, weight: NDArray[np.float64], quaternions: Sequence[str]
 ) -> pa.Table:
-    """Rows between the rows of two tables.
+    """Rows between the rows of two tables with the same columns; those that match nothing are null.
 
-    Args:
-        before: n rows; those that match nothing are null.
-        after: n rows with the same columns.
-        weight: float64[n], 0 for the row before, 1 for the row after.
-        quaternions: Paths of quaternions; those with a column for each part count.
+    The weight is 0 for the row before, 1 for the row after. Quaternions with a column for each part
+    count.
     """
     columns: dict[str, Any] = dict(zip(before.column_names, before.columns, strict=True))
     done: set[str] = set()

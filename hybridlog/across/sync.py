@@ -195,11 +195,7 @@ def _in_range(session: Session, question: Question) -> set[int]:
 def _times_of(
     session: Session, question: Question, recording: str, clock: Clock, counters: Counters
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Log times of a recording's messages, times on a clock, and the order by these.
-
-    Raises:
-        TopicError: the topic does not have the clock.
-    """
+    """Log times of a recording's messages, times on a clock, and the order by these."""
     own = replace(question, recordings=(recording,), fields=())
     reader = TopicReader(session, own, clock)
     read = [(np.empty(0, np.int64), np.empty(0, np.int64)), *reader.times(recording)]
@@ -248,23 +244,19 @@ def _left_out(
 def approximate_sets(
     times: Sequence[NDArray[np.int64]], tolerance: int | None = None
 ) -> NDArray[np.int64]:
-    """The sets that `ApproximateTime` makes of the messages of some topics.
+    """The sets that `ApproximateTime` makes, int64[k, n]: rows of the n topics' messages.
 
     `message_filters` matches messages of several topics so that each is used once, sets do not
-    cross, and no smaller set can be made of the messages between two sets. The latest of the
-    first messages of all topics is the *pivot*: the set with the shortest duration that holds it
-    is the answer. Later sets have to be shorter by the *age penalty* to be preferred.
+    cross, and no smaller set can be made of the messages between two sets. The latest of the first
+    messages of all topics is the *pivot*: the set with the shortest duration that holds it is the
+    answer. Later sets have to be shorter by the *age penalty* to be preferred.
 
     This is the algorithm of its C++ version with the defaults: an age penalty of 0.1, no lower
-    bounds between messages. Its queue has no limit here, so that nothing is dropped, and a log
-    has an end: there, the best set found so far is taken, where a robot would wait for more.
+    bounds between messages. Its queue has no limit here, so that nothing is dropped, and a log has
+    an end: there, the best set found so far is taken, where a robot would wait for more.
 
-    Args:
-        times: Times of the messages of each topic, ns, ascending.
-        tolerance: Longest duration of a set, ns (`setMaxIntervalDuration`); None for any.
-
-    Returns:
-        int64[k, n]: the row of each topic's message, set by set.
+    Times of the messages of each topic are ns, ascending. The tolerance is the longest duration of
+    a set, ns (`setMaxIntervalDuration`); None for any.
     """
     topics = range(len(times))
     # Views give Python numbers one by one, and take no memory.

@@ -45,12 +45,8 @@ _MAX_NAMES: Final = 3  # recordings in a message
 class TopicReader:
     """One topic of an alignment: its messages with their times on a clock.
 
-    Args:
-        session: The open store.
-        question: The question about the topic, kept as `asked`.
-        clock: The clock.
-        prefix: Beginning of its columns' names; empty for none.
-        is_apart: Its messages may be of other recordings than the rows.
+    The names of its columns begin with the prefix. If it `is_apart`, its messages may be of other
+    recordings than the rows.
     """
 
     def __init__(
@@ -120,9 +116,7 @@ class TopicReader:
     def tables(self, recording: str, span: tuple[int, int] | None = None) -> Iterator[Block]:
         """The messages beside a recording, by log time.
 
-        Args:
-            recording: Id of the recording.
-            span: Log time `[begin, end)`, ns, of a question without a range.
+        The span, ns, is that of a question without a range.
         """
         if self.elsewhere(recording) is not None:
             return
@@ -160,7 +154,7 @@ class TopicReader:
                     yield times, times
 
     def elsewhere(self, recording: str) -> str | None:
-        """Why no message can be beside the rows of a recording; None if there may be some."""
+        """The reason why no message can be beside a recording's rows; None if one may be."""
         snapshot = self._session.snapshot()
         place, places = snapshot.by_id[recording], self._session.chosen(self.question)
         if self.is_apart or place in places:
@@ -213,11 +207,8 @@ class TopicReader:
     ) -> None:
         """Add the columns of messages to those of the rows, under free names.
 
-        Args:
-            columns: Those of the rows, by name.
-            table: The messages.
-            blank: Numbers of rows that have no value, by column and reason.
-            known: Rows without a message, which do not count.
+        `blank` counts rows that have no value, by column and reason, but for those `known` to have
+        no message.
         """
         for name, column in zip(table.column_names, table.columns, strict=True):
             if name not in self._hidden:
