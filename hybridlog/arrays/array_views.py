@@ -31,11 +31,7 @@ def byte_array(data: Any) -> NDArray[np.uint8]:
 
 
 def check_rows(what: str, shape: tuple[int, int], row: int, step: int, size: int) -> None:
-    """Check that rows of `row` bytes, `step` bytes apart, lie within `size` bytes.
-
-    Raises:
-        PayloadError: they do not.
-    """
+    """Check that rows of `row` bytes, `step` bytes apart, lie within `size` bytes."""
     height, width = shape
     if height < 0 or width < 0:
         raise PayloadError(f"{what} cannot have {width} columns and {height} rows")

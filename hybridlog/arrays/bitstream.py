@@ -22,11 +22,7 @@ _HIGH_PROFILES = {44, 83, 86, 100, 110, 118, 122, 128, 134, 135, 138, 139, 244}
 
 
 def frame_of(decoded: Any) -> tuple[str, bytes]:
-    """The format and the bytes of a decoded message.
-
-    Raises:
-        PayloadError: It lacks them, or its format is none of `CODECS`.
-    """
+    """The format, one of `CODECS`, and the bytes of a decoded message."""
     try:
         message = attributes(decoded)
         form, data = str(message.format).lower(), byte_array(message.data).tobytes()

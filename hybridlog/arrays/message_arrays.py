@@ -50,33 +50,24 @@ _DEPTH_HEADER = struct.Struct("<iff")
 def to_numpy(type_name: str, message: object) -> NDArray[Any]:
     """A message as an array.
 
-    * `Image`, also Foxglove's `RawImage`: shape (height, width) or (height, width, channels)
-      in the encoding's own channel order; big-endian samples have a big-endian dtype. YUV
-      4:2:2 has two channels, not separated; NV12, NV21 and NV24 are returned as raw planes, shape
-      (rows of all planes, width).
-    * `CompressedImage`, also Foxglove's: shape (height, width) or (height, width, 3 or 4),
-      red first.
-      `compressedDepth` gives the depth image: uint16 millimetres or float32 metres
-      (NaN for missing measurements).
-    * `LaserScan`: shape (n,), fields `range` (metres), `intensity` (if present)
-      and `angle` (radians), float32. Ranges without an intensity have NaN.
-      `MultiEchoLaserScan` has a row for each echo, beam after beam, and `echo`, its number.
-    * `PointCloud2`: shape (width,) or, for an organised cloud, (height, width), with the
-      cloud's own fields, which may overlap; `PointCloud`: shape (n,), `x`, `y`, `z` and the
-      channels, NaN where a channel ends early.
+    * `Image`, also Foxglove's `RawImage`: shape (height, width) or (height, width, channels) in the
+      encoding's own channel order; big-endian samples have a big-endian dtype. YUV 4:2:2 has two
+      channels, not separated; NV12, NV21 and NV24 are returned as raw planes, shape (rows of all
+      planes, width).
+    * `CompressedImage`, also Foxglove's: shape (height, width) or (height, width, 3 or 4), red
+      first. `compressedDepth` gives the depth image: uint16 millimetres or float32 metres (NaN for
+      missing measurements).
+    * `LaserScan`: shape (n,), fields `range` (metres), `intensity` (if present) and `angle`
+      (radians), float32. Ranges without an intensity have NaN. `MultiEchoLaserScan` has a row for
+      each echo, beam after beam, and `echo`, its number.
+    * `PointCloud2`: shape (width,) or, for an organised cloud, (height, width), with the cloud's
+      own fields, which may overlap; `PointCloud`: shape (n,), `x`, `y`, `z` and the channels, NaN
+      where a channel ends early.
     * `foxglove.LaserScan` and `foxglove.PointCloud`, also of `foxglove_msgs`: the same.
 
-    An empty image, picture or cloud is an empty array. A step of 0 means rows without
-    padding. Images and `PointCloud2` clouds are views of the message's data, without a copy.
-
-    Args:
-        type_name: `sensor_msgs/Image` or `sensor_msgs/msg/Image`.
-        message: The decoded message, its fields as attributes or, from JSON, as a dict.
-
-    Raises:
-        PayloadError: the type is none of these, or the sizes, the encoding or the
-            fields do not fit the data.
-        MissingDependencyError: Pillow is required and not installed.
+    An empty image, picture or cloud is an empty array. A step of 0 means rows without padding.
+    Images and `PointCloud2` clouds are views of the message's data, without a copy. The message has
+    its fields as attributes or, from JSON, is a dict.
     """
     maker = _MAKERS.get(plain_type(type_name))
     if maker is None:
@@ -155,11 +146,7 @@ def _compressed_image(message: Any) -> NDArray[Any]:
 
 
 def depth_picture(form: str, data: bytes) -> bytes | None:
-    """The PNG in a `compressedDepth` image if its values are the depth, uint16 millimetres.
-
-    Raises:
-        PayloadError: no PNG is in it.
-    """
+    """The PNG in a `compressedDepth` image if its values are the depth, uint16 millimetres."""
     if not data:
         return data
     if len(data) < _DEPTH_HEADER.size or "rvl" in form.lower():

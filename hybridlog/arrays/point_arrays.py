@@ -67,13 +67,9 @@ def _scan(
     intensities: Any,
     echoes: NDArray[np.intp] | None = None,
 ) -> NDArray[Any]:
-    """One row for each range.
+    """One row for each range (m, at an angle in rad); there may be fewer intensities, or none.
 
-    Args:
-        angles: Of each range, rad.
-        ranges: m.
-        intensities: As many, fewer, or none.
-        echoes: The number of each range among the echoes of its beam.
+    `echoes` are numbers of the ranges among the echoes of their beams.
     """
     columns: dict[str, Any] = {"range": ranges}
     if len(intensities):
@@ -128,16 +124,9 @@ def _foxglove_cloud(message: Any) -> NDArray[Any]:
 def _point_dtype(
     fields: Sequence[tuple[Any, Any, Any, Any]], types: Mapping[int, str], step: int, order: str
 ) -> np.dtype[Any]:
-    """The structure of one point.
+    """The structure of one point of `step` bytes, in a byte order as numpy spells it.
 
-    Args:
-        fields: Name, type, offset and count of each.
-        types: Types by their number.
-        step: Bytes of a point.
-        order: Byte order, as numpy spells it.
-
-    Raises:
-        PayloadError: a field has an unknown type, or lies outside the point.
+    Of each field there are name, type, offset and count; `types` are by their number.
     """
     if len(fields) > MAX_FIELDS:
         raise PayloadError(f"a point cloud has more than {MAX_FIELDS} fields")
@@ -205,14 +194,7 @@ POINT_MAKERS: Final[Mapping[str, Callable[[Any], NDArray[Any]]]] = {
 
 
 def positions(points: NDArray[Any]) -> NDArray[np.float64]:
-    """Positions of points: float64[..., 3], m; those of a scan in its plane.
-
-    Args:
-        points: Records with `x`, `y` and `z`, or with `range` and `angle`.
-
-    Raises:
-        PayloadError: They are no points.
-    """
+    """Positions of points: float64[..., 3], m; those of a scan in its plane."""
     names = points.dtype.names or ()
     if {"x", "y", "z"} <= set(names):
         return np.stack([points[axis].astype(np.float64) for axis in "xyz"], axis=-1)

@@ -14,11 +14,7 @@ _MAX_PIXELS = 1 << 26
 
 
 def pyav() -> Any:
-    """The module of PyAV.
-
-    Raises:
-        MissingDependencyError: It is not installed.
-    """
+    """The module of PyAV, or a `MissingDependencyError`."""
     try:
         import av
     except ImportError as error:
@@ -29,18 +25,10 @@ def pyav() -> Any:
 
 
 class VideoDecoder:
-    """Decodes the frames of a topic, the first of which is a key frame.
+    """Decodes the frames of a topic, of a form in `CODECS`; the first one is a key frame.
 
-    Args:
-        form: One of `hybridlog.arrays.bitstream.CODECS`.
-        in_order: Pictures come in the order in which they are shown, from `take`; else each
-            with its frame, from `decode`.
-
-    Attributes:
-        is_over: It cannot take further frames.
-
-    Raises:
-        MissingDependencyError: PyAV is not installed, or lacks the decoder.
+    If it is `in_order`, pictures come in the order in which they are shown, from `take`; else each
+    with its frame, from `decode`. One that `is_over` cannot take further frames.
     """
 
     def __init__(self, form: str, *, in_order: bool = False) -> None:
@@ -63,15 +51,9 @@ class VideoDecoder:
         self._context: Any = context
 
     def decode(self, form: str, data: bytes, *, is_wanted: bool) -> NDArray[Any] | None:
-        """Take the next frame.
+        """Take the next frame; returns its picture, red first, if it is wanted.
 
-        Args:
-            form: Its format.
-            data: Its bytes.
-            is_wanted: Return its picture, red first; without, None.
-
-        Raises:
-            PayloadError: It cannot be decoded, or does not follow the frames so far.
+        A `PayloadError` says that it cannot be decoded, or does not follow the frames so far.
         """
         number = self._count
         found = next((one for one in self.take(form, data) if one.pts == number), None)
@@ -90,10 +72,7 @@ class VideoDecoder:
     def take(self, form: str, data: bytes) -> list[Any]:
         """Take the next frame; returns the pictures of PyAV that are ready, as a rule its own.
 
-        Their `pts` is the number of their frame, from 0 on.
-
-        Raises:
-            PayloadError: It cannot be decoded, or does not follow the frames so far.
+        Their `pts` is the number of their frame, from 0 on. Errors are as of `decode`.
         """
         self.is_over = True  # unless all is well
         if form != self._form:
@@ -112,11 +91,7 @@ class VideoDecoder:
         return found
 
     def rest(self) -> list[Any]:
-        """The pictures that are held back, at the end.
-
-        Raises:
-            PayloadError: One cannot be decoded.
-        """
+        """The pictures that are held back, at the end."""
         self.is_over = True
         return self._decoded(None)
 

@@ -59,11 +59,10 @@ class _Pose(NamedTuple):
 
 
 class _Places(NamedTuple):
-    """The columns of a topic's messages that are in the frame of their header.
+    """Columns of a topic's messages that are in the frame of their header.
 
     Attributes:
-        poses: Those of a message.
-        lists: Those of the elements of lists, such as of a path, by the name of the list.
+        lists: Poses of the elements of lists, such as of a path, by the name of the list.
         stamp: Path of the time.
         frame: Path of the frame.
     """
@@ -84,7 +83,6 @@ class Points(NamedTuple):
     """The points of a message in the frame.
 
     Attributes:
-        message: The message.
         stamp: Its header stamp, or its log time without one, ns.
         points: Records with `x`, `y`, `z` (float64), and its further fields; any shape.
     """
@@ -98,10 +96,6 @@ def stream(planner: Planner) -> Iterator[pa.Table]:
     """The tables of an answer, see `frames.answer.stream`; in the frame of the question, if any.
 
     Scans and clouds are lists then, one for each field of their points.
-
-    Raises:
-        UsageError: The messages have neither points nor poses, or are of several topics.
-        TopicError: There is no such frame in a recording, or no transforms.
     """
     if planner.question.frame is None:
         return answer.stream(planner)
@@ -127,9 +121,6 @@ def points_of(session: Session, question: Question, counters: Counters) -> Itera
     """The points of messages in the frame of the question, in order.
 
     Messages that cannot be arrays are left out; `counters.unreadable` counts them.
-
-    Raises:
-        TopicError: There is no such frame in a recording, or no transforms.
     """
     looked = _Looked(session, question, counters)
     for run in Planner(session, replace(question, frame=None), counters).runs():
@@ -159,11 +150,7 @@ def points_of(session: Session, question: Question, counters: Counters) -> Itera
 
 
 class _Looked:
-    """Looks up transforms to the frame of a question, and counts what is missing.
-
-    Attributes:
-        target: The frame.
-    """
+    """Looks up transforms to the frame of a question, and counts what is missing."""
 
     def __init__(self, session: Session, question: Question, counters: Counters) -> None:
         self._session = session

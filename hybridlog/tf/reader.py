@@ -31,20 +31,13 @@ if TYPE_CHECKING:
 
 _STATIC: Final = "tf_static"
 _MAX_NORM_ERROR: Final = 1e-2
-"""How far the norm of a quaternion may be from 1; that of tf2."""
+"""Greatest distance of a quaternion's norm from 1; that of tf2."""
 
 
 def frame_tree(session: Session, recording: RecordingSummary, topics: Sequence[str]) -> FrameTree:
-    """The frames of one recording.
+    """The frames of one recording, by its topics, full names, that may have transforms.
 
-    Args:
-        session: The open store.
-        recording: The recording.
-        topics: Full names of topics that may have transforms. Those whose names end in
-            `tf_static` hold at all times.
-
-    Raises:
-        TopicError: No topic has transforms.
+    Those whose names end in `tf_static` hold at all times.
     """
     question = Question(tuple(topics), (recording.id,))
     types = {
@@ -72,11 +65,7 @@ def frame_tree(session: Session, recording: RecordingSummary, topics: Sequence[s
 def frames_and_stamps(
     session: Session, question: Question, counters: Counters
 ) -> tuple[list[str], NDArray[np.int64]]:
-    """The frames that the headers of a topic name, and its times.
-
-    Returns:
-        Names of frames, and int64[n]: header stamps, or log times without headers; ns.
-    """
+    """The frames that the headers of a topic name, and header stamps, or log times without, ns."""
     known = session.field_types(question.topics, question.recordings) or {}
     wanted = [name for name in ("header.stamp", "header.frame_id") if name in known]
     if "header.stamp" not in wanted:  # no message has to be read

@@ -116,10 +116,7 @@ def rotated(rotation: Floats, points: Floats) -> Floats:
 def interpolated(before: Transform, after: Transform, share: Floats) -> Transform:
     """Between pairs of transforms: straight translation, spherical rotation the shorter way.
 
-    Args:
-        before: n transforms.
-        after: n transforms.
-        share: float64[n], 0 for `before` and 1 for `after`.
+    The share is 0 for `before` and 1 for `after`.
     """
     part = share[:, None]
     translation = before.translation + part * (after.translation - before.translation)
