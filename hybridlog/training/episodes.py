@@ -82,19 +82,9 @@ def episodes(
 ) -> Iterator[Episode]:
     """The episodes of a part of a question: one for each recording and range in it.
 
-    An episode begins when all topics have a value. A frame has the last value of each topic
-    that is not later than it.
-
-    Args:
-        piece: The part: its name, recordings and range.
-        features: The features.
-        fps: Frames per second.
-        on_gap: What a gap in a topic does: see `OnGap`.
-        dropped: Collects the number of frames that are in no episode because of gaps, by part.
-
-    Raises:
-        UsageError: There is a gap that is refused, or a field is no number.
-        TopicError: A recording lacks a topic.
+    An episode begins when all topics have a value. A frame has the last value of each topic that is
+    not later than it. `dropped` collects the number of frames that are in no episode because of
+    gaps, by part.
     """
     name, query = piece
     for summary, (begin, end) in RangeResolver(query.session, query.question).spans():
@@ -262,11 +252,7 @@ def _refuse(
     times: dict[str, NDArray[np.int64]],
     is_old: dict[str, NDArray[np.bool_]],
 ) -> None:
-    """Say which gap is the first.
-
-    Raises:
-        UsageError: Always.
-    """
+    """Raise a `UsageError` that says which gap is the first."""
     first = {topic: int(np.argmax(old)) for topic, old in is_old.items() if old.any()}
     topic = min(first, key=first.__getitem__)
     own, moment = times[topic], int(grid[first[topic]])

@@ -48,12 +48,7 @@ _ACTIONS: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """Fields of a topic that are a part of a feature.
-
-    Attributes:
-        topic: The topic.
-        paths: Numbers, or arrays of numbers.
-    """
+    """Fields of a topic, numbers or arrays of numbers, that are a part of a feature."""
 
     topic: str
     paths: tuple[str, ...]
@@ -80,11 +75,7 @@ class FeatureMap:
         return tuple(dict.fromkeys([*parts, *self.images.values()]))
 
     def resolved(self, session: Session) -> FeatureMap:
-        """The map with full names of topics.
-
-        Raises:
-            TopicError: There is no such topic, or several.
-        """
+        """The map with full names of topics."""
         full = {name: session.resolve((name,))[0] for name in self.topics}
         if several := [name for name, found in full.items() if len(found) > 1]:
             raise TopicError(f"{several[0]} means several topics: {listed(full[several[0]])}.")
@@ -99,20 +90,12 @@ class FeatureMap:
 
     @classmethod
     def given(cls, features: str | Path | Mapping[str, Any]) -> FeatureMap:
-        """A map of plain values, or from a file.
-
-        Raises:
-            UsageError: It cannot be read, or is no map.
-        """
+        """A map of plain values, or from a file."""
         return cls.read(features) if isinstance(features, str | Path) else cls.of(features)
 
     @classmethod
     def read(cls, path: str | Path) -> FeatureMap:
-        """Read a map from a file.
-
-        Raises:
-            UsageError: It cannot be read, or is no map; says where and what to write.
-        """
+        """Read a map from a file; a `UsageError` says where it is wrong and what to write."""
         text = read_yaml(path, "map of features")
         try:
             return cls.of(parse_yaml(text), str(path))
@@ -121,11 +104,7 @@ class FeatureMap:
 
     @classmethod
     def of(cls, values: object, name: str = "the map") -> FeatureMap:
-        """A map of plain values.
-
-        Raises:
-            UsageError: They are no map; says where and what to write.
-        """
+        """A map of plain values; a `UsageError` says where they are wrong and what to write."""
         root = _mapping(values, name)
         if unknown := root.keys() - {"robot_type", "features", "images"}:
             _refuse(name, f"{min(unknown, key=str)!r} is none of robot_type, features, images")
@@ -181,11 +160,8 @@ def nearly_empty(query: Query) -> dict[str, int]:
 def proposed(query: Query, without: Collection[str] = ()) -> FeatureMap:
     """A map for the topics of a question, by their types.
 
-    Joint states and odometry become states, commands become actions, images of all encodings
-    and videos become images.
-
-    Raises:
-        UsageError: There are no such topics.
+    Joint states and odometry become states, commands become actions, images of all encodings and
+    videos become images. Without such topics there is a `UsageError`.
     """
     states: list[Source] = []
     actions: list[Source] = []

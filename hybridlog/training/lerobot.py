@@ -87,21 +87,10 @@ def write_lerobot(
     *,
     progress: Callable[[str, int], None] | None = None,
 ) -> LerobotReport:
-    """Write the episodes of a question as a training set.
+    """Write the episodes of a question as a training set, into a directory of its own.
 
-    Args:
-        query: The recordings and their range.
-        features: The features.
-        path: Directory of the set. The same export goes on where it was interrupted.
-        options: How.
-        progress: Called with the name of an episode and the number of its frames.
-
-    Raises:
-        UsageError: The directory has something else, there is a gap, or no episode.
-        TopicError: A topic is missing.
-        PayloadError: No picture can be shown.
-        MissingDependencyError: PyAV is not installed.
-        DiskFullError: No space left.
+    The same export goes on where it was interrupted. `progress` is called with the name of an
+    episode and the number of its frames.
     """
     pyav()
     features = features.resolved(query.session)
@@ -164,11 +153,7 @@ class _Assembly:
     """Puts the episodes of a set together.
 
     Attributes:
-        root: Directory of the set.
-        made: The episodes.
-        features: The features.
-        options: How.
-        plan: What determines the bytes of the set.
+        plan: Decides the bytes of the set.
         rows: Of the table of episodes.
         tasks: Numbers of the tasks.
     """
@@ -188,11 +173,7 @@ class _Assembly:
         self._check()
 
     def _check(self) -> None:
-        """All episodes must have the same columns and sizes.
-
-        Raises:
-            UsageError: They differ.
-        """
+        """Refuse episodes of different columns and sizes."""
         first = self.made[0]
         for other in self.made[1:]:
             for what, one, two in (

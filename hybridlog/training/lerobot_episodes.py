@@ -49,10 +49,10 @@ class LerobotOptions:
     Attributes:
         fps: Frames per second.
         episodes_by: `recording`, `mark`, or a predicate.
-        task: What the robot does, in words.
+        task: Activity of the robot, in words.
         task_topic: A topic that says it instead; its text at the begin of an episode counts.
         codec: Codec of the pictures.
-        on_gap: What a gap in a topic does.
+        on_gap: Effect of a gap in a topic.
     """
 
     fps: int
@@ -110,13 +110,7 @@ class WrittenEpisode:
 def write_episode(
     session: Session, episode: Episode, features: FeatureMap, options: LerobotOptions, place: Path
 ) -> WrittenEpisode:
-    """Write an episode; its description is written last.
-
-    Raises:
-        UsageError: A picture is missing, or of another size than those before.
-        PayloadError: No picture can be shown.
-        DiskFullError: No space left.
-    """
+    """Write an episode; its description is written last."""
     if place.exists():
         shutil.rmtree(place)
     place.mkdir()
@@ -237,11 +231,7 @@ class _Video:
             self._file.mux(packet)
 
     def finish(self, name: str) -> None:
-        """Complete the file.
-
-        Raises:
-            PayloadError: There is no picture.
-        """
+        """Complete the file; without any picture it is refused."""
         if self._track is None:
             raise PayloadError(f"{name} has no picture that can be shown")
         self._mux(None)
