@@ -50,15 +50,9 @@ def _matplotlib() -> Iterator[None]:
 
 
 def figure(found: Sequence[Line], *, size: tuple[int, int], form: str) -> bytes:
-    """A picture with axes for each topic, one below the other.
+    """A picture, `png`, `svg` or `pdf`, with axes for each topic, one below the other.
 
-    Args:
-        found: The lines, by topic.
-        size: Width and height, pixels.
-        form: `png`, `svg` or `pdf`.
-
-    Raises:
-        MissingDependencyError: matplotlib is not installed.
+    The lines are by topic, the size is width and height in pixels.
     """
     with _matplotlib():
         from matplotlib import rc_context
@@ -165,14 +159,7 @@ _MAX_NAMES = 8  # names in a message
 
 @dataclass(frozen=True)
 class Line:
-    """A field of a topic in a recording.
-
-    Attributes:
-        topic: Full name.
-        recording: Name.
-        start: Beginning of the recording, ns.
-        series: The values.
-    """
+    """A field of a topic in a recording, which starts at a time in ns."""
 
     topic: str
     recording: str
@@ -183,15 +170,8 @@ class Line:
 def lines(query: Query, fields: Sequence[str], *, pixels: int) -> list[Line]:
     """The fields of a query over time, by topic and recording; the query's counters are set.
 
-    Args:
-        query: Each of its topics has a line for each of the fields that it has.
-        fields: As for `series`.
-        pixels: Width of the picture.
-
-    Raises:
-        TopicError: no topic has such a field.
-        UsageError: no field, a field that is no number, `reverse`, or more than `MAX_LINES` lines.
-        TimeError: the range is outside all recordings.
+    Each of its topics has a line for each of the fields (as for `series`) that it has, `MAX_LINES`
+    at most in all.
     """
     if not fields:
         numbers = [name for one in _by_topic(query) for name in numbers_of(one)]
@@ -230,10 +210,7 @@ def _groups(
 ) -> Iterator[list[str]]:
     """The fields that a topic has, together; one by one where only messages tell.
 
-    Args:
-        query: About one topic.
-        fields: Paths.
-        missing: Gets the fields that it does not have.
+    `missing` gets those that it does not have.
     """
     if field_types(query) is None:
         yield from ([field] for field in fields)

@@ -24,13 +24,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Picture:
-    """An image as the content of a file.
-
-    Attributes:
-        media_type: Such as `image/png`.
-        suffix: Suffix of such a file, with the dot: `.png`.
-        data: Content of the file.
-    """
+    """An image as the content of a file, with a suffix (`.png`) and a type (`image/png`)."""
 
     media_type: str
     suffix: str
@@ -58,24 +52,16 @@ _DEEP_GREY: Final = b"\x10\x00"
 
 
 def picture(message: Message, *, raw: bool = True, form: Literal["png", "jpg"] = "png") -> Picture:
-    """An image message as a file.
+    """An image message, of one of the types `IMAGES`, as a file.
 
-    A compressed image is returned as it came; its bytes say what it is, not its `format`. The
-    depth image of `compressedDepth` is PNG with 16 bits, or with 8 from least to greatest
-    where it is of floats. An uncompressed image is encoded: YUV and Bayer patterns become
-    colours, and `mono16` and the like keep 16 bits in PNG; other values than `uint8` and
-    `uint16` are spread from least to greatest.
+    A compressed image is returned as it came; its bytes say what it is, not its `format`. The depth
+    image of `compressedDepth` is PNG with 16 bits, or with 8 from least to greatest where it is of
+    floats. An uncompressed image is encoded in the given form: YUV and Bayer patterns become
+    colours, and `mono16` and the like keep 16 bits in PNG; other values than `uint8` and `uint16`
+    are spread from least to greatest.
 
-    Args:
-        message: Its type is one of `hybridlog.arrays.message_arrays.IMAGES`.
-        raw: False for a picture that every browser shows, and that is for the eye: formats
-            which browsers lack are encoded anew, and 16 bits are spread over 8.
-        form: Format for what is encoded.
-
-    Raises:
-        PayloadError: it is no image, is empty, or does not fit its encoding.
-        DefinitionError: no usable definition exists.
-        MissingDependencyError: Pillow or PyAV is required and not installed.
+    One that is not `raw` is for the eye, and every browser shows it: formats which browsers lack
+    are encoded anew, and 16 bits are spread over 8.
     """
     kind = message.type.replace("/msg/", "/")
     if kind not in IMAGES:
@@ -92,13 +78,7 @@ def picture(message: Message, *, raw: bool = True, form: Literal["png", "jpg"] =
 
 
 def shown_pixels(message: Message, *, deep: bool = False) -> NDArray[Any]:
-    """The pixels of an image message, as `hybridlog.drawing.pixels.pixels` gives them.
-
-    Raises:
-        PayloadError: it is no image, is empty, or does not fit its encoding.
-        DefinitionError: no usable definition exists.
-        MissingDependencyError: Pillow or PyAV is required and not installed.
-    """
+    """The pixels of an image message, as `hybridlog.drawing.pixels.pixels` gives them."""
     image, encoding = message.to_numpy(), getattr(message.decode(), "encoding", "rgba8")
     shown = pixels(image, str(encoding), deep=deep)
     if not shown.size:
@@ -107,11 +87,7 @@ def shown_pixels(message: Message, *, deep: bool = False) -> NDArray[Any]:
 
 
 def _as_it_came(message: Any, *, raw: bool) -> Picture | None:
-    """A compressed image unchanged; None if it has to be encoded anew.
-
-    Raises:
-        PayloadError: its bytes are of no known format.
-    """
+    """A compressed image unchanged; None if it has to be encoded anew."""
     data, form = bytes(message.data), str(message.format)
     if "compressedDepth" in form:
         data = depth_picture(form, data) or b""
@@ -130,11 +106,7 @@ def _as_it_came(message: Any, *, raw: bool) -> Picture | None:
 
 
 def _check_size(data: bytes) -> None:
-    """Refuse a small file that would fill the memory of the program that shows it.
-
-    Raises:
-        PayloadError: it has more than `MAX_SHOWN` pixels.
-    """
+    """Refuse a small file that would fill the memory of the program that shows it."""
     try:
         from PIL import Image, UnidentifiedImageError
     except ImportError:

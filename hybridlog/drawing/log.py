@@ -22,12 +22,9 @@ _MAX_NAME: Final = 200
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """Fields of a message type that a log line shows.
+    """Fields of a message type that a log line shows: text, and name of the sender; empty for none.
 
-    Attributes:
-        text: Field with the text.
-        name: Field with the name of the sender; empty for none.
-        levels: Least numbers in the field `level` for each of `LEVELS`; empty for none.
+    `levels` are the least numbers in the field `level` for each of `LEVELS`; empty for none.
     """
 
     text: str
@@ -70,11 +67,7 @@ class Line:
 
 
 def kind_of(type_name: str) -> Kind:
-    """The fields of a type's messages that a log line shows.
-
-    Raises:
-        UsageError: they are no lines of a log.
-    """
+    """The fields of a type's messages that a log line shows; other types are refused."""
     kind = KINDS.get(type_name.replace("/msg/", "/"))
     if kind is None:
         raise UsageError(f"{type_name or 'This type'} is no text log; {', '.join(KINDS)} are.")
@@ -82,13 +75,10 @@ def kind_of(type_name: str) -> Kind:
 
 
 def filtered(query: Query, kind: Kind, level: str = "", text: str = "") -> Query:
-    """The lines of a log that pass some filters.
+    """The lines of a log, one topic of one recording, that pass some filters.
 
-    Args:
-        query: About one topic of one recording.
-        kind: Its kind of messages.
-        level: Least level, one of `LEVELS`; empty for all lines.
-        text: Characters that the text or the sender has, in any case; no regular expression.
+    The least level is one of `LEVELS`; the text or the sender has the characters of `text`, in any
+    case; no regular expression. An empty one lets all lines pass.
     """
     if level and kind.levels:
         query = query.where(f"level >= {kind.levels[LEVELS.index(level)]}")
@@ -103,15 +93,9 @@ def filtered(query: Query, kind: Kind, level: str = "", text: str = "") -> Query
 def lines(
     query: Query, kind: Kind, time: int, seq: int, count: int, *, before: bool = False
 ) -> list[Line]:
-    """The next lines behind one, or the last ones in front of it, in order.
+    """The next lines behind one, or the last ones in front of it, in order, of a `filtered` query.
 
-    Args:
-        query: As of `filtered`.
-        kind: As there.
-        time: Log time of that line, ns.
-        seq: Its arrival number; -1 for all lines of that time, too.
-        count: Most lines.
-        before: Those in front.
+    That line has a log time, ns, and an arrival number; -1 for all lines of that time, too.
     """
     beside = query.between(time, time + 1).where(f"_meta.seq {'<' if before else '>'} {seq}")
     rest = query.between(None, time) if before else query.between(time + 1)

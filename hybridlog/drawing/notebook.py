@@ -57,11 +57,8 @@ def message_html(
 ) -> str:
     """The fields of a message, nested ones with dots in their names.
 
-    Args:
-        title: The message in short.
-        fields: Its fields; None if it cannot be read.
-        problem: The reason why it cannot.
-        picture: A thumbnail as PNG; empty for none.
+    Fields are None if it cannot be read, and the problem says why. The picture is a thumbnail as
+    PNG; empty for none.
     """
     image = ""
     if picture:

@@ -22,32 +22,19 @@ _BAYER: Final = "bayer_"
 
 
 def thumbnail(image: NDArray[Any], encoding: str = "rgb8") -> bytes:
-    """A picture of at most `SIDE` pixels a side, as PNG; empty for an empty image.
-
-    Args:
-        image: As for `pixels`.
-        encoding: Encoding of the message.
-    """
+    """A picture of at most `SIDE` pixels a side, as PNG; empty for an empty image."""
     shown = pixels(image, encoding)
     step = max(1, -(-max(shown.shape[:2]) // SIDE))
     return png(np.ascontiguousarray(shown[::step, ::step])) if shown.size else b""
 
 
 def pixels(image: NDArray[Any], encoding: str = "rgb8", *, deep: bool = False) -> NDArray[Any]:
-    """The pixels of an image as grey or red, green and blue.
+    """The pixels of an image, as of `Message.to_numpy`, as grey or red, green and blue.
 
-    YUV is converted by ITU-R BT.601, Bayer patterns are interpolated. Values of other types
-    than `uint8` are spread between the least and the greatest finite one; missing ones (NaN)
-    are black.
-
-    Args:
-        image: Shape (height, width) or (height, width, channels), as of `Message.to_numpy`.
-        encoding: Encoding of the message.
-        deep: Keep values of `uint16` as they are, and transparency.
-
-    Returns:
-        Shape (height, width), (height, width, 3) or, if `deep`, (height, width, 4); uint8 or,
-        if `deep`, uint16.
+    YUV is converted by ITU-R BT.601, Bayer patterns are interpolated. Values of other types than
+    `uint8` are spread between the least and the greatest finite one; missing ones (NaN) are black.
+    Shape (height, width) or (height, width, 3), uint8. `deep` ones keep values of uint16 as they
+    are, and transparency: (height, width, 4).
     """
     encoding = encoding.strip().lower()
     if encoding in _PLANES:
@@ -147,11 +134,7 @@ _UP: Final = 2
 
 
 def png(pixels: NDArray[Any]) -> bytes:
-    """A PNG file.
-
-    Args:
-        pixels: Shape (height, width), or with 3 or 4 channels; uint8 or uint16; not empty.
-    """
+    """A PNG file of pixels, (height, width) or with 3 or 4 channels; uint8 or uint16; not none."""
     height, width = pixels.shape[:2]
     samples = (
         pixels.astype(pixels.dtype.newbyteorder(">"), copy=False).view(np.uint8).reshape(height, -1)

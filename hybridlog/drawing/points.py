@@ -66,20 +66,11 @@ class Points:
 def points(
     message: Message, *, values: Collection[str] | None = None, limit: int = MAX_POINTS
 ) -> Points:
-    """The points of a scan or cloud.
+    """The points of a scan or cloud, a message of sensor_msgs or Foxglove.
 
-    Points that are not finite, and ranges outside of those that the scanner can measure, are
-    left out.
-
-    Args:
-        message: `LaserScan`, `MultiEchoLaserScan`, `PointCloud2` or `PointCloud` of sensor_msgs,
-            or Foxglove's `LaserScan` or `PointCloud`.
-        values: Names of values of the points; None for all. Unknown names are left out.
-        limit: Maximum number of points. If there are more, every n-th is taken.
-
-    Raises:
-        PayloadError: the message has another type, no points, or sizes that do not fit its data.
-        DefinitionError: it has no definition.
+    Points that are not finite, and ranges outside of those that the scanner can measure, are left
+    out. Of more points than the limit, every n-th is taken. `values` are names of what is wanted of
+    each point; None for all, and unknown ones are left out.
     """
     kind = plain_type(message.type)
     if kind not in POINT_MAKERS:
@@ -140,11 +131,7 @@ def _drawn(decoded: Any, rows: NDArray[Any], values: Collection[str] | None, lim
 
 
 def _axes(rows: NDArray[Any]) -> list[NDArray[Any]]:
-    """x, y and z of the points of a cloud; one that lacks is 0.
-
-    Raises:
-        PayloadError: two lack, or one is not a single number.
-    """
+    """x, y and z of the points of a cloud; one that lacks is 0, two are refused."""
     names = rows.dtype.names or ()
     if not len(rows):
         return [np.zeros(0)] * 3
@@ -157,12 +144,7 @@ def _axes(rows: NDArray[Any]) -> list[NDArray[Any]]:
 
 
 def _posed(axes: list[NDArray[Any]], pose: Any) -> list[NDArray[Any]]:
-    """The points in the frame of the message.
-
-    Args:
-        axes: x, y and z in the frame of the pose.
-        pose: Pose in the frame of the message; None for the frame itself.
-    """
+    """The points in the frame of the message, which their pose is in; None for the frame itself."""
     if pose is None:
         return axes
     own = placed(pose)

@@ -67,10 +67,9 @@ class Series:
     exact: bool
 
     def by_column(self, columns: int) -> NDArray[np.float64]:
-        """Means of the middle between least and greatest, NaN for none, in order of time.
+        """Means of the middle between least and greatest, in so many columns; NaN for none.
 
-        Args:
-            columns: Number of columns; there are no more than entries.
+        There are no more columns than entries, which are in order of time.
         """
         columns = max(1, min(columns, len(self.times)))
         middle = (self.least / 2 + self.greatest / 2).astype(np.float64)
@@ -104,23 +103,13 @@ class Series:
 def series(
     query: Query, fields: Sequence[str], *, pixels: int, span: Span | None = None
 ) -> list[Series]:
-    """Fields of the messages of a query over log time.
+    """Fields of the messages of a query, of one topic of one recording, over log time.
 
-    Numbers become floating, true and false 1 and 0, times and durations nanoseconds. The
-    counters of the query are set to the cost.
-
-    Args:
-        query: About one topic of one recording.
-        fields: Paths of numbers (`ranges.min`, `position[2]`), or of messages with numbers
-            (`twist.linear`), which give a series for each.
-        pixels: Width of the picture. Up to twice as many messages are returned exactly.
-        span: Log time `[begin, end)` of the picture, ns; None for that of the messages.
-
-    Raises:
-        TopicError: no such field exists.
-        UsageError: several topics or recordings, `reverse`, no field, a field that is no
-            number, or no pixel.
-        TimeError: the range of the query is outside all recordings.
+    Numbers become floating, true and false 1 and 0, times and durations nanoseconds. Fields are
+    paths of numbers (`ranges.min`, `position[2]`), or of messages with numbers (`twist.linear`),
+    which give a series for each. `pixels` is the width of the picture: up to twice as many messages
+    are returned exactly. Its span is log time `[begin, end)`, ns; None for that of the messages.
+    The counters of the query are set to the cost.
     """
     if pixels < 1:
         raise UsageError(f"A picture is at least one pixel wide, not {pixels}.")
@@ -142,15 +131,7 @@ def series(
 def over_time(query: Query, fields: Sequence[str], span: Span | None) -> tuple[Query, Span]:
     """The query for some fields of one topic in one recording, and its part of a span.
 
-    Args:
-        query: The query.
-        fields: Paths.
-        span: Log time `[begin, end)`, ns; None for that of the messages.
-
-    Raises:
-        UsageError: several topics or recordings, or `reverse`.
-        TopicError: no such field exists.
-        TimeError: the range of the query is outside all recordings.
+    That is log time `[begin, end)`, ns; None for that of the messages.
     """
     if query.question.reverse:
         raise UsageError("Time runs from left to right here: leave out reverse.")
@@ -176,11 +157,7 @@ def numbers_of(query: Query) -> list[str]:
 
 
 def _check(wanted: Sequence[Wanted], known: Mapping[str, str]) -> None:
-    """Refuse fields that are known to be no numbers, before anything is read.
-
-    Raises:
-        UsageError: one is.
-    """
+    """Refuse fields that are known to be no numbers, before anything is read."""
     for one in wanted:
         kind = known.get(one.path)
         has_fields = any(path.startswith(f"{one.path}.") for path in known)
@@ -215,11 +192,7 @@ class Wanted:
 
     @classmethod
     def of(cls, text: str) -> Wanted:
-        """The field of a path.
-
-        Raises:
-            UsageError: it is none.
-        """
+        """The field of a path."""
         path, bracket, rest = text.partition("[")
         rest = bracket + rest
         found = list(_ACCESS.finditer(rest))
@@ -289,12 +262,7 @@ def _numbers_in_json(texts: Any) -> Any:
 
 
 def _read(tables: Iterable[pa.Table], wanted: Sequence[Wanted], rows: ShownRows) -> list[Series]:
-    """The series from tables of messages, which are in order.
-
-    Raises:
-        TopicError: a field does not exist.
-        UsageError: a field is no number.
-    """
+    """The series from tables of messages, which are in order."""
     names: list[dict[str, bool]] = [{} for _ in wanted]  # of columns, True for numbers
     for table in tables:
         columns: dict[str, Numbers] = {}
@@ -320,15 +288,11 @@ def log_times(table: pa.Table) -> NDArray[np.int64]:
 
 
 class ShownRows:
-    """Messages in order of time; of very many, those that a picture shows.
+    """Messages in order of time; of very many, more than `most`, those that a picture shows.
 
     Then a pixel has its first and its last message, those with the least and the greatest finite
-    value of each column, and one without, if it has any.
-
-    Args:
-        span: Log time `[begin, end)` of the picture, ns.
-        pixels: Number of pixels.
-        most: Messages that are not yet very many.
+    value of each column, and one without, if it has any. The span of the picture is log time
+    `[begin, end)`, ns.
 
     Attributes:
         times: int64[n], log times, ns.
@@ -454,10 +418,8 @@ class Field(NamedTuple):
 def fields_of(known: Mapping[str, str] | None, messages: Iterator[Message]) -> list[Field]:
     """Numbers, elements of short arrays and summaries of arrays, in the order of the definition.
 
-    Args:
-        known: Types of all fields by path; None where no definition fixes them, and those of
-            the first messages count.
-        messages: The messages; only the first ones are read.
+    Where no definition fixes the types of fields, those of the first messages count; only these are
+    read.
     """
     found = _observed(messages) if known is None else _defined(known, messages)
     return list(islice(found, MAX_FIELDS))

@@ -38,12 +38,7 @@ _LATEST: Final = np.iinfo(np.int64).max
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Lane:
-    """The messages of a topic in a recording over time.
-
-    Attributes:
-        times: int64[n], log times, ns, sorted.
-        exact: False where they are estimates.
-    """
+    """Log times, ns, of a topic's messages in a recording, sorted; estimates if not `exact`."""
 
     times: NDArray[np.int64]
     exact: bool
@@ -58,18 +53,11 @@ class Lane:
         return usual_period(self.times[rows + 1] - self.times[rows])
 
     def gaps(self, edges: NDArray[np.int64], whole: Span, period: float) -> NDArray[np.intp]:
-        """Runs of pixels without messages that last longer than is usual.
+        """Runs of pixels without messages longer than usual: the first one, and one past the last.
 
-        A gap that a picture shows is one of the recording, but for how exact its ends are; one
-        that is shorter than two pixels may not be shown.
-
-        Args:
-            edges: int64[p + 1], ns.
-            whole: Log time `[begin, end)` of the recording, ns.
-            period: The usual time from one message to the next, ns; 0 if unknown.
-
-        Returns:
-            intp[n, 2], first pixel and the one behind the last.
+        A gap that a picture shows is one of the recording, but for how exact its ends are; one that
+        is shorter than two pixels may not be shown. The edges of pixels, the whole recording and
+        the usual period are in ns; a period of 0 is unknown.
         """
         is_outside = (edges[1:] <= whole[0]) | (edges[:-1] >= whole[1])
         is_empty = np.concatenate([[False], (self.counts(edges) == 0) & ~is_outside, [False]])
@@ -100,16 +88,9 @@ def aligned(span: tuple[int, int], pixels: int) -> NDArray[np.int64]:
 def lane_of(
     session: Session, recording: RecordingEntry, topic: str, max_times: int = MAX_TIMES
 ) -> Lane:
-    """The messages of a topic.
+    """The messages of a topic, by its full name.
 
-    Args:
-        session: The open store.
-        recording: The recording.
-        topic: Full name.
-        max_times: Messages whose times are read; of more, those of a chunk are spread evenly.
-
-    Raises:
-        TopicError: The recording has no such topic.
+    At most so many times are read; of more, those of a chunk are spread evenly.
     """
     if topic not in (known := recording.messages_by_topic()):
         raise TopicError(f"{recording.name} has no topic {topic!r}.")
@@ -159,11 +140,9 @@ class Ticks:
 
 
 class Match(NamedTuple):
-    """A message that satisfies the predicate; matches are ordered as these tuples are.
+    """A message that satisfies the predicate: log time, ns since the epoch, and arrival number.
 
-    Attributes:
-        time: Log time, ns since the epoch.
-        seq: Arrival number in the recording.
+    Matches are ordered as these tuples are.
     """
 
     time: int
@@ -173,13 +152,8 @@ class Match(NamedTuple):
 class Matches:
     """The messages of one topic of one recording that satisfy a predicate, in memory.
 
-    A picture of them at any zoom reads nothing.
-
-    Args:
-        query: The question, without a time range, `limit` and `every`.
-
-    Raises:
-        ResourceError: There are more than `MAX_MATCHES`.
+    A picture of them at any zoom reads nothing. The query has no time range, `limit` and `every`;
+    more than `MAX_MATCHES` are refused.
     """
 
     def __init__(self, query: Query) -> None:
@@ -196,15 +170,7 @@ class Matches:
         return self._times.nbytes + self._seqs.nbytes + self._held.nbytes
 
     def ticks(self, span: Span, pixels: int) -> Ticks:
-        """Matches by pixel.
-
-        Args:
-            span: Log time `[begin, end)` of the picture, ns.
-            pixels: Width of the picture.
-
-        Raises:
-            UsageError: the span is empty, or there is no pixel.
-        """
+        """Matches by pixel of a picture of a span of log time, ns, not empty."""
         width = _pixel_width(span, pixels)
         found = self._times[slice(*np.searchsorted(placed(self._times), span))]
         place, begins, counts = np.unique(
@@ -215,16 +181,8 @@ class Matches:
     def bands(self, span: Span, pixels: int) -> NDArray[np.int64]:
         """The intervals in which the predicate holds, joined where a picture cannot tell.
 
-        Args:
-            span: Log time `[begin, end)` of the picture, ns.
-            pixels: Width of the picture.
-
-        Returns:
-            int64[n, 2], begin and end, ns since the epoch, in order; at most one more than
-            pixels. Those less than a pixel apart are one.
-
-        Raises:
-            UsageError: the span is empty, or there is no pixel.
+        They are int64[n, 2], begin and end, ns since the epoch, in order; at most one more than
+        pixels. Those less than a pixel apart are one.
         """
         width = _pixel_width(span, pixels)
         low = int(np.searchsorted(self._held[:, 1], span[0], "right"))
@@ -238,9 +196,7 @@ class Matches:
     def after(self, place: Match, count: int) -> list[Match]:
         """The first matches behind a place, in order, at most `count`.
 
-        Args:
-            place: A match, or a time with the arrival number -1; it is not among them.
-            count: Greatest number.
+        It is a match, or a time with the arrival number -1, and not among them.
         """
         begin = self.count_before(Match(place.time, place.seq + 1))
         return self._rows(begin, begin + count)

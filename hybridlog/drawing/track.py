@@ -31,13 +31,11 @@ _POSITIONS_PER_PIXEL = 6  # positions of a pixel at most
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """A local metric grid: east and north of an origin, on the ellipsoid of WGS 84.
+    """A local metric grid: east and north of an origin (degrees), on the ellipsoid of WGS 84.
 
     Lengths are right near the origin; 100 km away from it, they are wrong by a few percent.
 
     Attributes:
-        latitude: Of the origin, degrees.
-        longitude: Of the origin, degrees.
         east: Metres of a degree of longitude at the origin.
         north: Metres of a degree of latitude at the origin.
     """
@@ -109,11 +107,7 @@ class Position:
 
 
 def position_of(known: Mapping[str, str] | None) -> Position | None:
-    """The place of the position in the messages; None if they have none.
-
-    Args:
-        known: Types of their fields by path; None if no definition fixes them.
-    """
+    """The place of the position in messages with these types of fields; None if they have none."""
     if known is None:
         return Position("", is_geographic=True)
     for end, is_geographic in (("latitude", True), ("position.x", False)):
@@ -127,19 +121,12 @@ def position_of(known: Mapping[str, str] | None) -> Position | None:
 
 
 def track(query: Query, *, pixels: int, span: Span | None = None) -> Track:
-    """The positions of a topic, such as NavSatFix or Odometry, over log time.
+    """The positions of a topic of one recording, such as NavSatFix or Odometry, over log time.
 
     A message has a fix if its position is one and its `status.status`, if there is one, is not
-    negative. The counters of the query are set to the cost.
-
-    Args:
-        query: About one topic of one recording.
-        pixels: Steps of time. Up to six times as many messages are returned exactly.
-        span: Log time `[begin, end)`, ns; None for that of the messages.
-
-    Raises:
-        UsageError: several topics or recordings, no positions, `reverse`, or no pixel.
-        TimeError: the range of the query is outside all recordings.
+    negative. `pixels` are steps of time: up to six times as many messages are returned exactly. The
+    span is log time `[begin, end)`, ns; None for that of the messages. The counters of the query
+    are set to the cost.
     """
     if pixels < 1:
         raise UsageError("A track has at least one pixel.")
@@ -193,11 +180,7 @@ def _is_position(latitude: Numbers, longitude: Numbers) -> NDArray[np.bool_]:
 
 
 def _numbers(table: pa.Table, path: str) -> Numbers:
-    """A column, NaN for null, and for a column that is not there.
-
-    Raises:
-        UsageError: it has no numbers.
-    """
+    """A column, NaN for null, and for a column that is not there."""
     values = Wanted.of(path).columns(table).get(path, np.full(table.num_rows, np.nan))
     if values is None:
         raise UsageError(f"{path} is no number: only numbers can be drawn.")
@@ -210,15 +193,10 @@ def fix_of(message: Message, prefix: str = "") -> dict[str, Any]:
     * `latitude`, `longitude`: degrees; None for what is no number. `altitude`: m, None if unknown.
     * `has_fix`: False if the receiver says that it has none, or the position is none.
     * `status`: number that the receiver gives; None if the message has none.
-    * `ellipse`: half axes of the ellipse that holds the position with 95 %, m, and the angle of
-      the first one, rad from east to north; None if it is unknown.
+    * `ellipse`: half axes of the ellipse that holds the position with 95 %, m, and the angle of the
+      first one, rad from east to north; None if it is unknown.
 
-    Args:
-        message: A message with a latitude and a longitude.
-        prefix: Path in front of them, from `position_of`.
-
-    Raises:
-        UsageError: it has no position.
+    The prefix is from `position_of`.
     """
     fields: Any = message.fields
     inner = _inner(fields, prefix)
@@ -245,14 +223,7 @@ def fix_of(message: Message, prefix: str = "") -> dict[str, Any]:
 def pose_of(message: Message, prefix: str) -> dict[str, Any]:
     """The pose of a message: `time`, log time in ns; `x`, `y`, m; `heading`, rad from x to y.
 
-    What is no number or not there is None.
-
-    Args:
-        message: A message with a pose.
-        prefix: Path in front of `x`, from `position_of`.
-
-    Raises:
-        UsageError: it has no pose.
+    What is no number or not there is None. The prefix is from `position_of`.
     """
     inner = _inner(message.fields, prefix)
     if not {"x", "y"} <= inner.keys():

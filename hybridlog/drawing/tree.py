@@ -45,16 +45,9 @@ def tree(
 ) -> Node:
     """A part of a message, with what is below it as far as there is room.
 
-    Args:
-        message: The message.
-        path: Place of a field or an element at each level; empty for the whole message.
-        begin: First element, field or character.
-        count: Number of elements or fields, at most `MAX_SHOWN`; None for a few.
-
-    Raises:
-        PayloadError: the payload does not fit its definition.
-        DefinitionError: no usable definition exists.
-        UsageError: the message has no such part.
+    The path is the place of a field or an element at each level; empty for the whole message. From
+    its first element, field or character, `begin`, there are `count`, at most `MAX_SHOWN`; None for
+    a few.
     """
     value: Any = message.content()
     for place in path:
@@ -68,12 +61,7 @@ def tree(
 
 
 class _Walk:
-    """Makes the nodes of one answer.
-
-    Attributes:
-        nodes: Number of nodes that may still be made.
-        characters: Number of characters that they may still have.
-    """
+    """Makes the nodes of one answer; `nodes` and `characters` say how many may still be made."""
 
     def __init__(self) -> None:
         self.nodes = MAX_NODES
@@ -119,12 +107,7 @@ class _Walk:
 
 
 class _Plain(NamedTuple):
-    """A plain value.
-
-    Attributes:
-        type: Its type.
-        text: Its text.
-    """
+    """A plain value as text."""
 
     type: str
     text: str
