@@ -87,20 +87,11 @@ class Context:
             self.store = self._looks.store.snapshot()
 
     def recording(self, params: RequestParams) -> RecordingEntry:
-        """The recording that the parameter `recording` names by its id or name.
-
-        Raises:
-            TopicError: There is none.
-            UsageError: The parameter is missing.
-        """
+        """The recording that the parameter `recording` names by its id or name."""
         return self.store.entry(params.text("recording"))
 
     def query(self, recording: RecordingEntry, *topics: str) -> Query:
-        """A query about topics, by their full names, of one recording.
-
-        Raises:
-            TopicError: The recording has no such topic.
-        """
+        """A query about topics, by their full names, of one recording."""
         known = {channel.topic for channel in recording.channels}
         for topic in topics:
             if topic not in known:
@@ -108,12 +99,7 @@ class Context:
         return self.store.query(topics, [recording.id])
 
     def topic(self, params: RequestParams) -> tuple[RecordingEntry, Query]:
-        """The recording, and a query about its topic that the parameter `topic` names.
-
-        Raises:
-            TopicError: No such recording or topic exists.
-            UsageError: A parameter is missing or out of bounds.
-        """
+        """The recording, and a query about its topic that the parameter `topic` names."""
         recording = self.recording(params)
         return recording, self.query(recording, params.text("topic"))
 
@@ -156,10 +142,7 @@ Answer: TypeAlias = "Callable[[Context, RequestParams], Any]"
 def route(path: str, answer: Answer, turns: threading.Semaphore | None = None) -> Route:
     """A route that answers in a thread when it is its turn, and stops when the client has gone.
 
-    Args:
-        path: Path below the token.
-        answer: Works out the answer.
-        turns: Held by the answer in the place of the context's.
+    The path is that below the token; other turns take the place of the context's.
     """
 
     def answered(request: Request, given_up: threading.Event) -> Response:
@@ -219,13 +202,12 @@ def broken_response(_: Request, error: Exception) -> Response:
 
 @dataclass(frozen=True, slots=True)
 class Current:
-    """The message that is current at a time.
+    """The message that is current at a time: the last one not after it; None if there is none.
 
     Attributes:
-        message: The last message not after that time; None if there is none.
         time: Its log time, ns since the start of the recording; None without a message.
-        until: Log time of the next message; None if no later one is known. Both are texts, as
-            the page has no integers of 64 bits.
+        until: Log time of the next message; None if no later one is known. Both are texts, as the
+            page has no integers of 64 bits.
     """
 
     message: Message | None
@@ -250,10 +232,6 @@ def current(context: Context, params: RequestParams) -> Current:
     """The message of the parameters `recording`, `topic`, `at` and `seq`.
 
     Of several messages at that time, it is the last one whose arrival number is at most `seq`.
-
-    Raises:
-        TopicError: No such recording or topic exists.
-        UsageError: A parameter is missing or out of bounds.
     """
     recording, query = context.topic(params)
     start = start_of(recording)
@@ -314,14 +292,9 @@ _INTEGER: Final = re.compile(r"-?\d{1,19}", re.ASCII)
 
 
 class RequestParams:
-    """The parameters of one request.
+    """The parameters of one request, as in the URL; wrong and missing ones are refused.
 
-    Args:
-        parameters: As in the URL.
-        tag: Entity tag of the answer that the browser has already; None for none.
-
-    Attributes:
-        tag: That tag.
+    The entity tag is that of the answer that the browser has already; None for none.
     """
 
     def __init__(self, parameters: QueryParams, tag: str | None = None) -> None:
@@ -338,16 +311,7 @@ class RequestParams:
         return name in self._parameters
 
     def text(self, name: str, default: str | None = None, *, longest: int = 1024) -> str:
-        """A text.
-
-        Args:
-            name: Name of the parameter.
-            default: The text if it is not given; None if it must be.
-            longest: Greatest number of characters.
-
-        Raises:
-            UsageError: It is missing, too long, or given twice.
-        """
+        """A text, at most so long; without a default it must be given."""
         found = self._one(name)
         if found is None:
             return _missing(name) if default is None else default
@@ -356,11 +320,7 @@ class RequestParams:
         return found
 
     def texts(self, name: str, *, most: int, longest: int = 1024) -> list[str]:
-        """All values of a parameter that may be repeated.
-
-        Raises:
-            UsageError: There are more than `most`, or one is longer than `longest`.
-        """
+        """All values of a parameter that may be repeated, at most so many."""
         found = self._parameters.getlist(name)
         if len(found) > most:
             raise UsageError(f"{name} is given {len(found)} times, at most {most} are possible.")
@@ -369,28 +329,14 @@ class RequestParams:
         return found
 
     def word(self, name: str, words: Collection[str], default: str) -> str:
-        """One of some words.
-
-        Raises:
-            UsageError: It is none of them.
-        """
+        """One of some words."""
         found = self.text(name, default)
         if found not in words:
             raise UsageError(f"{name} is one of {', '.join(words)}.")
         return found
 
     def integer(self, name: str, least: int, most: int, default: int | None = None) -> int:
-        """A whole number between two bounds, both inclusive.
-
-        Args:
-            name: Name of the parameter.
-            least: Least value.
-            most: Greatest value.
-            default: The value if it is not given; None if it must be.
-
-        Raises:
-            UsageError: It is missing, no whole number, or out of bounds.
-        """
+        """A whole number between two bounds, both inclusive; without a default it must be given."""
         text = self._one(name)
         if text is None:
             return _missing(name) if default is None else default
@@ -399,40 +345,21 @@ class RequestParams:
         return int(text)
 
     def pixels(self) -> int:
-        """The width of the picture, from 1 to `MAX_PIXELS`.
-
-        Raises:
-            UsageError: It is missing or out of bounds.
-        """
+        """The width of the picture, from 1 to `MAX_PIXELS`."""
         return self.integer("pixels", 1, MAX_PIXELS)
 
     def offset(self, name: str) -> int:
-        """A time since the start of the recording, ns.
-
-        Raises:
-            UsageError: It is missing, no whole number, or out of bounds.
-        """
+        """A time since the start of the recording, ns."""
         return self.integer(name, -MAX_OFFSET, MAX_OFFSET)
 
     def moment(self, start: int) -> int:
-        """The time `at`, ns since 1970, cut to what is a time.
-
-        Args:
-            start: The time that offsets count from.
-
-        Raises:
-            UsageError: It is missing, no whole number, or out of bounds.
-        """
+        """The time `at`, ns since 1970, cut to what is a time; offsets count from `start`."""
         return min(max(start + self.offset("at"), 0), TIME_LIMIT - 1)
 
     def span(self, start: int) -> tuple[int, int]:
         """The range from `begin` to `end`, ns since 1970, cut to what is a time; never empty.
 
-        Args:
-            start: The time that offsets count from.
-
-        Raises:
-            UsageError: A bound is missing, no whole number or out of bounds, or it is empty.
+        Offsets count from `start`.
         """
         begin, end = self.offset("begin"), self.offset("end")
         if end <= begin:

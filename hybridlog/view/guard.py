@@ -38,10 +38,8 @@ _ONCE: Final = ("host", "origin")
 class Guard:
     """Refuses requests that are not the page's own.
 
-    Args:
-        app: The application behind it; it sees paths below the token.
-        rules: Who may ask, with a token and the port.
-        shared: Beginnings of paths below the token that pages of guests may read, too.
+    The application behind it sees paths below the token. Such paths that begin with one of `shared`
+    may be read by pages of guests, too.
     """
 
     def __init__(

@@ -81,11 +81,7 @@ def new_token() -> str:
 
 
 def listen(port: int) -> socket.socket:
-    """Take a port of the loopback interface; 0 for any that is free.
-
-    Raises:
-        UsageError: It cannot be used.
-    """
+    """Take a port of the loopback interface; 0 for any that is free."""
     # With the protocol named, asyncio sends answers at once and not with the next acknowledgement.
     listening = socket.socket(proto=socket.IPPROTO_TCP)
     try:

@@ -33,8 +33,6 @@ class PageQuestion:
     """A question about one recording.
 
     Attributes:
-        store: The store.
-        recording: The recording.
         topics: Full names; none for all.
         where: Predicate, empty for every message.
         within: Greatest distance in time of messages of other topics, empty without any.
@@ -49,13 +47,7 @@ class PageQuestion:
     span: Span | None
 
     def query(self) -> Query:
-        """Its messages.
-
-        Raises:
-            WhereError: The predicate cannot be parsed, or does not fit the fields.
-            UsageError: `within` is missing or in vain.
-            TimeError: The range is empty or outside of the recording.
-        """
+        """Its messages."""
         query = self.store.query(self._topics(), [self.recording.id])
         if self.span is not None:
             # First, so that conditions on other topics are asked in this range only.
@@ -79,13 +71,9 @@ class PageQuestion:
         }
 
     def around(self, distance: str) -> PageQuestion:
-        """The messages of all topics near the matches in time.
+        """The messages of all topics near the matches in time, at most a duration away.
 
-        Args:
-            distance: Greatest distance, a duration.
-
-        Raises:
-            UsageError: The predicate has conditions on other topics already, or there is none.
+        The predicate must have no conditions on other topics.
         """
         if len(self.topics) != 1 or not self.where or names_topics(self.where):
             raise UsageError(
@@ -153,13 +141,7 @@ def _topic_of(where: str) -> str | None:
 def question_of(context: Context, params: RequestParams) -> PageQuestion:
     """The question of a request, about all times.
 
-    Args:
-        context: The context.
-        params: Has `recording`, `topic`, repeated, `where` and `within`.
-
-    Raises:
-        TopicError: There is no such recording or topic.
-        UsageError: A parameter is missing or too long.
+    It has the parameters `recording`, `topic`, repeated, `where` and `within`.
     """
     recording = context.recording(params)
     topics = tuple(dict.fromkeys(params.texts("topic", most=MAX_TOPICS)))

@@ -26,19 +26,9 @@ _MAX_CONNECTIONS: Final = 256
 
 
 class ViewServer:
-    """A server for one open store; the port is taken when it is made.
+    """A server for one open store; the port of 127.0.0.1 (0 for a free one) is taken at once.
 
-    Args:
-        store: The store that is shown.
-        port: Port of 127.0.0.1; 0 for any that is free.
-        viewers: Foxglove may read selections as MCAP.
-        origins: So may pages of these origins.
-
-    Attributes:
-        url: The address of the page, with its token.
-
-    Raises:
-        UsageError: The port cannot be used.
+    Foxglove (`viewers`) and pages of `origins` may read selections as MCAP. The URL has the token.
     """
 
     def __init__(
@@ -93,10 +83,7 @@ _STATIC: Final = Path(__file__).parent / "static"
 def make_app(store: Store, rules: Admission) -> Guard:
     """The application, behind its guard.
 
-    Args:
-        store: The store that is shown.
-        rules: Who may ask. Their guests may read the routes below `mcap/`; without any, these
-            routes do not exist.
+    Guests of the rules may read the routes below `mcap/`; without any, these do not exist.
     """
     has_guests = rules.viewers or bool(rules.origins)
     names = (*ROUTES, "mcap") if has_guests else ROUTES

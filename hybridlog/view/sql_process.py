@@ -29,10 +29,7 @@ _T = TypeVar("_T")
 class SqlProcess:
     """Answers by one process, which starts when it is needed, and again when it has ended.
 
-    It ends with this object, or with the process that has it.
-
-    Args:
-        store: The open store; the process opens it for itself.
+    It ends with this object, or with the process that has it, and opens the store for itself.
     """
 
     def __init__(self, store: Store) -> None:
@@ -41,15 +38,10 @@ class SqlProcess:
         self._control: Connection[Any, Any] | None = None
 
     def ask(self, work: Callable[..., _T], *arguments: Any) -> _T:
-        """Call a function of a module in the process.
+        """Call a function of a module in the process, with a `Context` of it and further arguments.
 
-        Args:
-            work: It gets a `Context` of the process. It is given up when the caller is.
-            arguments: Further arguments, and the answer, are pickled.
-
-        Raises:
-            ResourceError: The process has ended twice.
-            HybridlogError: As the function raises it.
+        These and the answer are pickled. It is given up when the caller is; a process that ends
+        twice is an error.
         """
         for _ in range(2):
             with suppress(EOFError, ConnectionError):

@@ -44,12 +44,7 @@ _ONLY_READS: Final = ToolAnnotations(
 
 
 def serve(store: Store, seconds: float = MAX_SECONDS) -> None:
-    """Answer until standard input ends.
-
-    Args:
-        store: The store, opened to be read only.
-        seconds: Seconds that an answer may take.
-    """
+    """Answer until standard input ends, in so many seconds each; the store is only read."""
     make_server(store, seconds).run("stdio")
 
 
@@ -65,12 +60,7 @@ def make_server(store: Store, seconds: float = MAX_SECONDS) -> MCPServer:
 
 
 class _Answers:
-    """Answers of tools.
-
-    Args:
-        store: The store.
-        seconds: Seconds that an answer may take.
-    """
+    """Answers of tools, each in so many seconds."""
 
     def __init__(self, store: Store, seconds: float) -> None:
         self._process = SqlProcess(store)
