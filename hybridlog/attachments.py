@@ -98,7 +98,6 @@ class Extras(NamedTuple):
     Attributes:
         channels: Channels of its topics, also those without messages.
         attachments: Those from before the end of the time range, in the order of the log.
-        metadata: All metadata records.
         left_out: Number of attachments from behind the time range.
         problems: Reason for each metadata record that cannot be read.
     """
@@ -111,11 +110,7 @@ class Extras(NamedTuple):
 
 
 def attachments_of(session: Session, entry: RecordingEntry) -> list[StoredAttachment]:
-    """The attachments of a recording, in the order of the log.
-
-    Raises:
-        SegmentError: A segment is damaged.
-    """
+    """The attachments of a recording, in the order of the log."""
     if not entry.attachments:
         return []
     found: list[StoredAttachment] = []
@@ -137,21 +132,12 @@ def attachments_of(session: Session, entry: RecordingEntry) -> list[StoredAttach
 
 
 def metadata_of(session: Session, entry: RecordingEntry) -> list[StoredMetadata]:
-    """The metadata records of a recording's log, in their order.
-
-    Raises:
-        SegmentError: A segment is damaged.
-    """
+    """The metadata records of a recording's log, in their order."""
     return [read() for read in _metadata_records(session, entry)]
 
 
 def extras_of(session: Session, question: Question) -> Extras:
-    """Attachments and metadata records that belong to the answer of a question as a slice.
-
-    Raises:
-        SegmentError: A segment is damaged.
-        TimeError: The range is empty, or outside all recordings.
-    """
+    """Attachments and metadata records that belong to the answer of a question as a slice."""
     found = Extras([], [], [], 0, [])
     left_out = 0
     topics = set(question.topics)

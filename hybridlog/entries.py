@@ -93,7 +93,6 @@ class Misfit:
     Attributes:
         segment: Number in the file's name.
         file: Its name; empty for one that is missing.
-        reason: Description of the problem.
         is_unlisted: Whether it is a whole segment of this recording that the manifest lacks.
     """
 
@@ -109,13 +108,11 @@ class Inventory:
 
     Attributes:
         id: Id of the recording, which is the name of its directory.
-        path: The directory.
         listing: Names of its files; of several segments of one number, the listed one.
-        manifest: Its manifest; None without one.
         summaries: Summaries of valid segments, by number.
         misfits: Files that differ from the manifest.
-        lost: Listed segments that are missing or changed; of those that are gone, files of rows
-            of which nothing is believed.
+        lost: Listed segments that are missing or changed; of those that are gone, files of rows of
+            which nothing is believed.
     """
 
     id: str
@@ -231,7 +228,7 @@ def inventory_of(
 
 
 def _problem(size: int | None, wanted: int) -> str:
-    """What is wrong with a file of a size, None for a missing one; empty if nothing is."""
+    """The problem of a file of a size, None for a missing one; empty if there is none."""
     return "" if size == wanted else "is missing" if size is None else "has another size"
 
 
@@ -324,13 +321,10 @@ def describe(catalog: Catalog, inventory: Inventory, *, is_open: bool = False) -
 def described_of(
     entry: RecordingEntry, look: str, files: str, channels: Mapping[int, Channel] | None = None
 ) -> Described:
-    """The rows of a recording in the catalog.
+    """The rows of a recording in the catalog, with states of its directory and its files.
 
-    Args:
-        entry: Its entry, without marks that somebody set.
-        look: State of its directory.
-        files: State of its files.
-        channels: By id; None if the catalog has their definitions.
+    The entry has no marks that somebody set; channels are None if the catalog has their
+    definitions.
     """
     shown = with_marks(entry)
     return Described(entry, summary_of(shown, look), topic_types(shown), files, channels or {})
@@ -377,8 +371,7 @@ def summary_by(
 ) -> tuple[RecordingSummary, frozenset[TopicType]] | None:
     """The summary and the topics of a whole recording by its manifest.
 
-    Returns:
-        As of `summary_of` and `topic_types`; None if only its files say what is left.
+    They are as of `summary_of` and `topic_types`; None if only its files say what is left.
     """
     if not manifest.is_ended:
         return None
@@ -535,7 +528,7 @@ def lost_in_crash(manifest: Manifest, after: Sealed) -> list[truth.Loss]:
 
 
 def described(inventory: Inventory) -> Manifest:
-    """What the segments of a recording say of it, without its files."""
+    """The manifest that a recording's segments tell, without its files."""
     for _, summary in sorted(inventory.summaries.items()):
         said = summary.recording
         known = {name: said.get(name) for name in ("id", "name", "tags", "source", "created")}
@@ -710,7 +703,7 @@ def _listing_of(inventory: Inventory, numbers: Iterable[int]) -> Callable[[Manif
 
 
 def _rows_of(inventory: Inventory, number: int) -> tuple[File | None, Sequence[File]]:
-    """What the files of rows of a log say: its line of the manifest, and theirs."""
+    """The files of rows of a log tell its line of the manifest, and theirs."""
     name = inventory.listing.sealed[number]
     if not is_rows(name):
         return None, ()

@@ -196,9 +196,7 @@ class Message:
 class Documents:
     """The index documents of some messages, created together on first access.
 
-    Args:
-        channels: Channels by index, as in `batch.channel`.
-        batch: The messages.
+    Channels are by index, as in `batch.channel`.
     """
 
     def __init__(
@@ -219,12 +217,7 @@ class Documents:
         return document_of(self._bodies[row])
 
     def decoded(self, row: int) -> Decoded:
-        """The columns of one message.
-
-        Raises:
-            PayloadError: The payload does not fit its definition.
-            DefinitionError: There is no definition to read it by.
-        """
+        """The columns of one message."""
         codec = self._channels[int(self._batch.channel[row])].codec
         decoded = columns_of(codec, self._batch.take(slice(row, row + 1)))
         if decoded.unreadable:
@@ -232,11 +225,7 @@ class Documents:
         return decoded
 
     def refuse(self, row: int) -> NoReturn:
-        """Refuse a payload that is gone.
-
-        Raises:
-            PayloadError: Always.
-        """
+        """Refuse a payload that is gone."""
         from hybridlog.columns.left_rows import digest_in, with_rows
         from hybridlog.schema.left import missing_payload
 
@@ -255,12 +244,7 @@ class Documents:
 
 
 def messages_in(run: MessageRun, picture_of: PictureOf | None = None) -> Iterator[Message]:
-    """The messages of a run, in its order.
-
-    Args:
-        run: The run.
-        picture_of: Gives the pictures of frames of video; None where none are asked for.
-    """
+    """The messages of a run, in its order; with pictures of frames of video if asked for."""
     batch, channels = run.batch, run.channels
     documents = Documents(channels, batch)
     view = memoryview(batch.buffer)

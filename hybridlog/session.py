@@ -65,7 +65,7 @@ _Topics = tuple[tuple[str, ...], tuple[str, ...] | None]
 
 
 class Asked(Protocol):
-    """What is asked: an open store as it is at each question, or always at one moment."""
+    """The object of questions: an open store as it is at each, or always at one moment."""
 
     directory: StoreDirectory
 
@@ -80,10 +80,7 @@ class Session:
     recordings have flushed by then is read when it first asks about them. Where a file is gone, or
     another one, the newer state of its recording takes the place of the one of the moment.
 
-    Args:
-        shared: What all moments of the store share.
-        recordings: All recordings; running ones as they were at the last look.
-        resolved: Topics of patterns, as long as the topics are the same.
+    `resolved` has topics of patterns, as long as the topics are the same.
     """
 
     def __init__(
@@ -125,14 +122,7 @@ class Session:
         return self._recordings
 
     def look(self, recordings: Collection[str] | None = None) -> Snapshot:
-        """See what running recordings have flushed.
-
-        Args:
-            recordings: Their ids; None for all.
-
-        Returns:
-            All recordings of the moment.
-        """
+        """See what running recordings, some or all, have flushed; returns all recordings."""
         snapshot = self._recordings
         for place in snapshot.unfinished:
             summary = snapshot.summaries[place]
@@ -310,9 +300,7 @@ class Session:
     ) -> dict[str, str] | None:
         """Types of the fields of some topics, by path; None where no definition fixes them.
 
-        Args:
-            topics: Full names.
-            recordings: Ids; None for all.
+        Recordings are ids; None for all.
         """
         snapshot = self.look(recordings)
         places = snapshot.having(topics, recordings)
@@ -328,12 +316,7 @@ class Session:
     def having(
         self, topics: Sequence[str], recordings: Iterable[str | RecordingEntry] | None = None
     ) -> _Topics:
-        """Topics, and the ids of the recordings that have any of them.
-
-        Args:
-            topics: Full names.
-            recordings: Ids, names or entries; None for all.
-        """
+        """Topics, and the ids of the recordings, of some or all, that have any of them."""
         ids = None
         if recordings is not None:
             known = self._recordings.summaries
@@ -474,8 +457,7 @@ class Session:
     ) -> Iterator[tuple[Chunk, int]]:
         """Chunks that may hold the last message of some channels by a time, ns.
 
-        Yields:
-            A chunk, and the greatest log time, ns, that it or any later chunk may hold.
+        With each comes the greatest log time, ns, that it or any later chunk may hold.
         """
         spans = sorted(recording.spans_with(channels), key=lambda span: span[1])
         spans = [span for span in spans if span[1] <= latest]
@@ -499,11 +481,7 @@ class Session:
         return known[1]
 
     def chunk_table(self, recording: RecordingEntry, number: int) -> ChunkTable:
-        """The chunks of a segment of a recording.
-
-        Raises:
-            ChangedError: Its file is not that of the entry any more.
-        """
+        """The chunks of a recording's segment; a `ChangedError` if its file is another one."""
         try:
             return self.catalog.table(recording, number)
         except CatalogError:
@@ -546,14 +524,7 @@ class Session:
         place: ChunkPlace,
         count: Callable[[StoredChunk], None],
     ) -> StoredChunk:
-        """A chunk, from the cache if it is there. Its buffer is read-only.
-
-        Args:
-            recording: Its recording.
-            segment: Number of its segment.
-            place: Its position there.
-            count: Called with the chunk if it is read.
-        """
+        """A chunk, from the cache if it is there, else counted. Its buffer is read-only."""
 
         def read() -> StoredChunk:
             chunk = self.read_chunk(recording.id, segment, place)
@@ -568,10 +539,7 @@ class Session:
     def segment(self, recording: str, number: int) -> SegmentReader:
         """The reader of a segment of a recording, by its id. Thread safe.
 
-        Raises:
-            ChangedError: It has been let go, or is another file by now.
-            SegmentError: It cannot be opened.
-            TopicError: The recording is gone.
+        A `ChangedError` says that it has been let go, or is another file by now.
         """
         entry = self.entry(recording)
         if number in entry.flushed:
@@ -587,8 +555,7 @@ class Session:
     def hold(self, recording: RecordingEntry, segments: Iterable[int]) -> None:
         """Open segments that will be read, if a ring may let them go meanwhile.
 
-        Raises:
-            ChangedError: One has been let go.
+        A `ChangedError` says that one has been let go.
         """
         numbers = [*map(int, recording.digests)]
         has_let_go = len(numbers) <= max(numbers, default=-1)
@@ -602,12 +569,7 @@ class Session:
         return now is not None and number not in now.logs and now.has_let_go(number)
 
     def read_chunk(self, recording: str, number: int, place: ChunkPlace) -> StoredChunk:
-        """Read a chunk of a segment of a recording, by its id.
-
-        Raises:
-            SegmentError: It is damaged.
-            TopicError: The recording is gone.
-        """
+        """Read a chunk of a segment of a recording, by its id."""
         return self._read(recording, number, lambda reader: reader.read_chunk(place))
 
     def _read(self, recording: str, number: int, read: Callable[[SegmentReader], _T]) -> _T:
@@ -618,11 +580,9 @@ class Session:
             raise
 
     def _check_same(self, entry: RecordingEntry, number: int, *, reads: bool = True) -> None:
-        """See whether a segment that cannot be read is another file by now.
+        """Raise a `ChangedError` if a segment that cannot be read is another file by now.
 
-        Raises:
-            ChangedError: It is. Later questions to this moment are about the newer files.
-            TopicError: The recording is gone.
+        Later questions to this moment are about the newer files.
         """
         place = self._recordings.by_id.get(entry.id)
         look = None if place is None else self._recordings.summaries[place].look
@@ -662,7 +622,7 @@ class Session:
 
 
 def _file_in(entry: RecordingEntry, number: int) -> tuple[object, ...]:
-    """What tells a segment of a recording from a later file of its number."""
+    """Tells a segment of a recording from a later file of its number."""
     key = str(number)
     return entry.digests.get(key), entry.files.get(key), number in entry.flushed
 

@@ -1,4 +1,4 @@
-"""What all moments of an open store share: the catalog, open files, caches."""
+"""All that moments of an open store share: the catalog, open files, caches."""
 
 from __future__ import annotations
 
@@ -41,10 +41,9 @@ _MAX_OPEN_SEGMENTS = 256
 
 
 class Shared(ABC):
-    """What all questions to one open store share. Thread safe for reading.
+    """All that questions to one open store share. Thread safe for reading.
 
     Attributes:
-        directory: The store's directory.
         index: The index in MongoDB, an `IndexAccess`.
         repairs: Repairs made when the store was opened.
         cache: What was read or worked out; chunks of single messages are a kind of it.
@@ -204,7 +203,7 @@ class Shared(ABC):
             return reader
 
     def rows(self, entry: RecordingEntry) -> RecordingRows:
-        """What is left of logs that are gone, shared by all of a recording as it is now."""
+        """Rows of logs that are gone, shared by all of a recording as it is now."""
         with self._opening:
             return self._rows_of(entry)
 

@@ -47,12 +47,8 @@ def _columns_of(summaries: Sequence[RecordingSummary], topics: Iterable[str]) ->
 class Snapshot:
     """The summaries of all recordings. Unchangeable, so it is safe for many threads.
 
-    Args:
-        summaries: In any order.
-        topics: Topics and their types, by the hash that summaries have.
-
-    Attributes:
-        summaries: Oldest log time first, empty recordings last.
+    They are by log time, oldest first, empty recordings last; topics and their types are by the
+    hash that summaries have.
     """
 
     def __init__(
@@ -103,13 +99,7 @@ class Snapshot:
         topics: Mapping[str, Collection[TopicType]],
         gone: Collection[str] = (),
     ) -> Snapshot:
-        """All recordings, some of them as they are now.
-
-        Args:
-            changed: Summaries of recordings that are new, or have changed.
-            topics: Their topics and types, by hash.
-            gone: Ids of recordings that are gone.
-        """
+        """All recordings, some of them as they are now; topics are by hash."""
         changed = sorted(changed, key=_order)
         same = {*gone, *(one.id for one in changed)} & self.by_id.keys()
         places = sorted((self.by_id[recording] for recording in same), reverse=True)
@@ -234,29 +224,17 @@ class Snapshot:
         return np.intersect1d(found, np.array(own, np.intp))
 
     def between(self, places: NDArray[np.intp], begin: int, end: int) -> NDArray[np.intp]:
-        """Those of some recordings that overlap a range of log time.
-
-        Args:
-            places: Their positions.
-            begin: Begin of the range, ns.
-            end: End of the range, ns, exclusive.
-        """
+        """Those of some recordings that overlap the log time `[begin, end)`, ns."""
         if begin >= end:
             return places[:0]
         low, high = (max(min(bound, _LATEST), -_LATEST) for bound in (begin, end))
         return places[(self.begin[places] < high) & (self.end[places] > low)]
 
     def during(self, places: NDArray[np.intp], begin: int, end: int, now: int) -> NDArray[np.intp]:
-        """Those of some recordings that overlap a range of log time.
+        """Those of some recordings that overlap the log time `[begin, end)`, ns.
 
         A recording that is being written begins with its first known message, or when it was
         started, and reaches until now.
-
-        Args:
-            places: Their positions.
-            begin: Begin of the range, ns.
-            end: End of the range, ns, exclusive.
-            now: The present time, ns.
         """
         first, last = self.begin[places], self.end[places]
         is_written = np.array([self.summaries[p].status == "open" for p in places], np.bool_)

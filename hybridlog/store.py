@@ -179,7 +179,7 @@ def _session_of(address: str | Path, mongo: str | None) -> Session:
 
 @contextmanager
 def _target(to: str | Path, options: CopyOptions, store: Store) -> Iterator[Target]:
-    """Where recordings of a store are copied to."""
+    """The place that recordings of a store are copied to."""
     from hybridlog.follow.follower import make_tables
     from hybridlog.maintenance.copying import Target
     from hybridlog_storage.copy_places import BucketStore, Directory
@@ -222,11 +222,7 @@ def _target(to: str | Path, options: CopyOptions, store: Store) -> Iterator[Targ
 
 
 def _local(to: str | Path) -> Path:
-    """The directory to copy to.
-
-    Raises:
-        UsageError: It is written like a place elsewhere.
-    """
+    """The directory to copy to; one that is written like a place elsewhere is refused."""
     found = _ELSEWHERE.fullmatch(str(to))
     if found is not None and (found[1].startswith("/") or not os.path.lexists(to)):
         raise UsageError(
@@ -295,11 +291,7 @@ class Store:
         return self._source.now()
 
     def _to_change(self) -> OpenStore:
-        """What is open of the store, which is about to be changed.
-
-        Raises:
-            UsageError: This is a snapshot, or the store was opened before this process was forked.
-        """
+        """The open store, about to be changed; a snapshot, or one of before a fork, is refused."""
         self.shared.check_process()
         if self._source is not self.shared:
             raise UsageError("A snapshot of a store only answers: change the store itself.")
@@ -878,7 +870,7 @@ class Store:
         )
 
     def _newest(self) -> Callable[[], Snapshot]:
-        """What tells all recordings as they are when one begins."""
+        """Tells all recordings as they are when one begins."""
         _ = self.session  # what a crash has left is mended before
         return self.shared.newest
 

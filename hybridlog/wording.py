@@ -48,11 +48,7 @@ def size(count: float) -> str:
 
 
 def parse_size(text: str) -> int:
-    """Bytes from `1MiB`, `500kB`, `65536`.
-
-    Raises:
-        UsageError: The text is no size.
-    """
+    """Bytes from `1MiB`, `500kB`, `65536`."""
     match = _SIZE.fullmatch(text)
     if match is None:
         raise UsageError(f"{text!r} is no size: write 65536, 500kB or 1MiB.")
