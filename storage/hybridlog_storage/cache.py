@@ -35,14 +35,7 @@ class Cache:
             return self._values[kind, *key][0]
 
     def put(self, kind: Kind, *key: Hashable, value: object, size: int) -> None:
-        """Keep a value, in place of the one of before; nothing if it is too large.
-
-        Args:
-            kind: Its kind.
-            key: All that it depends on.
-            value: The value.
-            size: Its bytes.
-        """
+        """Keep a value of `size` bytes in place of an older one; nothing if it is too large."""
         with self._lock:
             self._remove((kind, *key))
             if size > self.max_bytes:

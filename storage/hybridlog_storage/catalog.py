@@ -109,7 +109,7 @@ _STORED: Final[dict[str, Any]] = {
     "messages": 0, "payload_bytes": 0, "first": None, "last": None, "first_publish": None,
     "last_publish": None,
 }  # fmt: skip
-"""What a chunk table says without decoding."""
+"""Statistics that a chunk table has without decoding."""
 
 
 @dataclass(slots=True, repr=False)
@@ -255,10 +255,8 @@ def channel_totals(
 ) -> dict[int, ChannelStats]:
     """Statistics of the channels of a segment.
 
-    Args:
-        table: Its chunks.
-        decoded: Results of decoding, from `decoded_in`; None before the messages are decoded.
-        silent: Ids of channels without publish times.
+    `decoded` is from `decoded_in`, None before messages are decoded; `silent` has the ids of
+    channels without publish times.
     """
     names = ("channel", "messages", "payload_bytes", "first", "last")
     rows = table.by_channel()[[*names, "first_publish", "last_publish"]].tolist()
@@ -275,11 +273,7 @@ def channel_totals(
 
 
 def decoded_in(chunks: Iterable[Mapping[int, ChannelStats]]) -> dict[int, ChannelStats]:
-    """What decoding has found out of a segment, by the channels that its messages came on.
-
-    Args:
-        chunks: Statistics by channel, of each chunk that could be decoded.
-    """
+    """Join what decoding has found out of each chunk, by the channels that messages came on."""
     found: dict[int, ChannelStats] = {}
     sums = defaultdict[int, list[float]](list)
     for one in chunks:
@@ -294,15 +288,7 @@ def decoded_in(chunks: Iterable[Mapping[int, ChannelStats]]) -> dict[int, Channe
 
 @dataclass(frozen=True, slots=True)
 class Described:
-    """A recording, as read from its files.
-
-    Attributes:
-        entry: Its entry.
-        summary: Its summary.
-        topics: Its topics and their types.
-        files: State of the files; the row is used while it is unchanged.
-        channels: By id.
-    """
+    """A recording, as read from its files; used while `files`, their state, is unchanged."""
 
     entry: RecordingEntry
     summary: RecordingSummary
@@ -312,17 +298,10 @@ class Described:
 
 
 class Catalog:
-    """The catalog of a store. Thread safe.
+    """The catalog of a store; what is of another store is removed. Thread safe.
 
-    Args:
-        store: The store's directory.
-        store_id: The store's id; what is of another store is removed.
-        in_memory: Leave the file as it is, for a store that this user cannot write.
-        cells: Its cells, if they lie elsewhere.
-
-    Attributes:
-        is_in_memory: True if what is put into it stays in the memory of this process.
-        has_changed: True if an ended recording was changed by this process.
+    `in_memory` leaves the file as it is, for a store that this user cannot write; `cells` are given
+    if they lie elsewhere. `has_changed` says that this process has changed an ended recording.
     """
 
     def __init__(
@@ -365,9 +344,7 @@ class Catalog:
     def put(self, described: Described, *, waits: bool = True) -> None:
         """Insert or replace a recording.
 
-        Args:
-            described: The recording.
-            waits: False for a question, which does not wait for other processes.
+        A question has `waits=False`: it does not wait for other processes.
         """
         entry, summary = described.entry, described.summary
         if entry.status != "open":
@@ -400,10 +377,8 @@ class Catalog:
     ) -> None:
         """Note summaries that manifests have made, at once; no question waits for it.
 
-        Args:
-            summaries: Of whole recordings.
-            topics: Their topics and types, by hash.
-            is_change: Whether one differs, in more than its look, from what was known.
+        `topics` are by hash; `is_change` says that a summary differs, in more than its look, from
+        what was known.
         """
         if is_change:
             self._remove_recordings_file()
@@ -418,12 +393,7 @@ class Catalog:
         self._cells.write(statements, _NOTING_S)
 
     def put_indexed(self, recordings: Collection[str], index: str) -> None:
-        """Note that an index is complete for recordings, as long as they look the same.
-
-        Args:
-            recordings: Their ids.
-            index: The id of the index.
-        """
+        """Note that an index is complete for recordings, as long as they look the same."""
 
         def statements() -> Iterator[Statement]:
             for one in self.summaries(recordings):
@@ -440,14 +410,7 @@ class Catalog:
     def put_decoded(
         self, recording: str, number: int, digest: str, decoded: Mapping[int, ChannelStats]
     ) -> None:
-        """Store the results of decoding a segment.
-
-        Args:
-            recording: Id of its recording.
-            number: Its number.
-            digest: Its digest.
-            decoded: The results, from `decoded_in`.
-        """
+        """Store the results of decoding a segment, from `decoded_in`."""
         cell = put(_DECODED, recording, encode((digest, decoded)), number)
         self._cells.write(lambda: [cell], _BUSY_S)
 

@@ -45,7 +45,7 @@ _TROUBLES: Final = (
     sqlite3.SQLITE_PERM,
     sqlite3.SQLITE_PROTOCOL,
 )
-"""What is wrong with a disk or with other processes, not with the file."""
+"""Faults of a disk or of other processes, not of the file."""
 _T = TypeVar("_T")
 
 
@@ -70,16 +70,11 @@ def _is_whole(kind: Any, key: Any, number: Any, body: Any, crc: Any) -> bool:
 
 
 class Cells:
-    """Cells by kind, key and number. Thread safe.
+    """Cells by kind, key and number; in memory without a path. Thread safe.
 
-    Args:
-        path: The file; None for memory.
-        owner: The store; the file of another one is made again.
-        writes: False to leave the file as it is, and use a copy in memory.
-
-    Attributes:
-        lock: Held while cells are read or changed.
-        changes: Counts what was written here.
+    The file of another `owner`, a store, is made again. Without `writes` it stays as it is, and a
+    copy in memory is used. `lock` is held while cells are read or changed; `changes` counts what
+    was written here.
     """
 
     def __init__(self, path: Path | None, owner: str, *, writes: bool = True) -> None:
@@ -202,12 +197,7 @@ class Cells:
         return self._run(work)
 
     def write(self, make: Callable[[], Iterable[Statement]], wait_s: float = 0) -> None:
-        """Change cells.
-
-        Args:
-            make: Returns the statements, while no other process changes cells.
-            wait_s: Seconds to wait for another process.
-        """
+        """Change cells by the statements of `make`; meanwhile no other process changes any."""
 
         def work(opened: sqlite3.Connection) -> None:
             with _transaction(opened, wait_s):

@@ -33,11 +33,11 @@ Prepared = tuple[Manifest, "Source"]
 
 @dataclass(frozen=True, slots=True)
 class How:
-    """How recordings are copied.
+    """The way in which recordings are copied.
 
     Attributes:
-        prepare: Makes of a manifest, and of those of its logs that are to be sent, what is sent
-            in its place; None to send the files as they are.
+        prepare: Makes of a manifest, and of those of its logs that are to be sent, what is sent in
+            its place; None to send the files as they are.
         check: Prove what is there already, too, and send it again if it is wrong.
         limit_rate: Bytes a second, at most; None for no limit.
         named: Makes a free name there of the name here. Meanwhile nobody else begins a recording,
@@ -57,11 +57,10 @@ class How:
 
 @dataclass(slots=True)
 class Copied:
-    """What was copied.
+    """A recording after it was copied.
 
     Attributes:
         manifest: As it is there now.
-        is_new: Whether it was not there before.
         bytes: Of the files that were sent, or proved.
         sent: Paths of the files that were sent, below the recording.
         sent_bytes: Bytes of them, without those that an interrupted copy had sent.
@@ -81,16 +80,8 @@ class Copied:
 def copy(source: Source, target: Place, recording: str, how: How | None = None) -> Copied:
     """Copy a recording. What an interrupted copy has left is used by the next one.
 
-    Args:
-        source: The store that has it.
-        target: Where it goes.
-        recording: Its id.
-        how: How it is copied.
-
-    Raises:
-        RefusedError: It is damaged, or another recording there has its id; others can be copied.
-        RecordingGoneError: It is not here, or is being removed there.
-        HybridlogError: A store does not answer, or cannot be written; what was copied stays.
+    After a `RefusedError` (it is damaged, or another recording there has its id) others can be
+    copied; after any error, what was copied stays.
     """
     for attempt in range(_TRIES):
         here = source.manifests.read(recording)

@@ -63,13 +63,10 @@ class Sending:
     """A file that is sent.
 
     Attributes:
-        source: The store that has it.
-        recording: Id of its recording.
         file: Its path below its recording.
-        size: Its bytes.
-        digest: Of all of them, as the manifest has it.
-        count: Told of bytes that were sent, or were there already; waits if that is too fast,
-            and is a safe point.
+        digest: Of all its bytes, as the manifest has it.
+        count: Told of bytes that were sent, or were there already; waits if that is too fast, and
+            is a safe point.
         limit_rate: Bytes a second, at most; None for no limit.
     """
 
@@ -92,11 +89,7 @@ class Sending:
         return f"{RECORDINGS}/{self.recording}/.{self.digest[:32]}.part"
 
     def again(self, at: int = 0) -> Iterator[bytes]:
-        """Its bytes from one on.
-
-        Raises:
-            RefusedError: It cannot be read, or has another size.
-        """
+        """Its bytes from one on; `RefusedError` if it cannot be read, or has another size."""
         return self.source.pieces(self.name, at, self.size)
 
     def pieces(self, at: int = 0) -> Iterator[bytes]:
@@ -109,11 +102,7 @@ class Sending:
                 self.count(len(part), True)
 
     def checked(self) -> Iterator[bytes]:
-        """The same; the last ones only if all have the digest.
-
-        Raises:
-            RefusedError: They have not, or cannot be read.
-        """
+        """The same; the last ones only if all have the digest, else `RefusedError`."""
         found, last = hasher(), b""
         for piece in self.pieces():
             found.update(piece)
@@ -143,13 +132,10 @@ class Sending:
 
 
 class Place(ABC):
-    """A store that recordings are copied to.
+    """A store that recordings are copied to; `address` is what people call it.
 
-    Attributes:
-        address: What people call it.
-        manifests: Its manifests.
-        mends: Whether each copy looks for lost files, and makes a lost manifest again: not on a
-            server, where each look takes a while.
+    With `mends`, each copy looks for lost files, and makes a lost manifest again: not on a server,
+    where each look takes a while.
     """
 
     address: str
@@ -158,12 +144,7 @@ class Place(ABC):
 
     @abstractmethod
     def working(self, recording: str) -> AbstractContextManager[None]:
-        """Copy into a recording; where there are locks, nobody else does meanwhile.
-
-        Raises:
-            HeldError: Another process copies it.
-            HybridlogError: The place cannot be written or reached.
-        """
+        """Copy into a recording; where there are locks, nobody else does meanwhile: `HeldError`."""
 
     @abstractmethod
     def sees(self, name: str) -> bool:
@@ -171,19 +152,13 @@ class Place(ABC):
 
     @abstractmethod
     def sizes(self, recording: str) -> dict[str, int]:
-        """Bytes of each ordinary file of a recording, by path below it.
-
-        Raises:
-            HybridlogError: The place does not answer.
-        """
+        """Bytes of each ordinary file of a recording, by path below it."""
 
     @abstractmethod
     def send(self, sent: Sending) -> None:
         """Bring a file, and prove it; it takes the place of one of its name.
 
-        Raises:
-            RefusedError: It is damaged at the source.
-            HybridlogError: It cannot be written, or did not arrive.
+        A file that is damaged at the source raises `RefusedError`.
         """
 
     @abstractmethod
@@ -194,9 +169,7 @@ class Place(ABC):
     def is_whole(self, sent: Sending, *, reads: bool = False) -> bool:
         """True if a file that is there has the digest; it is on the disk then.
 
-        Args:
-            sent: The file.
-            reads: Believe no checksum that was worked out when the file arrived.
+        `reads`: believe no checksum that was worked out when the file arrived.
         """
 
 
@@ -205,17 +178,7 @@ class Source(Place):
 
     @abstractmethod
     def pieces(self, name: str, at: int, size: int) -> Iterator[bytes]:
-        """Bytes of a file.
-
-        Args:
-            name: Its path below the store.
-            at: The first one.
-            size: The bytes that it must have.
-
-        Raises:
-            RefusedError: It is missing, or has another size.
-            HybridlogError: The place does not answer.
-        """
+        """Bytes of a file below the store; `RefusedError` if it is missing, or has not `size`."""
 
     @contextmanager
     def opened(self, name: str, size: int) -> Iterator[int]:
@@ -233,11 +196,7 @@ class Source(Place):
 
 
 class Directory(Source):
-    """The directory of a store.
-
-    Args:
-        path: The store.
-    """
+    """The directory of a store."""
 
     def __init__(self, path: Path) -> None:
         self.address = str(path)
@@ -365,12 +324,7 @@ class Directory(Source):
 
 
 class BucketStore(Source):
-    """A store in a bucket.
-
-    Args:
-        bucket: The objects below its address.
-        manifests: Its manifests; None to ask for each of them.
-    """
+    """A store in a bucket; without `manifests`, each of them is asked for."""
 
     def __init__(self, bucket: Bucket, manifests: Manifests | None = None) -> None:
         self.address = bucket.address

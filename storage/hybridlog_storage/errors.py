@@ -37,10 +37,7 @@ def exhausted(number: int | None, doing: str) -> ResourceError | None:
 def unreadable(error: OSError, path: Path, subject: str = "") -> HybridlogError:
     """The error for a file or folder that cannot be read: a shortage, or a `StoreError`.
 
-    Args:
-        error: The system's error.
-        path: The file or folder.
-        subject: How the message calls it; by its path without one.
+    The message calls it `subject`, or by its path.
     """
     problem = f"{subject or path} cannot be read: {error.strerror}."
     return exhausted(error.errno, f"reading {path}") or StoreError(problem)

@@ -35,12 +35,7 @@ class lazy(Generic[_T]):  # noqa: N801 - a decorator
 
 
 class RowType:
-    """The type of rows with named numbers, which numpy takes as a `dtype`.
-
-    Attributes:
-        names: Names of the fields.
-        itemsize: Bytes of a row.
-    """
+    """The type of rows with named numbers, which numpy takes as a `dtype`."""
 
     def __init__(self, *fields: tuple[str, str]) -> None:
         self._fields = fields

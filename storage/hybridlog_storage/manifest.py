@@ -58,10 +58,8 @@ class Source(Record, frozen=True):
 
     Attributes:
         kind: Such as `rosbag1`.
-        path: Of the file.
         profile: As MCAP files state it, such as `ros2`.
         fingerprint: Of the content; two recordings of one file have the same.
-        bytes: The size of the file.
         parts: Fingerprints of its parts, if it is a log of several files.
         flush_interval_s: Longest time until a message is flushed, seconds; None for a file.
     """
@@ -79,15 +77,13 @@ class Channel(Record, frozen=True):
     """Messages of one topic, type and encoding.
 
     Attributes:
-        topic: Its topic.
         type: Name of the message type; empty without a definition.
         encoding: Of the messages, such as `cdr`.
         metadata: As the source states it.
         messages: All that the recording has had, those of files that are gone included, but not
             those that a ring has let go.
         bytes: The same, of payloads.
-        first: Log time of the first one, ns since the epoch; None without messages.
-        last: Of the last one.
+        first: Log time of the first one, ns since the epoch, as `last`; None without messages.
         schema: SHA-256 of name, encoding and text of the definition; empty without one.
     """
 
@@ -117,14 +113,11 @@ class File(Record, frozen=True):
     Attributes:
         number: Its number; blob references name it.
         group: Number of the group of files that was opened and sealed together.
-        name: Its name.
         kind: `log` has messages; `rows` has what is left of those of the log of its number once
             that is gone.
-        bytes: Its size.
         digest: BLAKE3 of its bytes.
         written: When it was sealed, ns since the epoch.
-        first: Log time of its first message, ns; None without messages.
-        last: Of its last message.
+        first: Log time of its first message, ns, as `last`; None without messages.
         parts: What it has of each channel.
         has_losses: Whether it has rows of the loss ledger.
         gone: Why the file is no longer here; absent while it is.
@@ -159,15 +152,7 @@ class Note(Record, frozen=True):
 
 
 class Mark(Record, frozen=True):
-    """A moment or a period of a recording that somebody named.
-
-    Attributes:
-        id: Its id.
-        time: Its log time, ns since the epoch.
-        text: What was said of it.
-        tags: Its tags.
-        end: Log time of its end; None for a moment.
-    """
+    """A moment of a recording that somebody named; a period, if it has an `end`. Times are ns."""
 
     id: Random
     time: Nanoseconds
@@ -177,14 +162,10 @@ class Mark(Record, frozen=True):
 
 
 class Pin(Record, frozen=True):
-    """Messages that no rule may delete.
+    """Messages that no rule may delete; users type the id.
 
-    Attributes:
-        id: Its id, which users type.
-        first: First log time, ns since the epoch; None from the beginning on.
-        last: Last log time; None up to the end.
-        topics: Topics whose files must stay; None for all.
-        reason: Why.
+    `first` and `last` are log times, ns since the epoch, None for no bound. Files of `topics` must
+    stay; None for all.
     """
 
     id: PinId
@@ -201,8 +182,7 @@ class Loss(Record, frozen=True):
         cause: One word, such as `transport`.
         topic: The topic; empty if unknown.
         count: Messages that are missing; None if unknown.
-        first: Beginning of the loss, ns since the epoch; None if unknown.
-        last: Its end.
+        first: Beginning of the loss, ns since the epoch, as its end, `last`; None if unknown.
         reason: An explanation for people.
         file: The damaged file; empty for messages that were never in one.
         offset: Where in the file, bytes.
@@ -221,12 +201,10 @@ class Loss(Record, frozen=True):
 
 
 class LetGo(Record, frozen=True):
-    """What a ring has let go of a recording.
+    """The messages that a ring has let go of a recording.
 
-    Attributes:
-        messages: How many messages.
-        through: The greatest number of a file that went. What has such a number or a smaller one
-            and is not listed is about to be deleted, or left over.
+    `through` is the greatest number of a file that went. What has such a number or a smaller one
+    and is not listed is about to be deleted, or left over.
     """
 
     messages: Count
@@ -238,20 +216,15 @@ class Manifest(Record, frozen=True):
 
     Attributes:
         id: Never changes; the files lie in `recordings/<id>`.
-        name: What people call it.
         created: When it began, ns since the epoch.
         changes: How many there have been.
-        status: `open` while it is recorded, or after its recorder died; `unproven` if it was
-            made again after it was lost; `removed` if its files are being deleted.
-        source: Where it comes from.
-        tags: Its tags.
-        notes: Its notes, in the order of writing.
+        status: `open` while it is recorded, or after its recorder died; `unproven` if it was made
+            again after it was lost; `removed` if its files are being deleted.
+        notes: In the order of writing.
         marks: Marks that somebody set, in this order; those of its recorder are messages.
         uncounted_marks: How many more there would be beyond `MAX_MARKS`.
-        pins: Its pins.
-        channels: Its channels by number.
-        files: Its files, in the order of writing.
-        losses: Its loss ledger.
+        channels: By number.
+        files: In the order of writing.
         cut_bytes: Bytes that were cut off after its recorder was killed: records not yet whole.
         damage: What else was wrong then, in words.
         let_go: What its ring has let go; None for nothing.
@@ -328,9 +301,8 @@ class Manifest(Record, frozen=True):
 def new_id(kind: str) -> str:
     """Draw the id of a recording.
 
-    Args:
-        kind: A word that its folder shows, such as the name of a file; other characters than
-            letters and digits become hyphens.
+    Its folder shows `kind`, such as the name of a file; other characters than letters and digits
+    become hyphens.
     """
     word = re.sub("[^a-z0-9]+", "-", kind.lower()).strip("-")[:40].strip("-")
     return "-".join(filter(None, (time.strftime("%Y%m%d"), word, new_random())))
@@ -369,12 +341,7 @@ def replace(part: _Part, **values: object) -> _Part:
 
 
 def state_of(manifest: Manifest, files: str) -> str:
-    """A hash of a manifest but for what people say of the recording, and of what files there are.
-
-    Args:
-        manifest: The manifest.
-        files: State of the files.
-    """
+    """A hash of a manifest but for what people say of the recording, and of its files' state."""
     said = {"tags": {}, "notes": (), "marks": (), "uncounted_marks": 0, "pins": ()}
     plain = replace(manifest, name="-", changes=0, **said)
     return blake3(json.encode(plain) + files.encode()).hexdigest()
@@ -426,15 +393,7 @@ def with_rows(manifest: Manifest, log: File, rows: Iterable[File]) -> Manifest:
 
 
 def rows_line(log: File, name: str, size: int, digest: str, parts: Mapping[int, Part]) -> File:
-    """The line of a file of rows.
-
-    Args:
-        log: The line of the log.
-        name: Name of the file.
-        size: Its bytes.
-        digest: BLAKE3 of them.
-        parts: What it has of each channel.
-    """
+    """The line of a file of rows of a log; `digest` is BLAKE3."""
     return replace(
         log,
         name=name,

@@ -67,26 +67,14 @@ class Manifests(ABC):
 
     @abstractmethod
     def ids(self) -> list[str]:
-        """Ids of all recordings that have a manifest, sorted; also of those being removed.
-
-        Raises:
-            HybridlogError: The store does not answer.
-        """
+        """Ids of all recordings that have a manifest, sorted; also of those being removed."""
 
     def without(self) -> list[str]:
-        """Ids of recordings that have lost their manifest, sorted; of none by default.
-
-        Raises:
-            HybridlogError: The store does not answer.
-        """
+        """Ids of recordings that have lost their manifest, sorted; of none by default."""
         return []
 
     def clear(self) -> None:
-        """Remove what is left of beginnings and removals of processes that were killed.
-
-        Raises:
-            HybridlogError: Something cannot be removed.
-        """
+        """Remove what is left of beginnings and removals of processes that were killed."""
         for one in self.ids():
             try:
                 self.find(one)
@@ -96,22 +84,13 @@ class Manifests(ABC):
                 continue  # it is told where it is asked about
 
     def read(self, recording: str) -> Manifest:
-        """The newest manifest of a recording.
-
-        Raises:
-            RecordingGoneError: There is no such recording.
-            ManifestError: The manifest is damaged.
-            HybridlogError: The store does not answer.
-        """
+        """The newest manifest of a recording; `RecordingGoneError` if there is none."""
         return _present(self._read(recording)[0])
 
     def find(self, recording: str) -> Manifest | None:
         """The newest manifest of a recording; None if there is no such recording.
 
-        Raises:
-            RecordingGoneError: It is being removed.
-            ManifestError: The manifest is damaged.
-            HybridlogError: The store does not answer.
+        One that is being removed raises `RecordingGoneError`.
         """
         try:
             found, _ = self._read(recording)
@@ -120,30 +99,16 @@ class Manifests(ABC):
         return _present(found)
 
     def each(self, recordings: Iterable[str]) -> Iterator[Manifest]:
-        """The newest manifests of some recordings, without those that cannot be read.
-
-        Raises:
-            HybridlogError: The store does not answer.
-        """
+        """The newest manifests of some recordings, without those that cannot be read."""
         for one in recordings:
             with suppress(StoreError):
                 yield self.read(one)
 
     def change(self, recording: str, how: Callable[[Manifest], Manifest]) -> Manifest:
-        """Replace a manifest.
+        """Replace a manifest by what `how` makes of the newest one; returns what it then is.
 
-        Args:
-            recording: Its id.
-            how: Makes the new manifest of the newest one, perhaps several times; if it returns
-                what it was given, nothing is written. What it raises ends the change.
-
-        Returns:
-            The manifest with the change.
-
-        Raises:
-            RecordingGoneError: There is no such recording, or it was removed meanwhile.
-            ManifestError: The manifest is damaged.
-            HybridlogError: It cannot be written; the old one is still there.
+        `how` may be called several times; if it returns what it was given, nothing is written. What
+        it raises ends the change. After an error the old manifest is still there.
         """
         return self._change(recording, lambda now: how(_present(now)))
 
@@ -154,27 +119,14 @@ class Manifests(ABC):
 
     @contextmanager
     def creating(self) -> Iterator[Callable[[Manifest], None]]:
-        """Create manifests; on a disk nobody else can create one meanwhile.
-
-        Raises:
-            RecordingExistsError: The recording exists.
-            HybridlogError: It cannot be written.
-        """
+        """Create manifests; on a disk nobody else can create one meanwhile."""
         yield self._create
 
     def restore(self, recording: str, make: Callable[[Manifest | None], Manifest]) -> Manifest:
-        """Make a manifest again that is lost or damaged.
+        """Make a manifest again that is lost or damaged; returns the one there if it can be read.
 
-        Args:
-            recording: Its id.
-            make: Makes it of the one before the last change, if there is one; nobody begins a
-                recording meanwhile.
-
-        Returns:
-            The manifest; the one that is there if it can be read.
-
-        Raises:
-            HybridlogError: It cannot be written.
+        `make` gets the one before the last change, if there is one; nobody begins a recording
+        meanwhile.
         """
         with self.creating() as create:
             with suppress(RecordingGoneError, ManifestError):
@@ -189,16 +141,7 @@ class Manifests(ABC):
     ) -> Manifest:
         """Remove a recording with all its files; finishes a removal that was interrupted.
 
-        Args:
-            recording: Its id.
-            check: Called with the newest manifest; raises to keep the recording.
-
-        Returns:
-            What it was.
-
-        Raises:
-            RecordingGoneError: There is no such recording.
-            HybridlogError: It cannot be changed, or something cannot be deleted.
+        `check` gets the newest manifest, and raises to keep the recording. Returns what it was.
         """
 
         def removed(now: Manifest) -> Manifest:
@@ -283,11 +226,7 @@ class Manifests(ABC):
 
 
 class DiskManifests(Manifests):
-    """The manifests of a store in a directory.
-
-    Args:
-        path: The store.
-    """
+    """The manifests of a store in a directory."""
 
     def __init__(self, path: Path) -> None:
         self._folder = path / MANIFESTS
@@ -346,7 +285,7 @@ class DiskManifests(Manifests):
                     yield _present(_decoded(one, files.read_in(fd, f"{one}{_SUFFIX}", MAX_BYTES)))
 
     def path(self, recording: str) -> Path:
-        """Where the manifest of a recording lies."""
+        """The path of the manifest of a recording."""
         return self._folder / f"{recording}{_SUFFIX}"
 
     def clear(self) -> None:
@@ -514,11 +453,7 @@ class DiskManifests(Manifests):
 
 
 class BucketManifests(Manifests):
-    """The manifests of a store in a bucket.
-
-    Args:
-        bucket: The objects below the address of the store.
-    """
+    """The manifests of a store in a bucket."""
 
     cure = "`hybridlog copy` from a store that has it brings it back."
 
@@ -639,7 +574,7 @@ def _opened(path: Path, flags: int) -> int:
 
 
 def _odd(path: Path) -> str:
-    """What is wrong with a file's place, or its folder, that is no file or folder; else empty."""
+    """The problem of a file's place or folder that is no file or folder; empty without one."""
     for place, fits in ((path.parent, stat.S_ISDIR), (path, stat.S_ISREG)):
         with suppress(OSError):
             if not fits(files.status(place).st_mode):

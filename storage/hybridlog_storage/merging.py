@@ -1,4 +1,4 @@
-"""What the manifest of a recording becomes where the recording is copied to.
+"""The manifest that a recording gets where it is copied to.
 
 Files, channels, losses and the status come with the copy; who copies from an older one takes
 nothing back. All that people said of the recording there stays, and so do its logs, which are
@@ -20,10 +20,8 @@ if TYPE_CHECKING:
 def wanted(here: Manifest, there: Manifest | None, *, awaited: bool = True) -> list[File]:
     """The logs that a copy lacks; of those that are gone here, the rows are sent.
 
-    Args:
-        here: The manifest of the source.
-        there: That of the copy so far; None if it is new.
-        awaited: Those, too, that were left for later.
+    `there` is the manifest of the copy so far, None if it is new; `awaited` adds those that were
+    left for later.
     """
     known = {} if there is None else there.logs
     return [
@@ -35,15 +33,9 @@ def wanted(here: Manifest, there: Manifest | None, *, awaited: bool = True) -> l
 
 
 def merged(here: Manifest, there: Manifest | None, brought: Collection[int]) -> Manifest:
-    """The manifest of a copy.
+    """The manifest of a copy; `there` is the one so far, None if it is new.
 
-    Args:
-        here: That of the source.
-        there: That of the copy so far; None if it is new.
-        brought: Numbers of the logs that are there now, whole, or with their rows.
-
-    Raises:
-        RefusedError: They are of two recordings.
+    `brought` has the numbers of the logs that are there now, whole, or with their rows.
     """
     if there is None:
         return here
@@ -74,11 +66,7 @@ def _messages(manifest: Manifest) -> int:
 
 
 def check_origin(here: Manifest, there: Manifest | None) -> None:
-    """Raise if two manifests of one id are not of one recording.
-
-    Raises:
-        RefusedError: They are not.
-    """
+    """Raise `RefusedError` if two manifests of one id are not of one recording."""
     if there is None:
         return
     logs, channels = there.logs, there.channels

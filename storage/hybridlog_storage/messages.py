@@ -231,11 +231,7 @@ class Batch:
 class LooseBatch:
     """Messages with a separate buffer each, to be joined once. All columns have length n.
 
-    Rows are in arrival order.
-
-    Attributes:
-        payloads: object[n], the buffer of each payload.
-        length: As in `Batch`, like the other columns.
+    Rows are in arrival order. `payloads` is object[n]; the other columns are as in `Batch`.
     """
 
     payloads: NDArray[np.object_]

@@ -13,11 +13,7 @@ if TYPE_CHECKING:
 
 
 def order_of(*keys: NDArray[Any]) -> NDArray[np.intp] | None:
-    """The order of rows; None if they are in order.
-
-    Args:
-        keys: The keys of each row, the most significant first.
-    """
+    """The order of rows by keys, the most significant first; None if they are in order."""
     is_tie = np.ones(max(len(keys[0]) - 1, 0), np.bool_)
     for key in keys:
         if (is_tie & (key[1:] < key[:-1])).any():
@@ -39,15 +35,9 @@ def distinct(values: NDArray[T]) -> NDArray[T]:
 
 
 def run_starts(values: NDArray[Any]) -> NDArray[np.intp]:
-    """Start of each run of equal values, ascending; of an empty array none.
+    """Start of each run of equal values, intp[k], ascending; of an empty array none.
 
     For few values this takes a fifth of the time of `np.diff`.
-
-    Args:
-        values: [n].
-
-    Returns:
-        intp[k], the first is 0.
     """
     changes = (values[1:] != values[:-1]).nonzero()[0]
     starts = np.zeros(len(changes) + min(len(values), 1), np.intp)
@@ -56,15 +46,7 @@ def run_starts(values: NDArray[Any]) -> NDArray[np.intp]:
 
 
 def run_lengths(starts: NDArray[np.intp], total: int) -> NDArray[np.intp]:
-    """Length of each run.
-
-    Args:
-        starts: intp[k], start of each run.
-        total: End of the last run.
-
-    Returns:
-        intp[k].
-    """
+    """Length of each run, intp[k]; `total` is the end of the last one."""
     lengths = np.empty(len(starts), np.intp)
     lengths[-1] = total
     lengths[:-1] = starts[1:]

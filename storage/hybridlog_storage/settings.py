@@ -52,9 +52,8 @@ class StoreSettings(Struct, frozen=True):
     """The content of `hybridlog.toml`.
 
     Attributes:
-        store_id: Random id of the store.
-        mongo: URI, without a password, of the MongoDB to use; `none` to use no MongoDB; None
-            for the embedded one.
+        mongo: URI, without a password, of the MongoDB to use; `none` to use no MongoDB; None for
+            the embedded one.
         arrays: Topics whose tables have arrays in full.
         cache_mb: Size of the embedded MongoDB's cache in MiB; None for the smallest one.
         retention: The table `[retention]`, as it stands there.

@@ -67,17 +67,10 @@ _LOOK: Final = "flock -w 9 . true && sha256sum < /dev/null > /dev/null && echo h
 
 
 class Server(Place):
-    """A store on a server. A context manager.
+    """A store on a server, `ssh://user@host:port/path`. A context manager.
 
-    Args:
-        url: `ssh://user@host:port/path`; `/~/path` is below the home directory.
-        ssh: The ssh program, with options; None for `ssh`.
-
-    Attributes:
-        has_shell: Whether it runs the programs that give a directory's promises.
-
-    Raises:
-        UsageError: It is no such URL.
+    `/~/path` is below the home directory. `ssh` is the ssh program, with options; None for `ssh`.
+    `has_shell` says that the server runs the programs that give a directory's promises.
     """
 
     mends = False
@@ -299,11 +292,8 @@ class Server(Place):
     ) -> list[str]:
         """Run commands in the folder of the store; what they print.
 
-        Args:
-            lines: The commands; those that begin with `-` may fail.
-            passed: A handle that a command reads.
-            watch: Called now and then with the id of the process; what it raises ends it.
-            options: Of the program.
+        Lines that begin with `-` may fail. `passed` is a handle that a command reads. `watch` is
+        called now and then with the id of the process; what it raises ends that.
         """
         root = self._root.replace("\\", "\\\\").replace('"', '\\"')
         script = "\n".join([f'-@mkdir "{root}"', f'@cd "{root}"', *map(_silent, lines), ""])
@@ -502,7 +492,7 @@ def _check_size(path: Path, most: int) -> None:
 
 
 def _text(file: IO[bytes]) -> str:
-    """What a program has printed."""
+    """The output of a program."""
     file.seek(0)
     return file.read(_MAX_SAID).decode(errors="replace")
 
@@ -515,11 +505,7 @@ def _reason(errors: IO[bytes]) -> str:
 
 
 def _quoted(name: str) -> str:
-    """A path below the store, as commands of sftp take it.
-
-    Raises:
-        RefusedError: They cannot.
-    """
+    """A path below the store, as commands of sftp take it; `RefusedError` if they cannot."""
     if not name.isprintable():
         raise RefusedError(f"sftp cannot send {name!r}: it has odd characters in its name.")
     escaped = re.sub(r'(["\\\\])', r"\\\1", name)
@@ -542,7 +528,7 @@ def _handle(fd: int) -> str:
 
 
 def _position(process: int, fd: int) -> int:
-    """How far a process has read an open file, if the system says."""
+    """The bytes that a process has read of an open file, if the system says."""
     folder, found = Path(f"/proc/{process}"), 0
     with suppress(OSError, ValueError):
         for one in (folder / "fd").iterdir():

@@ -112,11 +112,7 @@ _answer = _Answer()
 
 @contextmanager
 def until_given_up(given_up: threading.Event) -> Iterator[None]:
-    """Work out an answer in this thread until the event is set.
-
-    Raises:
-        GivenUpError: It was set.
-    """
+    """Work out an answer in this thread until the event is set: then `GivenUpError` is raised."""
     _answer.given_up = given_up
     try:
         yield
@@ -179,8 +175,7 @@ def pause(seconds: float) -> None:
 def postpone(action: Action) -> bool:
     """Have `action` called at the next safe point. For signal handlers.
 
-    Returns:
-        False outside of `at_safe_points`: the handler has to stop the process itself.
+    False outside of `at_safe_points`: the handler has to stop the process itself.
     """
     block = _block
     if block is None:

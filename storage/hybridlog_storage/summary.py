@@ -21,10 +21,7 @@ Int = Annotated[int, Meta(ge=-MAX_INT, le=MAX_INT)]
 class TopicType(NamedTuple):
     """A topic of a recording, and how its messages are encoded.
 
-    Attributes:
-        topic: Full name.
-        encoding: Encoding of the messages; empty if all messages of the topic are lost.
-        schema: Hash of the schema; empty without one.
+    `encoding` is empty if all messages of the topic are lost; `schema`, a hash, without one.
     """
 
     topic: str
@@ -33,27 +30,16 @@ class TopicType(NamedTuple):
 
 
 class RecordingSummary(NamedTuple):
-    """One recording in short.
+    """One recording in short; attributes without a description are as of `RecordingEntry`.
 
     Attributes:
-        id: As of `RecordingEntry`, like all attributes without a description here.
-        name: See there.
-        tags: See there.
-        source: See there.
-        created: See there.
-        status: See there.
         span: Log time `[first, last]`, ns, both inclusive; None without messages.
         extent: Log time `[begin, end)`, ns, with lost messages; `(0, 0)` without any.
         topics: Hash of its topics and their types; see `hash_of`.
-        topic_count: Number of its topics.
-        messages: Number of messages.
-        stored_bytes: See there.
-        segments: See there.
         has_losses: Whether its loss ledger has a row.
         has_lost_segments: Whether stored messages of it are missing.
         expired: Number of messages whose payloads were deleted to make room.
         not_copied: Number of messages whose payloads were not copied yet.
-        notes: See there.
         look: State of its directory and its manifest when its files were read.
         indexed_by: The id of the index that is known to be complete for it; empty if none is.
     """

@@ -47,12 +47,9 @@ def earlier(time: int, start: int = 0) -> Iterator[int]:
 
 
 def touches(windows: NDArray[np.int64], first: int, last: int) -> bool:
-    """True if any window reaches into the time from `first` to `last`.
+    """True if any window reaches into the time from `first` to `last`, ns.
 
-    Args:
-        windows: int64[n, 2], `[begin, end)`, ns, apart and in order.
-        first: First time, ns.
-        last: Last time, ns.
+    `windows` is int64[n, 2], `[begin, end)`, ns, apart and in order.
     """
     place = int(windows[:, 1].searchsorted(min(first, END - 1), "right"))
     return place < len(windows) and bool(windows[place, 0] <= last)

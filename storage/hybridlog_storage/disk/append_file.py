@@ -41,13 +41,7 @@ _REFUSED = {errno.EINVAL, errno.EOPNOTSUPP}
 
 
 class AppendFile:
-    """A file open for appending.
-
-    Args:
-        fd: The file; it is closed with this object.
-        position: Its length, bytes; 0 for direct writes.
-        direct: Whether it was opened for direct writes.
-    """
+    """A file open for appending, of `position` bytes: 0 for direct writes. It closes `fd`."""
 
     def __init__(self, fd: int, position: int = 0, *, direct: bool = False) -> None:
         self.position = position
@@ -61,11 +55,7 @@ class AppendFile:
 
     @classmethod
     def create(cls, path: Path) -> Self:
-        """Create a file of a recording.
-
-        Raises:
-            OSError: It exists, or cannot be made.
-        """
+        """Create a file of a recording."""
         flags = os.O_RDWR | os.O_CREAT | os.O_EXCL
         if DIRECT:
             try:
@@ -79,11 +69,7 @@ class AppendFile:
 
     @classmethod
     def reopen(cls, path: Path) -> Self:
-        """Open an existing ordinary file.
-
-        Raises:
-            OSError: It cannot be opened for writing, or is not an ordinary file.
-        """
+        """Open an existing ordinary file."""
         fd = files.open_file(path, os.O_RDWR)
         if not stat.S_ISREG(os.fstat(fd).st_mode):
             os.close(fd)
@@ -96,11 +82,7 @@ class AppendFile:
         return self._stage is not None
 
     def append(self, parts: Sequence[Buffer]) -> None:
-        """Append all parts; they are in the file when this returns.
-
-        Raises:
-            OSError: when the system refuses; the file is then as it was before.
-        """
+        """Append all parts; they are in the file when this returns, and none after an `OSError`."""
         before = self.position
         try:
             self._append(parts)
@@ -115,11 +97,7 @@ class AppendFile:
                 self._hasher.update(part)
 
     def digest(self) -> str:
-        """BLAKE3 of all bytes of the file, in hexadecimal digits.
-
-        Raises:
-            OSError: It has to be read, and the system refuses.
-        """
+        """BLAKE3 of all bytes of the file, in hexadecimal digits."""
         if self._hasher is None:
             self._hasher = blake3()
             for at in range(0, self.position, _STAGE):
@@ -151,11 +129,7 @@ class AppendFile:
         self._put(pieces)
 
     def room_before(self, content: Buffer, position: int) -> int:
-        """Bytes of padding that let large content be written without a copy.
-
-        Returns:
-            0 where padding does not help.
-        """
+        """Bytes of padding that let large content be written without a copy; 0 where none helps."""
         if self._stage is None or not _is_own(np.frombuffer(content, np.uint8)):
             return 0
         return -position % BLOCK
@@ -163,8 +137,7 @@ class AppendFile:
     def cut(self, position: int) -> None:
         """Truncate the file at a position. Later writes go through the page cache; they are few.
 
-        Raises:
-            OSError: when the system refuses; they overwrite what is behind it.
+        If the system refuses, they overwrite what is behind it.
         """
         self._stage = self._hasher = None
         self.position = position
@@ -174,11 +147,7 @@ class AppendFile:
         files.system.truncate(self._fd, position)
 
     def rewrite(self, position: int, data: Buffer) -> None:
-        """Overwrite bytes of the file; not for direct writes.
-
-        Raises:
-            OSError: when the system refuses; some of them may have been written by then.
-        """
+        """Overwrite bytes of the file, some also if it fails; not for direct writes."""
         assert self._stage is None
         assert position + len(data) <= self.position
         self._hasher = None
@@ -189,20 +158,12 @@ class AppendFile:
             pieces = left_over(pieces, done)
 
     def trim(self) -> None:
-        """Set the file's exact length.
-
-        Raises:
-            OSError: when the system refuses.
-        """
+        """Set the file's exact length."""
         if os.fstat(self._fd).st_size != self.position:
             files.system.truncate(self._fd, self.position)
 
     def finish(self, *, sync: bool) -> None:
-        """Set the file's exact length and close it.
-
-        Raises:
-            OSError: when the system refuses.
-        """
+        """Set the file's exact length and close it."""
         try:
             self.trim()
             if sync:

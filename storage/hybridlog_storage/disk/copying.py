@@ -43,11 +43,7 @@ def copy_payloads(batch: Batch, target: bytearray | memoryview, starts: NDArray[
 
 
 def joined(batches: Sequence[Batch]) -> Batch:
-    """Concatenate batches, with their whole buffers, over one new buffer.
-
-    Args:
-        batches: At least one; a single one is returned unchanged.
-    """
+    """Join batches, at least one, with whole buffers, over a new one; a single one is unchanged."""
     if len(batches) == 1:
         return batches[0]
     starts = accumulate((len(b.buffer) for b in batches), initial=0)
@@ -64,12 +60,7 @@ def joined(batches: Sequence[Batch]) -> Batch:
 
 
 def interleave(batches: Sequence[Batch], order: NDArray[np.intp]) -> Batch:
-    """Reorder the messages of several batches over one new buffer.
-
-    Args:
-        batches: At least one.
-        order: intp[n], row i of the result is row `order[i]` of the concatenated batches.
-    """
+    """Reorder messages over one new buffer: row i is row `order[i]` of the joined batches."""
     length = np.concatenate([b.length for b in batches])[order]
     ends = np.cumsum(length)
     offset = ends - length

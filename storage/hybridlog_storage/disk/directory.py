@@ -82,11 +82,9 @@ def listed_files(manifest: Manifest) -> list[ListedFile]:
 
 @dataclass(frozen=True, slots=True)
 class Holder:
-    """The process that holds a recording's lock, by its own account.
+    """The process that holds a recording's lock, by its own account; `name` is for messages.
 
-    Attributes:
-        name: Its id and its command, for messages.
-        is_recording: Whether it records, instead of changing an ended recording.
+    Unless `is_recording`, it changes an ended recording.
     """
 
     name: str
@@ -101,7 +99,6 @@ class Listing:
         sealed: Names of sealed segments, by number; of those that are gone, of their first file of
             rows once `choosing` has told.
         open: Names of segments that were never sealed, by number.
-        others: All other names.
         rows: Sizes of files of rows, by name.
         look: As of `StoreDirectory.looks`, before the names were read.
         print: A value that changes whenever a relevant file changes; of the manifest, see
@@ -155,18 +152,9 @@ class Listing:
 
 
 class StoreDirectory:
-    """A store's directory.
+    """A store's directory; with `read_only` it behaves as if this user could not write it.
 
-    Args:
-        path: The directory.
-        read_only: Behave as if this user could not write it.
-
-    Attributes:
-        manifests: The manifests of its recordings: all that they are.
-        is_remote: Whether it stands for a place in a bucket, see `remote.store`.
-
-    Raises:
-        StoreError: It is not a store, has another format, or cannot be read.
+    With `is_remote` it stands for a place in a bucket, see `remote.store`.
     """
 
     is_remote: ClassVar[bool] = False
@@ -187,10 +175,8 @@ class StoreDirectory:
     ) -> StoreDirectory:
         """Create a store, or open an existing one.
 
-        Args:
-            path: The directory.
-            mongo: URI of the MongoDB to use instead of the embedded one; without a password.
-            cache_mb: Size of the embedded MongoDB's cache in MiB; for a new store only.
+        `mongo` is the URI, without a password, of the MongoDB to use instead of the embedded one;
+        `cache_mb`, the size of the latter's cache in MiB, is for a new store only.
         """
         if path.exists() and not path.is_dir():
             raise StoreError(f"{path} is a file; a store is a directory. Choose another name.")
@@ -285,11 +271,8 @@ class StoreDirectory:
     def looks(self, ids: Sequence[str]) -> dict[str, str]:
         """The look of each recording, by id; those without a manifest are left out.
 
-        It changes whenever a file gets or loses its name, and when the manifest changes. A
-        change inside a segment shows only in `Listing.print`.
-
-        Args:
-            ids: From `ids`.
+        It changes whenever a file gets or loses its name, and when the manifest changes. A change
+        inside a segment shows only in `Listing.print`.
         """
         found: dict[str, str] = {}
         if not ids:
@@ -340,13 +323,8 @@ class StoreDirectory:
     ) -> Iterator[tuple[StoreDirectory, int]]:
         """A directory where files of a recording can be changed, within `writing`: this one.
 
-        Args:
-            recording: Its id.
-            segments: Numbers of the segments that are changed.
-            check: Called with the newest manifest before it is changed; raises to leave it.
-
-        Yields:
-            The directory, and a number for the names of new files of rows.
+        With it comes a number for the names of new files of rows. `segments` has the numbers of
+        those that are changed; `check` gets the newest manifest before, and raises to leave it.
         """
         yield self, 0
 
@@ -369,8 +347,7 @@ class StoreDirectory:
     def look_closely(self, recording: str | None = None) -> bool:
         """Look whether files are there; True if some are not. Here each question does.
 
-        Args:
-            recording: Id of one recording, all of which is read anew from then on; None for all.
+        All of a single recording is read anew from then on; None is for all recordings.
         """
         return False
 
@@ -461,18 +438,10 @@ class StoreDirectory:
     def writing(
         self, recording: str, name: str = "", *, wait_s: float = 0.0, records: bool = False
     ) -> Iterator[None]:
-        """Lock a recording for writing.
+        """Lock a recording for writing, else `HeldError`; `TopicError` if it is gone.
 
-        Args:
-            recording: Its id.
-            name: What people call it, for messages.
-            wait_s: Seconds to wait for another command that holds it. A recorder may hold it
-                for hours, so it is not waited for.
-            records: Whether this process records it.
-
-        Raises:
-            HeldError: Another process holds it.
-            TopicError: It is gone.
+        `wait_s` is for another command that holds it. A recorder may hold it for hours, so it is
+        not waited for.
         """
         begun, path = time.monotonic(), self.recording(recording) / LOCK
         while True:

@@ -62,12 +62,7 @@ def sync_file(fd: int) -> None:
 
 
 def publish(temporary: Path, final: Path) -> None:
-    """Durably give a synced file its final name.
-
-    Args:
-        temporary: The file; in the folder of `final`.
-        final: Its new name; a file of that name is replaced.
-    """
+    """Durably give a synced file its final name in its folder; a file of that name is replaced."""
     files.rename(temporary, final)
     files.sync_folder(final.parent)
 

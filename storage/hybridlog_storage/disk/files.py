@@ -137,13 +137,7 @@ def _is_in_store(path: Path) -> bool:
 
 
 def open_file(path: Path, flags: int, mode: int = 0o666) -> int:
-    """Open a file of a store; no symlink is followed, and no pipe is waited for.
-
-    Args:
-        path: The file.
-        flags: As of `os.open`.
-        mode: Permissions of a new file; the umask applies.
-    """
+    """Open a file of a store; no symlink is followed, and no pipe is waited for."""
     if not flags & _WRITES and (found := _mounted(path)) is not None:
         return found[0].open(found[1])
     with folder(path.parent) as fd:
@@ -151,12 +145,7 @@ def open_file(path: Path, flags: int, mode: int = 0o666) -> int:
 
 
 def read_file(path: Path, most: int) -> bytes:
-    """Read a small ordinary file.
-
-    Args:
-        path: The file.
-        most: Largest expected size; one more byte is read to notice larger files.
-    """
+    """Read a small ordinary file, up to `most` bytes and one more, to notice larger files."""
     return _content(open_file(path, os.O_RDONLY), most, path)
 
 
@@ -191,12 +180,8 @@ def write_file(
 ) -> None:
     """Write a small file atomically. It replaces a file or symlink of its name.
 
-    Args:
-        path: The file.
-        content: Its bytes.
-        sync: Whether it is on the disk when this returns.
-        modified: Time of its modification, ns; None for the one that the system gives.
-        temporary: A free name beside it, until all is written; None for a random one.
+    With `sync` it is on the disk when this returns. `modified` is in ns. `temporary` is a free name
+    beside it, until all is written; None for a random one.
     """
     temporary = temporary or path.with_name(f".{path.name}.{secrets.token_hex(8)}")
     fd = open_file(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL)
@@ -222,16 +207,7 @@ def write_file(
 
 @contextmanager
 def locked_folder(path: Path, wait_s: float = math.inf) -> Iterator[None]:
-    """Lock a folder against other processes.
-
-    Args:
-        path: The folder.
-        wait_s: Seconds to wait for them; without end if not given.
-
-    Raises:
-        BlockingIOError: Another process has held the lock for longer.
-        OSError: The folder cannot be opened.
-    """
+    """Lock a folder against other processes; `BlockingIOError` after `wait_s`."""
     with folder(path) as fd:
         lock(fd, wait_s)
         yield
@@ -268,14 +244,10 @@ def names(path: Path) -> dict[str, os.stat_result]:
 def changed_names(
     path: Path, before: Identity | None
 ) -> tuple[Identity, dict[str, os.stat_result] | None]:
-    """The status of each entry of a folder, by name, if it may have changed.
+    """The status of each entry of a folder, by name, if it may have changed since `before`.
 
-    Args:
-        path: The folder.
-        before: What this returned first when it was read; None if it never was.
-
-    Returns:
-        Inode of the folder and time of its last change, ns, and None for entries as before.
+    First comes its inode and the time of its last change, ns, which is `before` of the next call;
+    the entries are None if they are as before.
     """
     if (found := _mounted(path)) is not None:
         number, entries = found[0].names(found[1])
@@ -420,10 +392,8 @@ def _mounted(path: Path) -> tuple[Mounted, tuple[str, ...]] | None:
 def user_directory(variable: str, below_home: str, purpose: str) -> Path:
     """The directory of hybridlog in one of the user's base directories; it need not exist.
 
-    Args:
-        variable: Environment variable with an absolute path; a relative one does not count.
-        below_home: Path below the home directory that counts without it.
-        purpose: What is kept there, for the error.
+    `variable` is an environment variable with an absolute path; a relative one does not count.
+    Without it, the path `below_home` does. `purpose` is for the error.
     """
     named = os.environ.get(variable, "")
     if os.path.isabs(named):  # noqa: PTH117 - a relative one does not count

@@ -23,14 +23,7 @@ def socket_base() -> Path:
 
 
 def lasting_socket(file: int) -> Path:
-    """Path of a socket that goes with an open file, the same in every process.
-
-    Args:
-        file: Descriptor of the file.
-
-    Raises:
-        StoreError: The path is too long, or its directory is not private to this user.
-    """
+    """Path of a socket that goes with an open file, the same in every process."""
     about = os.fstat(file)
     return _private(socket_base() / f"{about.st_dev:x}-{about.st_ino:x}.sock")
 

@@ -23,11 +23,7 @@ _undo: list[tuple[int, Callable[[], object]]] = []
 
 
 class Unfinished:
-    """A temporary name of a file or directory.
-
-    Args:
-        path: An unused path; the owner creates a file or a directory there.
-    """
+    """A temporary name, unused so far, where the owner creates a file or a directory."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -35,11 +31,9 @@ class Unfinished:
         self._at_the_end = weakref.finalize(self, _remove, path)
 
     def publish(self, final: Path) -> None:
-        """Rename it atomically to its final name, and sync the directory.
+        """Rename it atomically to its final name in its directory, and sync that.
 
-        Args:
-            final: A path in the same directory. It replaces a file, or as a directory an empty
-                directory.
+        It replaces a file, or as a directory an empty directory.
         """
         from hybridlog_storage.disk.durability import publish
 
@@ -74,8 +68,7 @@ def scratch_directory() -> Unfinished:
 def undone(undo: Callable[[], object]) -> Iterator[None]:
     """Take something back if the block fails, or if the process is stopped in it.
 
-    Args:
-        undo: Takes it back; may be called before it was done.
+    `undo` may be called before it was done.
     """
     registered = os.getpid(), undo
     _undo.append(registered)

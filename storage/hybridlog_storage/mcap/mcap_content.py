@@ -64,7 +64,6 @@ class ChunkHead(NamedTuple):
     """A chunk record before its content.
 
     Attributes:
-        opcode: Kind of the record.
         length: Bytes of the record by its length field, the head included.
         first: Smallest log time, ns.
         last: Largest log time, ns.
@@ -102,12 +101,7 @@ def chunk_head_of(record: Buffer) -> ChunkHead | None:
 
 
 class Definition(NamedTuple):
-    """A schema or channel, and the first message that it applies to.
-
-    Attributes:
-        row: First row of the batch that it applies to, 0 to n.
-        record: The definition.
-    """
+    """A schema or channel, and the first row of the batch that it applies to, 0 to n."""
 
     row: int
     record: records.Schema | records.Channel
@@ -158,21 +152,12 @@ class ChunkContent(NamedTuple):
 def parse_content(
     buffer: Buffer, *, torn: bool = False, loose: bool = False, most: int = 1 << 62
 ) -> ChunkContent:
-    """Read the records of an uncompressed chunk.
+    """Read the records of an uncompressed chunk. Other kinds are skipped, as MCAP requires.
 
-    Args:
-        buffer: The bytes with the records.
-        torn: The end of the records is missing: omit an incomplete record.
-        loose: Stop, without error, at the first record that is neither a whole message nor a
-            definition that fills its record.
-        most: Most records.
-
-    Returns:
-        Messages and definitions. Records of other kinds are skipped, as MCAP requires.
-
-    Raises:
-        SegmentError: A record runs over the end, or has the invalid kind 0; the message
-            names its offset. Or there are more than `most`.
+    If it is `torn`, the end is missing: an incomplete record is omitted. `loose` stops, without
+    error, at the first record that is neither a whole message nor a definition that fills its
+    record. More than `most` records, one that runs over the end, or one of the invalid kind 0 raise
+    a `SegmentError` that names the offset.
     """
     walk = _Walk(buffer)
     starts = np.fromiter(walk.messages(most, loose=loose), np.int64)
@@ -194,19 +179,11 @@ def parse_content(
 def parse_parts(
     pieces: Iterator[Buffer], size: int, compressed: int, *, torn: bool = False
 ) -> Iterator[ChunkContent]:
-    """Read the records of a chunk of any size in parts, in bounded memory.
+    """Read the records of a chunk of any size, in parts of `_PART` bytes or more: bounded memory.
 
-    Args:
-        pieces: Its uncompressed content.
-        size: Bytes that it claims.
-        compressed: Bytes of its compressed content.
-        torn: The end of the content is missing.
-
-    Yields:
-        The records, in order, in parts of at least `_PART` bytes.
-
-    Raises:
-        SegmentError: The rest cannot be read.
+    `pieces` are its uncompressed content, `size` the bytes that it claims, `compressed` those of
+    its compressed content; if it is `torn`, the end is missing. After an error only the rest is
+    lost.
     """
     held, base, most = bytearray(), 0, MIN_RECORDS + compressed
     wanted = _PART  # bytes to read at once
@@ -239,11 +216,7 @@ def parse_parts(
 
 
 def _believed(held: bytearray, base: int, size: int, compressed: int) -> int:
-    """Bytes of the incomplete record at the end of what was read.
-
-    Raises:
-        SegmentError: Its head is not believed.
-    """
+    """Bytes of the incomplete record at the end of what was read, if its head is believed."""
     opcode, length = RECORD_HEAD.unpack_from(held)
     length += RECORD_HEAD.size
     where = f"the record at byte {base} of its content"
@@ -320,15 +293,7 @@ def _batch(buffer: Buffer, starts: NDArray[np.int64]) -> tuple[Batch, NDArray[np
 
 
 def heads_at(buffer: Buffer, starts: NDArray[np.int64]) -> NDArray[np.void]:
-    """The heads of message records.
-
-    Args:
-        buffer: The content of a chunk.
-        starts: int64[n], where the records start; no head runs over the end.
-
-    Returns:
-        `MESSAGE_HEAD`[n].
-    """
+    """The heads, `MESSAGE_HEAD`[n], of records that start at int64[n]; none runs over the end."""
     if not len(starts):
         return np.empty(0, MESSAGE_HEAD)
     # A view of a head at every byte of the buffer; only the needed ones are copied.
@@ -379,16 +344,8 @@ _READERS: dict[int, Callable[[ReadDataStream], records.McapRecord]] = {
 def read_record(opcode: int, content: Buffer) -> tuple[records.McapRecord | None, int]:
     """Parse one record that is neither a message nor a chunk nor an attachment.
 
-    Args:
-        opcode: Its kind.
-        content: Its bytes, without the head. Bytes behind its fields are ignored.
-
-    Returns:
-        The record, None for another opcode; and the size of its fields in bytes (0 for
-        None).
-
-    Raises:
-        SegmentError: Its fields exceed it, or are not UTF-8.
+    With it comes the size of its fields, bytes; those behind them are ignored. None and 0 for
+    another opcode.
     """
     reader = _READERS.get(opcode)
     if reader is None:
@@ -423,17 +380,9 @@ def is_in_summary(opcode: int) -> bool:
 
 
 def parse_summary(data: Buffer, *, skipped: int = 0) -> tuple[Summary, dict[int, Buffer]]:
-    """Parse the records between the data of a file and its footer.
+    """Parse the records between the data of a file and its footer, but for the kind `skipped`.
 
-    Args:
-        data: Their bytes.
-        skipped: Opcode of records that are not parsed.
-
-    Returns:
-        The summary; and the content of the last record of each kind that MCAP does not know.
-
-    Raises:
-        SegmentError: It is damaged.
+    With the summary comes the content of the last record of each kind that MCAP does not know.
     """
     view, at = memoryview(data), 0
     found = Summary()

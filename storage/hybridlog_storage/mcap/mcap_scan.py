@@ -76,18 +76,10 @@ Item: TypeAlias = McapRecord | Attachment | ChunkContent | Damage
 
 
 class Scan:
-    """One MCAP file, read forward in bounded memory.
+    """One MCAP file, read forward in bounded memory; its position is moved.
 
-    Args:
-        file: Seekable; its position is moved.
-        size: Bytes of the file.
-        limit: Most uncompressed bytes of a chunk; larger ones count as damage.
-
-    Attributes:
-        summary: The summary at the end of a closed file; None if it is missing or damaged.
-
-    Raises:
-        OSError: The file cannot be read.
+    Chunks of more than `limit` uncompressed bytes count as damage. `summary` is None if it is
+    missing, as in a file that was not closed, or damaged.
     """
 
     def __init__(self, file: BinaryIO, size: int, limit: int = MAX_UNCOMPRESSED) -> None:
@@ -144,14 +136,9 @@ class Scan:
         return self.summary is not None
 
     def items(self) -> Iterator[tuple[int, Item]]:
-        """All items from the start to the end of the file.
+        """Each byte of the file where an item starts, and the item, in file order.
 
-        Yields:
-            Byte in the file and the item that starts there, in file order: messages with the
-            definitions between them, other records, and damage.
-
-        Raises:
-            OSError: The file cannot be read.
+        Items are messages with the definitions between them, other records, and damage.
         """
         is_closed = False
         while self._at < self._bytes.size:
@@ -243,7 +230,7 @@ class Scan:
 
     @lazy
     def _listed(self) -> set[tuple[int, int, int, int, str]]:
-        """What the summary says of each chunk, wherever it starts."""
+        """The summary's word on each chunk, wherever it starts."""
         return {
             (
                 one.message_start_time,
@@ -262,11 +249,7 @@ class Scan:
         )
 
     def _contents(self, chunk: ChunkHead, end: int) -> Iterator[ChunkContent]:
-        """The records of a chunk, after comparing its checksum; no checksum covers a torn one.
-
-        Raises:
-            SegmentError: The rest does not decompress, or is not believed.
-        """
+        """The records of a chunk, after comparing its checksum; no checksum covers a torn one."""
         length, is_torn = end - chunk.start, end < chunk.end
         if not is_torn and max(chunk.size, length) <= _MAX_WHOLE:
             data = self._bytes.at(chunk.start, length, move=length <= _WINDOW)

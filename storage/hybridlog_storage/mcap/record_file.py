@@ -16,15 +16,9 @@ _SEARCHED: Final = 1 << 20  # bytes searched at once
 
 
 class RecordFile:
-    """A file of records that is read forward.
+    """A file of records that is read forward; `read` takes an offset and a length.
 
-    Args:
-        read: Reads bytes: offset, and length.
-        size: Bytes of the file.
-        window: Bytes that are read at once around the heads of records.
-
-    Attributes:
-        size: Bytes of the file.
+    `window` bytes are read at once around the heads of records.
     """
 
     def __init__(self, read: Callable[[int, int], memoryview], size: int, window: int) -> None:
@@ -39,13 +33,7 @@ class RecordFile:
         self._start = 0  # of the window
 
     def at(self, offset: int, length: int, *, move: bool = False) -> memoryview:
-        """Bytes of the file, fewer at its end.
-
-        Args:
-            offset: The first byte.
-            length: Number of bytes.
-            move: Read more than that, for what follows.
-        """
+        """Bytes of the file, fewer at its end; `move` reads more than that, for what follows."""
         length = min(length, self.size - offset)
         if length <= 0:
             return memoryview(b"")
@@ -61,7 +49,7 @@ class RecordFile:
         return self._window[:length]
 
     def rest(self, offset: int) -> memoryview:
-        """What is in memory from a byte on."""
+        """The bytes that are in memory, from one on."""
         return self._window[offset - self._start :]
 
     def search(

@@ -23,9 +23,8 @@ _LONGEST = 120  # a MongoDB namespace (database.collection) has at most 255 byte
 def collection_of(topic: str) -> str:
     """The collection that holds the index documents of a topic.
 
-    Returns:
-        `r_gripper_controller__command` for `/r_gripper_controller/command`; for a
-        topic that is not a canonical ROS name, a readable form, `~` and eight hex digits.
+    `r_gripper_controller__command` for `/r_gripper_controller/command`; for a topic that is not a
+    canonical ROS name, a readable form, `~` and eight hex digits.
     """
     if _CANONICAL.fullmatch(topic) and len(topic) <= _LONGEST:
         return topic[1:].replace("/", "__")

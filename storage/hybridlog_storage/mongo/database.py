@@ -78,12 +78,9 @@ _RESERVED_NAMES = frozenset({"admin", "local", "config"})
 
 @dataclass(frozen=True, slots=True)
 class CollectionStats:
-    """Size of a collection; all zero if it does not exist.
+    """Size of a collection, bytes on the disk; all zero if it does not exist.
 
-    Attributes:
-        documents: Number of documents.
-        storage_bytes: Bytes on disk.
-        index_bytes: Bytes of the indexes on disk; a clustered collection needs none.
+    A clustered collection needs no indexes.
     """
 
     documents: int
@@ -94,11 +91,9 @@ class CollectionStats:
 class Database:
     """One MongoDB database, opened by `connect`. A context manager; thread safe.
 
-    Every method raises `DatabaseError` if the server does not answer or refuses. Methods
-    with a `filter` or a pipeline raise `WhereError` if that is invalid.
-
-    Attributes:
-        is_lost: True after a method found no connection; make a new `Database` then.
+    Every method raises `DatabaseError` if the server does not answer or refuses. Methods with a
+    `filter` or a pipeline raise `WhereError` if that is invalid. `is_lost` is True after a method
+    found no connection; make a new `Database` then.
     """
 
     def __init__(self, client: MongoClient[Document], name: str, address: str) -> None:
@@ -111,16 +106,10 @@ class Database:
     def connect(cls, uri: str, name: str = "hybridlog", *, timeout_s: float = 5.0) -> Self:
         """Connect and check that the server answers and is new enough.
 
-        Args:
-            uri: MongoDB connection string. A database named in it wins over `name`, a
-                `serverSelectionTimeoutMS` in it over `timeout_s`.
-            name: Database to use; it need not exist.
-            timeout_s: Seconds to wait for the server, now and in every later operation. If
-                the URI is that of a replica set, 20 seconds more: it may elect a primary.
-
-        Raises:
-            UsageError: The URI or the database's name is malformed or not allowed.
-            DatabaseError: No server answers, the login is refused, or the server is too old.
+        A database named in the URI wins over `name`, a `serverSelectionTimeoutMS` in it over
+        `timeout_s`. That is for every later operation, too; with the URI of a replica set it is 20
+        seconds more, as it may elect a primary. A URI or name that is not allowed raises
+        `UsageError`.
         """
         from pymongo import MongoClient
         from pymongo.errors import InvalidURI, PyMongoError
@@ -248,22 +237,11 @@ class Database:
         self._again(create)
 
     def insert_raw(self, collection: str, documents: Sequence[bytes]) -> int:
-        """Insert BSON documents as they are.
+        """Insert BSON documents as they are; number of new ones, fewer after a repeated command.
 
-        An existing `_id` is skipped: documents are a pure function of the segment, so the
-        document is the same. After an error any part may have been inserted, and inserting
-        all again is safe.
-
-        Args:
-            collection: The target, created by `ensure_collection`.
-            documents: The documents.
-
-        Returns:
-            Number of new documents; fewer after a repeated command.
-
-        Raises:
-            DiskFullError: The server has no space left.
-            DatabaseError: It refuses a document, or does not answer.
+        An existing `_id` is skipped: documents are a pure function of the segment, so the document
+        is the same. After an error any part may have been inserted, and inserting all again is
+        safe. `ensure_collection` has made the collection.
         """
         from bson.raw_bson import RawBSONDocument
 
@@ -298,10 +276,9 @@ class Database:
         Their pipelines are joined, since MongoDB reads a whole clustered collection for `$or` of
         ranges.
 
-        Args:
-            questions: Collection and filter of each, the latter with a range of `_id`. What
-                about a hundred of them find must fit into memory.
-            stage: Returns the last stage of a pipeline, by the number of the question.
+        A question is a collection and a filter with a range of `_id`; what about a hundred of them
+        find must fit into memory. `stage` returns the last stage of a pipeline, by the number of
+        the question.
         """
         from bson import encode
 
@@ -334,14 +311,7 @@ class Database:
         *,
         limit: int = 0,
     ) -> list[Document]:
-        """Find documents; for small answers.
-
-        Args:
-            collection: The collection; one that does not exist is empty.
-            filter: MongoDB's filter document.
-            projection: MongoDB's projection document.
-            limit: Most documents; 0 for all.
-        """
+        """Find documents, for small answers; none in a missing collection. `limit` 0 is all."""
         of, shape = self._database[collection], None if projection is None else dict(projection)
         return self._again(
             lambda: list(of.find(dict(filter or {}), shape, limit=limit)), question=True
@@ -361,14 +331,10 @@ class Database:
         collection: str,
         filter: Mapping[str, object] | None = None,  # noqa: A002
     ) -> int:
-        """Number of documents that match.
+        """Number of documents that match; 0 in a collection that does not exist.
 
-        Without a filter this is the collection's own count. It costs nothing, but is an
-        estimate after a server was killed.
-
-        Args:
-            collection: The collection; one that does not exist is empty.
-            filter: MongoDB's filter document.
+        Without a filter this is the collection's own count. It costs nothing, but is an estimate
+        after a server was killed.
         """
         of = self._database[collection]
         if not filter:
@@ -485,13 +451,7 @@ def without_secrets(uri: str) -> str:
 
 @contextlib.contextmanager
 def _mapped(address: str, *, question: bool = False) -> Iterator[None]:
-    """Map errors of pymongo and bson.
-
-    Args:
-        address: The server, for the message.
-        question: The command contains the caller's filter, so some errors mean that the
-        filter is invalid.
-    """
+    """Map errors of pymongo and bson; with a `question` of the caller some mean a wrong filter."""
     from bson.errors import BSONError
     from pymongo.errors import (
         ConnectionFailure,

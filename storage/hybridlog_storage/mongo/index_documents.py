@@ -47,10 +47,7 @@ def between(begin: int | None = None, end: int | None = None) -> dict[str, objec
 class Origin:
     """Values shared by all documents of one channel of one recording.
 
-    Attributes:
-        key: The first 64 bits of the recording's id, 16 hexadecimal digits.
-        topic: The topic, as the source spells it.
-        has_publish_time: Whether `_meta.pub` is written.
+    `key` is the first 64 bits of the recording's id, 16 hexadecimal digits.
     """
 
     key: str
@@ -108,16 +105,10 @@ class DocumentAssembler:
         body: NDArray[np.uint8],
         error: str | None = None,
     ) -> NDArray[np.uint8]:
-        """Assemble the documents of some messages.
+        """Assemble documents: uint8[k, width], a whole BSON document a row.
 
-        Args:
-            placed: Messages of some chunks.
-            rows: intp[k], the rows to use.
-            body: uint8[k, w], BSON elements of each message's fields.
-            error: The reason for missing fields, for `_meta.error`.
-
-        Returns:
-            uint8[k, width]: one whole BSON document a row.
+        `rows` is intp[k]; `body` is uint8[k, w], the BSON elements of each message's fields.
+        `error` is the reason for missing ones, for `_meta.error`.
         """
         tail = self._tails.get(error)
         if tail is None:

@@ -42,12 +42,9 @@ class Indexed:
 
 
 class Owner(NamedTuple):
-    """The owner of a database.
+    """The owner of a database: a store, its host and path, and the id of the index.
 
-    Attributes:
-        store: Id of the store.
-        place: Its host and path. A copy of it at another place has the same id.
-        made: Id of the index.
+    A copy of the store at another place has the same id.
     """
 
     store: str
@@ -88,32 +85,21 @@ class IndexState:
     def begin(self, entry: RecordingEntry, segments: Mapping[str, str] | None = None) -> None:
         """Note that documents of a recording are about to be made, or removed.
 
-        Args:
-            entry: The recording.
-            segments: Digest of each segment whose documents stay, by its number as text.
+        `segments` has the digest of each segment whose documents stay, by its number as text.
         """
         state = {"id": entry.id, "made": secrets.token_hex(8), "segments": dict(segments or {})}
         self._db.update(RECORDINGS, {"_id": entry.key}, {"$set": state}, upsert=True)
 
     def put_segments(self, key: str, segments: Mapping[str, str]) -> None:
-        """Note that all documents of some segments are there.
-
-        Args:
-            key: Key of the recording.
-            segments: Their digests, by number as text.
-        """
+        """Note that all documents of some segments are there: their digests, by number as text."""
         digests = {f"segments.{number}": digest for number, digest in segments.items()}
         self._db.update(RECORDINGS, {"_id": key}, {"$set": digests})
 
     def clear(self, entry: RecordingEntry, but: Collection[str] = ()) -> None:
-        """Remove the index documents of a recording.
+        """Remove the index documents of a recording, but those of some segments, numbers as text.
 
         They are looked for in its topics, within its times and an hour around them: a crash may
         have cut messages whose documents are here.
-
-        Args:
-            entry: The recording.
-            but: Numbers of the segments whose documents stay, as text.
         """
         chosen: dict[str, object] = {"_meta.rec": entry.key}
         if entry.span is not None:
@@ -127,8 +113,7 @@ class IndexState:
     def clear_everywhere(self, keys: Collection[object]) -> None:
         """Remove all documents of recordings, looking through everything.
 
-        Args:
-            keys: Their keys, or other values of `_meta.rec` in foreign documents.
+        Keys may be other values of `_meta.rec`, of foreign documents.
         """
         for collection in self.document_collections():
             self._db.delete(collection, {"_meta.rec": {"$in": list(keys)}})

@@ -72,11 +72,7 @@ _OTHER_WAYS = (
 
 
 def find_mongod() -> Path:
-    """Path of the mongod to run: HYBRIDLOG_MONGOD, the wheel's, or the one on the PATH.
-
-    Raises:
-        MissingDependencyError: None exists; the message says how to get one.
-    """
+    """Path of the mongod to run: HYBRIDLOG_MONGOD, the wheel's, or the one on the PATH."""
     named = os.environ.get("HYBRIDLOG_MONGOD")
     if named:
         found = shutil.which(Path(named).expanduser())
@@ -102,22 +98,19 @@ def find_mongod() -> Path:
 class EmbeddedMongod:
     """This process's use of the mongod of a store. A context manager.
 
-    A process may have several, and threads may share one. The end of the process ends its
-    use; `stop` ends it earlier.
+    A process may have several, and threads may share one. The end of the process ends its use;
+    `stop` ends it earlier.
 
     Args:
         directory: Directory of mongod's data, log and lock files; created if missing, in an
             existing parent. If it belongs to another user, `<name>-<uid>` beside it is used.
-        cache_mb: Limit of mongod's cache in MiB; less than 256 counts as 256. The process
-            that starts mongod decides.
+        cache_mb: Limit of mongod's cache in MiB; less than 256 counts as 256. The process that
+            starts mongod decides.
         linger_s: Seconds for which mongod runs after its last use; None takes
             HYBRIDLOG_MONGOD_LINGER_S, or 5. The process that starts mongod decides.
 
     Attributes:
         damage: The reason why the last start replaced the data files; None if it did not.
-
-    Raises:
-        UsageError: HYBRIDLOG_MONGOD_LINGER_S is not a number of seconds.
     """
 
     def __init__(
@@ -154,15 +147,8 @@ class EmbeddedMongod:
     def start(self) -> str:
         """Return the URI of a running mongod; start one if necessary.
 
-        May be called again at any time, for example after a `DatabaseError`: it checks again,
-        and restarts a mongod that has ended. Damaged data files are replaced by empty ones.
-
-        Raises:
-            MissingDependencyError: No mongod is installed.
-            StoreError: The directory cannot be written.
-            ResourceError: mongod lacks file handles or memory.
-            DiskFullError: There is no space for mongod's files.
-            DatabaseError: mongod does not start; the message quotes its log.
+        May be called again at any time, for example after a `DatabaseError`: it checks again, and
+        restarts a mongod that has ended. Damaged data files are replaced by empty ones.
         """
         with self._mutex:
             entered = self._users is None
@@ -180,13 +166,7 @@ class EmbeddedMongod:
     def publish(self, wait_s: float) -> str:
         """An address for other programs that stays the same, as a URI.
 
-        mongod ends when nobody has been connected for a while.
-
-        Args:
-            wait_s: Seconds for which it runs in any case from now on.
-
-        Raises:
-            HybridlogError: As for `start`.
+        mongod ends when nobody has been connected for a while, but not within `wait_s`.
         """
         uri = self.start()
         with self._mutex:
@@ -237,11 +217,7 @@ class EmbeddedMongod:
             raise _directory_error(self._directory, error) from error
 
     def _find_or_launch(self, users: int) -> str:
-        """The URI of a running mongod.
-
-        Args:
-            users: The open and locked `users.lock`.
-        """
+        """The URI of a running mongod; `users` is the open and locked `users.lock`."""
         try:
             path = str(lasting_socket(users))
         except StoreError as error:
@@ -267,12 +243,9 @@ class EmbeddedMongod:
             time.sleep(0.01)
 
     def _launch(self, path: str, keeper: int, *, has_started: bool) -> None:
-        """Start a keeper, which starts mongod.
+        """Start a keeper, which starts mongod; both inherit the lock of `keeper`, `keeper.lock`.
 
-        Args:
-            path: The socket.
-            keeper: The open and locked `keeper.lock`; keeper and mongod inherit the lock.
-            has_started: Whether one was started already, and has ended.
+        `has_started`: one was started already, and has ended.
         """
         try:
             program = find_mongod()
@@ -357,7 +330,7 @@ class EmbeddedMongod:
 
 
 START_LINE = "hybridlog: starts mongod\n"
-"""What the keeper logs before it starts mongod."""
+"""A line that the keeper logs before it starts mongod."""
 _STORAGE = ("/storage/", "wiredtiger", "WT_PANIC", "data corruption")
 """Words in the last lines of a mongod that ended because of its data files."""
 
@@ -433,12 +406,7 @@ def _try_lock(descriptor: int, kind: int) -> bool:
 
 
 def _own_directory(given: Path) -> Path:
-    """The directory to use: the given one, or this user's own beside it; created if missing.
-
-    Raises:
-        StoreError: It is a symlink or a file, or belongs to another user.
-        OSError: It cannot be created.
-    """
+    """The directory to use: the given one, or this user's own beside it; created if missing."""
     user = os.geteuid()
     for directory in (given, given.with_name(f"{given.name}-{user}")):
         _make_folder(directory)
@@ -464,12 +432,7 @@ def _make_folder(path: Path) -> None:
 
 
 def _refuse_odd_files(directory: Path) -> None:
-    """Refuse a directory with anything but plain files and folders, which mongod would follow.
-
-    Raises:
-        StoreError: It holds something else.
-        OSError: It cannot be read.
-    """
+    """Refuse a directory with anything but plain files and folders, which mongod would follow."""
     for place, folders, names in os.walk(directory):
         for name in (*folders, *names):
             mode = Path(place, name).lstat().st_mode

@@ -41,13 +41,9 @@ _PR_SET_PDEATHSIG = 1
 
 
 def main(lock: int, linger_s: float, socket: str, command: list[str]) -> int:
-    """Run mongod until it is unused; return the exit status of this process.
+    """Run mongod until it is unused for `linger_s`; the exit status of this process.
 
-    Args:
-        lock: Descriptor whose lock mongod shares.
-        linger_s: Seconds for which mongod runs after its last use.
-        socket: Its unix socket.
-        command: mongod and its arguments.
+    mongod shares the lock of the descriptor `lock`.
     """
     os.umask(0o077)
     end_signals: list[int] = []
@@ -127,8 +123,7 @@ def _wait(
 ) -> bool:
     """Wait until mongod has ended, a signal asks to end, or it is idle (`users` is then locked).
 
-    Returns:
-        Whether the store was removed, and mongod's data with it.
+    True if the store was removed, and mongod's data with it.
     """
     born = time.monotonic()
     idle_since: float | None = None

@@ -116,11 +116,9 @@ class CachedFile(int):
 
 
 class BlockCache:
-    """The cached blocks of a user's objects.
+    """The cached blocks of a user's objects; by default in the user's cache.
 
-    Args:
-        path: Its directory; by default in the user's cache.
-        most: Bytes that it may take, about; what was opened longest ago goes first.
+    It takes about `most` bytes; what was opened longest ago goes first.
     """
 
     def __init__(self, path: Path | None = None, most: int = MAX_CACHED) -> None:

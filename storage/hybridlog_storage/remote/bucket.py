@@ -61,12 +61,9 @@ _users: Final[dict[str, int]] = {}
 
 @dataclass(frozen=True, slots=True)
 class Object:
-    """An object as a list or an answer describes it.
+    """An object as a list or an answer describes it; its name is below the address of the bucket.
 
-    Attributes:
-        name: Its name below the address of the bucket.
-        size: Its bytes.
-        version: The entity tag; another one after every change.
+    `version` is the entity tag, another one after every change.
     """
 
     name: str
@@ -95,17 +92,9 @@ class Object:
 
 
 class Bucket:
-    """The objects below an address.
+    """The objects below an address, such as `s3://lab/store`.
 
-    Args:
-        address: Such as `s3://lab/store`.
-
-    Attributes:
-        lost: Names of objects that were looked for, and are missing or have another size.
-
-    Raises:
-        UsageError: It is not the address of a bucket.
-        MissingDependencyError: obstore is not installed.
+    `lost` has the names of objects that were looked for, and are missing or have another size.
     """
 
     def __init__(self, address: str) -> None:
@@ -124,11 +113,7 @@ class Bucket:
     def objects(self, prefix: str = "") -> list[Object]:
         """All objects whose names begin with a folder's name, in order; 1,000 a request.
 
-        Args:
-            prefix: Whole parts of names: `recordings/` has what is below it.
-
-        Raises:
-            BucketError: The server does not answer, or refuses.
+        `prefix` has whole parts of names: `recordings/` has what is below it.
         """
         import obstore
 
@@ -139,31 +124,14 @@ class Bucket:
         return self._again(prefix, listed)
 
     def read(self, name: str, begin: int, end: int, size: int) -> bytes:
-        """Part of an object.
-
-        Args:
-            name: The object.
-            begin: The first byte.
-            end: The byte behind the last one.
-            size: The bytes it must have in all.
-
-        Raises:
-            FileNotFoundError: It does not exist.
-            ObjectChangedError: It has another size.
-            BucketError: The server does not answer, or refuses.
-        """
+        """Bytes `[begin, end)` of an object; `ObjectChangedError` if it has not `size` in all."""
         about, data = self._get(name, {"range": (begin, end)}, end - begin)
         if (about.size, len(data)) != (size, end - begin):
             raise ObjectChangedError(f"{self._place(name)} has another size than it had.")
         return data
 
     def read_whole(self, name: str, most: int) -> tuple[Object, bytes]:
-        """A small object, and what it is; of a larger one than expected only one byte more.
-
-        Raises:
-            FileNotFoundError: It does not exist.
-            BucketError: The server does not answer, or refuses.
-        """
+        """A small object, and what it is; of a larger one than expected only one byte more."""
         return self._get(name, {}, most)
 
     def _get(self, name: str, options: GetOptions, most: int) -> tuple[Object, bytes]:
@@ -177,14 +145,9 @@ class Bucket:
         return self._again(name, read)
 
     def create(self, name: str, content: bytes) -> str:
-        """Create an object of a free name. One that has this very content counts as created.
+        """Create an object of a free name, else `ObjectExistsError`; returns its version.
 
-        Returns:
-            Its version.
-
-        Raises:
-            ObjectExistsError: The name is taken, by other content.
-            BucketError: The server does not answer, refuses, or ignores conditions.
+        One that has this very content counts as created.
         """
         self._check("create")
         with suppress(ObjectExistsError):  # by another writer, or by this one whose answer is lost
@@ -196,29 +159,15 @@ class Bucket:
         raise ObjectExistsError(f"{self._place(name)} exists, with other content.")
 
     def replace(self, name: str, content: bytes, version: str) -> str:
-        """Replace an object that has still a version.
+        """Replace an object that still has a version; returns the new one.
 
-        Returns:
-            Its new version.
-
-        Raises:
-            ObjectChangedError: It has another one.
-            BucketError: The server does not answer, refuses, or ignores conditions.
+        If it has another version, it raises `ObjectChangedError`.
         """
         self._check({"e_tag": f'"{"0" * 32}"'})
         return self._put(name, content, {"e_tag": version})
 
     def put(self, name: str, size: int, pieces: Iterable[Buffer]) -> Object:
-        """Write an object, which takes the place of one of its name; not if `pieces` raises.
-
-        Args:
-            name: Its name.
-            size: Its bytes; many go in parts.
-            pieces: Its content.
-
-        Raises:
-            BucketError: The server does not answer, refuses, or ignores conditions.
-        """
+        """Write an object, which takes the place of one of its name; not if `pieces` raises."""
         import obstore
 
         self._check("create")
@@ -229,11 +178,7 @@ class Bucket:
             return Object(name, size, _version(made))
 
     def delete(self, names: Sequence[str]) -> None:
-        """Delete objects; those that do not exist are left out.
-
-        Raises:
-            BucketError: The server does not answer, or refuses.
-        """
+        """Delete objects; those that do not exist are left out."""
         import obstore
 
         if not names:
@@ -247,8 +192,7 @@ class Bucket:
     def _check(self, mode: PutMode) -> None:
         """Try once, before the first write, whether the server honours a condition.
 
-        Raises:
-            BucketError: It ignores it: writers would overwrite each other in silence.
+        One that ignores it is refused: writers would overwrite each other in silence.
         """
         from obstore.exceptions import NotSupportedError
 

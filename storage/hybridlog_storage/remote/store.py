@@ -153,9 +153,8 @@ class CatalogCells(Cells):
 class SeenManifests(BucketManifests):
     """The manifests of a bucket as they were at the last look; a change asks for the newest.
 
-    Attributes:
-        objects: Their objects by id.
-        number: Counts what others have changed at a look, and what came or went here.
+    `objects` are by id; `number` counts what others have changed at a look, and what came or went
+    here.
     """
 
     def __init__(self, bucket: Bucket, cells: CatalogCells) -> None:
@@ -275,14 +274,7 @@ class SeenManifests(BucketManifests):
 class BucketFiles:
     """A store in a bucket, by the paths of its files; see `files.mounted`.
 
-    Args:
-        bucket: The bucket.
-        cache: Of its blocks.
-
-    Attributes:
-        path: What stands for it among paths.
-        cells: Of its catalog.
-        manifests: Its manifests.
+    `path` stands for it among paths; `cells` are those of its catalog.
     """
 
     def __init__(self, bucket: Bucket, cache: BlockCache) -> None:
@@ -351,16 +343,7 @@ def mount(address: str) -> BucketFiles:
 
 
 class RemoteDirectory(StoreDirectory):
-    """A store in a bucket: read like a directory, changed by its manifests.
-
-    Args:
-        address: Such as `s3://lab/store`.
-        read_only: Refuse all changes.
-
-    Raises:
-        StoreError: It is not a store, has another format, or cannot be read.
-        BucketError: The server does not answer, or refuses.
-    """
+    """A store in a bucket, `s3://lab/store`: read like a directory, changed by its manifests."""
 
     is_remote: ClassVar[bool] = True
 
@@ -475,9 +458,7 @@ class RemoteDirectory(StoreDirectory):
     def look_closely(self, recording: str | None = None) -> bool:
         """Compare files with their objects; True if some are missing.
 
-        Args:
-            recording: Id of the one whose files are compared, and from then on read from the
-                server again; None for all.
+        Those of a single recording are from then on read from the server again; None is for all.
         """
         place = f"{RECORDINGS}/{recording}/" if recording else f"{RECORDINGS}/"
         there = {one.name: one.size for one in self.bucket.objects(place)}
@@ -527,9 +508,7 @@ class RemoteDirectory(StoreDirectory):
     ) -> Iterator[None]:
         """Nothing is locked: a change is made of the newest manifest, and made again.
 
-        Raises:
-            StoreError: This process would record, or the store was opened for reading only.
-            TopicError: The recording is gone.
+        This process may not record: `StoreError`.
         """
         self.check_changes()
         if records:

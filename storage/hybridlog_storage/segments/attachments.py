@@ -36,14 +36,9 @@ _CRC = struct.Struct("<I")
 
 @dataclass(frozen=True, slots=True)
 class Attachment:
-    """An attachment record of a file.
+    """An attachment record of a file; times are ns, 0 if unknown. `data` is in the file.
 
-    Attributes:
-        log_time: Time at which it was recorded, ns; 0 if unknown.
-        create_time: Time at which it was created, ns; 0 if unknown.
-        name: Its name; need be no valid file name, and need not be unique.
-        media_type: Its media type, such as `text/plain`.
-        data: Its content, in the file.
+    Its name need be no valid file name, and need not be unique.
     """
 
     log_time: int
@@ -53,11 +48,7 @@ class Attachment:
     data: FilePart
 
     def pieces(self) -> Iterator[bytes]:
-        """The content, in pieces of at most `PIECE` bytes.
-
-        Raises:
-            SegmentError: The file is shorter than before.
-        """
+        """The content, in pieces of at most `PIECE` bytes."""
         part = self.data.again()
         left = len(part)
         while left:
@@ -82,11 +73,7 @@ class Attachment:
         )
 
     def record(self) -> Iterator[bytes]:
-        """Its MCAP record, in pieces.
-
-        Raises:
-            SegmentError: As `pieces`.
-        """
+        """Its MCAP record, in pieces."""
         fields = self.fields()
         crc = crc32(fields)
         size = len(fields) + len(self.data) + _CRC.size
@@ -112,18 +99,10 @@ class Attachment:
 def parse_attachment(
     head: Buffer, part: FilePart, *, needs_crc: bool = False
 ) -> tuple[Attachment, int]:
-    """Parse an attachment record.
+    """Parse an attachment record; with it comes the size of its fields, bytes.
 
-    Args:
-        head: The beginning of its content, up to `MAX_HEAD` bytes.
-        part: Its whole content.
-        needs_crc: Compare the checksum also where it is 0, which says that there is none.
-
-    Returns:
-        The attachment, and the size of its fields, bytes.
-
-    Raises:
-        SegmentError: Its fields exceed it or are not UTF-8, or its checksum differs.
+    `head` is the beginning of its content, up to `MAX_HEAD` bytes, `part` all of it. `needs_crc`
+    compares the checksum also where it is 0, which says that there is none.
     """
     try:
         log_time, create_time = _TIMES.unpack_from(head)

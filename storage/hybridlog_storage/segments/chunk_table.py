@@ -75,10 +75,9 @@ class ChunkTable:
         return sum(last[0]) if last else 0
 
     def part_bounds(self) -> NDArray[np.int64]:
-        """Bounds of each chunk's rows in `parts`.
+        """Bounds of each chunk's rows in `parts`: int64[n + 1].
 
-        Returns:
-            int64[n + 1]; the rows of chunk i are `[bounds[i], bounds[i + 1])`.
+        The rows of chunk i are `[bounds[i], bounds[i + 1])`.
         """
         bounds = np.zeros(len(self.chunks) + 1, np.int64)
         np.cumsum(self.chunks["parts"], out=bounds[1:])
@@ -102,11 +101,9 @@ class ChunkTable:
         return replace(self, parts=parts)
 
     def by_channel(self) -> NDArray[np.void]:
-        """Totals of each channel.
+        """Totals of each channel with messages, `PART`[c], by channel id.
 
-        Returns:
-            `PART`[c], by channel id; only channels with messages. `messages` is taken
-            modulo 2^32, which no segment reaches.
+        `messages` is taken modulo 2^32, which no segment reaches.
         """
         if not len(self.parts):
             return self.parts
@@ -132,11 +129,7 @@ class ChunkTable:
 
     @classmethod
     def from_bytes(cls, body: Buffer) -> ChunkTable:
-        """Parse the output of `to_bytes`.
-
-        Raises:
-            SegmentError: It is damaged, or contradicts itself.
-        """
+        """Parse the output of `to_bytes`; `SegmentError` if it contradicts itself."""
         if len(body) < _HEAD.size:
             raise SegmentError("the chunk table is too short")
         counts = _HEAD.unpack_from(body)
@@ -191,14 +184,10 @@ def _part_problem(table: ChunkTable, parts: NDArray[np.void]) -> str | None:
 
 
 def parts_of(batch: Batch, order: NDArray[np.intp]) -> tuple[NDArray[np.void], int, int]:
-    """Statistics of each channel in a chunk.
+    """Statistics of each channel in a chunk, `PART`[c] by channel id; first and last log time, ns.
 
-    Args:
-        batch: Its messages, one at least; `channel` holds channel ids.
-        order: intp[n], rows by channel and, within one, by log time.
-
-    Returns:
-        `PART`[c], by channel id; the first and the last log time of all, ns.
+    `batch` has a message at least, and channel ids; `order` is intp[n], rows by channel and, within
+    one, by log time.
     """
     first, last = order[0], order[-1]
     if batch.channel[first] == batch.channel[last]:  # as in most chunks
@@ -239,13 +228,10 @@ class TableBuilder:
     def chunk(
         self, place: tuple[int, int, int], span: tuple[int, int], parts: NDArray[np.void]
     ) -> None:
-        """Add a chunk.
+        """Add a chunk; `span` is its smallest and largest log time, ns, `parts` is from `parts_of`.
 
-        Args:
-            place: Byte and length of the chunk record, and bytes of message indexes and arrival
-                record behind it.
-            span: Smallest and largest log time in it, ns.
-            parts: `PART`[c], from `parts_of`.
+        `place` is byte and length of the chunk record, and bytes of message indexes and arrival
+        record behind it.
         """
         self._chunks += _CHUNK_ROW.pack(*place, *span, len(parts))
         self._parts += parts.tobytes()

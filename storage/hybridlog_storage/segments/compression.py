@@ -49,20 +49,10 @@ _per_thread = threading.local()
 def decompress(
     compression: str, data: Buffer, uncompressed_size: int, *, limit: int = MAX_UNCOMPRESSED
 ) -> bytes | memoryview:
-    """Decompress the content of a chunk.
+    """Decompress the content of a chunk; without a codec, a view of `data`.
 
-    Args:
-        compression: MCAP name of the codec: `zstd`, `lz4`, or empty for none.
-        data: The compressed data.
-        uncompressed_size: Expected bytes of output.
-        limit: Most bytes of output.
-
-    Returns:
-        `uncompressed_size` bytes; for no codec, a view of `data`.
-
-    Raises:
-        SegmentError: The codec is unknown, the size is above the limit or differs from
-        the output, or the data is damaged.
+    `compression` is its name in MCAP: `zstd`, `lz4`, or empty for none. An output of more than
+    `limit` bytes, or not of `uncompressed_size`, raises `SegmentError`.
     """
     if uncompressed_size > limit:
         raise SegmentError(
@@ -102,11 +92,7 @@ def _joined(pieces: Iterator[bytes | memoryview], size: int) -> memoryview:
 
 
 def check_size(compression: str, uncompressed_size: int, size: int) -> None:
-    """Raise if compressed data cannot hold what it claims to hold.
-
-    Raises:
-        SegmentError: The ratio is above the maximum of the codec, or the codec is unknown.
-    """
+    """Raise `SegmentError` if compressed data cannot hold what it claims to hold."""
     if compression not in _MAX_RATIO:
         raise SegmentError(
             f"its compression {compression[:32]!r} is not known; rewrite the file with zstd"
@@ -134,12 +120,9 @@ class Readable(Protocol):
 
 
 class FilePart:
-    """A part of a file that is read piece by piece.
+    """A part of a file that is read piece by piece; the position of `file` is moved.
 
-    Args:
-        file: Seekable; its position is moved.
-        start: First byte.
-        size: Number of bytes, all of them in the file.
+    All of its `size` bytes are in the file.
     """
 
     def __init__(self, file: Readable, start: int, size: int) -> None:
@@ -173,14 +156,9 @@ class FilePart:
 
 
 def decompress_pieces(compression: str, data: Buffer | FilePart) -> Iterator[bytes | memoryview]:
-    """Decompress piece by piece, in memory independent of the size.
+    """Decompress in pieces of up to 256 KiB, in memory independent of the size.
 
-    Yields:
-        Pieces of up to 256 KiB.
-
-    Raises:
-        SegmentError: The data is damaged; the pieces before are intact. A missing end is
-            no error.
+    Pieces before damage are intact. A missing end is no error.
     """
     if isinstance(data, FilePart):
         data = data.again()
@@ -238,16 +216,12 @@ def _lz4_pieces(data: Buffer | FilePart) -> Iterator[bytes]:
 class Compressor:
     """Compresses chunks, except those that would not shrink.
 
-    Compressed images and the like cost much time and gain nothing. So a few samples of a
-    large chunk are tried first, and a chunk that gains less than 3 % is stored
-    uncompressed. Thread safe; compression releases the interpreter lock.
+    Compressed images and the like cost much time and gain nothing. So a few samples of a large
+    chunk are tried first, and a chunk that gains less than 3 % is stored uncompressed. Thread safe;
+    compression releases the interpreter lock.
 
-    Args:
-        name: The codec; `none` stores everything as it is.
-        level: Level of the codec: 1 to 22 for zstd (negative: faster), 0 to 16 for lz4.
-
-    Raises:
-        ValueError: The codec is unknown or the level not allowed.
+    The codec `none` stores everything as it is. The level is 1 to 22 for zstd (negative: faster), 0
+    to 16 for lz4; another one is a `ValueError`.
     """
 
     def __init__(
@@ -266,16 +240,9 @@ class Compressor:
         self._own = threading.local()  # threads must not share a ZstdCompressor
 
     def compress(self, data: Buffer, *, hurried: bool = False) -> tuple[str, Buffer]:
-        """Compress a chunk if it gains enough.
+        """Compress a chunk if it gains enough: name of the codec and bytes, else empty and `data`.
 
-        Args:
-            data: Content of the chunk.
-            hurried: Compress only if samples shrink to a fifth or less, and at level 1 at
-            most.
-
-        Returns:
-            MCAP name of the codec and the compressed bytes, or the empty name and `data`
-            itself.
+        `hurried` compresses only if samples shrink to a fifth or less, and at level 1 at most.
         """
         bound = _WORTH_IT if hurried else _MAX_SHARE
         level = min(self.level, _FAST) if hurried else self.level

@@ -41,23 +41,13 @@ class Rows(Protocol):
     """Finds what is left of chunks. The caller checks it."""
 
     def left(self, log: int, chunk: int) -> tuple[Batch, NDArray[np.int64]]:
-        """The rows that remain of a chunk of a log, and the arrival numbers of its messages.
-
-        Raises:
-            SegmentError: It is missing or damaged.
-        """
+        """The rows that remain of a chunk of a log, and the arrival numbers of its messages."""
 
 
 def front(reader: SegmentReader, summary: SegmentSummary, log: File) -> bytes:
-    """What stands in front of the columns of the first file of rows of a log, behind its magic.
+    """Make what stands before the columns of the first file of rows of a log, behind its magic.
 
-    Args:
-        reader: The log.
-        summary: Its summary.
-        log: Its line of the manifest, which says that it is gone.
-
-    Raises:
-        SegmentError: It is damaged.
+    `log` is its line of the manifest, which says that it is gone.
     """
     stretches = {one.offset: one.length for one in reader.records()}
     stretches[summary.start] = reader.size - summary.start
@@ -71,18 +61,9 @@ def front(reader: SegmentReader, summary: SegmentSummary, log: File) -> bytes:
 
 
 class GoneLog(SegmentReader):
-    """A log that is gone, by its first file of rows.
+    """A log that is gone, by its first file of rows; `log` is its line of the manifest.
 
-    Args:
-        path: The file.
-        number: Number of the log.
-        rows: Has what is left of its chunks; None for a summary only.
-
-    Attributes:
-        log: Its line of the manifest.
-
-    Raises:
-        SegmentError: The file is missing or damaged.
+    Without `rows` it has a summary only.
     """
 
     def __init__(self, path: Path, number: int, rows: Rows | None = None) -> None:
@@ -123,11 +104,7 @@ class GoneLog(SegmentReader):
         return log
 
     def read(self, offset: int, length: int) -> memoryview:
-        """Bytes of the log, of which there are metadata records and the summary only.
-
-        Raises:
-            SegmentError: They are gone.
-        """
+        """Bytes of the log, of which there are metadata records and the summary only."""
         if not self._stretches:
             return super().read(offset, length)
         for place, data in self._stretches:
@@ -151,11 +128,7 @@ class GoneLog(SegmentReader):
         return False
 
     def read_chunk(self, place: ChunkPlace) -> StoredChunk:
-        """What is left of a chunk.
-
-        Raises:
-            SegmentError: It is missing or damaged.
-        """
+        """The rows that are left of a chunk."""
         check_wanted()
         try:
             if self._rows is None:
@@ -179,14 +152,5 @@ class GoneLog(SegmentReader):
 
 
 def open_log(path: Path, number: int, rows: Rows | None = None) -> SegmentReader:
-    """Open a sealed log, or what is left of it.
-
-    Args:
-        path: Its file, or its first file of rows.
-        number: Its number.
-        rows: Has what is left of its chunks.
-
-    Raises:
-        SegmentError: It cannot be opened.
-    """
+    """Open a sealed log, or what is left of it, by its first file of rows."""
     return GoneLog(path, number, rows) if path.suffix == ".parquet" else SegmentReader(path, number)

@@ -22,12 +22,7 @@ _LARGE = 1 << 15  # mean bytes of heads and payloads
 class OpenChunk:
     """Messages, each in a buffer of its own.
 
-    Args:
-        first_log_time: Log time of the first message, ns.
-
-    Attributes:
-        opened: When it was opened, seconds of `time.monotonic`.
-        size: Bytes of its content.
+    `opened` is seconds of `time.monotonic`; `size` is the bytes of its content.
     """
 
     def __init__(self, first_log_time: int) -> None:

@@ -32,11 +32,7 @@ _LOOKS: Final = 5  # at what seems damaged, before it counts as damaged
 class Flushed(NamedTuple):
     """Content of a segment at one moment, as the summary of a sealed one says it.
 
-    Attributes:
-        table: Its chunks.
-        attachments: Attachments of the source, in file order.
-        metadata: Metadata records of the source, in file order.
-        reader: Reads its chunks.
+    Attachments and metadata are those of the source, in file order.
     """
 
     table: ChunkTable
@@ -46,19 +42,7 @@ class Flushed(NamedTuple):
 
 
 class OpenSegment:
-    """The content that a segment has at this moment.
-
-    Args:
-        recording: The recording's directory.
-        number: Number of the segment; it may be sealed meanwhile.
-
-    Attributes:
-        number: Its number in the recording.
-        reader: Reads its chunks.
-
-    Raises:
-        SegmentError: It cannot be opened.
-    """
+    """The content that a segment has at this moment; it may be sealed meanwhile."""
 
     def __init__(self, recording: Path, number: int) -> None:
         self.number = number
@@ -111,16 +95,10 @@ class OpenSegment:
         return self._flushed
 
     def follow(self) -> bool:
-        """Read what was flushed since, also if the segment was sealed meanwhile.
+        """Read what was flushed since, also if it was sealed meanwhile; True if there is anything.
 
-        A read beside a write may see a part of it, and zeros in place of the rest. So what
-        seems damaged is looked at again, and counts only if it is still the same.
-
-        Returns:
-            True if there is anything new.
-
-        Raises:
-            SegmentError: The file cannot be read.
+        A read beside a write may see a part of it, and zeros in place of the rest. So what seems
+        damaged is looked at again, and counts only if it is still the same.
         """
         is_cut = self.is_cut()
         if is_cut:

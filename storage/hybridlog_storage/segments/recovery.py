@@ -41,13 +41,9 @@ _PIECE = 4 << 20  # bytes read at once for a digest
 
 @dataclass(slots=True)
 class Recovered:
-    """The result of recovering an open segment.
+    """The result of recovering an open segment; `path` is None for an empty one, which is removed.
 
-    Attributes:
-        path: The sealed file, None for an empty one, which is removed.
-        messages: Recovered messages.
-        cut_bytes: Bytes of records cut from the end, without an incomplete summary.
-        damage: Descriptions of unreadable parts.
+    `cut_bytes` are of records at the end, without an incomplete summary.
     """
 
     path: Path | None
@@ -62,19 +58,12 @@ def recover_segment(
     *,
     recording: Mapping[str, object] | None = None,
 ) -> Recovered:
-    """Cut, complete and seal one open segment.
+    """Cut, complete and seal one open segment, `.mcap.open`, that has no writer.
 
-    Args:
-        path: A file whose name ends in `.mcap.open`, without a writer.
-        on_sealing: Called when the segment is complete and on the disk, before it gets its
-            final name, with what was recovered. If it fails, the file stays, and this can be
-            called again.
-        recording: Catalog entry of the recording, for a segment whose own is damaged.
-
-    Raises:
-        StoreError: It cannot be written, has another format, or is sealed already under its
-            final name. The file is unchanged.
-        DiskFullError: No room for the summary; all whole records stay.
+    `on_sealing` is called when the segment is complete and on the disk, before it gets its final
+    name. If it fails, the file stays, and this can be called again. `recording` is the catalog
+    entry, for a segment whose own is damaged. A `StoreError` leaves the file unchanged, a
+    `DiskFullError` all whole records.
     """
     number = int(path.name.removesuffix(OPEN_SUFFIX))
     final = path.with_name(sealed_name(number))
@@ -99,14 +88,8 @@ def recover_segment(
 def rebuild_summary(path: Path, digest: str) -> bool:
     """Write the damaged summary of a sealed segment again, if the file then has its digest.
 
-    The summary is a function of the data before it.
-
-    Returns:
-        Whether the segment was repaired; otherwise it is unchanged.
-
-    Raises:
-        StoreError: It cannot be read or written; it can be repaired again.
-        DiskFullError: No room for the summary.
+    The summary is a function of the data before it. False if the segment was not repaired: it is
+    unchanged. After an error it can be repaired again.
     """
     try:
         with _Rest.of(path, int(path.name.partition(".")[0])) as rest:
@@ -118,9 +101,7 @@ def rebuild_summary(path: Path, digest: str) -> bool:
 class _Rest:
     """The whole part of a segment, and the writer that goes on behind it.
 
-    Attributes:
-        messages: Number of messages in whole chunks.
-        cut_bytes: Bytes behind the last whole record that belong to no summary.
+    `messages` are in whole chunks; `cut_bytes` are behind the last whole record, and of no summary.
     """
 
     def __init__(self, segment: SegmentFile, reader: SegmentReader) -> None:

@@ -16,12 +16,9 @@ if TYPE_CHECKING:
 
 
 class SegmentDamage(NamedTuple):
-    """A damaged place of a segment.
+    """A damaged place of a segment; `offset` is the byte where it starts.
 
-    Attributes:
-        offset: Byte where it starts.
-        problem: What is wrong with it.
-        chunk: Number of the chunk that cannot be read; None for something else.
+    `chunk` is the number of a chunk that cannot be read; None for something else.
     """
 
     offset: int
@@ -34,17 +31,9 @@ def damage_of(
 ) -> tuple[list[SegmentDamage], bool]:
     """All damage in a sealed segment. Its chunks are read only if the digest differs.
 
-    Args:
-        path: The file.
-        digest: The one in the manifest; empty if it lists none.
-        progress: Called with the number of bytes read so far.
-
-    Returns:
-        The damage in file order, but for a damaged summary, which comes first; and whether the
-        summary is whole.
-
-    Raises:
-        SegmentError: It cannot be read.
+    It is in file order, but for a damaged summary, which comes first; with it comes whether the
+    summary is whole. `digest` is that of the manifest; empty if it lists none. `progress` is called
+    with the number of bytes read so far.
     """
     with SegmentReader(path, 0) as reader:
         try:

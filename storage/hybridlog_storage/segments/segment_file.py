@@ -66,11 +66,9 @@ _ROWS = re.compile(r"[0-9]{6}(\.[1-9][0-9]{0,9})?\.rows\.parquet")
 
 
 class Sealed(NamedTuple):
-    """A complete segment, for the manifest of its recording.
+    """A complete segment, for the manifest of its recording, of which `file` is a line.
 
-    Attributes:
-        file: Its line.
-        channels: Its channels by id, also those without messages; without totals.
+    `channels` are by id, also those without messages; without totals.
     """
 
     file: File
@@ -88,12 +86,8 @@ class Sealed(NamedTuple):
     ) -> Sealed:
         """A segment as a manifest lists it.
 
-        Args:
-            place: Its number, and that of the first segment of its group.
-            content: Its bytes, and their digest.
-            table: Its chunks.
-            channels: Its channels by id.
-            has_losses: Whether the loss ledger has rows in it.
+        `place` is its number, and that of the first segment of its group; `content` is its bytes,
+        and their digest.
         """
         number, group = place
         (number, group), (size, digest) = place, content
@@ -137,7 +131,7 @@ def rows_name(number: int, version: int = 0) -> str:
 
 
 def listed_parts(table: ChunkTable) -> dict[int, Part]:
-    """What a segment has of each channel, as a manifest lists it."""
+    """The content that a segment has of each channel, as a manifest lists it."""
     rows = table.by_channel()[["channel", "messages", "payload_bytes", "first", "last"]]
     return {channel: Part(*values) for channel, *values in rows.tolist()}
 
@@ -149,13 +143,10 @@ def _listed(channel: Channel) -> ListedChannel:
 
 
 class SegmentFile:
-    """An open segment: appends whole records and collects the summary.
+    """An open segment, `.mcap.open`: appends whole records and collects the summary.
 
-    Args:
-        path: The file; its name ends in `.mcap.open`.
-        number: Number of the segment.
-        file: The open file; a new one, or one whose records will be noted.
-        group: Number of the first segment of its group; its own by default.
+    `file` is a new one, or one whose records will be noted. `group` is the number of the first
+    segment of its group; its own by default.
     """
 
     def __init__(
@@ -185,18 +176,10 @@ class SegmentFile:
         group: int | None = None,
         sync: bool = False,
     ) -> SegmentFile:
-        """Start a new segment file.
+        """Start a new segment file; if there is no room for it, no file remains.
 
-        Args:
-            directory: The recording's directory.
-            number: Segment number, also the file's name.
-            recording: Catalog entry of the recording, stored in the file.
-            group: Number of the first segment of its group; its own by default.
-            sync: Return once the file's name is on the disk.
-
-        Raises:
-            StoreError: The file cannot be created.
-            DiskFullError: No room for it; no file remains.
+        `recording` is the catalog entry, stored in the file. With `sync` the file's name is on the
+        disk when this returns.
         """
         path = directory / f"{number:06d}{OPEN_SUFFIX}"
         try:
@@ -238,11 +221,7 @@ class SegmentFile:
         return self._file.direct
 
     def define(self, channels: Iterable[tuple[int, int, Channel]]) -> None:
-        """Write channels, each with its schema on its first use in the file, as a chunk.
-
-        Args:
-            channels: Id, id of the schema, and channel.
-        """
+        """Write channels (id, id of the schema, channel) as a chunk, schemas on first use."""
         records: list[bytes] = []
         schemas: dict[int, Schema] = {}
         defined = [*channels]
@@ -323,14 +302,10 @@ class SegmentFile:
         indexes: Mapping[int, int],
         parts: NDArray[np.void],
     ) -> None:
-        """Note a chunk that is in the file already.
+        """Note a chunk that is in the file already, with its `PART`[c].
 
-        Args:
-            offset: Byte of the chunk record.
-            trailer: Bytes of message indexes and arrival record behind it.
-            head: What stands before its content.
-            indexes: Bytes of the message index of each channel, by channel id.
-            parts: `PART`[c], statistics of each channel in it.
+        `trailer` is the bytes of message indexes and arrival record behind it, `indexes` those of
+        the message index of each channel, by channel id.
         """
         self.table.chunk((offset, head.length, trailer), (head.first, head.last), parts)
         self._chunk_indexes += record_bytes(
@@ -365,12 +340,7 @@ class SegmentFile:
     def prepare(self, *, sync: bool) -> Sealed:
         """Write the summary, and close the file; may be repeated.
 
-        Args:
-            sync: Force the file to the disk.
-
-        Raises:
-            StoreError: It cannot be written, or a sealed segment of this number exists.
-            DiskFullError: No room for the summary; the file is unchanged.
+        If there is no room for the summary, the file is unchanged.
         """
         final = self.path.with_name(sealed_name(self.number))
         with self._explained("sealing"):
@@ -386,11 +356,7 @@ class SegmentFile:
         return sealed
 
     def publish(self, *, sync: bool = True) -> Path:
-        """Give a prepared file its final name; may be repeated.
-
-        Args:
-            sync: Return once the name is on the disk.
-        """
+        """Give a prepared file its final name, with `sync` also on the disk; may be repeated."""
         final = self.path.with_name(sealed_name(self.number))
         with self._explained("sealing"):
             if self.path != final:

@@ -112,11 +112,7 @@ def channel_record(channel_id: int, schema_id: int, channel: Channel) -> Channel
 
 
 def channel_of(record: ChannelRecord, schemas: Mapping[int, SchemaRecord]) -> Channel:
-    """The channel described by a record of a segment.
-
-    Raises:
-        SegmentError: Its schema is not defined.
-    """
+    """The channel described by a record; `SegmentError` if its schema is not defined."""
     schema: Schema | None = None
     if record.schema_id:
         found = schemas.get(record.schema_id)
@@ -141,11 +137,7 @@ def json_metadata(name: str, value: object) -> Metadata:
 
 
 def json_of(record: Metadata) -> dict[str, object]:
-    """The value of a metadata record from `json_metadata`.
-
-    Raises:
-        SegmentError: it is not one.
-    """
+    """The value of a metadata record from `json_metadata`; `SegmentError` if it is not one."""
     try:
         value = json.loads(record.metadata["json"])
     except (KeyError, ValueError) as error:
@@ -163,11 +155,7 @@ def metadata_record(record: Metadata, offset: int) -> bytes:
 
 
 def metadata_of(data: Buffer, offset: int) -> Metadata:
-    """The metadata record at a byte of a segment, without its checksum.
-
-    Raises:
-        SegmentError: None is there, or it is damaged.
-    """
+    """The metadata record at a byte of a segment, without its checksum."""
     if len(data) < RECORD_HEAD.size + 8 or bytes(data[-8:]) != _metadata_check(data, offset):
         raise SegmentError("its checksum differs")
     opcode, length = RECORD_HEAD.unpack_from(data)
@@ -218,10 +206,9 @@ def damaged_head(size: int) -> bytes:
 
 
 def index_order(channel: NDArray[np.int32], log_time: NDArray[np.int64]) -> NDArray[np.intp]:
-    """Rows of a chunk by channel and, within one, by log time.
+    """Rows of a chunk, intp[n], by channel and, within one, by log time.
 
-    Returns:
-        intp[n]; messages of one channel and time stay in the order of the chunk.
+    Messages of one channel and time stay in the order of the chunk.
     """
     return np.lexsort((log_time, channel))
 
@@ -234,11 +221,8 @@ def message_indexes(
 ) -> dict[int, bytes]:
     """Message index record of each channel in a chunk, by channel id.
 
-    Args:
-        channel: int32[n], channel ids.
-        log_time: int64[n], ns.
-        record_offset: int64[n], byte of the content where each message record starts.
-        order: intp[n], from `index_order`.
+    `channel` is int32[n], ids; `log_time` is int64[n], ns; `record_offset` is int64[n], byte of the
+    content where each message record starts; `order` is from `index_order`.
     """
     channels = channel[order]
     entries = np.empty(len(order), _INDEX_ENTRY)
@@ -291,13 +275,9 @@ def pack_arrivals(seq: NDArray[np.int64]) -> bytes:
 
 
 def arrival_record(chunk: int, head_crc: int, indexes_crc: int, packed: Buffer) -> bytes:
-    """The record with the packed arrival numbers of a chunk.
+    """The record with the packed arrival numbers of the chunk that starts at a byte of the file.
 
-    Args:
-        chunk: Byte of the file where the chunk record starts.
-        head_crc: CRC-32 of the chunk record before its content.
-        indexes_crc: CRC-32 of its message indexes.
-        packed: From `pack_arrivals`.
+    Checksums are CRC-32: of the chunk record before its content, and of its message indexes.
     """
     head = RECORD_HEAD.pack(ARRIVAL_OPCODE, ARRIVALS.size + len(packed))
     return b"".join((head, ARRIVALS.pack(chunk, head_crc, indexes_crc), packed))
@@ -310,14 +290,10 @@ def group_of(recording: Mapping[str, object], number: int) -> int:
 
 
 class Trailer(NamedTuple):
-    """The records behind a chunk.
+    """The records behind a chunk, `length` bytes.
 
-    Attributes:
-        length: Their bytes.
-        head_crc: CRC-32 of the chunk record before its content.
-        indexes: Channel id and entries (`log_time`, `offset`) of each message index; None if
-            they have changed.
-        packed: The packed arrival numbers.
+    `head_crc` is the CRC-32 of the chunk record before its content. `indexes` are channel id and
+    entries (`log_time`, `offset`) of each message index; None if they have changed.
     """
 
     length: int
@@ -326,11 +302,7 @@ class Trailer(NamedTuple):
     packed: memoryview
 
     def arrivals(self, count: int) -> NDArray[np.int64]:
-        """The arrival numbers of a chunk's messages, in chunk order.
-
-        Raises:
-            SegmentError: They are damaged, or not `count`.
-        """
+        """The arrival numbers of messages in chunk order; `SegmentError` if not `count` of them."""
         try:
             if count > _MAX_ARRIVALS:
                 raise SegmentError("there are too many")
@@ -349,17 +321,10 @@ class Trailer(NamedTuple):
 
 
 def trailer_of(data: Buffer, chunk: int) -> Trailer:
-    """Parse the records behind a chunk, whatever follows them.
+    """Parse the records behind a chunk, whatever follows them; `chunk` is the byte where it starts.
 
-    Its message indexes may be damaged: the arrival record says where its chunk starts, and is
-    found by that.
-
-    Args:
-        data: The bytes behind the chunk.
-        chunk: Byte of the file where the chunk record starts.
-
-    Raises:
-        SegmentError: Its arrival numbers are missing.
+    Its message indexes may be damaged: the arrival record says where its chunk starts, and is found
+    by that.
     """
     raw, owner = bytes(data), chunk.to_bytes(8, "little")
     at = raw.find(owner)
@@ -392,15 +357,10 @@ def _indexes_of(data: bytes) -> list[tuple[int, NDArray[np.void]]] | None:
 
 
 def messages_at(content: Buffer, starts: NDArray[np.int64]) -> Batch | None:
-    """The messages of a chunk, given the starts of their records.
+    """The messages of an uncompressed chunk, by the starts of their records, int64[n], ascending.
 
-    Args:
-        content: The uncompressed chunk.
-        starts: int64[n], ascending.
-
-    Returns:
-        None if `starts` is wrong, that is, if the records do not cover the content from the
-        first byte to the last.
+    None if these are wrong, that is, if the records do not cover the content from the first byte to
+    the last.
     """
     if not len(starts) or starts[0] != 0 or int(starts[-1]) + MESSAGE_HEAD.itemsize > len(content):
         return None

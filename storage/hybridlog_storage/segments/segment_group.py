@@ -23,7 +23,7 @@ SECOND: Final = 2
 LATCHED: Final = 3
 """Key of the segment with latched messages, where they stay alone: a group of its own."""
 Key = Literal[1, 2, 3] | str
-"""Which segment of a group: one of the above, or that of a topic."""
+"""A segment of a group: one of the above, or that of a topic."""
 _NAMED: Final = 14  # topics with segments of their own by a rule
 _OTHERS: Final = 16  # and by their size: a group has 32 segments at most
 _LEAST: Final = 16  # times that mean payload that it has had: small logs have few files
@@ -97,14 +97,9 @@ class Division:
 
 
 class SegmentGroup:
-    """The open segments of a group.
+    """The open segments of a group, by key, in the order of their numbers.
 
-    Args:
-        create: Starts the next segment of a group, whose number is that of its first segment;
-            None for the first one.
-
-    Attributes:
-        segments: By key, in the order of their numbers.
+    `create` starts the next one, given the number of the first one of the group; None for that.
     """
 
     def __init__(self, create: Callable[[int | None], SegmentFile]) -> None:

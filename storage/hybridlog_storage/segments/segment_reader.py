@@ -145,15 +145,7 @@ class SegmentSummary:
 
 
 class SegmentReader:
-    """One sealed segment file.
-
-    Args:
-        path: The file.
-        number: Its number in the recording.
-
-    Raises:
-            SegmentError: The file is missing or cannot be opened.
-    """
+    """One sealed segment file."""
 
     _added = 0  # to ids of channels
 
@@ -185,11 +177,9 @@ class SegmentReader:
             self.close()
 
     def __enter__(self) -> Self:
-        """Return this reader."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close."""
         self.close()
 
     def grow(self) -> None:
@@ -197,11 +187,7 @@ class SegmentReader:
         self.size = os.fstat(self._fd).st_size
 
     def summary(self) -> SegmentSummary:
-        """Channels, chunks and metadata, from the summary at the end of the file.
-
-        Raises:
-            SegmentError: It is missing, damaged, or has another format.
-        """
+        """Channels, chunks and metadata, from the summary at the end of the file."""
         return self._summary(*self._records())
 
     def _no_summary(self, why: object) -> SegmentError:
@@ -276,30 +262,18 @@ class SegmentReader:
         )
 
     def records(self) -> list[MetadataIndex]:
-        """Places of all metadata records, the store's own, too.
-
-        Raises:
-            SegmentError: As `summary`.
-        """
+        """Places of all metadata records, the store's own, too."""
         return self._records()[0].metadata_indexes
 
     def metadata(self, index: MetadataIndex) -> Metadata:
-        """A metadata record.
-
-        Raises:
-            SegmentError: It is damaged.
-        """
+        """A metadata record."""
         try:
             return metadata_of(self.read(index.offset, index.length), index.offset)
         except SegmentError as error:
             raise self._lost("metadata record", index, str(error)) from error
 
     def attachment(self, index: AttachmentIndex) -> Attachment:
-        """An attachment, after checking all its bytes; they are read again later.
-
-        Raises:
-            SegmentError: It is damaged.
-        """
+        """An attachment, after checking all its bytes; they are read again later."""
         try:
             found = self.attachment_at(index.offset, index.length)
         except SegmentError as error:
@@ -309,11 +283,7 @@ class SegmentReader:
         return found
 
     def attachment_at(self, offset: int, length: int) -> Attachment:
-        """The attachment of a record, after checking all its bytes.
-
-        Raises:
-            SegmentError: It is damaged.
-        """
+        """The attachment of a record, after checking all its bytes."""
         start, size = offset + RECORD_HEAD.size, length - RECORD_HEAD.size
         head = self.read(start, max(min(size, MAX_HEAD), 0))
         found, used = parse_attachment(
@@ -332,12 +302,8 @@ class SegmentReader:
     def read_chunk(self, place: ChunkPlace) -> StoredChunk:
         """Read, decompress and check one chunk.
 
-        Args:
-            place: Its position. Damaged message indexes are ignored: messages and arrival
-                numbers have checksums of their own.
-
-        Raises:
-            SegmentError: It is missing or damaged; the message names file and offset.
+        Damaged message indexes are ignored: messages and arrival numbers have checksums of their
+        own.
         """
         check_wanted()
         data = self.read(place.offset, place.length + place.trailer)
@@ -358,15 +324,9 @@ class SegmentReader:
         return SegmentError(f"Chunk at byte {place.offset} of {self.path} is damaged: {error}")
 
     def read_times(self, place: ChunkPlace) -> dict[int, NDArray[np.int64]]:
-        """Log times of a chunk's messages by channel, from its message indexes alone.
+        """Log times of a chunk's messages, int64[n], ns, ascending, by channel id, of its indexes.
 
         If these are damaged, the chunk is read instead.
-
-        Returns:
-            int64[n], ns, ascending, by channel id.
-
-        Raises:
-            SegmentError: They are missing or damaged; the message names file and offset.
         """
         with suppress(SegmentError):
             behind = self.read(place.offset + place.length, place.trailer)
@@ -379,14 +339,7 @@ class SegmentReader:
         return {c: np.sort(batch.log_time[batch.channel == c]) for c in channels}
 
     def digest(self, progress: Callable[[int], None] | None = None) -> str:
-        """BLAKE3 of all bytes, which are read for it.
-
-        Args:
-            progress: Called with the number of bytes read so far.
-
-        Raises:
-            SegmentError: They cannot be read.
-        """
+        """BLAKE3 of all bytes, which are read for it; `progress` gets the number read so far."""
         found = hasher()
         for at in range(0, self.size, _PIECE):
             if at % _AHEAD == 0:
@@ -410,11 +363,7 @@ class SegmentReader:
             )
 
     def read(self, offset: int, length: int) -> memoryview:
-        """Unchecked bytes of the file.
-
-        Raises:
-            SegmentError: The file is too short, or cannot be read.
-        """
+        """Unchecked bytes of the file; `SegmentError` if it is too short."""
         if offset + length > self.size:
             raise SegmentError(
                 f"{self.path} ends at byte {self.size}, but bytes {offset} to "
@@ -438,13 +387,7 @@ def places_of(table: ChunkTable) -> list[ChunkPlace]:
 
 
 def place_of(table: ChunkTable, number: int, bounds: NDArray[np.int64] | None = None) -> ChunkPlace:
-    """Position of a chunk of a table.
-
-    Args:
-        table: The chunks of a segment.
-        number: Number of the chunk.
-        bounds: The table's `part_bounds`, if they are at hand.
-    """
+    """Position of a chunk of a table; `bounds` are its `part_bounds`, if they are at hand."""
     bounds = table.part_bounds() if bounds is None else bounds
     offset, length, trailer, first, last, _ = table.chunks[number].item()
     return ChunkPlace(
@@ -459,11 +402,7 @@ def place_of(table: ChunkTable, number: int, bounds: NDArray[np.int64] | None = 
 
 
 def check_format(recording: Mapping[str, object], path: Path) -> None:
-    """Raise if a segment has another format.
-
-    Raises:
-        SegmentError: It has.
-    """
+    """Raise `SegmentError` if a segment has another format."""
     version = recording.get("format")
     if version != FORMAT_VERSION:
         raise SegmentError(
@@ -473,11 +412,7 @@ def check_format(recording: Mapping[str, object], path: Path) -> None:
 
 
 def open_chunk(record: memoryview) -> tuple[Buffer, ChunkHead]:
-    """Content of a whole chunk record, and what stands before it.
-
-    Raises:
-        SegmentError: It is not a chunk record, or damaged.
-    """
+    """Content of a whole chunk record, and what stands before it; else `SegmentError`."""
     head = chunk_head_of(record[:MAX_CHUNK_HEAD])
     if head is None or head.opcode != Opcode.CHUNK or head.length != len(record):
         raise SegmentError("no chunk record is there")

@@ -116,19 +116,18 @@ class RecordingWriter:
     Args:
         directory: The recording's directory; it exists and is empty.
         recording: Catalog entry stored in every segment.
-        settings: How to divide and compress.
-        on_written: Called on a writer thread when less content is waiting. With it `append`
-            never waits for the disk, and the caller watches `stored_bytes`: when more than a
-            few chunks wait, only those that shrink to a fifth or less are compressed. Without
-            it `append` waits for a slow disk.
-        no_index: Returns whether the messages of a topic get no documents in MongoDB. The
-            segments keep that.
+        on_written: Called on a writer thread when less content is waiting. With it `append` never
+            waits for the disk, and the caller watches `stored_bytes`: when more than a few chunks
+            wait, only those that shrink to a fifth or less are compressed. Without it `append`
+            waits for a slow disk.
+        no_index: Returns whether the messages of a topic get no documents in MongoDB. The segments
+            keep that.
         is_named: Returns whether a rule names a topic, which then has segments of its own.
         is_latched: Returns whether the messages of a channel stay in the first segments.
         latched_apart: Whether they have a segment of their own in each group instead.
-        on_sealing: Called when a group is complete and, unless `sync` is never, on the disk,
-            before its segments get their final names. Called on a writer thread or by
-            `close_truncated`. An exception stops the writer like a failed write.
+        on_sealing: Called when a group is complete and, unless `sync` is never, on the disk, before
+            its segments get their final names. Called on a writer thread or by `close_truncated`.
+            An exception stops the writer like a failed write.
         make_room: Called on a writer thread when the disk is full; returns whether to try again.
     """
 
@@ -192,11 +191,7 @@ class RecordingWriter:
         return self._closed_bytes == self.stored_bytes
 
     def append(self, batch: Batch | LooseBatch, channels: Sequence[Channel]) -> None:
-        """Append a batch; `batch.channel` indexes `channels`.
-
-        Raises:
-            DiskFullError: No space; flushed chunks stay.
-        """
+        """Append a batch; `batch.channel` indexes `channels`. If it fails, flushed chunks stay."""
         if not len(batch):
             return
         seq = np.arange(self._next_seq, self._next_seq + len(batch), dtype=np.int64)
@@ -245,9 +240,7 @@ class RecordingWriter:
     def flush_older(self, seconds: float, *, most: int | None = None) -> None:
         """Close chunks of at least this age, then large ones; write packed chunks.
 
-        Args:
-            seconds: Their age.
-            most: Bytes that may remain in open chunks; None for any number.
+        `most` bytes may remain in open chunks; None for any number.
         """
         limit = time.monotonic() - seconds
         for key, chunk in [*self._clusters.items()]:
@@ -277,9 +270,8 @@ class RecordingWriter:
     def close_truncated(self, extras: Sequence[Metadata]) -> None:
         """Seal the chunks in the file and drop the others, after a failed write.
 
-        Raises:
-            DiskFullError: No room; the next opening of the store seals the segment. Or no
-                message is in the files.
+        `DiskFullError` if no message is in the files, or there is no room: the next opening of the
+        store seals the segment.
         """
         self._syncing = None
         self._shut_down()

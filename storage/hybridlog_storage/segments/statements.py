@@ -1,4 +1,4 @@
-"""What segments say of their recording in metadata records, checked, since all may be hostile."""
+"""Statements of segments on their recording, in metadata records; checked: they may be hostile."""
 
 from __future__ import annotations
 
@@ -29,11 +29,7 @@ LossRow = TypedDict(
 
 
 def loss_rows(value: Mapping[str, object]) -> list[dict[str, Any]]:
-    """Rows of the loss ledger, from the value of its metadata record, see `LossRow`.
-
-    Raises:
-        SegmentError: The value is damaged.
-    """
+    """Rows of the loss ledger, from the value of its metadata record, see `LossRow`."""
     rows: list[dict[str, Any]] = _checked(value.get("rows"), list[LossRow])
     _check_spans(rows)
     return rows

@@ -59,11 +59,8 @@ _UNKNOWN: Final = np.iinfo(np.int64)  # publish times stand in the messages only
 class WalkedChunk(NamedTuple):
     """A chunk whose head, arrival numbers and channels are whole; its content was not read.
 
-    Attributes:
-        offset: Byte of the chunk record.
-        length: Its bytes.
-        trailer: Bytes of message indexes and arrival numbers behind it.
-        parts: `PART`[c], statistics of each channel in it; publish times are unknown.
+    `offset` and `length` are of the chunk record; `trailer` is the bytes of message indexes and
+    arrival numbers behind it. `parts` is `PART`[c]; publish times are unknown.
     """
 
     offset: int
@@ -79,18 +76,11 @@ class _TornError(SegmentError):
 class Walk:
     """The records of a segment so far.
 
-    Args:
-        reader: Reads the file.
-
     Attributes:
         recording: What it says of its recording; None without.
         channels: Id of the schema, and channel, by id of the channel.
         schemas: Schemas by id, also of channels that are not defined.
-        chunks: Its chunks, in file order.
-        losses: Rows of the loss ledger.
-        attachments: Its attachments, in file order.
-        metadata: All metadata records, in file order.
-        damaged: What cannot be read, in file order.
+        damaged: What cannot be read, in file order, as all the others are.
         stopped: What is at the end of the file, if no writer leaves that; else None.
         is_complete: Whether the end of the data was reached: the writer had begun the summary.
         end: Where the last whole record ends, or damage before a later one.
@@ -112,11 +102,7 @@ class Walk:
         self.end = len(START)
 
     def go_on(self) -> None:
-        """Read what follows the last whole record.
-
-        Raises:
-            SegmentError: The file cannot be read, or has another format.
-        """
+        """Read what follows the last whole record."""
         self.stopped, self.is_complete = None, False
         self._bytes.size = self._reader.size
         self._bytes.forget()
@@ -209,11 +195,7 @@ class Walk:
         return end + trailer.length
 
     def _chunk_head(self, at: int, end: int) -> ChunkHead:
-        """A chunk record before its content.
-
-        Raises:
-            SegmentError: It contradicts itself, or the file ends in the chunk.
-        """
+        """A chunk record before its content; `SegmentError` if the file ends in the chunk."""
         head = chunk_head_of(self._peek(at, MAX_CHUNK_HEAD))
         if head is not None and at + head.end == end <= self._reader.size:
             return head
@@ -291,15 +273,7 @@ _PROVABLE: Final = frozenset({Opcode.CHUNK, Opcode.METADATA})
 
 
 def _parts_by_index(indexes: list[tuple[int, NDArray[np.void]]], size: int) -> NDArray[np.void]:
-    """Statistics of each channel in a chunk, from its message indexes.
-
-    Args:
-        indexes: They, checked.
-        size: Bytes of the chunk's content.
-
-    Returns:
-        `PART`[c], by channel id.
-    """
+    """Statistics, `PART`[c] by channel id, of a chunk of `size` bytes, from its checked indexes."""
     times = [rows["log_time"].astype(np.int64) for _, rows in indexes]
     starts = np.concatenate([rows["offset"] for _, rows in indexes]).astype(np.int64)
     counts = np.array([len(rows) for _, rows in indexes])
