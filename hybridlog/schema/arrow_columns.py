@@ -64,13 +64,9 @@ def structs(
     missing: NDArray[np.bool_] | None = None,
     kind: Iterable[pa.Field] | None = None,
 ) -> pa.StructArray:
-    """Fields side by side; the number of fields may be zero.
+    """Fields side by side, possibly none; rows are null where `missing` (bool[rows]) is True.
 
-    Args:
-        fields: Arrays of `rows` rows.
-        rows: Number of rows.
-        missing: bool[rows], True for null rows.
-        kind: The fields with their metadata; None for plain ones.
+    `kind` has the fields with their metadata; None for plain ones.
     """
     if kind is None:
         kind = [pa.field(name, array.type) for name, array in fields.items()]

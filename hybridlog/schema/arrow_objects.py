@@ -31,24 +31,16 @@ _INT64, _UINT64 = np.iinfo(np.int64), np.iinfo(np.uint64)
 def objects_array(
     objects: Sequence[Mapping[str, Any]], wanted: Sequence[Sequence[str]] | None
 ) -> pa.StructArray:
-    """Messages as a struct array.
-
-    Args:
-        objects: One for each row.
-        wanted: Paths of the fields to convert; None for all.
-    """
+    """Messages, one a row, as a struct array of the wanted paths; None for all."""
     return cast("pa.StructArray", _structs(objects, wanted, 1))
 
 
 def values_array(
     values: Sequence[Any], wanted: Sequence[Sequence[str]] | None = None, depth: int = 1
 ) -> pa.Array[Any]:
-    """Values of any kind as one array, with None as null.
+    """Values of any kind as one array, None as null; of objects the wanted paths, None for all.
 
-    Args:
-        values: Objects, lists, strings, bytes, numbers, booleans, None.
-        wanted: Paths within objects to convert; None for all.
-        depth: Levels above these values.
+    There are `depth` levels above these values.
     """
     kinds = {_kind(kind) for kind in set(map(type, values))} - {type(None)}
     array: pa.Array[Any] | None = None

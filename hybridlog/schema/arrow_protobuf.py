@@ -84,13 +84,7 @@ _MAX_UNSET = 10_000
 def messages_array(
     descriptor: Descriptor, messages: Sequence[Message], wanted: Wanted
 ) -> pa.StructArray:
-    """Messages of one type as a struct array.
-
-    Args:
-        descriptor: Type of the messages.
-        messages: One for each row.
-        wanted: Paths of the fields to convert; None for all.
-    """
+    """Messages of one type as a struct array of the wanted paths; None for all."""
     return cast("pa.StructArray", _Builder().messages(descriptor, messages, wanted, ()))
 
 

@@ -136,12 +136,7 @@ def bounds_of(array: Array) -> NDArray[np.int64]:
 
 
 def with_values(array: Array, values: Array) -> Array:
-    """Lists of the same lengths as those of a list array, with other elements.
-
-    Args:
-        array: The list array.
-        values: As many elements as its `flatten()` has.
-    """
+    """Lists as long as those of a list array, of as many values as its `flatten()` has."""
     return lists(values, bounds_of(array), missing_of(array))
 
 
@@ -158,11 +153,7 @@ def exact(kinds: Kinds, arrays: Arrays) -> pa.DataType:
 
 
 def widened(kinds: Kinds, arrays: Arrays) -> pa.DataType:
-    """The same by types alone: all values of the types fit.
-
-    Raises:
-        pa.ArrowInvalid: There is none.
-    """
+    """The same by types alone: all values of the types fit; `pa.ArrowInvalid` without one."""
     whole = all(map(_types.is_integer, kinds)) and not (
         pa.uint64() in kinds and any(map(_types.is_signed_integer, kinds))
     )
@@ -179,13 +170,8 @@ def common_type(
 ) -> pa.DataType:
     """The type that represents the values of all arrays exactly.
 
-    Args:
-        arrays: The arrays.
-        leaf: Returns the type of values that are neither structs nor lists.
-        summaries: True if arrays become summaries beside summaries.
-
-    Raises:
-        pa.ArrowInvalid: A name stands for two fields.
+    `leaf` returns the type of values that are neither structs nor lists; with `summaries`, arrays
+    become summaries beside summaries. A name that stands for two fields raises `pa.ArrowInvalid`.
     """
     inner = partial(common_type, leaf=leaf, summaries=summaries)
     kinds = list(dict.fromkeys(array.type for array in arrays))
@@ -279,8 +265,7 @@ def _range(arrays: Any) -> tuple[int, int]:
 def common_schema(tables: Iterable[pa.Table]) -> pa.Schema:
     """One schema that represents the values of all tables exactly, columns in first-seen order.
 
-    Args:
-        tables: Each is released before the next one is taken.
+    Each table is released before the next one is taken.
     """
     fields: dict[str, pa.Field] = {}
     seen: dict[str, dict[pa.DataType, Array]] = {}
@@ -331,18 +316,10 @@ def _example(array: Array) -> Array:
 
 
 def converted(array: Array, kind: pa.DataType, *, drops: bool = False) -> Array:
-    """The values of an array in another type that represents them.
+    """The values of an array in another type that represents them, else `pa.ArrowInvalid`.
 
-    Arrays become summaries where the type is that of summaries, and bytes become lists of
-    numbers.
-
-    Args:
-        array: The array.
-        kind: The type.
-        drops: True to leave out fields of structs that the type lacks.
-
-    Raises:
-        pa.ArrowInvalid: the type does not represent them exactly.
+    Arrays become summaries where the type is that of summaries, and bytes become lists of numbers.
+    With `drops`, fields of structs that the type lacks are left out.
     """
     if array.type == kind:
         return array
@@ -397,11 +374,7 @@ def plain_values(
 ) -> list[Any]:
     """Values as in JSON, except NaN: times in nanoseconds, bytes in base64.
 
-    Null fields of structs are left out.
-
-    Args:
-        array: The values.
-        cells: Returns other cells of an array, or None for these.
+    Null fields of structs are left out. `cells` returns other cells of an array, or None for these.
     """
     made = cells(array)
     if made is not None:
@@ -450,13 +423,9 @@ def _is_there(array: Array) -> list[bool]:
 
 
 def summary(array: Array) -> pa.StructArray:
-    """Each list as the summary that the index has of a long one.
+    """Each list, or bytes, as the summary that the index has of a long one.
 
-    Args:
-        array: Lists or bytes.
-
-    Returns:
-        `{n, min, max, mean}` of the finite numbers; `{n}` of other elements and of bytes.
+    It is `{n, min, max, mean}` of the finite numbers; `{n}` of other elements and of bytes.
     """
     found = _summarised(array)
     parts = {"n": pa.array(lengths_of(array))}
@@ -467,12 +436,7 @@ def summary(array: Array) -> pa.StructArray:
 
 
 def statistic(array: Array, name: str) -> Array | None:
-    """One number of each summary; None if summaries of such elements lack it.
-
-    Args:
-        array: Lists or bytes.
-        name: `n`, `min`, `max` or `mean`.
-    """
+    """`n`, `min`, `max` or `mean` of each summary; None if summaries of such elements lack it."""
     if name == "n":
         return pa.array(lengths_of(array), mask=missing_of(array))
     found = _summarised(array)
@@ -498,10 +462,7 @@ def _summarised(array: Array) -> Summary | None:
 def part_of_summary(records: Array, path: Sequence[str], name: str) -> Array | None:
     """One number of the summary of an array in records; None if summaries of it lack that.
 
-    Args:
-        records: A struct array, in which the array is a summary, or of a fixed length.
-        path: Names on the path of the array.
-        name: As for `statistic`.
+    The array is a summary there, or of a fixed length.
     """
     for inner in path:
         at = records.type.get_field_index(inner) if _types.is_struct(records.type) else -1

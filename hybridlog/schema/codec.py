@@ -84,9 +84,7 @@ class Decoded:
         """The messages as plain values: dict, list, str, bytes, bool, int, float, None.
 
         A field that a message lacks is not there. Times and durations are integer nanoseconds.
-
-        Args:
-            whole: False for `{"n": length}` in place of protobuf's `bytes`.
+        Without `whole`, protobuf's `bytes` are `{"n": length}`.
         """
         if not isinstance(self.records, Records):
             return self.records.plain(whole=whole)
@@ -116,25 +114,14 @@ class Codec(Protocol):
         length: NDArray[np.int64],
         fields: Collection[str] | None = None,
     ) -> Decoded:
-        """Decode messages.
+        """Decode messages at `offset` (int64[n]) of `length` bytes (int64[n]) in a buffer.
 
-        Args:
-            buffer: Holds the payloads.
-            offset: int64[n], where each payload starts.
-            length: int64[n], bytes of each payload.
-            fields: Dotted paths of those wanted, each with all below it; None for all.
-
-        Raises:
-            DefinitionError: There is no definition to read them by.
+        `fields` are dotted paths of those wanted, each with all below it; None for all. Without a
+        definition it raises DefinitionError.
         """
 
     def decode(self, payload: Buffer) -> object:
-        """One message as the usual library of its format has it.
-
-        Raises:
-            PayloadError: The payload does not fit its definition.
-            DefinitionError: It has no definition.
-        """
+        """One message as its format's usual library has it; PayloadError if it does not fit."""
 
 
 class OpaqueCodec:
@@ -156,19 +143,11 @@ class OpaqueCodec:
         length: NDArray[np.int64],
         fields: Collection[str] | None = None,
     ) -> NoReturn:
-        """Refuses.
-
-        Raises:
-            DefinitionError: Always.
-        """
+        """Refuses with DefinitionError."""
         raise DefinitionError(f"cannot be decoded: {self.reason}. `.raw` has the bytes")
 
     def decode(self, payload: Buffer) -> NoReturn:
-        """Refuses.
-
-        Raises:
-            DefinitionError: Always.
-        """
+        """Refuses with DefinitionError."""
         self.columns(payload, no_rows(), no_rows())
 
 
@@ -187,11 +166,7 @@ class ObjectCodec(ABC):
         """See `Codec.decode`."""
 
     def read(self, payload: memoryview) -> Any:
-        """The object that columns are made from.
-
-        Raises:
-            PayloadError: The payload does not fit.
-        """
+        """The object that columns are made from; PayloadError if the payload does not fit."""
         return self.decode(payload)
 
     def form(self, values: list[Any], fields: Collection[str] | None) -> Objects:
@@ -235,11 +210,7 @@ def columns_of(codec: Codec, batch: Batch, fields: Collection[str] | None = None
 
 
 def stamps_of(codec: Codec, batch: Batch) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
-    """Decode the header stamps of messages of one channel.
-
-    Returns:
-        Rows of the messages that have a stamp, and the stamps, ns.
-    """
+    """Rows of those messages of one channel that have a header stamp, and the stamps, ns."""
     decoded = columns_of(codec, batch, {STAMP})
     found = stamp_array(decoded.arrow())
     if found is None:

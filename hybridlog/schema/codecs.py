@@ -23,11 +23,7 @@ _ROS = {("ros1", "ros1msg"), ("cdr", "ros2msg"), ("cdr", "ros2idl"), ("cdr", "om
 
 
 def codec_for(channel: Channel) -> Codec:
-    """The codec of a channel. Never raises: an unreadable channel gets an `OpaqueCodec`.
-
-    Args:
-        channel: The channel; its message encoding and schema determine the codec.
-    """
+    """The codec of a channel. Never raises: an unreadable channel gets an `OpaqueCodec`."""
     schema = channel.schema
     state = state_of(channel.message_encoding)
     if state is not State.WHOLE:
@@ -80,11 +76,7 @@ class JsonCodec(ObjectCodec):
     """Messages in JSON. A JSON schema is ignored."""
 
     def decode(self, payload: Buffer) -> Plain:
-        """Decode the JSON text into Python objects.
-
-        Raises:
-            PayloadError: the payload is not JSON.
-        """
+        """Decode the JSON text into Python objects."""
         try:
             return cast("Plain", json.loads(str(memoryview(payload), "utf-8-sig")))
         except (ValueError, RecursionError) as error:

@@ -74,12 +74,7 @@ class Arrays:
 
 @dataclass(slots=True)
 class Records:
-    """Nested messages, and the top level itself.
-
-    Attributes:
-        fields: Column of each field, in the order of the definition.
-        rows: Number of rows (also of a message without fields).
-    """
+    """Nested messages, and the top level itself; columns are in the order of the definition."""
 
     fields: dict[str, Column]
     rows: int

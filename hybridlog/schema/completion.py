@@ -54,7 +54,6 @@ class _Candidate:
     Attributes:
         release: The newest release that has it.
         schema: The definition, with those of all nested types.
-        type: Its type.
         proof: MD5 sum of a ROS 1 type, RIHS01 hash of a ROS 2 type.
     """
 
@@ -67,12 +66,7 @@ class _Candidate:
 def completed(channel: Channel, payloads: Sequence[Buffer]) -> Channel:
     """A channel with the definition of its standard type, if its source has none.
 
-    Args:
-        channel: The channel.
-        payloads: Messages of it; a few are enough.
-
-    Returns:
-        The channel itself if it has a definition, or if none is proved.
+    A few payloads are enough. If it has a definition, or none is proved, it is the channel itself.
     """
     schema = channel.schema
     wire = _WIRES.get(channel.message_encoding)

@@ -50,12 +50,9 @@ MAX_FIXED_BYTES = 1 << 40
 
 @dataclass(frozen=True, slots=True)
 class Primitive:
-    """A number or a boolean.
+    """A number or a boolean; `code` is its kind and size in bytes, such as `u1`.
 
-    Attributes:
-        name: Its name in the definition.
-        code: Its kind and size in bytes, such as `u1`; those of `byte` and `char` differ between
-            ROS 1 and ROS 2.
+    Those of `byte` and `char` differ between ROS 1 and ROS 2.
     """
 
     name: str
@@ -74,11 +71,7 @@ class Primitive:
 
 @dataclass(frozen=True, slots=True)
 class Text:
-    """A string.
-
-    Attributes:
-        bound: Largest number of characters, None without a bound.
-    """
+    """A string of at most `bound` characters, None without a bound."""
 
     bound: int | None = None
 
@@ -87,10 +80,7 @@ class Text:
 class Instant:
     """A time or a duration: 32 bits of seconds, then 32 bits of nanoseconds.
 
-    Attributes:
-        kind: Time or duration.
-        signed_seconds: True except for the time of ROS 1.
-        signed_nanoseconds: True only for the duration of ROS 1.
+    Seconds are signed except for the time of ROS 1, nanoseconds only for the duration of ROS 1.
     """
 
     kind: Literal["time", "duration"]
@@ -100,13 +90,7 @@ class Instant:
 
 @dataclass(frozen=True, slots=True)
 class ArrayOf:
-    """An array or a sequence.
-
-    Attributes:
-        element: Type of each element.
-        width: Number of elements if the definition fixes it; it is then not on the wire.
-        bound: Largest number of elements of a bounded sequence. Not enforced on reading.
-    """
+    """An array, whose `width` is not on the wire, or a sequence; its bound is not enforced."""
 
     element: FieldType
     width: int | None = None
@@ -160,30 +144,15 @@ def parse_definition(schema: Schema) -> MessageType:
 
     Missing standard types (`std_msgs/Header`, `geometry_msgs/Point`, ...) are added;
     definitions in the text take precedence.
-
-    Args:
-        schema: Name, encoding and text of the source.
-
-    Raises:
-        DefinitionError: it is missing or malformed, refers to unknown types or to itself,
-            has too many fields, or uses a type without a portable wire form.
     """
     return parse_for_release(schema, "")[0]
 
 
 @lru_cache(maxsize=1024)
 def parse_for_release(schema: Schema, release: Release) -> tuple[MessageType, frozenset[str]]:
-    """Parse a definition; missing standard types are those of one release.
+    """Parse a definition; missing standard types are those of a release, and returned by name.
 
-    Args:
-        schema: As for `parse_definition`.
-        release: One of `releases`; empty for Noetic or Kilted.
-
-    Returns:
-        The type, and the names of the standard types that the text lacks.
-
-    Raises:
-        DefinitionError: As for `parse_definition`.
+    Without a release, they are those of Noetic or Kilted.
     """
     if not schema.encoding:
         raise DefinitionError(f"{schema.name}: no definition in the source")

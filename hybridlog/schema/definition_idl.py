@@ -60,11 +60,7 @@ class IdlTypes:
     enums: set[str] = field(default_factory=set)
 
     def resolved(self) -> dict[str, list[RawField]]:
-        """Structs by canonical name, with typedefs resolved.
-
-        Raises:
-            DefinitionError: Circular typedefs, or arrays of arrays.
-        """
+        """Structs by canonical name, with typedefs resolved."""
         return {
             canonical(name): [self._resolve(name, raw) for raw in fields]
             for name, fields in self.structs.items()
@@ -310,14 +306,5 @@ def _integer(token: str) -> int | None:
 
 
 def parse_idl(owner: str, text: str, types: IdlTypes) -> None:
-    """Add the declarations of one IDL text to `types`.
-
-    Args:
-        owner: Type name, for messages.
-        text: One IDL file.
-        types: Collects the declarations; later texts see the constants of earlier ones.
-
-    Raises:
-        DefinitionError: The text is malformed, or uses a construct without a ROS wire form.
-    """
+    """Add the declarations of one IDL file to `types`; later files see its constants."""
     _Parser(owner, text, types).parse()

@@ -42,7 +42,6 @@ class RawField:
     Attributes:
         name: Field name, not yet checked.
         type: A primitive by its ROS name, or a message by its canonical or bare name.
-        array: True for arrays and sequences.
         width: Number of elements of a fixed array.
         bound: Largest number of elements of a bounded sequence.
         text_bound: Largest length of a bounded string.
@@ -63,7 +62,6 @@ class Section:
     Attributes:
         name: Type name from the header line; empty for a first section without one.
         kind: `MSG`, `IDL`, `SRV` or `ACTION`; empty without a header line.
-        text: The definition.
     """
 
     name: str
@@ -126,16 +124,7 @@ def _lines(text: str) -> Iterator[str]:
 
 
 def parse_msg(name: str, text: str, *, defaults: bool) -> list[RawField]:
-    """Parse the fields of one `.msg` text, in order.
-
-    Args:
-        name: Type name, for messages.
-        text: The definition of this type alone.
-        defaults: Whether default values may follow the name (ROS 2).
-
-    Raises:
-        DefinitionError: A line is neither a field, a constant nor a comment.
-    """
+    """Parse the fields of one `.msg` text, in order; with `defaults`, values may follow (ROS 2)."""
     fields: list[RawField] = []
     for number, raw_line in enumerate(text.split("\n"), 1):
         line = raw_line.strip()
@@ -185,20 +174,11 @@ _PART_SUFFIX = re.compile(
 
 
 def parse_parts(name: str, text: str) -> dict[str, list[RawField]]:
-    """Types derived from a `.srv` (two parts) or `.action` (three parts) text.
+    """Fields of types derived from a `.srv` (two parts) or `.action` (three parts) text.
 
-    ROS 2 records services and actions as messages of derived types such as
-    `pkg/srv/Name_Event`, and stores the text of the service or action with them.
-
-    Args:
-        name: Canonical name of any of the derived types, or of the interface itself.
-        text: The definition, parts separated by lines of `---`.
-
-    Returns:
-        Fields by canonical type name.
-
-    Raises:
-        DefinitionError: It has not two or three parts, or an invalid line.
+    ROS 2 records services and actions as messages of derived types such as `pkg/srv/Name_Event`,
+    and stores the text of the service or action with them. `name` is the canonical name of any of
+    these, or of the interface itself.
     """
     parts: list[list[str]] = [[]]
     for line in text.split("\n"):
@@ -222,12 +202,7 @@ _ACTION = ("_Goal", "_Result", "_Feedback")
 
 
 def derived_from(stem: str, known: Collection[str]) -> dict[str, list[RawField]]:
-    """Types that ROS 2 derives from the parts of a service or an action.
-
-    Args:
-        stem: Canonical name of the service or action.
-        known: Names of types; only if all parts are among them, there are derived ones.
-    """
+    """Types that ROS 2 derives from the parts of a service or an action, if all are known."""
     if all(f"{stem}{part}" in known for part in _SERVICE):
         return {f"{stem}_Event": _event(stem)}
     if not all(f"{stem}{part}" in known for part in _ACTION):

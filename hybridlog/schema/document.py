@@ -67,13 +67,8 @@ def bodies(
 ) -> Iterator[Bodies | TooLarge]:
     """Make the body of each row; every row is in exactly one of the results.
 
-    The bytes equal `bson.encode` of the row's dictionary and depend on that row alone.
-    Memory does not grow with the number of rows.
-
-    Args:
-        records: The top level.
-        array_limit: Longer arrays are summarised.
-        max_bytes: Largest body.
+    The bytes equal `bson.encode` of the row's dictionary and depend on that row alone. Memory does
+    not grow with the number of rows. Arrays longer than `array_limit` are summarised.
     """
     if len(records) == 0:
         return
@@ -406,12 +401,7 @@ class _Piece:
 def _append(piece: _Piece, name: bytes, node: _Node, rows: slice, count: int) -> bool:
     """Append an element; return False and append nothing if rows differ in layout.
 
-    Args:
-        piece: The piece to extend.
-        name: Key.
-        node: Value.
-        rows: The rows of `node` for the rows of the piece.
-        count: Number of these rows, at least 1.
+    `rows` of the node, at least one, are for the rows of the piece.
     """
     template, writes = len(piece.template), len(piece.writes)
     piece.header(node.tag if isinstance(node.tag, int) else node.tag[rows], name)

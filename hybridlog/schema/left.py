@@ -78,19 +78,11 @@ class LeftFields(Objects):
         return self._narrowed(self._records(()), self._empty.arrow().type)
 
     def columns(self) -> pa.StructArray:
-        """The messages as columns of tables.
-
-        Raises:
-            UnfitError: They have no common type.
-        """
+        """The messages as columns of tables."""
         return self._joined(self._parts)
 
     def summarised(self) -> pa.StructArray:
-        """The messages as an Arrow array in which arrays are summaries.
-
-        Raises:
-            UnfitError: They have no common type.
-        """
+        """The messages as an Arrow array in which arrays are summaries."""
         return self._joined(self._records(None))
 
     def _joined(self, parts: Sequence[pa.StructArray]) -> pa.StructArray:
@@ -120,12 +112,7 @@ class LeftFields(Objects):
         return pa.concat_arrays([pa.nulls(0, kind), *arrays]).take(pa.array(self._order))
 
     def statistic(self, path: str, what: str) -> pa.Array[Any] | None:
-        """One number of the summary of an array in each message; None if there is none.
-
-        Args:
-            path: Dotted path of the array.
-            what: `n`, `min`, `max` or `mean`.
-        """
+        """`n`, `min`, `max` or `mean` of an array in each message; None if there is none."""
         from hybridlog.schema.arrow_types import part_of_summary
 
         names = path.split(".")
@@ -134,11 +121,7 @@ class LeftFields(Objects):
         return None if kind is None else self._narrowed(found, kind)
 
     def lacking(self, but: Collection[str] = ()) -> NDArray[np.bool_]:
-        """bool[n], True for messages of which a wanted array has only its summary left.
-
-        Args:
-            but: Dotted paths of arrays of which only summaries are wanted.
-        """
+        """bool[n], True where a wanted array, none of `but`, has only its summary left."""
         from hybridlog.columns.left_rows import lacking
 
         found = [lacking(part, self.fields, but) for part in self._parts]
@@ -146,12 +129,7 @@ class LeftFields(Objects):
 
 
 class LeftCodec:
-    """Codec of messages whose payloads are gone.
-
-    Args:
-        original: The codec of the payloads.
-        state: Why they are gone.
-    """
+    """Codec of messages whose payloads are gone; `state` says why."""
 
     def __init__(self, original: Codec, state: State) -> None:
         self.original = original
@@ -206,11 +184,7 @@ class LeftCodec:
         return Decoded(good, records, unreadable, np.sort(np.concatenate(surplus)))
 
     def decode(self, payload: Buffer) -> NoReturn:
-        """Refuses.
-
-        Raises:
-            PayloadError: Always.
-        """
+        """Refuses with PayloadError."""
         raise PayloadError(f"its payload was {CAUSES[self.state]}; only its fields are stored")
 
 

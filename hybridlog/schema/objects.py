@@ -36,11 +36,7 @@ _INT64_MIN, _INT64_MAX = -(1 << 63), (1 << 63) - 1
 
 
 class Nanoseconds(Int64):
-    """A time or a duration.
-
-    Attributes:
-        kind: Time or duration.
-    """
+    """A time or a duration."""
 
     kind: str = "time"
 
@@ -57,10 +53,8 @@ _LONG = frozenset(("int64", "uint32", "uint64"))
 def document_cells(array: pa.Array[Any], *, typed: bool, whole: bool) -> list[Any] | None:
     """Cells of an array as plain values and index documents have them, for `plain_values`.
 
-    Args:
-        array: The array.
-        typed: True if a definition fixes the width of integers.
-        whole: False for `{"n": length}` in place of bytes.
+    With `typed`, a definition fixes the width of integers. Bytes are `{"n": length}`
+    without `whole`.
     """
     from hybridlog.schema.arrow_types import is_bytes, is_time, lengths_of
 
@@ -118,14 +112,9 @@ class Objects:
     def bodies(
         self, array_limit: int, max_bytes: int
     ) -> Iterator[tuple[NDArray[np.uint8] | str, NDArray[np.intp]]]:
-        """Bodies of index documents of equal width, or the reason why there are none.
+        """Bodies of index documents of equal width, or why there are none, and their messages.
 
-        Args:
-            array_limit: Arrays of more elements are summarised.
-            max_bytes: Largest body.
-
-        Returns:
-            For each, the messages that it is about.
+        Arrays of more than `array_limit` elements are summarised.
         """
         found: dict[int | str, tuple[list[int], list[bytes]]] = {}
         for row, value in enumerate(self.plain(whole=False)):

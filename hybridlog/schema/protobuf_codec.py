@@ -57,15 +57,9 @@ _STANDARD = frozenset(
 
 
 class ProtobufCodec(ObjectCodec):
-    """Messages of one protobuf type.
+    """Messages of one protobuf type, whose schema is a `FileDescriptorSet` with dependencies.
 
     Unset fields with presence are not in the index document.
-
-    Args:
-        schema: Name of the type, and a `FileDescriptorSet` with its dependencies.
-
-    Raises:
-        DefinitionError: The package is missing, or the definition cannot be used.
     """
 
     def __init__(self, schema: Schema) -> None:
@@ -83,11 +77,7 @@ class ProtobufCodec(ObjectCodec):
         return _Messages(values, fields, self._class.DESCRIPTOR)
 
     def decode(self, payload: Buffer) -> Message:
-        """Decode the protobuf message.
-
-        Raises:
-            PayloadError: The payload is not of this type.
-        """
+        """Decode the protobuf message."""
         from google.protobuf.message import DecodeError
 
         message = self._class()
@@ -102,11 +92,7 @@ class ProtobufCodec(ObjectCodec):
 
 @dataclass(slots=True)
 class _Messages(Objects):
-    """Some protobuf messages.
-
-    Attributes:
-        descriptor: Their type.
-    """
+    """Some protobuf messages of one type."""
 
     descriptor: Descriptor | None = None
 
@@ -160,15 +146,10 @@ def _message_class(schema: Schema) -> type[Message]:
 
 
 def _fill(pool: DescriptorPool, data: bytes) -> Exception | None:
-    """Adds all files of a set to a pool, each after its imports.
+    """Adds all files of a set to a pool, each after its imports; returns the error of one.
 
-    Imports that the set lacks are dropped: they matter only if a type of theirs is used.
-
-    Returns:
-        The reason why a file could not be added, None if all were.
-
-    Raises:
-        ValueError: Files import each other in a circle.
+    Imports that the set lacks are dropped: they matter only if a type of theirs is used. Files that
+    import each other in a circle raise ValueError.
     """
     from google.protobuf.descriptor_pb2 import FileDescriptorSet
 

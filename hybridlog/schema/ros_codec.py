@@ -44,11 +44,7 @@ _REGISTERING = threading.Lock()
 
 
 class RosCodec:
-    """Messages of one ROS type.
-
-    Raises:
-        DefinitionError: The definition cannot be used.
-    """
+    """Messages of one ROS type."""
 
     indexed = True
     reason: str | None = None
@@ -67,12 +63,7 @@ class RosCodec:
         return self._paths
 
     def decode(self, payload: Buffer) -> object:
-        """Decode the message with rosbags: fields as attributes, arrays as numpy views.
-
-        Raises:
-            PayloadError: The payload does not fit the definition.
-            DefinitionError: rosbags cannot make a class from the definition.
-        """
+        """Decode the message with rosbags: fields as attributes, arrays as numpy views."""
         if self._objects is None:
             with _REGISTERING:
                 self._objects = self._objects or RosObjects(self._type, self._wire)
@@ -107,9 +98,6 @@ class RosObjects:
 
     rosbags runs code generated from type and field names. So it gets the checked type and
     never the text of the definition.
-
-    Raises:
-        DefinitionError: rosbags cannot make a class from it.
     """
 
     def __init__(self, message_type: MessageType, wire: Literal["ros1", "cdr"]) -> None:
@@ -131,11 +119,7 @@ class RosObjects:
             ) from error
 
     def decode(self, payload: Buffer) -> object:
-        """The message.
-
-        Raises:
-            PayloadError: The payload does not fit the definition.
-        """
+        """The message; PayloadError if the payload does not fit the definition."""
         view = memoryview(payload)
         read = self._store.deserialize_ros1 if self._wire == "ros1" else self._store.deserialize_cdr
         from rosbags.serde import SerdeError

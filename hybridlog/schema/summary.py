@@ -49,13 +49,7 @@ class Totals:
     def add(
         self, values: NDArray[np.float64], begins: NDArray[np.intp], places: NDArray[np.intp]
     ) -> None:
-        """Add the sums of runs of values.
-
-        Args:
-            values: The values, run after run.
-            begins: Where each run begins.
-            places: The place of each run, each once.
-        """
+        """Add the sums of runs of values, which begin at `begins`, each to a place of its own."""
         is_large = np.abs(values) >= _LARGE
         if is_large.any():
             large = np.where(is_large, values, 0.0) / _LARGE
@@ -100,15 +94,11 @@ def summary_of(values: Sequence[object]) -> Summary | None:
 
 
 def summarise(values: Scalars, offset: NDArray[np.int64]) -> Summary:
-    """Summarise every row of a ragged array.
+    """Summarise every row of a ragged array; row i is `values[offset[i]:offset[i + 1]]`.
 
-    The summary of a row depends on its elements alone, to the last bit. Sums of floats use
-    one `reduceat`, which adds each segment separately and in the same order. A regular-grid
-    reduction is never used, because its order may differ.
-
-    Args:
-        values: All elements.
-        offset: int64[rows + 1]; row i holds elements `offset[i]:offset[i + 1]`.
+    The summary of a row depends on its elements alone, to the last bit. Sums of floats use one
+    `reduceat`, which adds each segment separately and in the same order. A regular-grid reduction
+    is never used, because its order may differ.
     """
     elements = values.values[int(offset[0]) : int(offset[-1])]
     offset = offset - offset[0]

@@ -54,16 +54,9 @@ class _Odd:
 class WireReader:
     """Reads payloads of one message type.
 
-    Args:
-        message_type: Type of the payloads.
-        wire: Their format.
-        fields: Dotted paths of the fields to read, top-level or nested (`header.stamp`,
-            `transforms[].child_frame_id`; the brackets are optional). A path includes
-            everything below it. Unknown paths are ignored. None reads all. Fields that are
-            not read are still checked.
-
-    Raises:
-        DefinitionError: The type cannot be read with bounded cost.
+    `fields` are dotted paths of those to read, top-level or nested (`header.stamp`,
+    `transforms[].child_frame_id`; the brackets are optional), each with everything below it; None
+    for all. Unknown paths are ignored. Fields that are not read are still checked.
     """
 
     def __init__(
@@ -73,14 +66,9 @@ class WireReader:
         self._program = compile_type(message_type, wire, fields)
 
     def read(self, buffer: Buffer, offset: NDArray[np.int64], length: NDArray[np.int64]) -> Decoded:
-        """Read payloads. Never raises because of their content.
+        """Read payloads at `offset` of `length` bytes (int64[n]). Never raises for their content.
 
         Large arrays of a single row may be views into `buffer`.
-
-        Args:
-            buffer: Holds the payloads.
-            offset: int64[n], where each payload starts.
-            length: int64[n], bytes of each payload.
         """
         offset = np.asarray(offset, np.int64)
         end = offset + np.asarray(length, np.int64)
@@ -100,11 +88,7 @@ class WireReader:
         return Decoded(good, records, unreadable, surplus)
 
     def message_in(self, payload: Buffer) -> memoryview:
-        """A payload without the bytes that are left over behind its message.
-
-        Raises:
-            MisfitError: It does not fit the definition.
-        """
+        """A payload without the bytes that are left over behind its message."""
         view = memoryview(payload)
         start = 0 if self._wire == "ros1" else _HEADER
         order: Literal["<", ">"] = ">" if start and view[:2].tobytes() == b"\0\0" else "<"

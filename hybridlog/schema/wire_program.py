@@ -29,11 +29,7 @@ Wanted: TypeAlias = "bool | dict[str, Wanted]"
 
 @dataclass(frozen=True, slots=True)
 class Leaf:
-    """A requested field with a column.
-
-    Attributes:
-        slot: Number of the column's slot.
-    """
+    """A requested field with a column."""
 
     slot: int
 
@@ -49,13 +45,7 @@ Node: TypeAlias = Leaf | Branch
 
 
 def assemble(node: Node, slots: list[Column | None], rows: int) -> Column:
-    """Assemble the column of a tree of names from its filled slots.
-
-    Args:
-        node: The tree.
-        slots: Columns, each of `rows` rows.
-        rows: Number of rows, for a message without fields.
-    """
+    """Assemble the column of a tree of names from its filled slots, of `rows` rows each."""
     if isinstance(node, Leaf):
         column = slots[node.slot]
         assert column is not None
@@ -68,7 +58,6 @@ class Fixed:
     """A field of fixed size.
 
     Attributes:
-        path: Dotted path, for messages.
         align: Alignment in bytes.
         size: Bytes.
         slot: Slot of its column, None if it is not requested.
@@ -110,11 +99,8 @@ class Run:
     def layout(self, first: int, phase: int, modulus: int) -> Layout:
         """Layout from field `first` on, as far as the known phase allows.
 
-        Args:
-            first: Index of a field. If its alignment is larger than `modulus`, the layout is
-                empty.
-            phase: Phase of the start, modulo `modulus`.
-            modulus: 1, 2, 4 or 8. Fields of larger alignment cannot be placed.
+        The start has `phase` modulo `modulus`: 1, 2, 4 or 8. Fields of larger alignment cannot be
+        placed; from such a one, the layout is empty.
         """
         key = (first, phase, modulus)
         found = self._layouts.get(key)
@@ -173,14 +159,7 @@ class NumbersStep:
 
 @dataclass(frozen=True, slots=True)
 class ArrayStep:
-    """An array or a sequence of anything else.
-
-    Attributes:
-        path: Dotted path, for messages.
-        slot: Slot of its column, None if it is not requested.
-        width: Number of elements; None if the count is on the wire.
-        element: The program of one element.
-    """
+    """An array or a sequence of anything else; without `width`, the count is on the wire."""
 
     path: str
     slot: int | None
@@ -196,13 +175,10 @@ class Program:
     """Steps that read one message, or one element of an array.
 
     Attributes:
-        steps: In wire order.
-        slots: Number of slots.
         root: Assembles the slots; None if no field is requested.
         least: Its minimum size in bytes.
         align: Largest alignment of its fields of fixed size.
         fixed: True if its size depends only on the phase of its start.
-        empty: True if it has no fields.
     """
 
     steps: tuple[Step, ...]
@@ -270,11 +246,7 @@ def _is_fixed(step: Step) -> bool:
 
 
 def wanted_tree(fields: Collection[str] | None) -> Wanted:
-    """Paths as a tree of names; True stands for everything below.
-
-    Args:
-        fields: Dotted paths, `[]` after array names optional. None for all.
-    """
+    """Dotted paths (`[]` optional) as a tree of names; True, as for None, is everything below."""
     if fields is None:
         return True
     tree: dict[str, Wanted] = {}
@@ -374,14 +346,8 @@ class _Compiler:
 
 
 def compile_type(message_type: MessageType, wire: Wire, fields: Collection[str] | None) -> Program:
-    """Compile a message type.
+    """Compile a message type to gather fields by dotted paths; None for all.
 
-    Args:
-        message_type: The type.
-        wire: Wire format.
-        fields: Dotted paths of the fields to gather, None for all. Unknown ones are ignored.
-
-    Raises:
-        DefinitionError: Elements that take no bytes hold arrays themselves.
+    Unknown ones are ignored. Elements that take no bytes and hold arrays raise DefinitionError.
     """
     return _Compiler(wire).program(message_type, "", wanted_tree(fields))

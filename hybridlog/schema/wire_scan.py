@@ -41,30 +41,15 @@ class Scanner:
     def check(self, program: Program, start: int, end: int) -> None:
         """Walk over a whole message. Bytes may be left over, except of a type without fields.
 
-        Args:
-            program: The message.
-            start: First byte; in CDR the one behind the encapsulation header.
-            end: End of the payload.
-
-        Raises:
-            MisfitError: The payload does not fit.
+        In CDR, `start` is behind the encapsulation header. A payload that does not fit raises
+        MisfitError.
         """
         rest = end - self.walk(program, start, end, start)
         if program.empty and rest > self._padding:
             raise MisfitError(f"{rest} bytes left over: the definition has no fields")
 
     def walk(self, program: Program, at: int, end: int, origin: int) -> int:
-        """The position behind one message or element.
-
-        Args:
-            program: Program of the message or element.
-            at: Its start.
-            end: End of the payload.
-            origin: Origin of the alignment.
-
-        Raises:
-            MisfitError: The payload does not fit.
-        """
+        """The position behind a message or element at `at`; `origin` is that of the alignment."""
         for step in program.steps:
             if isinstance(step, Run):
                 size = step.size((at - origin) & self._mask)
@@ -131,11 +116,7 @@ class Scanner:
     def elements(
         self, program: Program, at: int, end: int, origin: int, count: int
     ) -> tuple[list[int], int]:
-        """Start of each of `count` elements, and the position behind the last.
-
-        Raises:
-            MisfitError: The payload does not fit.
-        """
+        """Start of each of `count` elements, and the position behind the last."""
         starts = []
         for _ in range(count):
             starts.append(at)

@@ -124,19 +124,11 @@ class Walker:
     def read(
         self, program: Program, start: NDArray[np.int64], end: NDArray[np.int64]
     ) -> tuple[Column | None, NDArray[np.bool_] | None]:
-        """Read columns of whole messages.
+        """Read columns of whole messages from `start` to `end`, int64[n], all within the buffer.
 
-        Args:
-            program: The message.
-            start: int64[n], first bytes; in CDR those behind the encapsulation headers.
-            end: int64[n], ends of the payloads. All within the buffer.
-
-        Returns:
-            The column, None if no field is requested; and bool[n], True where bytes are left
-            over behind the message, None if there are none.
-
-        Raises:
-            MisfitError: At least one payload does not fit; it is not named.
+        In CDR they start behind the encapsulation headers. The column is None if no field is
+        requested; bool[n] is True where bytes are left over behind the message, None if there are
+        none. MisfitError names no payload.
         """
         slots: list[Column | None] = [None] * program.slots
         if len(start) == 0:
@@ -296,11 +288,9 @@ class Walker:
     def _elements(
         self, element: Program, cursor: _Cursor, counts: int | NDArray[np.int64]
     ) -> tuple[NDArray[np.int64], int, int] | None:
-        """Advance over all elements.
+        """Advance over all elements; returns their starts, and phase and modulus as far as known.
 
-        Returns:
-            Start of each element, row by row, and phase and modulus as far as known. None if
-            elements take no bytes.
+        Returns None if elements take no bytes.
         """
         most = counts if isinstance(counts, int) else int(counts.max())
         if element.least == 0:
