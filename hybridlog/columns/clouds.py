@@ -43,12 +43,7 @@ class PointColumns:
         self._names: set[str] = set()  # of fields of points
 
     def with_points(self, columns: pa.StructArray, clouds: pa.StructArray) -> pa.StructArray:
-        """Columns of clouds, and one more with their points, null where they are malformed.
-
-        Args:
-            columns: The columns.
-            clouds: The clouds, as codecs give them.
-        """
+        """Columns of clouds, and one more with their points, null where they are malformed."""
         found = self.points(clouds)
         field = pa.field(POINTS, found.type, metadata={OWN: b"1"})
         return pa.StructArray.from_arrays(

@@ -52,10 +52,6 @@ class ReusedBytes(NamedTuple):
 
     They keep their place in the new file, where nothing refers to them: DuckDB reads the
     footer, and opens the file again by its name for the rows.
-
-    Attributes:
-        offset: Where they lie.
-        data: The bytes.
     """
 
     offset: int
@@ -68,7 +64,6 @@ class Leaf(NamedTuple):
     Attributes:
         top: Name of the table's column that contains it.
         path: Its dotted path in the file.
-        kind: Type of its values.
         is_own: True for a column of the table itself, not of a field.
         names: Names of the fields on the path to it, without lists.
         array: Names of the fields on the path to the array whose summary it is part of.
@@ -104,16 +99,7 @@ def leaves(schema: pa.Schema) -> Iterator[Leaf]:
 
 
 class TablePart(NamedTuple):
-    """Rows of one topic in a row group, in order.
-
-    Attributes:
-        file: The file.
-        group: Number of the row group.
-        begin: First row of the topic in it.
-        rows: Number of its rows.
-        first: A lower bound of their log times, ns.
-        last: An upper bound of these.
-    """
+    """Rows of one topic in a row group from `begin` on; `first` and `last` bound log times, ns."""
 
     file: ColumnFile
     group: int
@@ -124,15 +110,7 @@ class TablePart(NamedTuple):
 
 
 class ColumnFile:
-    """Reads one file of a table. Thread safe.
-
-    Args:
-        path: The file.
-
-    Raises:
-        FileNotFoundError: the file does not exist.
-        StoreError: the file cannot be read, or is damaged.
-    """
+    """Reads one file of a table; FileNotFoundError without it. Thread safe."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -196,11 +174,7 @@ class ColumnFile:
         return self._parquet.metadata.row_group(group).column(leaf)
 
     def reusable(self) -> ReusedBytes:
-        """The bytes of its row groups.
-
-        Raises:
-            StoreError: they cannot be read.
-        """
+        """The bytes of its row groups."""
         begin, end = self.about.span
         try:
             return ReusedBytes(begin, self._source.raw(begin, end))
@@ -208,26 +182,14 @@ class ColumnFile:
             raise self._damaged(error) from error
 
     def table(self) -> pa.Table:
-        """All rows.
-
-        Raises:
-            StoreError: they are damaged.
-        """
+        """All rows."""
         numbers = range(len(self.leaves))
         groups = [self.read(group, numbers) for group in range(len(self.groups))]
         table = pa.concat_tables(groups) if groups else self.schema.empty_table()
         return table.replace_schema_metadata(None)
 
     def read(self, group: int | None, leaves: Sequence[int]) -> pa.Table:
-        """Some columns of a row group.
-
-        Args:
-            group: Its number; None for no rows.
-            leaves: Column numbers in Parquet's order: single values, depth first.
-
-        Raises:
-            StoreError: the columns are damaged.
-        """
+        """Columns, numbered in Parquet's order (depth first), of a row group; None for no rows."""
         try:
             with self._lock:
                 if group is not None:
@@ -245,11 +207,7 @@ class ColumnFile:
         return table
 
     def check(self) -> str:
-        """Read every value; returns BLAKE3 of all bytes.
-
-        Raises:
-            StoreError: a part is damaged.
-        """
+        """Read every value; returns BLAKE3 of all bytes."""
         try:
             digest = self._source.digest()
         except (OSError, StoreError) as error:
@@ -304,12 +262,10 @@ class ColumnFile:
     def choose(
         self, paths: Collection[str] | None, own: Collection[str], *, arrays: bool = False
     ) -> dict[str, tuple[int, ...]]:
-        """Numbers of the columns for some fields, by the table's column that contains them.
+        """Numbers of the columns of some fields, None for all, by the table's column around them.
 
-        Args:
-            paths: Dotted paths of fields; None for all.
-            own: Columns of the table itself.
-            arrays: True if all rows have `arrays` in full, and their summaries.
+        `own` are columns of the table itself. With `arrays`, all rows have these in full, and their
+        summaries.
         """
         key = None if paths is None else frozenset(paths), frozenset(own), arrays
         found = self._chosen.get(key)

@@ -46,12 +46,7 @@ class UnfitError(Exception):
 
 
 class FieldShape:
-    """Turns fields of messages into columns.
-
-    Args:
-        arrays: True to keep arrays in full, of any length.
-        reserved: Names that no field may have.
-    """
+    """Turns fields of messages into columns, with `arrays` in full at any length."""
 
     def __init__(self, *, arrays: bool = False, reserved: Collection[str] = RESERVED) -> None:
         self._has_arrays = arrays
@@ -59,11 +54,7 @@ class FieldShape:
         self._plain: set[Any] = set()  # types of messages that are columns as they are
 
     def columns(self, records: Array) -> Array:
-        """Fields as columns.
-
-        Returns:
-            A struct array; its fields are the columns.
-        """
+        """Fields as columns: the fields of a struct array."""
         return self._struct(records, self._reserved)
 
     def _column(self, array: Array) -> Array:
@@ -167,11 +158,8 @@ def records_of(
 ) -> Array:
     """Columns as fields of messages, under the names of the fields.
 
-    Args:
-        columns: A struct array; its fields are the columns.
-        is_summarised: Returns whether the array at a path becomes summaries; else lists, of
-            which none is too long.
-        above: Path of the columns.
+    `is_summarised` tells of the array at a path whether it becomes summaries; else lists, of which
+    none is too long. The columns are the fields of a struct array at the path `above`.
     """
     kind = columns.type
     if pa.types.is_struct(kind):
@@ -233,9 +221,6 @@ def joined(pieces: Sequence[Array]) -> Array:
 
     A column missing from a piece is null there. If one piece has summaries of an array, all
     get summaries. Values without a common exact type become JSON text.
-
-    Raises:
-        UnfitError: no common type exists.
     """
     try:
         kind = common_type(pieces, summaries=True)
@@ -246,11 +231,7 @@ def joined(pieces: Sequence[Array]) -> Array:
 
 
 def type_of_all(kinds: Sequence[Any]) -> Any:
-    """The type that all values of some types fit.
-
-    Raises:
-        UnfitError: There is none.
-    """
+    """The type that all values of some types fit; without one, UnfitError."""
     try:
         return common_type([pa.nulls(0, kind) for kind in kinds], widened, summaries=True)
     except pa.ArrowException as error:
@@ -264,13 +245,7 @@ def copied(array: Array) -> Array:
 
 
 def without(array: Array, rows: Any, total: int) -> Array:
-    """Rows at their positions in an array that is null elsewhere.
-
-    Args:
-        array: k rows.
-        rows: intp[k], their positions, ascending.
-        total: Number of rows of the result.
-    """
+    """Rows at ascending positions (intp[k]) in an array of `total` rows, null elsewhere."""
     if len(rows) == total:
         return array
     places = np.zeros(total, np.int64)

@@ -45,12 +45,7 @@ _Piece = tuple[Section, Any]
 
 @dataclass(slots=True)
 class Addition:
-    """Rows of one recording for a folder.
-
-    Attributes:
-        pieces: Rows of topics for a shared file, with all columns, and what they are.
-        files: Finished files of long topics.
-    """
+    """Rows of one recording for a folder: pieces of a shared file, and files of long topics."""
 
     pieces: list[_Piece] = field(default_factory=list)
     files: list[Path] = field(default_factory=list)
@@ -59,11 +54,8 @@ class Addition:
 class TableFolders:
     """Adds and removes tables of one recording, which this process has locked for writing.
 
-    Args:
-        root: The store.
-        recording: Id of the recording.
-        created: When it was created, ns; None if unknown: then it is looked for in all files.
-        digests: Digests of its segments; rows of others go.
+    Rows of other segments than those of `digests` go. Without `created` (ns), the recording is
+    looked for in all files.
     """
 
     def __init__(
@@ -86,15 +78,9 @@ class TableFolders:
         replaced: Collection[str] = (),
         prefixes: Collection[str] = (),
     ) -> None:
-        """Add tables, in place of older ones of the same topics.
+        """Add tables by folder, in place of older ones of the `replaced` topics.
 
-        Args:
-            additions: New tables by folder.
-            replaced: Topics whose older tables go.
-            prefixes: Beginnings of the names of folders that may have such tables.
-
-        Raises:
-            OSError: a file cannot be written.
+        `prefixes` are beginnings of the names of folders that may have such tables.
         """
         self._keeps_bytes = not prefixes  # tables that are made anew leave no holes
         with suppress(FileExistsError):
@@ -113,27 +99,14 @@ class TableFolders:
                     _log.warning("no table in %s: %s", name, error or repr(error))
 
     def remove(self, prefixes: Collection[str] = ("",)) -> None:
-        """Remove all tables of the recording.
-
-        Args:
-            prefixes: Beginnings of the names of folders that may have tables of it.
-
-        Raises:
-            OSError: one cannot be removed.
-        """
+        """Remove all tables of the recording in folders whose names begin with a prefix."""
         with suppress(FileNotFoundError), files.locked_folder(self._root / TABLES):
             for name in _folders(self._root):
                 if name.startswith(tuple(prefixes)):
                     self._change(name, Addition(), lambda _: True)
 
     def _change(self, folder: str, addition: Addition, goes: Callable[[str], bool] | None) -> None:
-        """Remove and add tables in a folder; an empty one is removed.
-
-        Args:
-            folder: Its name.
-            addition: What is added.
-            goes: Returns whether older rows of a topic go; None if there are none.
-        """
+        """Remove older rows of topics that go, and add tables; an empty folder is removed."""
         place = self._root / TABLES / folder
         names = [n for n in files.names(place) if n.endswith(SUFFIX)]
         shared = [*shared_for(shared_times(names), self._created)]
@@ -218,13 +191,7 @@ class TableFolders:
     def _write(
         self, path: Path, pieces: Iterable[_Piece], before: ColumnFile | None = None
     ) -> None:
-        """Write a shared file, and give it its name by one rename.
-
-        Args:
-            path: The file.
-            pieces: What it has, in any order.
-            before: The file that it replaces.
-        """
+        """Write a shared file, in place of `before`, and give it its name by one rename."""
         pieces = sorted(pieces, key=lambda piece: piece[0].place)
         found = [section for section, _ in pieces]
         schema = pieces[0][1].schema
@@ -294,12 +261,7 @@ def shared_times(names: Iterable[str]) -> list[int]:
 
 
 def shared_for(times: Sequence[int], created: int | None) -> Iterator[str]:
-    """Names of shared files that may have rows of a recording, the likeliest first.
-
-    Args:
-        times: As of `shared_times`.
-        created: When it was created, ns; None if unknown.
-    """
+    """Names of shared files that may have rows of a recording, likeliest first; `created` in ns."""
     end = len(times) if created is None else bisect_right(times, max(created, 0))
     return map(_shared_name, reversed(times[:end]))
 
@@ -309,14 +271,7 @@ def _shared_name(time: int) -> str:
 
 
 class Listing:
-    """The entries of a folder, which are read again only after a change.
-
-    Args:
-        path: The folder.
-
-    Attributes:
-        names: The status of each entry, by name; empty without the folder.
-    """
+    """Status of a folder's entries by name, read again only after a change; none without it."""
 
     def __init__(self, path: Path) -> None:
         self.names: dict[str, os.stat_result] = {}
@@ -324,11 +279,7 @@ class Listing:
         self._read_at: tuple[int, int] | None = None  # inode, and time of its last change
 
     def look(self) -> bool:
-        """Read the entries if they may have changed; returns whether it did.
-
-        Raises:
-            StoreError: they cannot be read.
-        """
+        """Read the entries if they may have changed; returns whether it did."""
         try:
             now, names = files.changed_names(self._path, self._read_at)
             if names is None:

@@ -82,12 +82,7 @@ def type_prefix(type_name: str) -> str:
 
 
 def shape_folder(type_name: str, schema: Any) -> str:
-    """Name of the folder of a message type.
-
-    Args:
-        type_name: Name of the type, possibly empty.
-        schema: The Arrow schema of its tables.
-    """
+    """Folder of a message type, whose name may be empty, by the Arrow schema of its tables."""
     text = json.dumps([_described(column) for column in schema])
     return type_prefix(type_name) + hashlib.sha256(text.encode()).hexdigest()[:8]
 
@@ -106,10 +101,9 @@ def _described(column: Any) -> list[Any]:
 
 
 def table_schema_of(channel: Channel) -> str:
-    """What determines the columns of a channel: its original encoding, and the hash of its schema.
+    """Original encoding and schema hash of a channel, which determine its columns.
 
-    Args:
-        channel: The channel; a reduced one names its original encoding in its metadata.
+    A reduced channel names its original encoding in its metadata.
     """
     schema = "" if channel.schema is None else schema_hash(channel.schema)
     return f"{encoding_of(channel.message_encoding, channel.metadata)}:{schema}"
@@ -126,11 +120,8 @@ def column_names(
     """Fields of a message, and the name of the column for each.
 
     A field with a reserved name gets a trailing `_`. A field that differs from an earlier one
-    only in case gets a number, since DuckDB ignores case.
-
-    Args:
-        names: Names of the fields, in order.
-        reserved: Reserved names; none inside a nested message.
+    only in case gets a number, since DuckDB ignores case. No name is reserved inside a nested
+    message.
     """
     names = list(names)
     taken = {name.casefold() for name in reserved}
@@ -147,13 +138,7 @@ def column_names(
 
 
 class TopicCounts(NamedTuple):
-    """Rows of a topic of a recording in a file.
-
-    Attributes:
-        rows: All rows.
-        unreadable: Rows without fields, because their messages do not fit their definition.
-        arrays: Rows with arrays in full.
-    """
+    """Rows of a topic in a file; `unreadable` ones lack fields, `arrays` ones are whole."""
 
     rows: int
     unreadable: int = 0
@@ -171,14 +156,9 @@ class TopicCounts(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """The rows of one topic of one recording in a file.
+    """Rows of one topic of one recording in a file; `begin` is of the recording, ns.
 
-    Attributes:
-        id: Id of the recording.
-        topic: Full name of the topic.
-        begin: Log time at which the recording begins, ns.
-        segments: Digest of each segment that has rows in it, by its number as text.
-        counts: Its rows.
+    `segments` has the digest of each segment with rows in it, by its number as text.
     """
 
     id: str
@@ -200,13 +180,9 @@ class Section:
 
 @dataclass(frozen=True, slots=True)
 class About:
-    """The description of a file of tables, stored in the file itself.
+    """The description of a file of tables, in the file; `span` is the bytes of the row groups.
 
-    Attributes:
-        sections: The rows in the file, in its order.
-        span: First byte of the row groups, and the one after their end.
-        version: Version of the format.
-        of_rows: What a file of rows says of them besides; empty in a table.
+    `of_rows` is what a file of rows says of them besides; empty in a table.
     """
 
     sections: Sequence[Section]
@@ -220,11 +196,7 @@ class About:
 
     @classmethod
     def from_json(cls, text: bytes) -> About:
-        """The description from its JSON text.
-
-        Raises:
-            StoreError: the text is invalid, or of another version.
-        """
+        """The description from its JSON text; StoreError if invalid or of another version."""
         try:
             about = msgspec.json.decode(text, type=cls)
         except (ValueError, RecursionError) as error:

@@ -78,11 +78,7 @@ def _asks(wanted: Sequence[tuple[str, ...]], array: tuple[str, ...]) -> bool:
 
 
 def messages_left(parts: Sequence[pa.StructArray]) -> tuple[Batch, NDArray[np.int64]]:
-    """The rows that remain of a chunk, and their arrival numbers, in the order of arrival.
-
-    Args:
-        parts: Rows of each file; a struct has all columns.
-    """
+    """The rows that remain of a chunk, and their arrival numbers, in the order of arrival."""
 
     def numbers(name: str, kind: Any, *, of_ref: bool = False) -> NDArray[Any]:
         from_parts = [part.field("ref") if of_ref else part for part in parts]
@@ -124,10 +120,8 @@ def _summaries_in(
 def documents(columns: Array, *, typed: bool, summaries: bool = True) -> list[dict[str, Any]]:
     """Columns as index documents: arrays, or summaries of long ones, and without what is null.
 
-    Args:
-        columns: A struct array; its fields are the columns.
-        typed: True if a definition fixes the width of integers.
-        summaries: False to leave out arrays of which only a summary is left.
+    They are the fields of a struct array. With `typed`, a definition fixes the width of integers.
+    Without `summaries`, there are no arrays of which only a summary is left.
     """
     cells = partial(document_cells, typed=typed, whole=not summaries)
     found = plain_values(records_of(columns), cells)

@@ -34,18 +34,10 @@ class NoRoomError(Exception):
 
 
 class ParquetFileWriter:
-    """Writes one file of a table.
+    """Writes one file of a table, in the folder of a recording's unfinished tables.
 
-    Args:
-        path: The file, in the folder of a recording's unfinished tables.
-        schema: Its columns.
-        level: Level of zstd.
-        reused: Row groups of the file that this one replaces.
-        in_front: True to write the new row groups in front of the kept ones.
-        front: Bytes in front of the row groups, which no reader of Parquet looks at.
-
-    Raises:
-        OSError: the file cannot be created.
+    It keeps the row groups `reused` from the file that it replaces, with `in_front` behind the new
+    ones. No reader of Parquet looks at the bytes of `front`.
     """
 
     def __init__(
@@ -92,11 +84,7 @@ class ParquetFileWriter:
             raise
 
     def write(self, table: pa.Table) -> None:
-        """Write a row group.
-
-        Raises:
-            OSError: the row group cannot be written.
-        """
+        """Write a row group."""
         self._writer.write_table(table, row_group_size=max(table.num_rows, 1))
 
     def close(
@@ -106,19 +94,10 @@ class ParquetFileWriter:
         rows: Mapping[str, Any] | None = None,
         sync: bool = False,
     ) -> tuple[int, str]:
-        """Finish the file.
+        """Finish the file, with its sections in order; returns its bytes, and BLAKE3 of them.
 
-        Args:
-            sections: The rows in it, in its order.
-            rows: What a file of rows says of them besides.
-            sync: True to force it to the disk.
-
-        Returns:
-            Its bytes, and BLAKE3 of them.
-
-        Raises:
-            OSError: the file cannot be written.
-            NoRoomError: the row groups do not fit in front of the kept ones.
+        `rows` is what a file of rows says of them besides. Row groups that do not fit in front of
+        the kept ones raise NoRoomError.
         """
         try:
             span = self._begin, self._file.tell()

@@ -29,10 +29,6 @@ class RecordingRows:
     """The files of rows of one recording. Thread safe.
 
     Nothing is read before it is needed.
-
-    Args:
-        recording: The recording's directory.
-        cache: Keeps rows that were read.
     """
 
     def __init__(self, recording: Path, cache: Cache | None = None) -> None:
@@ -49,11 +45,7 @@ class RecordingRows:
         return {} if manifest is None else manifest.rows
 
     def left(self, log: int, chunk: int) -> tuple[Batch, NDArray[np.int64]]:
-        """The rows that remain of a chunk, and the arrival numbers of its messages.
-
-        Raises:
-            SegmentError: It is missing or damaged.
-        """
+        """The rows that remain of a chunk, and the arrival numbers of its messages."""
         from hybridlog.columns.left_rows import messages_left
         from hybridlog.columns.rows_file import RESTORE
 

@@ -76,15 +76,7 @@ def times(first: int | None, last: int | None) -> dict[str, Any]:
 
 
 def write_recordings_file(path: Path, summaries: Iterable[RecordingSummary]) -> None:
-    """Write the file.
-
-    Args:
-        path: Where it lies.
-        summaries: All recordings; those that have not ended are left out.
-
-    Raises:
-        OSError: It cannot be written.
-    """
+    """Write the summaries of the recordings that have ended."""
     ended = [one for one in summaries if one.status not in UNFINISHED]
     ended.sort(key=lambda one: (one.extent, one.id))
     # In tables, `recording` is the id, which stays when a recording is renamed.

@@ -28,12 +28,9 @@ class Piece:
     """Rows of a topic in a segment.
 
     Attributes:
-        segment: Number of the segment.
         own: The columns that every table has, by name.
         fields: A struct array, null where a message is unreadable; None without any fields.
-        unreadable: Number of unreadable messages.
         surplus: Rows of messages with bytes left over behind them.
-        has_arrays: True if they have arrays in full.
     """
 
     segment: int
@@ -96,15 +93,8 @@ def piece_of(
 ) -> Piece:
     """Rows of messages of one topic and state.
 
-    Args:
-        segment: Number of their segment.
-        batch: The messages; `channel` has ids.
-        places: Where they lie.
-        codec: Decodes them.
-        state: Their state, but for those that are unreadable.
-        has_publish_time: Whether messages of a channel have a publish time, by channel id.
-        columns: Turns their fields into columns.
-        fields: Paths of the fields that are wanted; None for all.
+    Readable ones have that state. `has_publish_time` is by channel id; `columns` turns fields into
+    columns; `fields` are paths of those wanted, None for all.
     """
     import pyarrow as pa
     import pyarrow.compute as pc

@@ -26,13 +26,7 @@ RESTORE: Final = " Restore it from a copy; `hybridlog verify` shows what is affe
 class RowsFile(ColumnFile):
     """One file of rows: messages of a topic. Thread safe.
 
-    Attributes:
-        listed: Its line of the manifest.
-        topic: Its topic.
-        places: Row group, its first row and number of rows of each chunk, by number.
-
-    Raises:
-        StoreError: It is missing, damaged, or another file than the listed one.
+    `places` has the row group of each chunk, its first row and number of rows there.
     """
 
     def __init__(self, folder: Path, listed: File, cache: Cache | None = None) -> None:
@@ -80,11 +74,7 @@ class RowsFile(ColumnFile):
         return found
 
     def of_chunk(self, chunk: int) -> pa.StructArray:
-        """The rows of a chunk; a struct has all columns.
-
-        Raises:
-            StoreError: They are damaged.
-        """
+        """The rows of a chunk; a struct has all columns."""
         group, begin, rows = self.places[chunk]
         found = self._cache.made(
             "column",
@@ -100,16 +90,7 @@ class RowsFile(ColumnFile):
 
 
 def lines_of(folder: Path, log: File, names: Iterable[str]) -> list[File]:
-    """Lines of a manifest for files of rows that no manifest lists.
-
-    Args:
-        folder: Their folder.
-        log: The line of their log.
-        names: Their names, the first one first.
-
-    Raises:
-        StoreError: One cannot be read.
-    """
+    """Lines of a manifest for files of rows of a log that none lists, from the first file on."""
     found = []
     for name in names:
         about = ColumnFile(folder / name).about

@@ -46,9 +46,6 @@ class _OpenFile:
     """A file that is being written.
 
     Attributes:
-        name: Its name.
-        topic: Its topic.
-        writer: Writes it.
         tables: Rows that wait for a row group.
         waiting: Their bytes.
         pending: Number and rows of each chunk among them.
@@ -69,12 +66,8 @@ class _OpenFile:
 class RowsWriter:
     """Writes what is left of the messages of a log.
 
-    Args:
-        folder: A folder named by the id of the recording, in which nobody else writes such files.
-        log: Line of the log in its manifest.
-        channels: Its channels by id.
-        front: Beginning of the first file, see `gone_log`.
-        version: Number in the name of the first file; others have those that follow.
+    Nobody else writes such files in `folder`, which is named by the id of the recording. `front`
+    begins the first file (see `gone_log`), whose name has the number `version`; others follow.
     """
 
     def __init__(
@@ -97,11 +90,7 @@ class RowsWriter:
         self._written: list[File] = []
 
     def add(self, chunk: StoredChunk) -> None:
-        """Add the messages of a chunk.
-
-        Raises:
-            HybridlogError: A file cannot be written.
-        """
+        """Add the messages of a chunk."""
         by_kind: dict[_Kind, list[int]] = {}
         for number in distinct(chunk.batch.channel).tolist():
             channel = self._channels[number]
@@ -123,11 +112,7 @@ class RowsWriter:
                 self._flush(file)
 
     def close(self) -> tuple[File, ...]:
-        """Finish all files, force them to the disk, and return their lines of the manifest.
-
-        Raises:
-            HybridlogError: One cannot be written.
-        """
+        """Finish all files, force them to the disk, and return their lines of the manifest."""
         while self._open:
             self._finish(self._open.popitem()[1])
         return tuple(sorted(self._written, key=lambda file: self.names.index(file.name)))

@@ -150,11 +150,7 @@ class _Topic:
         return copied(columns)
 
     def table(self, pieces: list[Piece]) -> Any:
-        """Rows in order of log time and arrival.
-
-        Raises:
-            UnfitError: their fields have no common type.
-        """
+        """Rows in order of log time and arrival."""
         import pyarrow as pa
 
         from hybridlog.columns.fields import joined as joined_columns
@@ -197,12 +193,7 @@ class _File:
         self._writer: ParquetFileWriter | None = None
 
     def write(self, pieces: list[Piece]) -> None:
-        """Write rows as row groups.
-
-        Raises:
-            OSError: the rows cannot be written.
-            UnfitError: the type of their fields differs from the file's.
-        """
+        """Write rows as row groups; UnfitError if the type of their fields is not the file's."""
         from hybridlog.columns.parquet_file import ParquetFileWriter
 
         table = self._topic.table(pieces)
@@ -246,14 +237,8 @@ class _File:
 class TableWriter:
     """Writes the tables of one recording, which this process has locked for writing.
 
-    Those of the topics that the store's settings name have arrays in full.
-
-    Args:
-        root: The store.
-        recording: Id of the recording.
-        name: Its name, for people.
-        topics: The topics with tables; None for all.
-        is_new: True if the recording has no tables yet.
+    Those of the topics that the store's settings name have arrays in full. Without `topics`, all
+    have tables; with `is_new`, there are none yet.
     """
 
     def __init__(
@@ -309,12 +294,7 @@ class TableWriter:
                 self._cut_segment(segment, digest)
 
     def close(self, entry: RecordingEntry) -> None:
-        """Finish all tables.
-
-        Args:
-            entry: The complete recording; topics with another number of messages get no table,
-                and keep an older one.
-        """
+        """Finish all tables; topics with another number of messages keep an older one."""
         if not self._has_ended:
             with self._harmless():
                 self._close(entry)

@@ -44,13 +44,7 @@ _MAX_FOUND: Final = 65_536  # tables that are kept
 
 
 class TopicRows(NamedTuple):
-    """The rows of a topic of a recording in a file.
-
-    Attributes:
-        file: The file.
-        begin: Its first row.
-        section: What they are.
-    """
+    """The rows of a topic of a recording in a file."""
 
     file: ColumnFile
     begin: int
@@ -62,12 +56,7 @@ class TopicRows(NamedTuple):
 
 
 class _Folder:
-    """The files of a folder.
-
-    Args:
-        path: The folder.
-        opened: Knows the open files.
-    """
+    """The files of a folder."""
 
     def __init__(self, path: Path, opened: OpenFiles) -> None:
         self._path = path
@@ -150,12 +139,7 @@ def _identity(status: os.stat_result) -> tuple[int, int, int]:
 
 
 class _Folders:
-    """The folders in one place.
-
-    Args:
-        place: Where they are.
-        opened: Knows the open files.
-    """
+    """The folders in one place."""
 
     def __init__(self, place: Path, opened: OpenFiles) -> None:
         self._place = place
@@ -228,22 +212,12 @@ class Tables:
             self._found[recording.id, topic] = None
 
     def whole(self, file: ColumnFile, *, arrays: bool) -> TopicTable:
-        """All rows of a file, as if they were of one topic.
-
-        Args:
-            file: The file.
-            arrays: True if the rows that count have arrays in full.
-        """
+        """All rows of a file, as if of one topic; `arrays` if those that count have them whole."""
         counts = file.counts._replace(arrays=file.counts.rows if arrays else 0)
         return TopicTable("", file.all_parts(), counts, self.opened)
 
     def check(self, recording: RecordingEntry, topic: str) -> TopicTable:
-        """The table of a topic in a recording.
-
-        Raises:
-            FileNotFoundError: no table of these segments exists.
-            StoreError: the table is damaged, or has another number of rows.
-        """
+        """The table of a topic in a recording; FileNotFoundError if these segments have none."""
         if recording.status == "open" or not self.can_have(recording, topic):
             raise FileNotFoundError
         with self._lock:
@@ -324,11 +298,7 @@ class Tables:
     def _table(
         self, recording: RecordingEntry, topic: str, found: Sequence[TopicRows]
     ) -> TopicTable | None:
-        """The table of a topic from some files; None without rows of it, or with stale ones.
-
-        Raises:
-            StoreError: its files do not fit together.
-        """
+        """The table of a topic from some files; None without rows of it, or with stale ones."""
         if not found or not all(rows.is_of(recording) for rows in found):
             return None
         counts = TopicCounts(0)
@@ -349,15 +319,9 @@ class Tables:
     def of_sealed(
         self, recording: RecordingEntry, topic: str, messages: Mapping[int, int]
     ) -> tuple[TopicTable, frozenset[int]] | None:
-        """The table of some sealed segments of a recording that is being written.
+        """The table of some sealed segments of a running recording; None without a valid one.
 
-        Args:
-            recording: The recording's entry in the catalog.
-            topic: Full name.
-            messages: Number of messages of the topic by sealed segment.
-
-        Returns:
-            The table, and the segments of which it has all rows; None without a valid one.
+        Returns also the segments of which it has all rows; `messages` is by sealed segment.
         """
         if not self.can_have(recording, topic):
             return None

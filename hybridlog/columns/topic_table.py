@@ -78,15 +78,7 @@ class TableRows:
 
 
 class TopicTable:
-    """All messages of a topic in a recording.
-
-    Attributes:
-        topic: Full name.
-        rows: Number of messages.
-        unreadable: Messages without fields, because they do not fit their definition.
-        has_arrays: True if arrays are there in full, but for those of bytes.
-        files: The files with its rows.
-    """
+    """All messages of a topic in a recording; with `has_arrays` in full, but for bytes."""
 
     def __init__(
         self, topic: str, parts: Sequence[TablePart], counts: TopicCounts, opened: OpenFiles
@@ -101,14 +93,7 @@ class TopicTable:
         self._summarised: dict[tuple[str, ...], bool] = {}
 
     def fields(self, paths: Collection[str] | None = None) -> Any:
-        """Type of `TableRows.records`.
-
-        Args:
-            paths: Dotted paths of fields, with or without empty brackets; None for all.
-
-        Raises:
-            UnfitError: the files have no common type.
-        """
+        """Type of `TableRows.records` for dotted paths, `[]` optional; None for all."""
         key = None if paths is None else frozenset(paths)
         if key not in self._types:
             if len(self._types) >= _MAX_TYPES:
@@ -131,9 +116,7 @@ class TopicTable:
     def has(self, path: str, *, summaries: bool = True) -> bool:
         """True if every file has the field: an array is a summary in some, a list in others.
 
-        Args:
-            path: Dotted path.
-            summaries: True if it may be a number of the summary of an array.
+        With `summaries` the path may be that of a number of the summary of an array.
         """
         names = names_of(path)
         return all(
@@ -151,12 +134,7 @@ class TopicTable:
         paths: Collection[str] | None = None,
         own: Collection[str] = (),
     ) -> int:
-        """Stored bytes to read for some fields.
-
-        Args:
-            paths: As for `fields`.
-            own: Columns of the table itself.
-        """
+        """Stored bytes to read for some fields."""
         own = {"t", "seq", *own}
         return sum(
             part.file.size(part.group, numbers)
@@ -173,13 +151,9 @@ class TopicTable:
     ) -> Iterator[TableRows]:
         """Messages by log time and arrival, one row group at a time.
 
-        Args:
-            paths: Dotted paths of fields, including all fields below them; None for all.
-            own: Columns of the table itself besides log time and arrival number.
-            spans: Ranges of log time, ns, disjoint, in order; None for all times.
-
-        Raises:
-            StoreError: the data read is damaged.
+        A path includes all fields below it; None is all fields. `own` columns come besides log time
+        and arrival number. `spans` are disjoint ranges of log time in order, ns; None for all
+        times.
         """
         kind = self.fields(paths)
 
@@ -233,20 +207,7 @@ class TopicTable:
     def read(
         self, part: TablePart, paths: Collection[str] | None, own: Collection[str]
     ) -> tuple[dict[str, Any], Any]:
-        """Columns of one row group.
-
-        Args:
-            part: One of `parts`.
-            paths: As for `fields`.
-            own: Columns of the table itself.
-
-        Returns:
-            The table's own columns by name, and the fields as for `TableRows.records`, in
-            the types of the file.
-
-        Raises:
-            StoreError: the data read is damaged.
-        """
+        """The table's own columns of a row group by name, and fields in the types of the file."""
         check_wanted()
         chosen = part.file.choose(paths, own, arrays=self.has_arrays)
         columns = {top: self._column(part, top, numbers) for top, numbers in chosen.items()}
