@@ -74,12 +74,10 @@ class IndexAccess:
     """The index of an open store.
 
     Args:
-        shared: The open store.
         mongo: URI of the MongoDB, `embedded`, or `none`; None for the one in the store's
             settings.
         cache_mb: Size of the embedded MongoDB's cache in MiB, if this process starts it; None
             for the one in the store's settings.
-        progress: Called while an index is brought up to date.
         recovers: False to leave what the index lacks of cut recordings to another opening.
 
     Attributes:
@@ -142,17 +140,7 @@ class IndexAccess:
         return database if self.may_write else None
 
     def database_for(self, purpose: str, *, writes: bool = False, brings: bool = True) -> Database:
-        """The index.
-
-        Args:
-            purpose: The activity, for messages.
-            writes: True if it changes the index.
-            brings: False to leave it as it is: it may lack recordings.
-
-        Raises:
-            DatabaseError: it is unavailable, or may not be changed; has the purpose and the
-                reason.
-        """
+        """The index, for a purpose that errors name; without `brings`, it may lack recordings."""
         database = self._reached(brings=brings)
         if database is None:
             raise DatabaseError(f"{purpose} needs MongoDB. {self.unavailable or ''}".strip())
@@ -176,14 +164,7 @@ class IndexAccess:
         return IndexTarget(database, renew=self._another_again)
 
     def connect(self, *, brings: bool = True) -> Database:
-        """Connect to the index and bring it up to date; once more if the connection breaks.
-
-        Args:
-            brings: False to leave it as it is.
-
-        Raises:
-            DatabaseError: MongoDB does not answer, or the store does without.
-        """
+        """Connect to the index and bring it up to date; once more if the connection breaks."""
         with self._connecting:
             if self.connected is not None and (self._is_complete or not brings):
                 return self.connected
@@ -231,14 +212,7 @@ class IndexAccess:
         return f"{platform.node()}:{os.path.realpath(self._directory.path)}"
 
     def address(self, wait_s: float) -> IndexAddress:
-        """The address of the index for other programs; it stays the same.
-
-        Args:
-            wait_s: Seconds for which an embedded MongoDB waits for clients.
-
-        Raises:
-            DatabaseError: MongoDB does not answer.
-        """
+        """The lasting address of the index; an embedded MongoDB waits `wait_s` for clients."""
         name = self.connect().name
         if self._mongod is not None:
             return IndexAddress(self._mongod.publish(wait_s), name)
@@ -259,11 +233,7 @@ class IndexAccess:
         return without_secrets(uri)
 
     def another(self) -> Database:
-        """An additional connection; starts the embedded MongoDB if it is not running.
-
-        Raises:
-            DatabaseError: MongoDB does not answer, or the store does without.
-        """
+        """An additional connection; starts the embedded MongoDB if it is not running."""
         from hybridlog.index import consent
 
         if self._uri is None:
@@ -305,11 +275,7 @@ class IndexAccess:
         return uri
 
     def _another_again(self) -> Database:
-        """An additional connection to the index, after one has failed.
-
-        Raises:
-            HybridlogError: It does not answer, or belongs to another store.
-        """
+        """An additional connection to the index, after one has failed."""
         if not self.id:
             with self._connecting:
                 self._open()

@@ -29,13 +29,8 @@ _FOLDER: Final = "trusted"
 def trusted_uri(settings: StoreSettings, store: Path, named: str | None = None) -> str:
     """The URI that a store uses, `embedded`, or `none`.
 
-    Args:
-        settings: The store's settings.
-        store: Its directory.
-        named: The one that this user names now. If it is the store's own, that is remembered.
-
-    Raises:
-        DatabaseError: The store names a server that this user has never named.
+    `named` is the one that this user names now; it is remembered if it is the store's own. A
+    store's server that this user has never named raises DatabaseError.
     """
     own = settings.mongo
     if named is not None:
@@ -62,15 +57,7 @@ def is_trusted(store_id: str, uri: str) -> bool:
 
 
 def trust(store_id: str, uri: str) -> None:
-    """Remember that this user has named a server for a store.
-
-    Args:
-        store_id: The store.
-        uri: The server.
-
-    Raises:
-        StoreError: That cannot be stored.
-    """
+    """Remember that this user has named a server for a store."""
     if is_trusted(store_id, uri):
         return
     path = _mark(store_id, uri)
@@ -88,9 +75,5 @@ def _mark(store_id: str, uri: str) -> Path:
 
 
 def state_directory() -> Path:
-    """Directory of what hybridlog remembers for this user.
-
-    Raises:
-        StoreError: this user has no home directory.
-    """
+    """Directory of what hybridlog remembers for this user."""
     return user_directory("XDG_STATE_HOME", ".local/state", "trusted servers")

@@ -30,12 +30,7 @@ Decoded = dict[int, ChannelStats]
 
 
 class Documents(NamedTuple):
-    """Index documents of one topic.
-
-    Attributes:
-        topic: Their topic.
-        tables: uint8[k, width] each, with a whole BSON document in each row.
-    """
+    """Index documents of one topic; tables are uint8[k, width], a whole BSON document a row."""
 
     topic: str
     tables: list[NDArray[np.uint8]]
@@ -47,11 +42,9 @@ class Documents(NamedTuple):
 
 
 class ChunkIndexer:
-    """Makes the index documents of one recording's chunks.
+    """Makes the index documents of the chunks of a recording, given by its id or key.
 
-    Args:
-        recording: Id or key of the recording.
-        has_documents: False to make only the chunks' catalog entries.
+    Without `has_documents`, it makes only their catalog entries.
     """
 
     def __init__(self, recording: str, *, has_documents: bool = True) -> None:
