@@ -31,20 +31,7 @@ def index_arrays(
     off: bool = False,
     progress: Progress | None = None,
 ) -> list[ArraysOfTopic]:
-    """Change the setting of topics, and make their tables anew where these differ from it.
-
-    Args:
-        directory: The store.
-        catalog: Its catalog.
-        entries: Its recordings.
-        topics: Full names.
-        known: The tables.
-        off: True for tables without arrays.
-        progress: Called after each chunk.
-
-    Raises:
-        StoreError: The settings cannot be written.
-    """
+    """Change the setting of topics, and make their tables anew where these differ from it."""
     others = [one for one in read_settings(directory.path).arrays if one not in topics]
     directory.change_settings(arrays=tuple(sorted(others if off else {*others, *topics})))
     found = {topic: ArraysOfTopic(topic) for topic in topics}

@@ -33,11 +33,6 @@ def bring_derived(source: Shared, target: RemoteDirectory, recordings: Collectio
     """Bring the tables and the rows of the catalog of recordings that were copied into a bucket.
 
     Nothing depends on it: without it answers are the same, and take more requests.
-
-    Args:
-        source: The open store that they were copied from.
-        target: The store in the bucket.
-        recordings: Their ids.
     """
     known = {}
     for recording in recordings:

@@ -83,12 +83,10 @@ class CopyReport:
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """Where recordings are copied to.
+    """The place that recordings are copied to.
 
-    Attributes:
-        place: The store.
-        named: Makes a name that no recording there has.
-        arrived: Ids of the recordings of which something was copied.
+    `named` makes a name that no recording there has; `arrived` are the ids of those of which
+    something was copied.
     """
 
     place: Place
@@ -101,9 +99,6 @@ class Copying:
     """Copies recordings of a store.
 
     Args:
-        directory: The store to read.
-        target: Where they go.
-        options: How they are copied.
         report: Takes the result, as it grows.
         expire: With `then_expire`, called with the id of each recording and the digests of logs
             whose copies were proved just now, by number.
@@ -118,13 +113,7 @@ class Copying:
     progress: Progress | None
 
     def run(self, chosen: Sequence[RecordingSummary]) -> None:
-        """Copy some recordings.
-
-        Raises:
-            UsageError: The place is this very store.
-            StoreError: The place cannot be written or reached; what was copied stays there.
-            DiskFullError: No room; the copy can be run again.
-        """
+        """Copy some recordings; after an error what was copied stays, and it can be run again."""
         self._place, self._source = self.target.place, self._source_of(self.directory)
         if self._is_same():
             raise UsageError(f"{self._place.address} is this very store: there is nothing to copy.")

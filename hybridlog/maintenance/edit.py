@@ -45,18 +45,8 @@ def change(
 ) -> RecordingEntry:
     """Change the manifest of a recording, also of a running one, and give it another name.
 
-    Args:
-        shared: The open store.
-        entry: The recording.
-        how: The change.
-        name: The name; it gets a number if another recording has it. None to leave it.
-
-    Returns:
-        The recording with the change.
-
-    Raises:
-        StoreError: The manifest cannot be written.
-        TopicError: The recording is gone.
+    The name gets a number if another recording has it; None to leave it. Returns the changed
+    recording.
     """
     directory = shared.directory
     directory.check_changes()
@@ -81,9 +71,6 @@ def time_of_mark(entry: RecordingEntry, moment: TimeLike) -> int:
 
     Outside of a recording, a mark would become its beginning or end, from which relative times
     count. One that is running has not ended yet.
-
-    Raises:
-        TimeError: It is invalid, or outside the recording.
     """
     start, end = extent_of(entry)
     time = parse_time(moment, start=start, end=end)
@@ -111,18 +98,7 @@ def mark(
 ) -> RecordingEntry:
     """Set a mark in the manifest of a recording, also of a running one, and return it.
 
-    Args:
-        shared: The open store.
-        entry: The recording.
-        moment: Log time of the mark, ns.
-        text: Text of the mark.
-        tags: Tags of the mark.
-        end: Log time of its end, ns; None for a moment.
-
-    Raises:
-        StoreError: The manifest cannot be written, or has as many marks as it can have.
-        TimeError: The mark would be before 1970, or end before it begins.
-        TopicError: The recording is gone.
+    `moment` and `end` are log times, ns; without `end` it is the mark of a moment.
     """
     if moment < 0:
         raise TimeError("A mark cannot be set before 1970: its log time has no sign.")
@@ -144,21 +120,10 @@ def mark_now(
     *,
     around: tuple[int, int] | None = None,
 ) -> str:
-    """Set a mark at the present moment of a recording that goes on.
+    """Set a mark at the present moment of a recording that goes on; returns its name.
 
-    Args:
-        directory: The store.
-        recording: Id of the recording.
-        now: Log time of the moment, ns.
-        note: Text of the mark.
-        tags: Tags of the mark.
-        around: Time before and after the moment that is marked and pinned, ns; None for none.
-
-    Returns:
-        The name of the recording.
-
-    Raises:
-        StoreError: The manifest cannot be written, or has as many marks as it can have.
+    `now` is its log time, ns; `around` the time before and after it that is marked and pinned, ns,
+    None for none.
     """
     key, said = new_random(), {text(one): text(value) for one, value in tags.items()}
 
@@ -188,19 +153,7 @@ def too_many_marks(name: str) -> StoreError:
 def unmark(
     shared: OpenStore, entry: RecordingEntry, moment: int | None, *, text: str
 ) -> RecordingEntry:
-    """Remove the marks of a text from the manifest of a recording, and return it.
-
-    Args:
-        shared: The open store.
-        entry: The recording.
-        moment: Log time of the mark, ns; None for any.
-        text: Text of the mark.
-
-    Raises:
-        StoreError: The manifest cannot be written.
-        TopicError: The recording is gone.
-        UsageError: It has no such mark.
-    """
+    """Remove marks of a text, at a log time (ns) or None for any, and return the recording."""
 
     def how(now: Manifest) -> Manifest:
         left = tuple(one for one in now.marks if one.text != text or moment not in {None, one.time})
@@ -221,17 +174,8 @@ def remove_if(
     """Delete a recording of an open store.
 
     Its manifest says so first, then its files go, then the manifest; who may write finishes what
-    was interrupted.
-
-    Args:
-        shared: The open store.
-        recording: The recording's id.
-        check: Called with the newest manifest; raises to keep the recording.
-
-    Raises:
-        StoreError: It is being written, or cannot be removed.
-        TopicError: It is gone.
-        DatabaseError: MongoDB fails; the files are gone, and the next connection clears it.
+    was interrupted. `check` is called with the newest manifest, and raises to keep the recording.
+    If MongoDB fails, the files are gone, and the next connection clears it.
     """
     directory = shared.directory
     try:

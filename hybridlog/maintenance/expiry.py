@@ -63,26 +63,14 @@ def expire(
     progress: Progress | None = None,
     make_room: Callable[[], bool] = lambda: False,
 ) -> Expired:
-    """Delete sealed logs of a recording that this process has locked.
+    """Delete sealed logs of a recording that this process has locked; it may record it, too.
 
-    Logs that are gone already are left out, and those without messages. Those that have their
-    rows go first. Where there is no room for rows, a log goes without, and is lost. Damaged ones
-    without rows stay.
-
-    Args:
-        directory: The store.
-        recording: Its id; it may be running, then it is the caller who records it.
-        segments: Numbers of sealed logs.
-        digests: Digests that they must have, by number.
-        copy: Address of a store with a proven copy of them.
-        check: Part of each change of the manifest; raises if they must stay by now.
-        version: As of `RowsWriter`.
-        progress: Called after each chunk of which rows are written.
-        make_room: Makes room for rows on a full disk; returns False if there is none to make.
-
-    Raises:
-        StoreError: Files cannot be read or written; a log that is listed is as before.
-        DiskFullError: There is no room to change the manifest.
+    Logs that are gone already are left out, and those without messages. Those that have their rows
+    go first. Where there is no room for rows, a log goes without, and is lost. Damaged ones without
+    rows stay. They must have the `digests`, by number; `copy` is the address of a store with a
+    proven copy of them. `check`, part of each change of the manifest, raises if they must stay by
+    now; `make_room` returns False if there is none to make. After an error, logs that are listed
+    are as before.
     """
     manifest, done = directory.manifests.read(recording), Expired()
     logs = [manifest.logs.get(number) for number in sorted(segments)]
@@ -143,14 +131,7 @@ def make_rows(
 ) -> None:
     """Write the rows that logs which may go lack, as long as they are wanted.
 
-    Args:
-        directory: The store.
-        recording: Id of a recording that this process has locked, or records.
-        is_wanted: Returns whether to go on.
-
-    Raises:
-        StoreError: Files cannot be read or written.
-        DiskFullError: There is no room.
+    This process has locked the recording, or records it.
     """
     manifest = directory.manifests.read(recording)
     for log in manifest.logs.values():
@@ -218,20 +199,11 @@ def let_go(
     check: Check = lambda _: None,
     lost: str = "",
 ) -> Manifest:
-    """Delete files of a recording with all that is left of them.
+    """Delete files of a recording with all that is left; returns the manifest without them.
 
-    Args:
-        directory: The store.
-        recording: Id of a recording that this process has locked, or records.
-        choose: Returns the files; called with each manifest that is changed.
-        check: Raises if they must stay.
-        lost: Reason of a row of the loss ledger; empty if they are counted as let go.
-
-    Returns:
-        The manifest without them.
-
-    Raises:
-        StoreError: The manifest cannot be changed, or a file cannot be deleted.
+    This process has locked the recording, or records it. `choose` is called with each manifest that
+    is changed; `check` raises if they must stay. `lost` is the reason of a row of the loss ledger,
+    empty if they are counted as let go.
     """
     gone: list[File] = []
 
@@ -271,22 +243,11 @@ def write_rows(
     version: int = 0,
     report: Callable[[int], None] = lambda _: None,
 ) -> tuple[File, ...]:
-    """Write what is left of the messages of a log.
+    """Write what is left of the messages of a log; returns the lines of the files in order.
 
-    Args:
-        recording: The folder of its recording; it stays as it is.
-        line: The line of the log in its manifest, which says that it is gone.
-        into: Folder of the new files.
-        version: As of `RowsWriter`.
-        report: Told the byte up to which the log was read.
-
-    Returns:
-        The lines of the files, which are on the disk, the first one first.
-
-    Raises:
-        SegmentError: The log is damaged, or has what rows cannot keep.
-        StoreError: Files cannot be written.
-        DiskFullError: There is no room.
+    The line of the log says that it is gone; the folder of its recording stays as it is. `report`
+    is told the byte up to which the log was read. A damaged log, or one with what rows cannot keep,
+    raises SegmentError.
     """
     from hybridlog.columns.rows_writer import RowsWriter
 
@@ -314,22 +275,11 @@ def write_rows(
 def without_payloads(
     path: Path, manifest: Manifest, logs: Collection[int], into: Path, copy: str
 ) -> Manifest:
-    """Write the rows of logs of a recording, which are to be copied later.
+    """Write the rows of logs of a recording, which are to be copied later, and its new manifest.
 
-    Args:
-        path: The recording's directory; it stays as it is.
-        manifest: Its manifest.
-        logs: Numbers of the logs; first ones of groups stay, and those without messages.
-        into: A folder for the new files. Their names are drawn, so that no other file of the
-            recording gets them.
-        copy: Address of the store that has the logs.
-
-    Returns:
-        The manifest with the new files in the place of others.
-
-    Raises:
-        StoreError: Files cannot be read or written.
-        DiskFullError: There is no room.
+    The recording's directory stays as it is; so do first logs of groups, and those without
+    messages. Names of the new files are drawn, so that no other file of the recording gets them.
+    `copy` is the address of the store that has the logs.
     """
     version = secrets.randbelow(8 * 10**8) + 10**8
     for number in sorted(logs):
@@ -346,11 +296,7 @@ def may_go(log: File) -> bool:
 
 
 def _remove(folder: Path, names: Collection[str]) -> None:
-    """Remove files, if they are there.
-
-    Raises:
-        StoreError: One cannot be removed.
-    """
+    """Remove files, if they are there."""
     failure: OSError | None = None
     for name in names:
         try:

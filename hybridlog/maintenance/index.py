@@ -24,14 +24,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class StoreIndex:
-    """The index of a store. All methods raise `DatabaseError` if MongoDB fails.
-
-    Attributes:
-        directory: The store.
-        catalog: Its catalog.
-        database: The index.
-        progress: Called after each chunk.
-    """
+    """The index of a store. All methods raise `DatabaseError` if MongoDB fails."""
 
     directory: StoreDirectory
     catalog: Catalog
@@ -47,21 +40,11 @@ class StoreIndex:
         removes: bool,
         report: RepairReport,
     ) -> set[str]:
-        """Index missing segments, and remove documents of removed recordings.
+        """Index missing segments, remove documents of removed recordings; returns changed ids.
 
-        Recordings that the catalog knows to be in this index are not looked at, unless the
-        index has another number of recordings than these.
-
-        Args:
-            snapshot: All recordings.
-            entry_of: Returns the entry of a recording.
-            index: Id of the index.
-            removes: False in a copy of the store that the index belongs to: what it does not have
-                may be there.
-            report: Collects the actions.
-
-        Returns:
-            Ids of the recordings whose entries have changed.
+        Recordings that the catalog knows to be in this index are not looked at, unless the index
+        has another number of recordings than these. `removes` is False in a copy of the store that
+        the index belongs to: what it does not have may be there.
         """
         directory, state = self.directory, IndexState(self.database)
         tables.remove_unfinished(directory, snapshot)
@@ -119,12 +102,10 @@ class StoreIndex:
             tables.remove_orphans(directory, present)
 
     def rebuild(self, entries: Iterable[RecordingEntry]) -> dict[str, HybridlogError]:
-        """Rebuild the index of recordings from their segments, one after the other.
+        """Rebuild the index of recordings from their segments; returns why some are unchanged.
 
-        The next opening finishes an interrupted rebuild.
-
-        Returns:
-            Why some are unchanged, by id: another process holds them, or they are gone.
+        The next opening finishes an interrupted rebuild. Unchanged ones, by id, are gone, or
+        another process holds them.
         """
         left: dict[str, HybridlogError] = {}
         for chosen in entries:

@@ -62,11 +62,7 @@ _LEAST_SPARE: Final = 1 << 16
 
 
 class Own(Protocol):
-    """The recording that this process makes; it holds the lock of it.
-
-    Attributes:
-        id: Its id.
-    """
+    """The recording that this process makes; it holds the lock of it."""
 
     id: str
 
@@ -98,7 +94,6 @@ class Keeper:
     """Applies rules of retention to a store.
 
     Args:
-        directory: The store.
         remove: Removes a whole recording, by its id, unless a check of its manifest raises.
         own: The recording that this process makes; None if it makes none.
         window: The newest of it that goes last, ns: a trigger may want it.
@@ -141,12 +136,7 @@ class Keeper:
         return found
 
     def keep(self, rules: Rules, progress: Progress | None = None) -> KeepReport:
-        """Let go what has to go.
-
-        Raises:
-            HeldError: Another process makes a pass.
-            DiskFullError: There is no room, not even that of the spare file.
-        """
+        """Let go what has to go; HeldError while another process makes a pass."""
         with self._alone():
             if not self._directory.is_remote:
                 _lay_spare(self._directory, rules)  # counts among what is used
@@ -172,17 +162,9 @@ class Keeper:
         copy: str,
         progress: Progress | None = None,
     ) -> KeepReport:
-        """Let payloads of a recording go, but for what pins and rules keep.
+        """Let payloads of a recording go, but for what pins and a `never_tag` of rules keep.
 
-        Args:
-            recording: Its id.
-            digests: The segments that have a copy elsewhere: digests by number.
-            rules: Rules whose `never_tag` holds.
-            copy: Address of the store with the copies.
-            progress: Called while rows are written.
-
-        Raises:
-            HeldError: Another process makes a pass.
+        `digests`, by number, are of the segments that have a copy in the store at `copy`.
         """
         with self._alone():
             found = KeepReport(self.plan(Rules()))
@@ -228,14 +210,7 @@ class Keeper:
             yield replace(held, segments=left)
 
     def _do(self, step: Step, rules: Rules, found: KeepReport, how: Mapping[str, Any]) -> None:
-        """Do a step, with the room of the spare file if there is no other.
-
-        Args:
-            step: The step.
-            rules: The rules.
-            found: Gets what became free, or the problem.
-            how: Further arguments of `expire`.
-        """
+        """Do a step, with the room of the spare file if there is no other; reports in `found`."""
         if self._failed[step.id] and not step.segments:
             return  # planned before it was known: the next plan judges again
         check = partial(_check, step, rules)
@@ -287,11 +262,7 @@ def _of_groups(groups: Sequence[int], manifest: Manifest) -> list[File]:
 
 
 def _check(step: Step, rules: Rules, manifest: Manifest) -> None:
-    """Raise if what goes in a step must stay by now.
-
-    Raises:
-        ChangedError: It must.
-    """
+    """Raise ChangedError if what goes in a step must stay by now."""
     if rules.is_never(manifest.tags):
         raise ChangedError(f"{step.recording}: a tag that keeps it was set meanwhile.")
     if manifest.pins and not step.segments and not step.groups:
@@ -336,14 +307,7 @@ def may_hold(entry: RecordingEntry, begin: int | None, end: int | None) -> bool:
 def pin_of(
     name: str, span: tuple[int | None, int | None], topics: Sequence[str] | None, reason: str
 ) -> Pin:
-    """A pin.
-
-    Args:
-        name: Its id.
-        span: First log time, and that after the last one, ns; None for no bound.
-        topics: Full names of topics; None for all.
-        reason: Why.
-    """
+    """A pin of `[first, end)` of log time, ns, with None for no bound; without topics, of all."""
     begin, end = span
     last = None if end is None else end - 1
     return Pin(name, begin, last, None if topics is None else tuple(topics), reason)
@@ -364,9 +328,7 @@ class RetentionThread:
     then. What it cannot do is told, and never stops the recorder.
 
     Args:
-        directory: The store.
         remove: Removes a whole recording, by its id, unless a check of its manifest raises.
-        own: The recording in progress.
         reserve: Bytes that the recorder wants free at least, where rules may make room.
         say: Shows a line to the user, each text once.
         window: The newest of the recording that goes last, ns.

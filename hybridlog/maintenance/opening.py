@@ -62,14 +62,7 @@ def open_catalog(directory: StoreDirectory) -> Catalog:
 
 @dataclass(frozen=True, slots=True)
 class StoreFiles:
-    """The recordings of a store, compared with their files, and recovered.
-
-    Attributes:
-        directory: The store.
-        catalog: Its catalog.
-        report: Collects problems and repairs.
-        mends: Whether what a crash has left is repaired.
-    """
+    """The recordings of a store, compared with their files, and recovered if it `mends`."""
 
     directory: StoreDirectory
     catalog: Catalog
@@ -109,15 +102,7 @@ class StoreFiles:
         return snapshot
 
     def catch_up(self, snapshot: Snapshot, recordings: AbstractSet[str]) -> Snapshot | None:
-        """All recordings after changes of some of them, as of `look_at_all`.
-
-        Args:
-            snapshot: All recordings before.
-            recordings: Ids of those that came, went, or whose files were changed.
-
-        Returns:
-            All recordings; None if only `look_at_all` can tell.
-        """
+        """All recordings after some came, went or changed; None if only `look_at_all` can tell."""
         directory, catalog, report = self.directory, self.catalog, self.report
         if report.unreadable:
             return None
@@ -137,12 +122,7 @@ class StoreFiles:
         looks: Mapping[str, str],
         known: Mapping[str, RecordingSummary],
     ) -> dict[str, RecordingSummary]:
-        """Summaries of recordings by id.
-
-        Args:
-            looks: The look of each directory, by id.
-            known: Summaries in the catalog, by id.
-        """
+        """Summaries by id, from the looks of directories and the summaries in the catalog."""
         found: dict[str, RecordingSummary] = {}
         due = set[str]()
         for recording, look in looks.items():
@@ -200,8 +180,7 @@ class StoreFiles:
     def _known(self, recording: str) -> tuple[RecordingEntry, str, str] | None:
         """A recording by its catalog row, with what people say of it by now.
 
-        Returns:
-            Its entry, its look and the state of its files; None if the row does not match them.
+        Its entry, its look and the state of its files; None if the row does not match them.
         """
         directory, row = self.directory, self.catalog.recording(recording)
         if row is None:
@@ -221,11 +200,7 @@ class StoreFiles:
         return with_said(entry, manifest), listing.look, files
 
     def current_entry(self, summary: RecordingSummary) -> tuple[RecordingEntry | None, bool]:
-        """The entry of a recording, compared with its files.
-
-        Returns:
-            The entry, None if the recording is gone; and whether the files were read again.
-        """
+        """The entry of a recording, None if it is gone; and whether its files were read again."""
         known = self._known(summary.id)
         if known is not None:
             return known[0], False
@@ -272,15 +247,7 @@ def _lost(directory: StoreDirectory, name: str) -> str:
 
 
 def recover(directory: StoreDirectory, recording: str, report: RepairReport) -> bool:
-    """Finish the interrupted work on a recording that this process has locked.
-
-    Returns:
-        False if it is gone.
-
-    Raises:
-        StoreError: It cannot be written, or its manifest cannot be read.
-        DiskFullError: No room; nothing is lost.
-    """
+    """Finish the interrupted work on a recording that this process has locked; False if gone."""
     path = directory.recording(recording)
     try:
         manifest = directory.manifests.read(recording)

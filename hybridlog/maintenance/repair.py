@@ -57,19 +57,10 @@ def repair(
     repairs: RepairReport,
     names: Mapping[str, str] | None,
 ) -> tuple[list[Repaired], list[Finding]]:
-    """Repair files, manifests and the catalog.
+    """Repair files, manifests and the catalog; returns what was repaired, and what was not.
 
-    Args:
-        directory: The store.
-        catalog: Its catalog.
-        repairs: Says which recordings cannot be read.
-        names: Names of the recordings by id; None for all.
-
-    Returns:
-        What was repaired, and what could not be.
-
-    Raises:
-        StoreError: The store cannot be written.
+    `repairs` says which recordings cannot be read; `names` are those of recordings by id, None for
+    all.
     """
     directory.check_writable()
     done: list[Repaired] = []
@@ -161,11 +152,7 @@ def repair_index(
     *,
     progress: Progress | None = None,
 ) -> list[Repaired]:
-    """Index those of some recordings that are not completely indexed.
-
-    Raises:
-        DatabaseError: MongoDB fails.
-    """
+    """Index those of some recordings that are not completely indexed."""
     known = IndexState(database).of([entry.key for entry in entries])
     done = []
     for entry in entries:
@@ -197,16 +184,9 @@ def _is_restored(directory: StoreDirectory, catalog: Catalog, entry: RecordingEn
 
 
 def become_another(path: Path, mongo: str | None) -> None:
-    """Give a copied store a new id.
+    """Give a copied store a new id; without `mongo`, it keeps the embedded MongoDB, or none.
 
-    Args:
-        path: The store.
-        mongo: URI of the MongoDB for its index, `embedded`, or `none`; None to keep the embedded
-            one, or none.
-
-    Raises:
-        UsageError: It names a MongoDB, and no other one is given.
-        StoreError: It cannot be written.
+    A store that names a MongoDB needs another one, else UsageError.
     """
     settings = read_settings(path)
     if is_uri(settings.mongo) and mongo is None:

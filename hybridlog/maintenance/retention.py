@@ -36,14 +36,7 @@ _KEYS: Final = ("quota", "min-free", "max-age", "topic", "never-tag", "fields-ag
 
 @dataclass(frozen=True, slots=True)
 class TopicRule:
-    """Age at which payloads of some topics go.
-
-    Attributes:
-        pattern: As the user wrote it.
-        fits: Tells whether a topic matches.
-        age_ns: The age, ns.
-        age: The age as the user wrote it.
-    """
+    """Age at which payloads of some topics go; `pattern` and `age` are as the user wrote them."""
 
     pattern: str
     fits: TopicMatcher
@@ -76,11 +69,7 @@ class Rules:
 
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> Rules:
-        """Rules from the table `[retention]`, or from options in its form.
-
-        Raises:
-            UsageError: A key is unknown, or a value is not of its kind.
-        """
+        """Rules from the table `[retention]`, or from options in its form."""
         unknown = [key for key in values if key not in _KEYS]
         if unknown:
             raise UsageError(f"Retention has no {listed(unknown)}; it has {', '.join(_KEYS)}.")
@@ -100,11 +89,7 @@ class Rules:
             raise UsageError(f"A rule of retention is malformed: {error}") from error
 
     def check_place(self, *, is_remote: bool) -> None:
-        """Raise if a store in a bucket cannot follow them.
-
-        Raises:
-            UsageError: They ask for free space.
-        """
+        """Raise if a store in a bucket cannot follow them, since they ask for free space."""
         if is_remote and self.min_free is not None:
             raise UsageError("A bucket has no disk that fills: use --quota, not --min-free.")
 
@@ -176,12 +161,8 @@ class HeldSegment:
     """A log, or what is left of it.
 
     Attributes:
-        number: Its number.
-        group: Number of its group.
         written: When it was written, or the time of its last message if that is later, ns.
         size: Bytes of its file; 0 if it is gone.
-        row_bytes: Bytes of its files of rows.
-        topics: Its topics.
         may_go: Whether its payloads may go before its group: not those of small topics.
         is_pinned: Whether a pin keeps messages of it.
         goes_last: Whether a trigger may still want what it holds.
@@ -203,15 +184,9 @@ class Held:
     """The content of a recording.
 
     Attributes:
-        id: Its id.
-        name: Its name.
         created: When it began, ns.
         written: When its last segment was written, or its last message if that is later, ns.
-        tags: Its tags.
         size: Bytes of all its files.
-        segments: Its logs, in their order.
-        is_ended: Whether it has ended.
-        pins: Number of its pins.
     """
 
     id: str
@@ -226,12 +201,9 @@ class Held:
 
 
 def held_of(manifest: Manifest, now: int, window: int = 0) -> Held:
-    """The content of a recording.
+    """The content of a recording at `now`, ns.
 
-    Args:
-        manifest: Its manifest.
-        now: The time, ns.
-        window: What is so little older than its newest sealed message goes last, ns.
+    Segments that are at most `window` (ns) older than its newest sealed message go last.
     """
     found: list[HeldSegment] = []
     ends = [part.last or 0 for log in manifest.logs.values() for part in log.parts.values()]
@@ -342,12 +314,8 @@ class Plan:
 def plan(held: Iterable[Held], rules: Rules, *, used: int, free: int | None, now: int) -> Plan:
     """Plan deletions: their order, and the reason of each.
 
-    Args:
-        held: What each recording holds, without segments that another process records.
-        rules: The rules.
-        used: Bytes that the store takes.
-        free: Free bytes of its disk; None in a bucket.
-        now: The time, ns.
+    `held` lacks segments that another process records; `used` and `free` are bytes, the latter None
+    in a bucket; `now` is ns.
     """
     return _Planning([*held], rules, used, free, now).made()
 
@@ -495,13 +463,9 @@ class _Planning:
         age_ns: int | None = None,
         need: float = math.inf,
     ) -> None:
-        """Let segments go, the oldest first, until enough is free; a step a recording.
+        """Let segments go, the oldest first, until `need` bytes become free; a step a recording.
 
-        Args:
-            reason: Why.
-            rule: Those with no other topics than its own; None for all.
-            age_ns: Those that are as old, ns; None for all.
-            need: Bytes that are to become free.
+        With `rule`, those with no other topics than its own; with `age_ns`, those that are as old.
         """
         chosen: dict[str, list[_Piece]] = {}  # by recording
         for held, segment in self._pieces:

@@ -24,13 +24,7 @@ def missing(
     entry: RecordingEntry,
     tables: Tables | None = None,
 ) -> set[str]:
-    """Topics whose tables are missing, or differ from the catalog.
-
-    Args:
-        directory: The store.
-        entry: The recording's entry in the catalog.
-        tables: Finds the tables.
-    """
+    """Topics whose tables are missing, or differ from the catalog."""
     from hybridlog.columns.tables import Tables
 
     tables = tables or Tables(directory.path)
@@ -96,11 +90,7 @@ def announce_removal(directory: StoreDirectory, recording: str) -> None:
 
 
 def remove(directory: StoreDirectory, recording: str, entry: RecordingEntry | None = None) -> None:
-    """Remove all tables of a recording.
-
-    Raises:
-        OSError: a table cannot be removed.
-    """
+    """Remove all tables of a recording."""
     from hybridlog.columns.folders import TableFolders
 
     announce_removal(directory, recording)

@@ -113,14 +113,8 @@ def verify(
 class _Index:
     """Counts the documents of recordings.
 
-    Args:
-        database: The index.
-        count_all: True to read each collection once, and find documents at any time. Otherwise
-            only those of the topics and the times of a recording are counted.
-
-    Attributes:
-        database: The index.
-        count_all: See there.
+    With `count_all` each collection is read once, and documents at any time are found. Otherwise
+    only those of the topics and the times of a recording are counted.
     """
 
     def __init__(self, database: Database, *, count_all: bool) -> None:
@@ -185,11 +179,7 @@ class _Check:
         self._result.findings.append(Finding(self._name, place, problem, cure))
 
     def run(self, progress: Progress | None) -> None:
-        """Check the whole recording.
-
-        Raises:
-            StoreError: The recording cannot be read at all.
-        """
+        """Check the whole recording; StoreError if it cannot be read at all."""
         holder = self._directory.holder(self._recording)
         self._directory.look_closely(self._recording)
         inventory = steady_inventory(self._directory, self._recording)
