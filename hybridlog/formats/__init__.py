@@ -25,8 +25,6 @@ class LogFormat:
     """A format of logs.
 
     Attributes:
-        name: Its name in messages.
-        files: Such files, for messages.
         reader: The `Source`, as `module:name`; called with the path of a file.
         beginnings: First bytes of a file, one of these.
         suffixes: Suffixes of file names in a directory that is searched for logs.

@@ -24,11 +24,7 @@ UNKNOWN: Final = LogFormat("unknown", "", "", (), (), has_end=True)
 
 
 def sniff(path: Path) -> tuple[LogFormat, bool]:
-    """Detect the format of a file from its first bytes.
-
-    Returns:
-        The format, and whether the file is compressed with zstd.
-    """
+    """Detect the format of a file from its first bytes, and whether zstd has compressed it."""
     try:
         with path.open("rb") as file:
             head = file.read(_LONGEST)
@@ -46,7 +42,6 @@ class LogFile:
     """A file of a log.
 
     Attributes:
-        path: The file.
         format: Its format; `UNKNOWN` if it is empty, no log or cannot be read.
         is_packed: Whether it is compressed with zstd.
         messages: Number of messages by the metadata of the log, None if unknown.

@@ -28,13 +28,7 @@ _BAG_HEAD = 8192  # bytes; the header record of a bag has 4 KiB
 
 @dataclass(slots=True)
 class Found:
-    """Logs and stores below a directory.
-
-    Attributes:
-        logs: The logs, by path.
-        stores: Stores, which are not searched.
-        problems: Directories and files that cannot be read.
-    """
+    """Logs by path, stores (which are not searched), and what is unreadable below a directory."""
 
     logs: list[LogSet] = field(default_factory=list)
     stores: list[Path] = field(default_factory=list)
@@ -142,14 +136,10 @@ class Watch:
     def _is_complete(
         self, file: _File, log: LogFile, now: int, names: set[str], *, is_closed: bool
     ) -> bool:
-        """True if nobody writes a file any more.
+        """True if nobody writes a file any more; `now` in ns.
 
-        Args:
-            file: The file.
-            log: The same.
-            now: The present time, ns.
-            names: Names of the files beside it.
-            is_closed: Whether a later part exists, or metadata lists it.
+        `names` are of the files beside it. `is_closed` says that a later part exists, or that
+        metadata lists it.
         """
         is_unchanged = now - file.changed >= self._settle_ns
         if not is_unchanged and file not in self._seen:

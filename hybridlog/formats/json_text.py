@@ -33,16 +33,9 @@ PIECE_BYTES: Final = 3 << 17
 
 
 def json_column(array: pa.Array) -> pa.Array:
-    """The values of an array as JSON, one string a row.
+    """The values of an array as JSON, one string a row; a null is the text `null`.
 
-    Args:
-        array: An array of any type whose text has at most 2**31 bytes.
-
-    Returns:
-        `pa.string()`, without nulls (a null is the text `null`).
-
-    Raises:
-        pa.ArrowNotImplementedError: The type has no JSON form here (a union).
+    The text has at most 2**31 bytes. A union raises `pa.ArrowNotImplementedError`.
     """
     text = _values(array)
     return pc.fill_null(text, "null") if text.null_count else text

@@ -49,10 +49,8 @@ class LogSet:
     Attributes:
         path: The file, the first of several, or the directory of a ROS 2 bag or a split log.
         parts: The files in reading order.
-        metadata: Metadata of the log.
         damage: Files that are missing, and metadata that cannot be read.
         gaps: Files that seem to be missing; damage unless all messages of the metadata are there.
-        unread: Files that are left out.
         problem: Why there is no log.
     """
 
@@ -332,14 +330,9 @@ class _JoinedSource(Source):
     def _numbered(
         self, inner: Source, numbers: NDArray[np.int32], alike: Counter[tuple[object, ...]]
     ) -> NDArray[np.int32]:
-        """Numbers of the channels of a file in this source.
+        """Numbers of the channels of a file in this source; `alike` is changed.
 
         Equal channels of one file are publishers of their own, of two files the same ones.
-
-        Args:
-            inner: The file.
-            numbers: Numbers of its channels so far.
-            alike: How many of these are alike, by what they have in common; changed.
         """
         more = []
         for channel in inner.channels[len(numbers) :]:

@@ -59,14 +59,9 @@ def _points(answer: Answer) -> Iterator[tuple[NDArray[Any], str, str, int]]:
 
 
 def ply_of(points: NDArray[Any]) -> bytes:
-    """A PLY file.
+    """A PLY file of records with `x`, `y` and `z`, or with `range` and `angle`, of any shape.
 
-    Args:
-        points: Records with `x`, `y` and `z`, or with `range` and `angle`, of any shape. Fields
-            of several numbers become as many properties.
-
-    Raises:
-        UsageError: They are no points.
+    Fields of several numbers become as many properties.
     """
     names = points.dtype.names or ()
     columns: dict[str, NDArray[Any]] = {}

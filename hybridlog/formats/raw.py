@@ -63,15 +63,9 @@ class Directory(Whole):
         self._last: dict[str, tuple[int, int]] = {}
 
     def add(self, data: Buffer, suffix: str, about: Mapping[str, object]) -> None:
-        """Write a file.
+        """Write a file named by `topic` and `log_time_ns` of `about`, its line of the index.
 
-        Args:
-            data: Its content.
-            suffix: Its suffix, with the dot.
-            about: The line of the index; its `topic` and `log_time_ns` give the name.
-
-        Raises:
-            DiskFullError: No space left.
+        The suffix has its dot.
         """
         with failures(self._name):
             name = self._write(str(about["topic"]), int(str(about["log_time_ns"])), suffix, data)

@@ -135,10 +135,8 @@ class Source(ABC):
         """Yield all readable messages once, in file order, in bounded memory.
 
         Each batch holds about `BATCH_BYTES` and at most `BATCH_MESSAGES` messages. Its
-        buffer stays valid after the source is closed.
-
-        Raises:
-            SourceError: The file cannot be read any more (an I/O error).
+        buffer stays valid after the source is closed. A file that cannot be read any more raises
+        SourceError.
         """
 
     @abstractmethod
@@ -176,14 +174,9 @@ def cannot_open(path: Path, error: OSError) -> SourceError:
 
 
 def regroup(batches: Iterator[Batch]) -> Iterator[Batch]:
-    """Join small batches and split large ones, in order.
+    """Join small batches and split large ones, in order; empty ones are omitted.
 
-    Args:
-        batches: Batches of any size, for example one for each chunk of a file. Empty ones
-            are omitted.
-
-    Yields:
-        Batches of about `BATCH_BYTES` and at most `BATCH_MESSAGES` messages.
+    Each then has about `BATCH_BYTES` and at most `BATCH_MESSAGES` messages.
     """
     held: list[Batch] = []
     size = rows = 0
@@ -242,9 +235,6 @@ def fingerprint(files: Sequence[Path]) -> Fingerprint:
     It covers the size of each file and its whole content up to `WHOLE` bytes. Larger files
     are covered by `SAMPLES` evenly spaced samples, the first at the start and the last at
     the end.
-
-    Raises:
-        SourceError: A file is missing or cannot be read.
     """
     whole, parts = blake2b(digest_size=16), []
     for path in files:

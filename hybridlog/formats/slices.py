@@ -28,12 +28,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Front:
-    """The choice of latched messages from before the time range, in MCAP and bag files.
-
-    Attributes:
-        latched: They are written.
-        original_times: They keep their log time.
-    """
+    """Latched messages from before the time range, and whether these keep their log time."""
 
     latched: bool = True
     original_times: bool = False
@@ -111,18 +106,10 @@ _writing = threading.Lock()  # one at a time: they would compete for the disk
 def cached_slice(query: Query, name: str, write: Callable[[Query, Path], None]) -> Path:
     """The MCAP file of a slice in `hybridlog/slices` of the user's cache.
 
-    It is written if there is none; those that are unused for longest make room for it. A file
-    is the same, byte for byte, whenever it is written again for the same state of the
-    recordings. Several threads and processes may use the same directory.
-
-    Args:
-        query: The slice.
-        name: What the file is called, beside its digest.
-        write: Writes it: all of it or nothing.
-
-    Raises:
-        UsageError: The slice is larger than all files may be together, or the directory
-            cannot be used.
+    It is written, all or nothing, if there is none; those that are unused for longest make room for
+    it. A file is the same, byte for byte, whenever it is written again for the same state of the
+    recordings. Several threads and processes may use the same directory. A slice larger than all
+    files may be together raises UsageError. The file is called `name`, and its digest.
     """
     directory = user_directory("XDG_CACHE_HOME", ".cache", "slices") / "slices"
     path = directory / f"{name[:_NAME_LENGTH]}-{fingerprint(query)[:_NAME_DIGITS]}.mcap"

@@ -32,12 +32,7 @@ _MAX_WINDOW = 1 << 27
 
 @dataclass(slots=True)
 class Spooled:
-    """A temporary unpacked file. Call `remove` once a reader has opened it.
-
-    Attributes:
-        path: The temporary file.
-        problem: Reason for truncated content, None if it is complete.
-    """
+    """A temporary unpacked file, and why it is cut. `remove` it once a reader has opened it."""
 
     path: Path
     problem: str | None

@@ -47,20 +47,11 @@ def parse_yaml(
     *,
     lines: dict[tuple[int, object], int] | None = None,
 ) -> object:
-    """Parse the first document of a text.
+    """Parse the first document of a text; fractions are strings.
 
-    Args:
-        text: The text.
-        wanted: Keys to keep in mappings, at any depth; None for all. Values of other keys
-            are skipped.
-        lines: Gets the line of each key, by the `id` of its mapping and the key.
-
-    Returns:
-        Dictionaries, lists, strings, integers, booleans and None; fractions are strings.
-
-    Raises:
-        YamlError: It is not YAML, a key is not a single word or is repeated, or there is
-            too much of it.
+    Only `wanted` keys of mappings are kept, at any depth; None for all. `lines` gets the line of
+    each key, by the `id` of its mapping and the key. A key that is not a single word or is repeated
+    raises YamlError, as too much text does.
     """
     import yaml
 

@@ -100,11 +100,7 @@ class McapSource(Source):
         self._handle = None
 
     def batches(self) -> Iterator[Batch]:
-        """Yield all readable messages once, in file order.
-
-        Raises:
-            SourceError: The file cannot be read any more.
-        """
+        """Yield all readable messages once, in file order."""
         try:
             for offset, item in self._items:
                 self.bytes_read = max(self.bytes_read, offset)
@@ -270,11 +266,7 @@ class _Definitions:
         )
 
     def use(self, channel_id: int) -> str:
-        """Enter this id into the table, if it is defined.
-
-        Returns:
-            The problem of its definition, empty if none or if it was reported before.
-        """
+        """Enter this id, if defined; returns the problem of its definition once, else ''."""
         record = self._records.get(channel_id)
         if record is None or self.table[channel_id] != _UNDEFINED:
             return ""

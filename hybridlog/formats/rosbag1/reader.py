@@ -133,11 +133,7 @@ class _Walk(NamedTuple):
     end: int
 
     def without_wrong(self, data: bytes) -> int:
-        """Leave out the last message if its length is wrong, as a record begins in it.
-
-        Returns:
-            The end of what is sound.
-        """
+        """Leave out a last message of wrong length: a record begins in it; returns the end."""
         if self.rows and sum(self.rows[-1][:2]) == self.end:
             start = self.rows[-1][0]
             if _OP in data[start : self.end + len(_OP)]:
@@ -504,11 +500,7 @@ class Rosbag1Source(Source):
         return self.size_bytes if place.is_cut else place.end
 
     def _unpacked(self, record: _Record, place: _Place) -> tuple[bytes, int]:
-        """The content of a chunk, also of one whose record states too few bytes.
-
-        Returns:
-            The content, and the number of its compressed bytes.
-        """
+        """Content of a chunk, also if its record states too few bytes, and compressed size."""
         size, length = record.number(b"size"), record.end - record.start
         most = min(max(size, _UNSTATED), MAX_PAYLOAD)
         # In a valid bag index records follow, so a little more is enough.

@@ -19,11 +19,7 @@ if TYPE_CHECKING:
 
 
 def read_metadata(folder: Path) -> BagMetadata | Damage | None:
-    """Read the metadata of the bag in a folder.
-
-    Returns:
-        The metadata, the damage if it cannot be read, or None without metadata.
-    """
+    """The metadata of the bag in a folder, the damage if it is unreadable, None without any."""
     path = folder / NAME
     try:
         with path.open("rb") as file:
@@ -40,12 +36,7 @@ def read_metadata(folder: Path) -> BagMetadata | Damage | None:
 
 
 def locate(folder: Path, metadata: BagMetadata) -> tuple[dict[Path, int | None], list[Damage]]:
-    """Find the files that the metadata lists.
-
-    Returns:
-        The existing files, in order, with their number of messages as listed; and the damage
-        for missing ones.
-    """
+    """The listed files that exist, in order, with their listed messages; and damage for others."""
     files: dict[Path, int | None] = {}
     missing: list[Damage] = []
     for name in metadata.files:

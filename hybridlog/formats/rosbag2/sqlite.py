@@ -304,13 +304,10 @@ def _connect_whole_pages(
 
 
 def _connect(path: Path) -> tuple[sqlite3.Connection, Path | None]:
-    """Open an untrusted database read-only.
+    """Open an untrusted database read-only; returns its write-ahead log, too, if left unused.
 
-    A database with a write-ahead log, left by a crashed recorder, is opened with it. Others
-    are opened as immutable, so that no file is written beside them.
-
-    Returns:
-        The connection, and the write-ahead log if it could not be used.
+    A database with a write-ahead log, left by a crashed recorder, is opened with it. Others are
+    opened as immutable, so that no file is written beside them.
     """
     unread: Path | None = None
     uri = "file:" + quote(os.fsencode(path.absolute())) + "?mode=ro"

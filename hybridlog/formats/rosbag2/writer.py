@@ -58,15 +58,7 @@ class _Span:
 
 @dataclass(slots=True)
 class _Topic:
-    """A topic of one type.
-
-    Attributes:
-        number: Its number in the bag.
-        channel: One of its channels.
-        type_hash: Hash of its type.
-        messages: Number of messages.
-        offered: QoS profiles that were offered.
-    """
+    """A topic of one type."""
 
     number: int
     channel: Channel
