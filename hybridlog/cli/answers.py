@@ -259,11 +259,7 @@ def write_answer(
     strict: bool = False,
     settings: Mapping[str, Any] | None = None,
 ) -> int:
-    """Write the answer of a query into a path or stream, all of it or nothing.
-
-    Returns:
-        Messages that are missing, because they do not fit their definition.
-    """
+    """Write an answer, all or nothing; returns how many messages do not fit their definition."""
     from hybridlog.formats.slices import IN_FORCE, payload_bytes
 
     counters, written = query.counters, 0

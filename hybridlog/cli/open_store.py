@@ -39,14 +39,9 @@ def opened_store(
 ) -> Iterator[Store]:
     """The open store, in a block around which its repairs are reported.
 
-    Args:
-        path: Its directory; without, `HYBRIDLOG_STORE` or `./hybridlog-store`.
-        mongo: URI of the MongoDB that holds the index.
-        quiet: No bar while the index is brought up to date.
-        snapshot: All that the command asks is of one moment.
-        records: The command records, also while MongoDB is unavailable.
-        verifies: The command says itself what `hybridlog verify --repair` cures.
-        how: Of `open_store`; what is not recovered is reported by another opening.
+    With `snapshot`, all that the command asks is of one moment. With `records` it records, also
+    while MongoDB is unavailable; with `verifies` it says itself what `hybridlog verify --repair`
+    cures.
     """
     from hybridlog_storage.lazy import import_numpy_late
 

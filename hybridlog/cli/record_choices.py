@@ -189,11 +189,7 @@ class RecordChoices(Between, Latched, InStore, AsJson, Quiet):
 
 
 def check_choices(choices: RecordChoices) -> None:
-    """Refuse parameters that do not fit together.
-
-    Raises:
-        UsageError: Neither a log nor a robot, both, or --watch of a file.
-    """
+    """Refuse parameters that do not fit together."""
     if choices.ros1 is not None and not choices.ros1.strip():
         raise UsageError("A ROS master's URI looks like http://host:11311; this one is empty.")
     if choices.paths and choices.is_live:
@@ -216,11 +212,7 @@ def matchers(choices: RecordChoices) -> tuple[TopicMatcher | None, TopicMatcher 
 
 
 def segment_settings(choices: RecordChoices, chunk_size: int = DEFAULT_CHUNK) -> SegmentSettings:
-    """Chunks and compression.
-
-    Raises:
-        UsageError: Chunks would be too large.
-    """
+    """Chunks and compression."""
     from hybridlog_storage.segments.segment_writer import SegmentSettings
 
     return SegmentSettings(

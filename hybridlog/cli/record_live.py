@@ -112,12 +112,7 @@ def _record(choices: RecordChoices) -> None:
 
 
 def recorder_options(choices: RecordChoices) -> RecorderOptions:
-    """Options of the recorder.
-
-    Raises:
-        UsageError: A value is out of range.
-        TopicError: A pattern that is malformed.
-    """
+    """Options for the recorder from those of the command; patterns are checked."""
     from hybridlog.contract import Contract
     from hybridlog.follow.triggers import Trigger
     from hybridlog.live.memory import default_budget
@@ -163,11 +158,7 @@ def _name(choices: RecordChoices) -> str:
 
 
 def sources_of(choices: RecordChoices) -> list[LiveSource]:
-    """The chosen sources; each imports the packages it needs.
-
-    Raises:
-        UsageError: A setting is malformed.
-    """
+    """The chosen sources; each imports the packages it needs."""
     found: list[LiveSource] = []
     if choices.ros1 is not None:
         from hybridlog.live.sources.ros1.source import Ros1Source

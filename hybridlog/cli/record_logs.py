@@ -210,11 +210,7 @@ def _outside(source: Source, between: tuple[int, int]) -> TimeError:
 
 
 class LogRecorder:
-    """Records logs with the options of the command; what came of them is told at the end.
-
-    Raises:
-        UsageError: An option is wrong.
-    """
+    """Records logs with the options of the command; what came of them is told at the end."""
 
     def __init__(self, choices: RecordChoices, logs: Sequence[LogSet], *, is_search: bool) -> None:
         self._choices = choices
@@ -241,11 +237,7 @@ class LogRecorder:
             raise click.exceptions.Exit(self._exit_code)
 
     def record(self, store: Store, log: LogSet, progress: Callable[[int, int], None]) -> None:
-        """Record a log, or those parts of it that are not in the store yet.
-
-        Raises:
-            HybridlogError: It was the only one, and cannot be recorded.
-        """
+        """Record a log, or the parts that the store lacks; raises if the only log cannot be."""
         for piece in self._pieces(store, log):
             self._current = piece.path
             try:
@@ -319,11 +311,7 @@ class LogRecorder:
             )
 
     def fail(self, path: Path | None, error: HybridlogError) -> None:
-        """Add an error.
-
-        Raises:
-            HybridlogError: It is of the only log.
-        """
+        """Add an error; that of the only log is raised."""
         if len(self._logs) == 1 and not self._is_search:
             self._current = None
             self._unfinished.clear()

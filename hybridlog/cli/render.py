@@ -23,7 +23,6 @@ class Column:
     """A column of a table.
 
     Attributes:
-        name: Its heading.
         get: Key or function that gives the value of a row; empty for the name as the key.
         side: Numbers stand on the right. Cells on the left may be folded between words, `whole`
             ones are not.
@@ -159,14 +158,9 @@ def print_table(
 ) -> None:
     """Print rows under headings; on a terminal that has no room for them, a block for each row.
 
-    A long table is printed some rows at a time: memory does not grow with it. Columns become
-    wider where later rows need it.
-
-    Args:
-        columns: The columns.
-        rows: What their functions take.
-        titles: Number of columns that are the title of a block.
-        about: Further words of each title.
+    A long table is printed some rows at a time: memory does not grow with it. Columns become wider
+    where later rows need it. The first `titles` columns are the title of a block, `about` adds
+    words to it.
     """
     source = iter(rows)
     block = [*islice(source, ROWS_AT_ONCE)]

@@ -99,12 +99,7 @@ def _values(
     fields: Sequence[tuple[str, str]],
     span: int,
 ) -> list[dict[str, Any]]:
-    """Least, mean and greatest of each field in the last seconds, of what is flushed.
-
-    Raises:
-        TopicError: No topic has that name.
-        UsageError: Several topics have.
-    """
+    """Least, mean and greatest of each field in the last seconds, of what is flushed."""
     from hybridlog.query.topics import resolve
 
     since, topics = time.time_ns() - span, [topic.topic for topic in state.topics]
