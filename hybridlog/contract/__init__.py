@@ -210,11 +210,7 @@ def _share(value: object) -> float:
 
 
 def parse_share(text: str) -> float:
-    """A share from `5%` or `0.05`.
-
-    Raises:
-        UsageError: It is none, or more than 1.
-    """
+    """A share from `5%` or `0.05`; UsageError if it is none, or more than 1."""
     try:
         return _share(text)
     except ValueError as error:

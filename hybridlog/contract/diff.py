@@ -101,17 +101,9 @@ def diff(
 ) -> list[Difference]:
     """Differences between two choices of recordings: what only one has first, then by topic.
 
-    Of two recordings of different length, the time that only one has is one difference, and
-    the others are those of the time that both have.
-
-    Args:
-        session: The open store.
-        a: The first choice.
-        b: The second one.
-        topics: Only these, as `Store.topic` takes them; empty for all.
-        between: Only messages of this range of each; None for all times.
-        tolerance: Numbers are equal that differ by at most this share of the greater one.
-        contract: Also compare which of its rules are broken; None for no contract.
+    Of two recordings of different length, the time that only one has is one difference, and the
+    others are those of the time that both have. Topics are as `Store.topic` takes them, empty for
+    all; `tolerance` is a share of the greater number.
     """
     known = sorted({*a.topics(), *b.topics()})
     wanted = resolve(topics, known) if topics else known
@@ -153,12 +145,7 @@ def diff(
 
 
 class _Shared(NamedTuple):
-    """The time that two recordings have both.
-
-    Attributes:
-        ranges: Its begin and end in each, ns.
-        others: What only the one and only the other has, in words.
-    """
+    """The time that two recordings both have, ns; `others` says what only one of them has."""
 
     ranges: tuple[Range, Range]
     others: tuple[str, str]
