@@ -31,11 +31,8 @@ class Sink(Protocol):
     def wants(self, topic: str, type_name: str) -> bool:
         """Tells whether a topic is to be recorded. Costs microseconds.
 
-        A source asks for each new topic, and subscribes to nothing else.
-
-        Args:
-            topic: Name as the source spells it.
-            type_name: Type as the source spells it, empty if not known yet.
+        A source asks for each new topic, and subscribes to nothing else. Names are as it spells
+        them; the type is empty if not known yet.
         """
         ...
 
@@ -69,12 +66,7 @@ class Sink(Protocol):
         ...
 
     def clock(self, now: int, *, received: int) -> None:
-        """Note the time of a simulation, as a source that has no topic for it reports it.
-
-        Args:
-            now: The time, ns.
-            received: Receive time, ns since the epoch.
-        """
+        """Note the time of a simulation, ns, as a source without a topic for it reports it."""
         ...
 
     def topic_came(self, topic: str, type_name: str) -> None:
@@ -86,19 +78,11 @@ class Sink(Protocol):
         ...
 
     def say(self, text: str) -> None:
-        """Show the user a problem and its remedy; recording goes on.
-
-        Args:
-            text: One line. The same text is shown once.
-        """
+        """Show the user a problem and its remedy in a line, each once; recording goes on."""
         ...
 
     def ended(self, reason: str = "") -> None:
-        """Note that the source has ended by itself.
-
-        Args:
-            reason: The error that ended it; empty after a regular end.
-        """
+        """Note that the source has ended by itself; `reason` is empty after a regular end."""
         ...
 
 
@@ -120,25 +104,15 @@ class LiveSource(ABC):
     was_reached: bool = True
 
     def check(self) -> None:  # noqa: B027 - most sources cannot check anything
-        """Raise the errors of `start` before a recording is created.
-
-        Raises:
-            UsageError: An address or another setting is invalid.
-            SourceError: The source can never work.
-            MissingDependencyError: A required package is not installed.
-        """
+        """Raise the errors of `start` before a recording is created."""
 
     @abstractmethod
     def start(self, sink: Sink) -> None:
         """Begin to listen.
 
-        Temporary problems (a master that is not up yet, a publisher that dies) do not
-        raise: the source reports them, and retries with growing pauses.
-
-        Raises:
-            UsageError: An address or another setting is invalid.
-            SourceError: The source can never work, such as a file that is not a log.
-            MissingDependencyError: A required package is not installed.
+        Temporary problems (a master that is not up yet, a publisher that dies) do not raise: the
+        source reports them, and retries with growing pauses. An invalid setting raises UsageError,
+        a source that can never work SourceError.
         """
 
     @abstractmethod

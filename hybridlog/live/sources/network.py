@@ -28,12 +28,7 @@ class UnreachedError(PeerError):
 
 
 class Endpoint(NamedTuple):
-    """Host and port of a program.
-
-    Attributes:
-        host: Name or address, without brackets.
-        port: 1 to 65535.
-    """
+    """Host (without brackets) and port of a program."""
 
     host: str
     port: int
@@ -47,9 +42,6 @@ def endpoint_of(uri: str, default_port: int | None = None) -> Endpoint:
     """Host and port of an `http` address.
 
     Nodes on IPv6 may omit the brackets (`http://::1:4711/`): the last colon counts.
-
-    Raises:
-        PeerError: The address is invalid.
     """
     wrong = PeerError(f"{one_line(uri)!r} is not an address like http://host:port")
     try:
@@ -91,11 +83,7 @@ class Network:
         self._lookups: dict[str, Future[Addresses]] = {}
 
     async def connect(self, endpoint: Endpoint) -> socket.socket:
-        """A connected socket that does not block.
-
-        Raises:
-            OSError: The connection is refused, the name is unknown, or the peer does not answer.
-        """
+        """A connected socket that does not block."""
         loop = asyncio.get_running_loop()
         failure: OSError = OSError(f"{one_line(endpoint.host)} has no address")
         addresses = await self.addresses_of(endpoint.host)
@@ -120,11 +108,7 @@ class Network:
         raise failure
 
     async def addresses_of(self, host: str) -> Addresses:
-        """Address families and addresses (with port 0) of a host.
-
-        Raises:
-            OSError: The name is unknown, or the resolver does not answer.
-        """
+        """Address families and addresses (with port 0) of a host."""
         try:
             return _look_up(host, socket.AI_NUMERICHOST)
         except OSError:

@@ -52,12 +52,8 @@ class ReplaySource(ThreadedSource):
     it is unknown. Attachments and metadata of an MCAP file are ignored.
 
     Args:
-        path: The log.
         speed: Seconds of the log per second: positive and finite. A sink or disk that
             cannot keep up is reported once.
-
-    Raises:
-        UsageError: The speed is not positive and finite.
     """
 
     kind = "replay"
@@ -82,19 +78,11 @@ class ReplaySource(ThreadedSource):
         self._waited_for = -1
 
     def check(self) -> None:
-        """Check that the log can be opened.
-
-        Raises:
-            SourceError: The file is not a readable log.
-        """
+        """Check that the log can be opened."""
         open_source(self._path).close()
 
     def start(self, sink: Sink) -> None:
-        """Open the log, and begin to play it.
-
-        Raises:
-            SourceError: The file is not a readable log.
-        """
+        """Open the log, and begin to play it."""
         self._source, self._sink = open_source(self._path), sink
         self._begin(sink, self._run)
 

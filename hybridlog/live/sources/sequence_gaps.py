@@ -21,13 +21,7 @@ _HEADER_TYPES: Final = frozenset({"Header", "std_msgs/Header", "roslib/Header"})
 
 
 class SequenceGap(NamedTuple):
-    """Consecutive messages that never came.
-
-    Attributes:
-        missing: Number of messages.
-        first: Receive time of the message before them, ns since the epoch.
-        last: Receive time of the message after them.
-    """
+    """Consecutive messages that never came, between two receive times, ns since the epoch."""
 
     missing: int
     first: int
@@ -81,12 +75,7 @@ class SequenceGapDetector:
         self._received = 0
 
     def see(self, number: int, received: int) -> None:
-        """Takes the number of the next message.
-
-        Args:
-            number: Its sequence number.
-            received: Its receive time, ns since the epoch.
-        """
+        """Takes the number of the next message, and its receive time, ns since the epoch."""
         if number == self.expected:
             self.expected = (number + 1) % MODULUS
         else:
@@ -94,13 +83,7 @@ class SequenceGapDetector:
         self._received = received
 
     def jump(self, number: int, first: int, last: int) -> None:
-        """Takes a number that is not the expected one.
-
-        Args:
-            number: The message's sequence number.
-            first: Receive time of the message before it, ns since the epoch.
-            last: Its receive time.
-        """
+        """Takes an unexpected number; times (ns) are of the message before it, and its own."""
         if self.expected >= 0:
             self._end_run()
             missing = (number - self.expected) % MODULUS

@@ -70,11 +70,7 @@ class Client:
             failures += 1
 
     async def _connect(self) -> str:
-        """Make one connection, and read it to its end.
-
-        Returns:
-            The reason of the end, for the user.
-        """
+        """Make one connection, and read it to its end; returns the reason, for the user."""
         session = Session(self._sink, self._address.shown, self._missed)
         opening = asyncio.ensure_future(self._open(session))
         if not await self._has_ended(opening, _OPEN_S):
@@ -120,11 +116,7 @@ class Client:
         return "the connection broke"
 
     async def _open(self, session: Session) -> WSTransport:
-        """Connect, and agree on the protocol.
-
-        Raises:
-            PeerError: The connection failed; the message names reason and remedy.
-        """
+        """Connect, and agree on the protocol; PeerError names reason and remedy."""
         place = Endpoint(self._address.host, self._address.port)
         try:
             made = await Network().connect(place)

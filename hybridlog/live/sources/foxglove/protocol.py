@@ -64,11 +64,7 @@ class Offer(NamedTuple):
 
 
 def parse_address(url: str) -> Address:
-    """Parse the address of a server.
-
-    Raises:
-        UsageError: The address is invalid.
-    """
+    """Parse the address of a server."""
     shown = without_user(url)
     try:
         parts = urlsplit(url)
@@ -107,11 +103,7 @@ def without_user(url: str) -> str:
 
 
 def parse_text(data: bytes) -> Mapping[str, object]:
-    """Parse a JSON message.
-
-    Raises:
-        PeerError: The message is malformed.
-    """
+    """Parse a JSON message."""
     try:
         message = json.loads(data.decode())
     except (ValueError, RecursionError) as error:
@@ -126,9 +118,6 @@ def parse_channel(entry: object) -> Offer:
 
     A channel with an unreadable definition has none: its messages are recorded, but their
     fields cannot be searched.
-
-    Raises:
-        PeerError: Id, topic or encoding are missing.
     """
     if not isinstance(entry, dict):
         raise PeerError("advertised a channel that is not a JSON object; it is ignored")

@@ -62,11 +62,8 @@ class _Subscription:
 class Session(WSListener):
     """One connection; picows calls it in the thread that reads.
 
-    Args:
-        sink: Takes the messages.
-        name: The server, for the user.
-        missed: Topics of an earlier connection, with the time of its end, ns since the
-            epoch. Topics that are available again are removed.
+    `missed` are topics of an earlier connection, with the time of its end, ns since the epoch.
+    Topics that are available again are removed.
     """
 
     max_bytes: Final = 1 << 30  # of a message

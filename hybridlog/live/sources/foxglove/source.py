@@ -47,20 +47,11 @@ class FoxgloveSource(ThreadedSource):
         self.was_reached = False
 
     def check(self) -> None:
-        """Check the address.
-
-        Raises:
-            UsageError: The address is invalid.
-        """
+        """Check the address."""
         parse_address(self._url)
 
     def start(self, sink: Sink) -> None:
-        """Begin to listen; the server need not be up yet.
-
-        Raises:
-            UsageError: The address is invalid.
-            MissingDependencyError: `picows` is not installed.
-        """
+        """Begin to listen; the server need not be up yet."""
         address = parse_address(self._url)
         try:
             from hybridlog.live.sources.foxglove.connection import Client

@@ -33,12 +33,7 @@ _Lists = list[tuple[str, list[str]]]
 
 
 class State(NamedTuple):
-    """State of the ROS system at one time.
-
-    Attributes:
-        publishers: Names of each topic's publishers.
-        ours: Topics that this node is registered for.
-    """
+    """State of the ROS system at one time; this node is registered for the topics `ours`."""
 
     publishers: dict[str, frozenset[str]]
     ours: frozenset[str]

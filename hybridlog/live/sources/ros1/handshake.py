@@ -52,11 +52,7 @@ def encode_header(fields: Mapping[str, str]) -> bytes:
 
 
 def decode_header(body: bytes) -> dict[str, str]:
-    """The fields of a connection header, which comes without its length.
-
-    Raises:
-        WireError: Lengths are inconsistent, or a field has no `=`.
-    """
+    """The fields of a connection header, which comes without its length."""
     fields: dict[str, str] = {}
     pos = 0
     while pos < len(body):
@@ -102,14 +98,7 @@ async def subscribe(
 ) -> tuple[socket.socket, dict[str, str]]:
     """Connects to a publisher of a topic, whatever its type.
 
-    Returns:
-        The socket, positioned at the first message, and the fields of the publisher's
-        header.
-
-    Raises:
-        UnreachedError: The publisher cannot be reached.
-        PeerError: It refuses, or violates the protocol.
-        OSError: It closes the connection.
+    Returns the socket, positioned at the first message, and the fields of the publisher's header.
     """
     protocol = await call(network, uri, "requestTopic", caller, topic, [["TCPROS"]])
     place = _place_of(protocol)

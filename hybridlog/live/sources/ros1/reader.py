@@ -21,11 +21,9 @@ _LAST_READ_S: Final = 0.5
 class Reader:
     """Reads streams until it is stopped.
 
-    One thread is enough: the kernel copies large messages while other threads run, and
-    Python splits small ones in one thread at a time anyway.
-
-    Args:
-        failed: Called in the thread with an unexpected error before it ends.
+    One thread is enough: the kernel copies large messages while other threads run, and Python
+    splits small ones in one thread at a time anyway. `failed` is called in it with an unexpected
+    error before it ends.
     """
 
     def __init__(self, failed: Callable[[BaseException], None]) -> None:

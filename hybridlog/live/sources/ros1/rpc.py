@@ -46,13 +46,7 @@ _MAX_CLIENTS: Final = 64
 
 
 async def call(network: Network, uri: str, method: str, *arguments: Any) -> object:
-    """Calls a method of the master or of a node, and returns its value.
-
-    Raises:
-        UnreachedError: The peer does not answer within 10 s.
-        PeerError: The answer is malformed.
-        RefusedError: The peer refuses.
-    """
+    """Calls a method of the master or of a node, which has 10 s, and returns its value."""
     endpoint = endpoint_of(uri)
     path = urlsplit(uri).path or "/RPC2"
     body = xmlrpc.client.dumps(arguments, method).encode(errors="replace")
@@ -154,11 +148,7 @@ def _value_of(answer: object) -> object:
 
 
 class RpcServer:
-    """Answers calls on one socket, which it owns.
-
-    Attributes:
-        endpoint: Its address.
-    """
+    """Answers calls on one socket, which it owns."""
 
     def __init__(self, listening: socket.socket, methods: Mapping[str, Method]) -> None:
         self._socket = listening

@@ -21,16 +21,10 @@ _BACKLOG: Final = 64
 async def listen(
     network: Network, environment: Mapping[str, str], say: Callable[[str], None]
 ) -> tuple[socket.socket, str]:
-    """Opens the node's socket on the address in `ROS_HOSTNAME` or `ROS_IP`.
+    """Opens the node's socket on `ROS_HOSTNAME` or `ROS_IP`; returns also its host for peers.
 
     Without these variables it listens on loopback. A master on another computer then cannot
     announce publishers, and polling finds them.
-
-    Returns:
-        The socket, and the host name for peers.
-
-    Raises:
-        OSError: Even loopback fails.
     """
     is_ipv6 = environment.get("ROS_IPV6") == "on"
     loopback = "::1" if is_ipv6 else "127.0.0.1"
@@ -76,11 +70,8 @@ def methods(
 ) -> dict[str, Method]:
     """The slave API of a node that only subscribes.
 
-    Args:
-        master_uri: The master's address.
-        topics: Returns the topics that the node is registered for.
-        changed: Called with a topic whose publishers may have changed.
-        say: Reports a line to the user.
+    `topics` returns those that the node is registered for; `changed` is called with one whose
+    publishers may have changed.
     """
 
     def publisher_update(arguments: tuple[object, ...]) -> list[object]:

@@ -68,19 +68,11 @@ class Ros1Source(ThreadedSource):
         self._end: Callable[[BaseException | None], None] | None = None
 
     def check(self) -> None:
-        """Checks the address.
-
-        Raises:
-            UsageError: The master's address is invalid.
-        """
+        """Checks the address."""
         self._endpoint()
 
     def start(self, sink: Sink) -> None:
-        """Begins to poll the master, which need not be up yet.
-
-        Raises:
-            UsageError: The master's address is invalid.
-        """
+        """Begins to poll the master, which need not be up yet."""
         uri = f"http://{self._endpoint()}/"
         self._begin(sink, lambda: asyncio.run(self._follow(sink, uri)))
 

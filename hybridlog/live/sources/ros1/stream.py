@@ -78,11 +78,7 @@ class Stream:
         self._wake_at(1)
 
     def read(self) -> bool:
-        """Reads once, and passes on all complete messages.
-
-        Returns:
-            False at the end of the stream; `failure` then holds the error, if any.
-        """
+        """Reads once, and passes on all complete messages; False at the end of the stream."""
         want = min(self._missing, _PIECE)
         if want < _LARGE:
             want = self._block if want or not self._large else self._next_large()
@@ -169,11 +165,7 @@ class Stream:
         self._sink.take(self._channel, rest, received=now, sequence=number)
 
     def _cut(self, data: bytes, pos: int, now: int) -> int:
-        """Passes on all complete messages from `pos` on.
-
-        Returns:
-            Offset of the first incomplete message.
-        """
+        """Passes on all complete messages; returns the offset of the first incomplete one."""
         take, channel, length = self._sink.take, self._channel, u32
         last = len(data) - 4
         while pos <= last:

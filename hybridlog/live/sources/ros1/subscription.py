@@ -32,14 +32,8 @@ _MAX_CHANNELS: Final = 64
 class Context:
     """Parts that all subscriptions of a source share.
 
-    Attributes:
-        network: Makes connections.
-        caller: Name of this node.
-        sink: Takes the messages.
-        reader: Reads the connections.
-        max_message_bytes: Longest message.
-        spawn: Runs a coroutine until the source stops.
-        look_again: Asks the master for the publishers of a topic soon.
+    `spawn` runs a coroutine until the source stops; `look_again` asks the master for the publishers
+    of a topic soon.
     """
 
     network: Network
@@ -52,12 +46,7 @@ class Context:
 
 
 class Subscription:
-    """A wanted topic.
-
-    Attributes:
-        topic: Name as the master spells it.
-        nodes: Names of its publishers at the last registration, None before.
-    """
+    """A wanted topic; `nodes` are its publishers at the last registration, None before."""
 
     def __init__(self, context: Context, topic: str) -> None:
         self.topic = topic
@@ -70,15 +59,10 @@ class Subscription:
         self._reported = (False, "")
 
     def update(self, type_name: str, uris: Iterable[str], *, is_wanted: bool) -> None:
-        """Updates the publishers.
+        """Updates the publishers, by their addresses.
 
-        A connection to a publisher that is no longer listed goes on until it ends: a
-        restarted master lists none at first.
-
-        Args:
-            type_name: The topic's type, empty if the master does not know it.
-            uris: Addresses of its publishers.
-            is_wanted: Messages of that type are wanted.
+        A connection to a publisher that is no longer listed goes on until it ends: a restarted
+        master lists none at first. `type_name` is empty if the master does not know it.
         """
         if type_name:
             self._type = type_name
@@ -105,11 +89,7 @@ class Subscription:
             self._context.sink.topic_gone(self.topic)
 
     def channel(self, fields: Mapping[str, str]) -> Channel | None:
-        """The channel of a connection, the same one for the same header.
-
-        Returns:
-            None if messages of the publisher's type are not wanted.
-        """
+        """The channel of a connection, the same for the same header; None if it is unwanted."""
         type_name = fields.get("type", "")
         if type_name and type_name != ANY and not self._takes(type_name, fields):
             return None
@@ -150,13 +130,7 @@ class Subscription:
 
 
 class _Link:
-    """The connection to one publisher of a topic.
-
-    Attributes:
-        is_listed: The master lists the publisher.
-        is_up: The connection is established.
-        has_ended: `run` has returned.
-    """
+    """The connection to one publisher of a topic, which the master lists or no longer lists."""
 
     def __init__(self, subscription: Subscription, uri: str) -> None:
         self.is_listed = True

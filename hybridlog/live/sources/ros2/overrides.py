@@ -31,11 +31,7 @@ _POLICIES = {
 
 
 def read_overrides(path: Path) -> dict[str, dict[str, Any]]:
-    """Reads the overrides: fields of `Profile` by topic.
-
-    Raises:
-        UsageError: The file is unreadable or not YAML, or a policy is unknown.
-    """
+    """Reads the overrides: fields of `Profile` by topic."""
     data = read_yaml(path, "QoS overrides")
     try:
         root = parse_yaml(data)
@@ -59,11 +55,7 @@ def read_overrides(path: Path) -> dict[str, dict[str, Any]]:
 
 
 def _policy(name: object, value: object, where: str) -> int:
-    """The number of a policy.
-
-    Raises:
-        UsageError: The policy or its value is unknown.
-    """
+    """The number of a policy."""
     if name in DURATIONS:
         return _duration(value, f"{where}: {name}")
     if name == "depth":
@@ -87,11 +79,7 @@ def _policy(name: object, value: object, where: str) -> int:
 
 
 def _duration(value: object, where: str) -> int:
-    """A duration in ns.
-
-    Raises:
-        UsageError: The value is not a duration.
-    """
+    """A duration in ns."""
     if isinstance(value, dict) and set(value) == {"sec", "nsec"}:
         sec, nsec = value["sec"], value["nsec"]
         if all(isinstance(part, int) and part >= 0 for part in (sec, nsec)):

@@ -66,21 +66,10 @@ class ChildMissingError(ChildError):
 
 
 class Process:
-    """A running child, which has sent its greeting.
+    """A running child, which has sent its greeting, `hello`.
 
-    Args:
-        python: The interpreter.
-        settings: First line of input for the child.
-        environment: Environment variables.
-        cancelled: Set to give up waiting for the greeting.
-
-    Attributes:
-        hello: The greeting.
-        peer: The socket to the child.
-
-    Raises:
-        ChildMissingError: The Python does not exist, or has no rclpy.
-        ChildError: The child failed otherwise.
+    `settings` is its first line of input; `cancelled` is set to give up waiting for the greeting. A
+    Python that does not exist, or has no rclpy, raises ChildMissingError.
     """
 
     def __init__(
@@ -149,11 +138,7 @@ class Process:
         raise ChildMissingError(why) if hello.get("missing") else ChildError(why)
 
     def _receive(self, size: int, deadline: float) -> bytes:
-        """Receives exactly `size` bytes, with a deadline of the monotonic clock.
-
-        Raises:
-            OSError: The child has ended, or the deadline has passed.
-        """
+        """Receives exactly `size` bytes by a deadline of the monotonic clock, or raises OSError."""
         parts = b""
         while len(parts) < size:
             if self._cancelled.is_set() or time.monotonic() > deadline:
@@ -210,20 +195,10 @@ class Process:
 def launch(
     python: str | None, settings: Mapping[str, Any], domain_id: int | None, cancelled: Event
 ) -> tuple[Process, str]:
-    """Starts a child under the first Python that has rclpy.
+    """Starts a child under the first Python that has rclpy; returns also its interpreter.
 
-    Args:
-        python: The only interpreter to try; None for those of `candidates`.
-        settings: First line of input for the child.
-        domain_id: ROS domain, None for that of the environment.
-        cancelled: Set to give up.
-
-    Returns:
-        The child and its interpreter.
-
-    Raises:
-        MissingDependencyError: No interpreter has rclpy.
-        ChildError: rclpy does not start.
+    Of `candidates`, or `python` alone if it is given; `cancelled` is set to give up. Without
+    `domain_id` it is that of the environment.
     """
     tried = []
     for name in [python] if python else candidates(os.environ):

@@ -78,8 +78,6 @@ class Receiver:
     """Reads from one child until it ends.
 
     Args:
-        peer: The socket to the child.
-        sink: Takes messages and events.
         outages: Topics that an earlier child recorded, with the time of its end, ns since
             the epoch. Topics that are recorded again are removed.
 
@@ -101,12 +99,7 @@ class Receiver:
         self.said_bye = False
 
     def run(self) -> None:
-        """Reads to the end.
-
-        Raises:
-            WireError: The child violates the protocol, or ends in the middle of a frame.
-            OSError: The socket is broken.
-        """
+        """Reads to the end; WireError if that is in the middle of a frame."""
         # A large payload is read directly into the bytes object for the sink, without a
         # copy.
         raw = io.FileIO(self._peer.fileno(), closefd=False)
@@ -181,13 +174,7 @@ class Receiver:
 
 
 def report_outage(sink: Sink, topic: str, since: int) -> None:
-    """Reports that a topic was not recorded from some time until now.
-
-    Args:
-        sink: Takes the report.
-        topic: The topic.
-        since: Begin of the outage, ns since the epoch.
-    """
+    """Reports that a topic was not recorded from some time, ns since the epoch, until now."""
     detail = "the ROS 2 child had ended"
     sink.lost(Loss(topic, Cause.CONNECTION, None, since, max(since, time.time_ns()), detail))
 

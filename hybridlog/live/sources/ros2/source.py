@@ -61,24 +61,12 @@ class Ros2Source(ThreadedSource):
         self._outages: dict[str, int] = {}
 
     def check(self) -> None:
-        """Start the child; messages are read after `start`.
-
-        Raises:
-            UsageError: The domain is invalid, or the overrides are unreadable.
-            SourceError: ROS does not start.
-            MissingDependencyError: No interpreter has rclpy.
-        """
+        """Start the child; messages are read after `start`."""
         if self._child is None:
             self._child, self._settings = self._launched()
 
     def start(self, sink: Sink) -> None:
-        """Begin to listen.
-
-        Raises:
-            UsageError: As `check`.
-            SourceError: As `check`.
-            MissingDependencyError: As `check`.
-        """
+        """Begin to listen."""
         self.check()
         child, settings = self._child, self._settings
         self._begin(sink, lambda: self._supervise(child, sink, settings))

@@ -60,14 +60,7 @@ class Child:
     # The main thread.
 
     def run(self, peer: socket.socket) -> None:
-        """Works until it is stopped.
-
-        Args:
-            peer: The socket of the outbox.
-
-        Raises:
-            OSError: The recorder has ended.
-        """
+        """Works until it is stopped; OSError if the recorder has ended."""
         writable = select.poll()
         writable.register(peer, select.POLLOUT)
         began = next_look = time.monotonic()
@@ -92,11 +85,7 @@ class Child:
         self._finish(writable)
 
     def _take(self, wait: float) -> tuple[int, int]:
-        """Takes messages of all subscriptions; returns their number and bytes.
-
-        Args:
-            wait: Maximum time to wait for a message, seconds.
-        """
+        """Takes messages, and waits `wait` seconds at most; returns their number and bytes."""
         ready = self._middleware.wait(wait)
         owners = self._topics.owners
         count = size = 0
@@ -131,14 +120,7 @@ class Child:
 
 
 def run(number: int) -> int:
-    """The program.
-
-    Args:
-        number: File descriptor of the socket.
-
-    Returns:
-        The exit code.
-    """
+    """The program, with the file descriptor of its socket; returns the exit code."""
     peer = socket.socket(fileno=number)
     peer.set_inheritable(False)
     # The recorder sends no command before the greeting.

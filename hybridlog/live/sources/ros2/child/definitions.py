@@ -94,11 +94,7 @@ class Definition(NamedTuple):
 
 
 def parse_type(name: str) -> TypeName:
-    """Parses the name of a type.
-
-    Raises:
-        UnknownTypeError: The name is not that of a ROS 2 type.
-    """
+    """Parses the name of a type."""
     found = _TYPE.fullmatch(name)
     if found is None:
         raise UnknownTypeError(f"{name!r} is not a type name like package/msg/Name")
@@ -123,11 +119,7 @@ class Definitions:
         self._folders = list(folders)
 
     def find(self, name: str) -> Definition:
-        """The definition of a type.
-
-        Raises:
-            UnknownTypeError: The package, the type or a required type is not installed.
-        """
+        """The definition of a type."""
         root = parse_type(name)
         try:
             return self._collect(root, f".{root.folder}", "MSG", "ros2msg")
@@ -174,11 +166,7 @@ class Definitions:
         return found if isinstance(found, str) else ""
 
     def _read(self, name: TypeName, suffix: str) -> bytes:
-        """Reads the file of a type.
-
-        Raises:
-            UnknownTypeError: The file does not exist or cannot be read.
-        """
+        """Reads the file of a type."""
         is_installed = False
         for folder in self._folders:
             package = folder / name.package

@@ -33,7 +33,6 @@ class Offer(NamedTuple):
     Attributes:
         publisher: Its id, as in its messages.
         node: Name of its node with the namespace; empty until it is known.
-        profile: Quality of service that it offers.
         type_hash: Hash of the type's description; empty in older releases.
     """
 
@@ -44,14 +43,7 @@ class Offer(NamedTuple):
 
 
 class Subscription:
-    """A raw subscription.
-
-    Attributes:
-        profile: Requested quality of service.
-        node: The rclpy node that it belongs to.
-        topic_and_type: Its topic and type.
-        take: Returns the next message and its information, None if there is none.
-    """
+    """A raw subscription; `take` returns the next message and its information, or None."""
 
     def __init__(
         self, middleware: Middleware, node: Any, handle: Any, kind: TypeName, profile: Profile
@@ -80,9 +72,6 @@ class Middleware:
     Attributes:
         implementation: Name of the middleware, such as `rmw_fastrtps_cpp`.
         invalid: Topics with names that ROS refuses, and the errors.
-
-    Raises:
-        ImportError: rclpy is not installed.
     """
 
     def __init__(self) -> None:
@@ -144,11 +133,7 @@ class Middleware:
         return found
 
     def offers(self, topic: str) -> list[tuple[str, Offer]]:
-        """The publishers of a topic that are not this program's, each with its type.
-
-        Raises:
-            Exception: Any error of rclpy.
-        """
+        """Other programs' publishers of a topic, with types; raises any error of rclpy."""
         found = []
         for info in self._node.get_publishers_info_by_topic(topic):
             offer = _offer(info)
@@ -157,12 +142,7 @@ class Middleware:
         return found
 
     def subscribe(self, topic: str, kind: TypeName, profile: Profile) -> Subscription:
-        """Subscribes to the serialized messages of a topic.
-
-        Raises:
-            ImportError: The type has no Python module.
-            Exception: Any error of rclpy.
-        """
+        """Subscribes to serialized messages; raises ImportError, or any error of rclpy."""
         message = message_class(kind)
         node = self._node_for(topic, kind)
         handle = node.create_subscription(
@@ -204,11 +184,7 @@ class Middleware:
         subscription.node.destroy_subscription(inner)
 
     def wait(self, seconds: float) -> list[Subscription]:
-        """Waits until some subscriptions have messages, with a time limit.
-
-        Returns:
-            The subscriptions with messages.
-        """
+        """Waits, with a time limit, and returns the subscriptions that have messages."""
         if self._wait_set is None:
             self._at = {sub.handle.pointer: sub for sub in self._open}
             self._wait_set = self._native.WaitSet(
@@ -291,11 +267,7 @@ def publisher_id(gid: bytes) -> bytes:
 
 
 def message_class(kind: TypeName) -> Any:
-    """The Python class of a type.
-
-    Raises:
-        ImportError: The type has no Python class.
-    """
+    """The Python class of a type; ImportError without one."""
     found: Any = import_module(f"{kind.package}.{kind.folder}")
     # The event of an action's service is Name.Impl.SendGoalService.Event.
     steps = {

@@ -121,14 +121,9 @@ class Outbox:
         times: tuple[int, int] | None = None,
         detail: str = "",
     ) -> None:
-        """Reports lost messages.
+        """Reports lost messages; `cause` is a value of `base.Cause`, `count` None if unknown.
 
-        Args:
-            topic: Their topic.
-            cause: Value of `base.Cause`.
-            count: Number of messages, None if unknown.
-            times: Begin and end of the loss, ns since the epoch; None for now.
-            detail: Text for the user.
+        `times` are begin and end of the loss, ns since the epoch; None for now.
         """
         first, last = times or (time.time_ns(),) * 2
         values = {"count": count, "first": first, "last": last, "detail": detail}
@@ -160,14 +155,7 @@ class Outbox:
         self.waiting += len(data)
 
     def send(self) -> bool:
-        """Sends as much as the socket takes without blocking.
-
-        Returns:
-            True if the queue is empty.
-
-        Raises:
-            OSError: The recorder has ended.
-        """
+        """Sends as much as the socket takes without blocking; True if the queue is empty."""
         self.close_batch()
         buffers = self._buffers
         while buffers:

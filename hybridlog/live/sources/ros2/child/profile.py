@@ -59,9 +59,8 @@ _PROFILE = """\
 def profile(allowed: str) -> str:
     """The profile, as XML.
 
-    Args:
-        allowed: Limit of the kernel for socket buffers, bytes; if it is not a number, the
-            buffer has the minimum size.
+    `allowed` is the kernel's limit for socket buffers, bytes; if it is not a number, the buffer has
+    the minimum size.
     """
     limit = int(allowed) if allowed.strip().isdigit() else _MIN_BUFFER
     return _PROFILE.format(size=max(_MIN_BUFFER, min(BUFFER, limit)))
@@ -70,9 +69,7 @@ def profile(allowed: str) -> str:
 def is_set_up(environment: MutableMapping[str, str], folder: Path) -> bool:
     """Tells whether the user has chosen a profile or a transport of Fast DDS.
 
-    Args:
-        environment: Environment variables.
-        folder: Working directory of the child, where Fast DDS looks for profiles.
+    It looks for profiles in `folder`, too, the working directory of the child.
     """
     named = any(environment.get(name) for name in (*VARIABLES, *_OTHERS))
     return named or any((folder / name).exists() for name in _FILES)

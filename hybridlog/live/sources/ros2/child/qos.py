@@ -63,15 +63,10 @@ DURATIONS = ("deadline", "lifespan", "liveliness_lease_duration")
 
 
 def request(offers: Sequence[Profile], depth: int, override: Mapping[str, Any]) -> Profile:
-    """A request that is compatible with all publishers.
+    """A request that is compatible with all publishers, of which there is at least one.
 
-    It has the reliability and durability that all of them offer. A deadline or a lease
-    would only exclude publishers.
-
-    Args:
-        offers: Profiles of the publishers, at least one.
-        depth: Length of the queue.
-        override: Fields of `Profile` that the user has set.
+    It has the reliability and durability that all of them offer. A deadline or a lease would only
+    exclude publishers. `override` has fields of `Profile` that the user has set.
     """
     reliable = all(offer.reliability == RELIABLE for offer in offers)
     lasting = all(offer.durability == TRANSIENT_LOCAL for offer in offers)

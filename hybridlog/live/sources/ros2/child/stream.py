@@ -42,9 +42,6 @@ class Stream:
     """Moves the messages of a topic from the middleware into the outbox.
 
     Args:
-        subscription: The subscription.
-        channel: Number of the channel.
-        offers: The present publishers.
         look_again: Updates `channels`: a publisher is not among them.
 
     Attributes:
@@ -76,14 +73,7 @@ class Stream:
         self._publishers = frozenset(offer.publisher for offer in offers)
 
     def take(self, outbox: Outbox) -> tuple[int, int]:
-        """Takes available messages, up to a limit for the sake of other topics.
-
-        Returns:
-            Number of messages and bytes.
-
-        Raises:
-            Exception: Any error of rclpy.
-        """
+        """Takes messages, up to a limit for other topics' sake; returns number and bytes."""
         take, put = self.subscription.take, outbox.message
         count = size = 0
         while count < _MAX_MESSAGES and size < _BYTES_AT_ONCE:
@@ -139,12 +129,7 @@ class Stream:
     def look(
         self, offers: Sequence[Offer], *, final: bool = False
     ) -> list[tuple[bytes, SequenceGap]]:
-        """Losses since the last call, by publisher; call it at each look at the graph.
-
-        Args:
-            offers: The present publishers.
-            final: No further look follows.
-        """
+        """Losses since the last call, by publisher; called at each look at the graph."""
         found = [
             (publisher, joined_gap(lost))
             for publisher, gaps in self._gaps.items()

@@ -35,8 +35,6 @@ class Topic:
     """A topic and type that has, or had, publishers.
 
     Attributes:
-        offers: The present publishers.
-        is_wanted: The recorder wants the topic.
         definition: Definition of the type, None if unknown.
         stream: The messages, None without a subscription.
         nodes: Names of the nodes of present and past publishers.
@@ -64,9 +62,7 @@ class Topics:
     """All topics of the graph; follows its changes.
 
     Args:
-        middleware: ROS.
         outbox: Takes events, and the messages of a subscription that is made anew.
-        definitions: Definitions of types.
         overrides: Fields of `Profile` by topic that the user has set.
 
     Attributes:
@@ -163,10 +159,7 @@ class Topics:
     def _check(self, topic: Topic, stream: Stream, known: Collection[bytes]) -> None:
         """Reports incompatible publishers and different versions of the type.
 
-        Args:
-            topic: The topic.
-            stream: Its messages.
-            known: Publishers of the last look; names of new ones come late.
+        `known` are publishers of the last look: names of new ones come late.
         """
         for offer in topic.offers:
             reasons = conflicts(offer.profile, stream.subscription.profile)

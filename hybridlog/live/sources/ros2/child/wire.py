@@ -44,11 +44,7 @@ def event_frame(event: dict[str, Any]) -> bytes:
 
 
 def parse_object(body: bytes) -> dict[str, Any]:
-    """Parses a JSON object.
-
-    Raises:
-        WireError: The text is not a JSON object.
-    """
+    """Parses a JSON object."""
     try:
         found = json.loads(body)
     except (ValueError, RecursionError) as error:
@@ -59,11 +55,7 @@ def parse_object(body: bytes) -> dict[str, Any]:
 
 
 def check_frame(kind: int, length: int) -> None:
-    """Checks the header of a frame.
-
-    Raises:
-        WireError: The kind is unknown, or the length is impossible.
-    """
+    """Checks the header of a frame."""
     if kind == EVENT:
         low, high = 2, MAX_EVENT
     elif kind == MESSAGE:
