@@ -204,8 +204,9 @@ def _recover(store: Store, recorders: Sequence[Recorder]) -> None:
 
 
 def _tell_left(messages: int) -> None:
-    left = output.counted(messages, "message")
-    output.remarks([f"hybridlog: {left} left for tables and index; Ctrl-C leaves them"])
+    if sys.stderr.isatty():
+        left = output.counted(messages, "message")
+        output.remarks([f"hybridlog: {left} left for tables and index; Ctrl-C leaves them"])
 
 
 def _watch(recorder: Recorder, stop: Flag, display: _Display) -> None:
