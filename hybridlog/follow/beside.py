@@ -97,9 +97,9 @@ class _Beside:
             while True:
                 order = self._control.recv()
                 if order == ENDED:
-                    self._ended.set()
                     if self._follower is not None:
-                        self._follower.is_stopped = True
+                        self._follower.is_stopped = True  # until it finishes
+                    self._ended.set()
                 elif order == RECOVERED:
                     self._recovers.start()
                 else:
@@ -127,6 +127,8 @@ class _Beside:
             while thread.is_alive():
                 thread.join(_EVERY_S)
                 self._tell_state()
+        self._rows_due = 0.0
+        self._make_rows()
         self._tell_state()
 
     def _tell_state(self) -> None:
