@@ -14,10 +14,11 @@ from hybridlog.session import Session
 from hybridlog.shared import Shared
 from hybridlog.snapshot import UNFINISHED
 from hybridlog_storage.disk import files
-from hybridlog_storage.errors import DiskFullError, HybridlogError
+from hybridlog_storage.errors import DatabaseError, DiskFullError, HybridlogError
 
 if TYPE_CHECKING:
     from hybridlog.maintenance.report import Progress
+    from hybridlog.record.recorder import RecordReport
     from hybridlog.snapshot import Snapshot
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.summary import RecordingSummary
@@ -187,6 +188,23 @@ class OpenStore(Shared):
                     made = (one for one in sorted(topics) if self.tables.of(entry, one) is not None)
                     repairs.tables += [(entry.name, one) for one in made]
             repairs.noted_tables -= {(recording, topic) for topic in topics}
+
+    def recorded(self, report: RecordReport) -> None:
+        """See a recording that has ended; if MongoDB is available again, index the rest."""
+        self.catch_up(report.entry.id)
+        if report.failure is None:
+            if self.index.connected is not None:
+                # The next connection need not look at it.
+                self.catalog.put_indexed([report.entry.id], self.index.id)
+            return
+        self.index.disconnect()
+        try:
+            self.index.connect()
+        except HybridlogError as error:
+            report.failure = error if isinstance(error, DatabaseError) else report.failure
+            return
+        report.entry = self.now().entry(report.entry.id)
+        report.indexed, report.missed, report.failure = report.entry.documents, 0, None
 
     # Closing.
 

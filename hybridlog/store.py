@@ -39,9 +39,7 @@ from hybridlog.wording import listed
 from hybridlog_storage.catalog import Catalog, RecordingEntry
 from hybridlog_storage.disk.directory import StoreDirectory
 from hybridlog_storage.errors import (
-    DatabaseError,
     HeldError,
-    HybridlogError,
     ResourceError,
     StoreError,
     TimeError,
@@ -844,7 +842,7 @@ class Store:
                 options=options or RecordOptions(**choices),
                 progress=progress,
             )
-        self._after(report)
+        self.shared.recorded(report)
         return report
 
     def start(self, name: str, options: LiveOptions | None = None, **choices: Any) -> LiveRecording:
@@ -855,42 +853,26 @@ class Store:
             options: Options of the recording.
             choices: Fields of `LiveOptions`, instead of `options`.
         """
+        from hybridlog.follow.follower import in_thread
         from hybridlog.live import LiveOptions, LiveRecording
+        from hybridlog.live.recording import follow_interval_s
 
-        chosen = options or LiveOptions(**choices)
-        target = self._to_change().index.index_to_record("Starting a recording")
+        chosen, shared = options or LiveOptions(**choices), self._to_change()
+        target = shared.index.index_to_record("Starting a recording")
         return LiveRecording(
             self.directory,
             self.catalog,
-            target,
+            in_thread(self.directory, self.catalog, target, follow_interval_s(chosen)),
             name,
             chosen,
             known=self._newest(),
-            on_close=self._after,
+            on_close=shared.recorded,
         )
 
     def _newest(self) -> Callable[[], Snapshot]:
         """Tells all recordings as they are when one begins."""
         _ = self.session  # what a crash has left is mended before
         return self.shared.newest
-
-    def _after(self, report: RecordReport) -> None:
-        """Update the store after the end of a recording."""
-        self._to_change().catch_up(report.entry.id)
-        if report.failure is None:
-            if self.shared.index.connected is not None:
-                # The next connection need not look at it.
-                self.catalog.put_indexed([report.entry.id], self.shared.index.id)
-            return
-        # If MongoDB is available again, the rest is indexed.
-        self.shared.index.disconnect()
-        try:
-            self.connect()
-        except HybridlogError as error:
-            report.failure = error if isinstance(error, DatabaseError) else report.failure
-            return
-        report.entry = self.entry(report.entry.id)
-        report.indexed, report.missed, report.failure = report.entry.documents, 0, None
 
     @again_if_lost
     def sizes(self, recordings: Names | None = None) -> Sizes:

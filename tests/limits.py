@@ -83,7 +83,7 @@ PLACES = {
     "edit_lock_wait_s": "hybridlog.maintenance.edit.LOCK_WAIT_S",
     "connection_patience_s": "hybridlog.view.server.BoundedConnection.patience_s",
     "directory_is_writable": "hybridlog_storage.disk.directory.StoreDirectory.is_writable",
-    "index_interval": "hybridlog.live.recording._index_interval_s",
+    "index_interval": "hybridlog.live.recording.follow_interval_s",
     "recording_filled": "hybridlog.live.recording.LiveRecording.filled",
 }
 

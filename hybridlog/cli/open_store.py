@@ -63,7 +63,7 @@ def opened_store(
         raise
     with store:
         doing = "so the files answer"
-        if records:
+        if records and recover:  # else beside the recorder
             target = store.shared.index.index_to_record("Recording")
             doing = "so the index is made later" if target.is_wanted else "so there is no index"
         if recover:

@@ -7,7 +7,7 @@ import signal
 import socket
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
@@ -26,8 +26,8 @@ from hybridlog.cli.record_choices import (
 )
 from hybridlog.cli.record_summary import LiveSummary
 from hybridlog.cli.signals import handled, restore_echo, write_note
-from hybridlog.contract.judge import broken
 from hybridlog_storage.errors import HybridlogError
+from hybridlog_storage.settings import NONE
 from hybridlog_storage.stopping import Flag
 
 if TYPE_CHECKING:
@@ -42,19 +42,24 @@ if TYPE_CHECKING:
 _MIN_CHUNK: Final = 1 << 19
 _STATE_S = 1.0
 _RECOVERY_POLL_S = 0.05
-_TRIGGERS_S: Final = 5.0
-"""To wait for triggers where a service manager, or another recording, waits."""
+_FOLLOWER_S: Final = 5.0
+"""To wait for the follower where a service manager, or another recording, waits."""
 
 
 class _Stop(Flag):
-    """A flag that the first signal sets."""
+    """A flag that the first signal sets.
+
+    Attributes:
+        leave: Called at each; returns whether it ended the waiting for the follower.
+    """
 
     number: int = signal.SIGINT
+    leave: Callable[[], bool] = staticmethod(lambda: False)
 
     @property
-    def triggers_s(self) -> float | None:
-        """Seconds to wait for triggers; a person can press Ctrl-C again instead."""
-        return None if self.number == signal.SIGINT else _TRIGGERS_S
+    def wait_s(self) -> float | None:
+        """Seconds to wait for the follower; a person can press Ctrl-C again instead."""
+        return None if self.number == signal.SIGINT else _FOLLOWER_S
 
 
 def record_live(choices: RecordChoices) -> None:
@@ -82,12 +87,15 @@ def _record(choices: RecordChoices) -> None:
             held.enter_context(source).check()
         store = held.enter_context(opened_to_record(choices, recover=False))
         make_room(store, options.reserve_bytes)
-        recovery = threading.Thread(target=_recover, args=(choices, store), daemon=True)
+        recorders: list[Recorder] = []
+        recovery = threading.Thread(target=_recover, args=(store, recorders), daemon=True)
         with _stop_flag() as stop, frozen_objects():
             full = ""
             while True:
                 recorder = Recorder(store, sources, options, display.say)
                 recorder.start()
+                stop.leave = recorder.leave
+                recorders.append(recorder)
                 if full:
                     display.say(f"the manifest of {full} is full: {recorder.name} goes on")
                 else:
@@ -96,18 +104,21 @@ def _record(choices: RecordChoices) -> None:
                     _watch(recorder, stop, display)
                 if stop.is_set or not recorder.is_full:
                     break
-                reports += recorder.stop(_TRIGGERS_S)
+                reports += recorder.stop(_FOLLOWER_S)
                 options, full = recorder.rest, recorder.name
                 sources = [held.enter_context(source) for source in sources_of(choices)]
             notify_service("STOPPING=1", "STATUS=writing what is left")
             output.remarks(["hybridlog: writing what is left; Ctrl-C leaves at once"])
-            reports += recorder.stop(stop.triggers_s)
+            reports += recorder.stop(stop.wait_s, _tell_left)
             while recovery.is_alive() and not stop.wait(_RECOVERY_POLL_S):
                 pass
         rules, results = options.contract, []
         if rules is not None:
-            results = [one for each in reports for one in store.judge(rules, each.entry.id)]
-        ending = LiveSummary(reports, recorder, recorder.look(), sources, options, broken(results))
+            from hybridlog.contract.judge import broken  # loads pyarrow
+
+            judged = [one for each in reports for one in store.judge(rules, each.entry.id)]
+            results = broken(judged)
+        ending = LiveSummary(reports, recorder, recorder.look(), sources, options, results)
         ending.print_and_exit(as_json=choices.as_json)
 
 
@@ -179,16 +190,23 @@ def sources_of(choices: RecordChoices) -> list[LiveSource]:
     return found
 
 
-def _recover(choices: RecordChoices, store: Store) -> None:
+def _recover(store: Store, recorders: Sequence[Recorder]) -> None:
     """Open the store again, which recovers what a crash has cut, beside the recorder.
 
     A process that ends meanwhile cuts nothing: the next command recovers it.
     """
     try:
-        with opened_store(store.directory.path, choices.mongo, quiet=True) as opened:
-            opened.shared.index.database  # noqa: B018 - brings the index up to date
+        with opened_store(store.directory.path, NONE, quiet=True) as opened:
+            recorders[-1].recovered()
+            opened.catalog.has_changed = False  # the end of this command lists all recordings
     except (HybridlogError, OSError) as error:
         output.note(f"hybridlog: earlier recordings are not recovered yet: {error}")
+
+
+def _tell_left(messages: int) -> None:
+    if sys.stderr.isatty():
+        left = output.counted(messages, "message")
+        output.remarks([f"hybridlog: {left} left for tables and index; Ctrl-C leaves them"])
 
 
 def _watch(recorder: Recorder, stop: Flag, display: _Display) -> None:
@@ -202,12 +220,13 @@ def _watch(recorder: Recorder, stop: Flag, display: _Display) -> None:
 def _stop_flag() -> Iterator[_Stop]:
     """A flag that the first signal sets; the second signal ends the process at once.
 
-    Flushed chunks stay, and the next command on the store seals them.
+    Flushed chunks stay, and the next command on the store seals them. While all is sealed and the
+    follower is waited for, a signal leaves that.
     """
     with _Stop() as stopped:
 
         def stop(number: int) -> None:
-            if stopped.is_set:
+            if not stopped.leave() and stopped.is_set:
                 write_note(
                     "\nhybridlog: stopped. Flushed chunks stay; the next command seals them."
                 )

@@ -1,4 +1,4 @@
-"""The process beside a recorder that evaluates its triggers, as the recorder sees it."""
+"""The process beside a live recorder that makes all that is derived, as the recorder sees it."""
 
 from __future__ import annotations
 
@@ -6,99 +6,176 @@ import os
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+from hybridlog.entries import put_entry
+from hybridlog_storage.settings import EMBEDDED, NONE
 
 if TYPE_CHECKING:
     from hybridlog.follow.triggers import Trigger
+    from hybridlog_storage.catalog import Catalog, RecordingEntry
+    from hybridlog_storage.disk.directory import StoreDirectory
+    from hybridlog_storage.errors import DatabaseError
     from hybridlog_storage.messages import Channel
 
 _START: Final = (
-    "import sys; sys.path[:] = {!r}; from hybridlog.follow.evaluation import serve; serve({})"
+    "import sys; sys.path[:] = {!r}; from hybridlog.follow.beside import serve; serve({})"
 )
 _POLL_S: Final = 0.1
+_PATIENCE_S: Final = 1.0  # then the user hears of what is left at the end
 _TRIES: Final = 5
 """So often in a row it may end before it has read anything."""
 _PAUSE_S: Final = 1.0
 _TOLD_TO_MANAGERS: Final = {"NOTIFY_SOCKET", "WATCHDOG_PID", "WATCHDOG_USEC"}
+RECOVERED: Final = "recovered"
+"""Tells it that earlier recordings are sealed: it brings their documents up to date."""
+ENDED: Final = "ended"
+"""Tells it that the recording is sealed."""
 
 
-class TriggerProcess:
-    """Evaluates triggers on what a recording has flushed, by a process that ends with this one.
+class Followed(NamedTuple):
+    """How far a follower is.
 
-    Without triggers there is no process. `judged` has the numbers of the sealed files that were
-    read; it is None without triggers, or when the process is given up.
+    `is_wanted` tells whether the recording gets documents. `read` and `indexed` count messages, and
+    `missed` those that the index lacks after a `failure` of the database.
+    """
+
+    is_wanted: bool
+    read: int = 0
+    indexed: int = 0
+    missed: int = 0
+    failure: DatabaseError | None = None
+
+
+class Task(NamedTuple):
+    """What the process is to do.
+
+    `interval_s` lies between two looks of the follower; with None it does everything at the end.
+    After an earlier process has died (`is_again`), `seen` tells what the triggers have seen.
+    """
+
+    store: str
+    mongo: str | None
+    cache_mb: int | None
+    recording: str
+    triggers: Sequence[str]
+    interval_s: float | None
+    is_again: bool = False
+    seen: Any = None
+
+
+class FollowerProcess:
+    """Evaluates triggers, then makes rows, tables and documents, by a process that ends with this.
 
     When it ends before the recording, as for want of memory, it is started again, and goes on
     where it was.
+    `judged` has the numbers of the sealed files that triggers have read; it is None without
+    triggers, or when the process is given up. At the end it is waited for `wait_s`, if that is not
+    None, and `left` is told once how many messages are left.
     """
 
     def __init__(
         self,
-        store: str,
-        recording: str,
+        directory: StoreDirectory,
+        catalog: Catalog,
+        task: Task,
         triggers: Sequence[Trigger],
         *,
         hit: Callable[[str, int], object],
         say: Callable[[str], None],
     ) -> None:
+        self.state = Followed((task.mongo or directory.settings.mongo or EMBEDDED) != NONE)
         self.judged: Collection[int] | None = () if triggers else None
+        self.wait_s: float | None = None
+        self.left: Callable[[int], object] = lambda _: None
+        self._is_finishing = self._is_left = False
+        self._directory = directory
+        self._catalog = catalog
         self._triggers = triggers
-        self._task = store, recording, [one.text for one in triggers]
-        self._read: object = None
+        self._task = task
+        self._has_seen = not triggers
         self._why = "their process ends again and again"
         self._hit = hit
         self._say = say
-        self._channels: list[Channel] = []
+        self._orders: list[Channel | str] = []
         self._process: subprocess.Popen[bytes] | None = None
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._run, name="hybridlog-follow", daemon=True)
 
     def start(self) -> None:
         """Begin."""
-        if self._triggers:
-            self._thread.start()
+        self._thread.start()
 
     def expect(self, channel: Channel) -> None:
         """Tell the triggers that can never fire on a channel, before its first message."""
         if any(one.fits(channel.topic) for one in self._triggers):
-            self._channels.append(channel)
+            self._orders.append(channel)
 
-    def finish(self, wait_s: float | None) -> bool:
-        """Wait until what the ended recording has is read; False if that takes longer."""
-        if self._triggers:
-            self._thread.join(wait_s)
-        is_late = self._thread.is_alive()
-        self.stop()
-        return not is_late
+    def order(self, what: str) -> None:
+        """Tell it that something has happened."""
+        self._orders.append(what)
 
-    def stop(self) -> None:
+    def finish(self, entry: RecordingEntry) -> RecordingEntry:
+        """Wait until it has done everything, but no longer than wanted."""
+        self._is_finishing = True
+        self.order(ENDED)
+        begun, waited, is_told = time.monotonic(), 0.0, False
+        while self._thread.is_alive() and not self._is_left:
+            if self.wait_s is not None and waited >= self.wait_s:
+                break
+            self._thread.join(_POLL_S)
+            waited = time.monotonic() - begun
+            left = entry.messages - self.state.read
+            if not is_told and waited >= _PATIENCE_S and left > 0:
+                self.left(left)
+                is_told = True
+        if self._thread.is_alive():
+            if not self._has_seen:
+                self._say("triggers have not seen the last messages: that takes too long")
+            self._say("tables and index are not complete: the next command makes the rest")
+        self.abandon()
+        return put_entry(self._directory, self._catalog, entry.id)
+
+    def leave(self) -> bool:
+        """Let `finish` wait no longer; False if it does not wait."""
+        was_waiting, self._is_left = self._is_finishing and not self._is_left, self._is_finishing
+        return was_waiting
+
+    def abandon(self) -> None:
         """End it at once."""
         self._over.set()
         if self._process is not None:
             self._process.kill()
+        if self._thread.is_alive():
+            self._thread.join()
+
+    def forget(self) -> None:
+        """Leave documents of a removed recording to the next connection, which finds them."""
 
     def _run(self) -> None:
         tries = _TRIES
         while tries and not self._over.is_set():
-            read, is_done = self._read, False
+            seen, state, is_done = self._task.seen, self.state, False
             with suppress(EOFError, OSError):
                 is_done = self._follow()
             if is_done:
-                break
-            tries = _TRIES if self._read != read else tries - 1
+                return
+            tries = _TRIES if (self._task.seen, self.state) != (seen, state) else tries - 1
+            self._task = self._task._replace(is_again=True)
             self._over.wait(_PAUSE_S)
-        else:
-            self.judged = None
-            if not self._over.is_set():
-                self._say(f"triggers are evaluated no more: {self._why}")
+        self.judged = None
+        if not self._over.is_set():
+            what = "triggers are evaluated no more" if self._triggers else "tables are made later"
+            self._say(f"{what}: {self._why}")
 
     def _follow(self) -> bool:
-        """Start it, and hear it to its end; True if it has read everything."""
+        """Start it, and hear it to its end; True if it has done everything."""
         ours, theirs = Pipe()
         with ours:
             with theirs:
@@ -110,22 +187,26 @@ class TriggerProcess:
                 self._process.wait()
 
     def _hear(self, control: Connection[Any, Any]) -> bool:
-        control.send((*self._task, self._read))
+        control.send(self._task)
         told = 0
-        while True:
-            for channel in self._channels[told:]:
-                control.send(channel)
+        while not self._over.is_set():
+            for order in self._orders[told:]:
+                control.send(order)
                 told += 1
             if not control.poll(_POLL_S):
                 continue
             kind, *values = control.recv()
             if kind == "hit":
                 text, times = values
-                for time in times:
-                    self._hit(text, time)
+                for at in times:
+                    self._hit(text, at)
             elif kind == "read":
-                (self._read,) = values
+                self._task = self._task._replace(seen=values[0])
                 self.judged = values[0][1]
+            elif kind == "seen":
+                self._has_seen = True
+            elif kind == "state":
+                (self.state,) = values
             elif kind == "say":
                 self._say(*values)
             elif kind == "failed":
@@ -133,6 +214,7 @@ class TriggerProcess:
                 return False
             else:
                 return True
+        return False
 
 
 def _started(control: Connection[Any, Any]) -> subprocess.Popen[bytes]:

@@ -21,14 +21,18 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 
 from hybridlog.columns.recording_logs import RecordingRows
-from hybridlog.columns.table_writer import TableWriter
+from hybridlog.columns.table_writer import TableWriter, load
 from hybridlog.entries import put_entry
+from hybridlog.follow.child import Followed
 from hybridlog.index.indexing import ChunkIndexer
+from hybridlog.maintenance.expiry import make_rows
 from hybridlog.maintenance.report import reporter
+from hybridlog.maintenance.retention import Rules
 from hybridlog.maintenance.tables import channels_of, missing
 from hybridlog_storage.catalog import decoded_in, file_of
 from hybridlog_storage.errors import (
     DatabaseError,
+    DiskFullError,
     HybridlogError,
     SegmentError,
     StoreError,
@@ -39,6 +43,7 @@ from hybridlog_storage.mongo.index_state import IndexState
 from hybridlog_storage.segments.gone_log import open_log
 from hybridlog_storage.segments.open_segment import OpenSegment
 from hybridlog_storage.segments.segment_reader import places_of
+from hybridlog_storage.settings import read_settings
 from hybridlog_storage.threads import Threads
 
 if TYPE_CHECKING:
@@ -55,8 +60,6 @@ if TYPE_CHECKING:
     from hybridlog_storage.segments.chunk import StoredChunk
     from hybridlog_storage.segments.segment_reader import ChunkPlace, SegmentReader
 
-INTERVAL_S: Final = 5.0
-"""Longest time between two looks at a recording in progress, seconds."""
 _SEND_BYTES: Final = 8 << 20  # documents that are sent together, at most
 _GROUP_BYTES: Final = 1 << 20  # content of small chunks that are decoded together
 _RETRY_S: Final = 2.0  # between attempts after the database has failed
@@ -162,19 +165,19 @@ class _Segment:
     """A segment in work.
 
     Attributes:
+        is_wanted: Whether documents are made.
         opened: Its file while it grows.
         chunks: Number of chunks that were read.
         decoded: Results of decoding each chunk.
         is_decoded: Whether these are known already; then only rows are made.
-        is_wanted: Whether documents are made.
         is_sent: Whether all of them were handed to the sender.
     """
 
+    is_wanted: bool
     opened: OpenSegment | None = None
     chunks: int = 0
     decoded: list[Decoded] = field(default_factory=list)
     is_decoded: bool = False
-    is_wanted: bool = True
     is_sent: bool = True
 
 
@@ -254,14 +257,37 @@ class Follower:
         return self.messages - self.indexed if self.failure is not None else 0
 
     @property
-    def first_unread(self) -> int:
-        """Number of the first segment that it still reads."""
-        return next(n for n in range(len(self._ended) + 1) if n not in self._ended)
-
-    @property
     def problem(self) -> str:
         """Why no tables were made; empty if they were."""
         return self._tables.problem
+
+    @property
+    def state(self) -> Followed:
+        """How far it is."""
+        return Followed(
+            self._target.is_wanted, self.messages, self.indexed, self.missed, self.failure
+        )
+
+    def make_rows(self) -> None:
+        """Write rows of what is sealed, where rules of the store let payloads go.
+
+        Raises:
+            StoreError: Files cannot be read or written.
+            DiskFullError: There is no room.
+        """
+        if not Rules.of(read_settings(self._directory.path).retention).is_empty:
+            make_rows(self._directory, self._entry.id, lambda: not self.is_stopped)
+
+    def forget(self) -> None:
+        """Remove the documents of a recording that is removed.
+
+        Where that fails, the next connection finds a recording without files.
+        """
+        if self._target.database is not None:
+            with suppress(HybridlogError):
+                state, key = IndexState(self._target.database), self._entry.key
+                state.clear_everywhere([key])
+                state.remove([key])
 
     def follow(self) -> None:
         """Read what was flushed since the last time.
@@ -273,11 +299,10 @@ class Follower:
         self._check_cut()
         listing = self._directory.listing(self._entry.id)
         pending = {*listing.open, *listing.sealed} - self._ended
-        logs = {}
-        if not pending.isdisjoint(listing.sealed):
-            logs = self._directory.manifests.read(self._entry.id).logs
+        manifest = self._directory.manifests.read(self._entry.id)
+        logs = manifest.logs
         for number in sorted(pending):
-            segment = self._segments.setdefault(number, _Segment())
+            segment = self._segment(number)
             opened = segment.opened = segment.opened or OpenSegment(self._path, number)
             opened.follow()
             table = opened.flushed.table
@@ -287,6 +312,11 @@ class Follower:
                     return
             if number in logs and number in listing.sealed:
                 self._end_segment(number, logs[number].digest)
+        for number, log in logs.items():
+            if not (log.is_here or number in self._ended or self.is_stopped):
+                path = self._path / manifest.rows[number][0].name
+                with open_log(path, number, RecordingRows(self._path)) as gone:
+                    self._read_segment(self._entry, gone, log.digest)
         self._send()
 
     def finish(self, entry: RecordingEntry) -> RecordingEntry:
@@ -319,6 +349,10 @@ class Follower:
             self.discard()
         return entry
 
+    def _segment(self, number: int) -> _Segment:
+        is_wanted = self._target.is_wanted and str(number) not in self._done
+        return self._segments.setdefault(number, _Segment(is_wanted=is_wanted))
+
     def discard(self) -> None:
         """Leave the rest to the next follower."""
         self._stop_sending()
@@ -332,7 +366,8 @@ class Follower:
             with open_log(self._path / file_of(entry, number), number, rows) as reader:
                 report = reporter(self._progress, entry.name, entry.stored_bytes, done)
                 if number not in self._ended:
-                    self._read_segment(entry, reader, in_tables, report)
+                    digest = entry.digests[str(number)]
+                    self._read_segment(entry, reader, digest, in_tables, report)
                 done += reader.size
                 report(reader.size)
 
@@ -340,14 +375,14 @@ class Follower:
         self,
         entry: RecordingEntry,
         reader: SegmentReader,
-        in_tables: AbstractSet[int] | None,
-        report: Callable[[int], None],
+        digest: str,
+        in_tables: AbstractSet[int] | None = None,
+        report: Callable[[int], None] = lambda _: None,
     ) -> None:
         """Read what is left of a sealed segment."""
         number = reader.number
         summary = reader.summary()
-        segment = self._segments.setdefault(number, _Segment())
-        segment.is_wanted = self._target.is_wanted and str(number) not in self._done
+        segment = self._segment(number)
         places = summary.chunks
         if not segment.is_wanted and self._catalog.decoded(entry, number) is not None:
             segment.is_decoded = True
@@ -358,7 +393,7 @@ class Follower:
                 raise TimeoutError
             self._take(segment, group, summary.channels)
             report(group[-1].offset)
-        self._end_segment(number, entry.digests[str(number)])
+        self._end_segment(number, digest)
 
     def _groups(
         self, number: int, reader: SegmentReader, places: Iterable[ChunkPlace]
@@ -395,6 +430,8 @@ class Follower:
         documents, decoded = self._indexer.documents_of(chunks, channels)
         segment.decoded += decoded
         messages = sum(len(chunk.batch) for chunk in chunks)
+        if not segment.is_wanted and self._target.is_wanted:
+            return  # they are there already
         self.messages += messages
         if not segment.is_wanted:
             return
@@ -482,7 +519,7 @@ class Follower:
 
 
 class FollowerThread:
-    """Runs a follower in the process of the recorder, which waits for it at its end only.
+    """Runs a follower in this process, which waits for it at the end only.
 
     Args:
         follower: The follower.
@@ -490,7 +527,9 @@ class FollowerThread:
     """
 
     def __init__(self, follower: Follower, interval_s: float | None) -> None:
+        load()
         self.follower = follower
+        self.forget = follower.forget
         self._interval_s = interval_s
         self._entry: RecordingEntry | None = None
         self._crash: BaseException | None = None
@@ -498,6 +537,11 @@ class FollowerThread:
         self._calls: SimpleQueue[None] = SimpleQueue()
         self._thread = threading.Thread(target=self._run, name="hybridlog-index", daemon=True)
         self._thread.start()
+
+    @property
+    def state(self) -> Followed:
+        """How far it is."""
+        return self.follower.state
 
     def finish(self, entry: RecordingEntry) -> RecordingEntry:
         """Finish the follower, and raise its errors other than those of the database."""
@@ -522,11 +566,21 @@ class FollowerThread:
                     with suppress(StoreError):  # the next look or `finish` sees it
                         self.follower.follow()
             if self._entry is not None:
+                self.follower.is_stopped = False
+                with suppress(StoreError, DiskFullError):  # or else they are written when logs go
+                    self.follower.make_rows()
                 self._entry = self.follower.finish(self._entry)
         except BaseException as error:
             self._crash = error
         finally:
             self.follower.discard()
+
+
+def in_thread(
+    directory: StoreDirectory, catalog: Catalog, target: IndexTarget, interval_s: float | None
+) -> Callable[[RecordingEntry], FollowerThread]:
+    """What begins to follow a new recording, on a thread of this process."""
+    return lambda entry: FollowerThread(Follower(directory, catalog, entry, target), interval_s)
 
 
 class Brought(NamedTuple):
@@ -580,14 +634,7 @@ def bring(
         done: dict[str, str] = {}
         is_whole = True
         if database is not None:
-            state = IndexState(database)
-            indexed = None if anew else state.one(entry.key)
-            if indexed is not None:
-                done = dict(indexed.segments.items() & entry.digests.items())
-            is_whole = indexed is not None and indexed.is_whole(entry)
-            if not is_whole:
-                state.begin(entry, done)
-                state.clear(entry, but=done)
+            done, is_whole = begin_again(database, entry, anew=anew)
         if is_whole and entry.is_decoded and not wanted:
             return Brought(None)
         follower = Follower(
@@ -604,6 +651,29 @@ def bring(
     if follower.failure is not None:
         raise follower.failure
     return Brought(follower.made, follower.problem)
+
+
+def begin_again(
+    database: Database, entry: RecordingEntry, *, anew: bool = False
+) -> tuple[dict[str, str], bool]:
+    """Keep the documents of whole segments, and remove others.
+
+    Args:
+        database: The index.
+        entry: The recording.
+        anew: Whether none are kept.
+
+    Returns:
+        Digests of the segments by number as text, and whether they are all there are.
+    """
+    state = IndexState(database)
+    indexed = None if anew else state.one(entry.key)
+    done = {} if indexed is None else dict(indexed.segments.items() & entry.digests.items())
+    is_whole = indexed is not None and indexed.is_whole(entry)
+    if not is_whole:
+        state.begin(entry, done)
+        state.clear(entry, but=done)
+    return done, is_whole
 
 
 def make_tables(

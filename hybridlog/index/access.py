@@ -82,6 +82,7 @@ class IndexAccess:
 
     Attributes:
         wanted: The URI that was asked for; None for the one in the store's settings.
+        cache_mb: As above.
         may_write: False if the user of MongoDB may only read.
         has_none: True if the store does without MongoDB: none is wanted, or ours does not start.
         id: Id of the index; an index that replaces it has another one. Empty without a
@@ -105,7 +106,7 @@ class IndexAccess:
         self.unavailable: HybridlogError | None = None
         self._shared = shared
         self._directory = shared.directory
-        self._cache_mb = cache_mb
+        self.cache_mb = cache_mb
         self._progress = progress
         self._recovers = recovers
         self._uri: str | None = None
@@ -258,7 +259,7 @@ class IndexAccess:
         from hybridlog_storage.mongo.mongod import EmbeddedMongod
 
         if self._mongod is None:
-            cache_mb = self._cache_mb or _bounded_cache_mb(self._directory.settings.cache_mb)
+            cache_mb = self.cache_mb or _bounded_cache_mb(self._directory.settings.cache_mb)
             self._mongod = EmbeddedMongod(self._directory.mongod, cache_mb=cache_mb)
         try:
             uri = self._mongod.start()

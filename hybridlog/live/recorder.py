@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 
 from hybridlog.entries import text as as_text
 from hybridlog.entries import with_said
-from hybridlog.follow.child import TriggerProcess
+from hybridlog.follow.child import RECOVERED, FollowerProcess, Task
 from hybridlog.live.clocks import CLOCK, MachineClock, SimulatedTime
 from hybridlog.live.incidents import Incidents, Moment
 from hybridlog.live.memory import resident_bytes
@@ -32,7 +32,7 @@ from hybridlog.live.policy import (
     Throttle,
     first_fit,
 )
-from hybridlog.live.recording import LiveOptions
+from hybridlog.live.recording import LiveOptions, LiveRecording, follow_interval_s
 from hybridlog.live.ring import GROUPS, Ring
 from hybridlog.live.silence import RULE, Silence, SilenceWatch
 from hybridlog.live.state import RecorderState, StateFile
@@ -64,6 +64,7 @@ if TYPE_CHECKING:
     from hybridlog.query.topics import TopicMatcher
     from hybridlog.record.recorder import RecordReport
     from hybridlog.store import Store
+    from hybridlog_storage.catalog import RecordingEntry
 
 _MAX_REPORTS = 1000
 _MAX_CACHED = 4096  # channel objects that are found without comparing their content
@@ -179,19 +180,20 @@ class Recorder:
         if options.use_sim_time:
             self._simulated = SimulatedTime(self, options.budget_bytes // _HELD_SHARE)
         self._sink: Sink = self._simulated or self
-        self._target = store.start(options.name, self._of_recording())
+        self._target = LiveRecording(
+            store.directory,
+            store.catalog,
+            self._begin_to_follow,
+            options.name,
+            self._of_recording(),
+            known=store.shared.newest,
+            on_close=store.shared.recorded,
+        )
         self.name = self._target.name
         self._says = StateFile(store.directory, self._target.id)
-        self._triggers = triggers = TriggerProcess(
-            self._directory.address,
-            self._target.id,
-            options.triggers,
-            hit=lambda text, time: self.fire(text, self._passed(time)),
-            say=self.say,
-        )
         ring_s = options.ring_s
         self._ring = (
-            None if ring_s is None else Ring(self._directory, self._target, ring_s, triggers)
+            None if ring_s is None else Ring(self._directory, self._target, ring_s, self._follower)
         )
         self._incidents = Incidents(
             partial(self._directory.manifests.change, self._target.id),
@@ -213,6 +215,26 @@ class Recorder:
         except BaseException:
             self._target.abort()
             raise
+
+    def _begin_to_follow(self, entry: RecordingEntry) -> FollowerProcess:
+        index, triggers = self._shared.index, self._options.triggers
+        task = Task(
+            self._directory.address,
+            index.wanted,
+            index.cache_mb,
+            entry.id,
+            [one.text for one in triggers],
+            follow_interval_s(self._of_recording()),
+        )
+        self._follower = FollowerProcess(
+            self._directory,
+            self._shared.catalog,
+            task,
+            triggers,
+            hit=lambda text, time: self.fire(text, self._passed(time)),
+            say=self.say,
+        )
+        return self._follower
 
     def _of_recording(self) -> LiveOptions:
         options, settings = self._options, self._options.settings
@@ -239,13 +261,12 @@ class Recorder:
                 recording is removed.
         """
         try:
-            self._triggers.start()
+            self._follower.start()
             for source in self._sources:
                 source.start(self._sink)
         except BaseException:
             for source in self._sources:
                 source.stop()
-            self._triggers.stop()
             self._says.remove()
             self._target.abort()
             raise
@@ -261,14 +282,25 @@ class Recorder:
         """Wait for the end for at most so long; returns True once it has come."""
         return self._over.wait(seconds)
 
-    def stop(self, triggers_s: float | None = None) -> list[RecordReport]:
-        """Stop the sources; flush, index and seal everything; then wait for the triggers.
+    def recovered(self) -> None:
+        """Earlier recordings are sealed: the follower brings the index up to date with them."""
+        self._follower.order(RECOVERED)
+
+    def leave(self) -> bool:
+        """Leave to the next command what the follower has not done; False before all is sealed."""
+        return self._follower.leave()
+
+    def stop(
+        self, wait_s: float | None = None, left: Callable[[int], object] = lambda _: None
+    ) -> list[RecordReport]:
+        """Stop the sources; flush and seal everything; then wait for the follower.
 
         The recording is removed if no source was ever reached and no message came, or if the
         disk had no room for any.
 
         Args:
-            triggers_s: Seconds to wait until triggers have seen all; None for as long as it takes.
+            wait_s: Seconds to wait for the follower; None for as long as it takes.
+            left: Told how many messages it has left, when that takes a while.
 
         Returns:
             A report for each recording.
@@ -283,6 +315,7 @@ class Recorder:
         self._silence.stop(ended_at)
         if self._simulated is not None:
             self._simulated.close()
+        self._follower.wait_s, self._follower.left = wait_s, left
         self._says.remove()
         self._retention.stop()
         self._incidents.stop()
@@ -292,20 +325,17 @@ class Recorder:
         ):
             report = self._target.close()
         else:
-            self._triggers.stop()
             self._target.abort()
             return []
-        self._judge_last(report, triggers_s)
+        self._note_last(report)
         if self._target.cut_off:
             self._refuse(Cause.DISK, "the disk was full")
             for topic, count in self._target.cut_off.items():
                 self._count_lost(topic, Cause.DISK, count)
         return [report]
 
-    def _judge_last(self, report: RecordReport, triggers_s: float | None) -> None:
-        """Wait until triggers have seen the ended recording, and mark and pin what they found."""
-        if not self._triggers.finish(triggers_s):
-            self.say("triggers have not seen the last messages: that takes too long")
+    def _note_last(self, report: RecordReport) -> None:
+        """Mark and pin what triggers have found last."""
         try:
             if self._incidents.write():
                 change(self._shared, report.entry, lambda now: now)
@@ -468,7 +498,7 @@ class Recorder:
             too_many = self._expected > _MAX_EXPECTED
         if not too_many:
             self._target.expect(channel)
-            self._triggers.expect(channel)
+            self._follower.expect(channel)
 
     def take(
         self,
@@ -625,7 +655,7 @@ class Recorder:
         number: int,
     ) -> None:
         """Store the fields of a message without its payload."""
-        from hybridlog.columns.left_rows import reduced  # a recording has loaded it
+        from hybridlog.columns.left_rows import reduced  # loads pyarrow
 
         if recorded.reduced is None:
             recorded.reduced = left_channel(recorded.channel, REDUCED)

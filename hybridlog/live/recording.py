@@ -19,8 +19,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 
-from hybridlog.columns.table_writer import load
-from hybridlog.follow.follower import INTERVAL_S
 from hybridlog.live.memory import MIN_USER_BUDGET, default_budget
 from hybridlog.live.policy import SMALL_BYTES
 from hybridlog.record.capture import Capture
@@ -33,10 +31,11 @@ from hybridlog_storage.segments.segment_format import LOSSES_METADATA, json_meta
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 
 if TYPE_CHECKING:
-    from hybridlog.follow.follower import IndexTarget
+    from hybridlog.follow.child import FollowerProcess
+    from hybridlog.follow.follower import FollowerThread
     from hybridlog.query.topics import TopicMatcher
     from hybridlog.snapshot import Snapshot
-    from hybridlog_storage.catalog import Catalog
+    from hybridlog_storage.catalog import Catalog, RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.messages import Buffer
 
@@ -44,7 +43,8 @@ if TYPE_CHECKING:
 _WAKE_BYTES = 4 << 20  # queued bytes that wake the writing thread: a batch has a fixed cost
 _TICK_S = 0.1  # interval of the writing thread when little comes
 _FLUSH_AT = 0.95  # share of the flush interval after which chunks are closed
-_INDEX_INTERVALS = 4  # flush intervals between two passes of the index
+_INDEX_INTERVALS = 4  # flush intervals between two looks of the follower
+_LOOK_S = 5.0  # longest time between them
 _MAX_NS = 1 << 63
 _SOURCE = {"path": "", "kind": "live", "profile": "", "bytes": 0}
 LIVE_SETTINGS = SegmentSettings(segment_size=1 << 30, segment_span_s=600.0)
@@ -112,7 +112,7 @@ class LiveRecording:
     Args:
         directory: The store.
         catalog: The store's catalog.
-        target: Where its index documents go.
+        follow: Begins to follow it.
         name: Name of the recording.
         options: Options.
         on_close: Called with the report at the end of the recording.
@@ -122,14 +122,13 @@ class LiveRecording:
         self,
         directory: StoreDirectory,
         catalog: Catalog,
-        target: IndexTarget,
+        follow: Callable[[RecordingEntry], FollowerThread | FollowerProcess],
         name: str,
         options: LiveOptions,
         *,
         known: Callable[[], Snapshot],
         on_close: Callable[[RecordReport], None],
     ) -> None:
-        load()
         self._options = options
         self._small_bound = options.budget_bytes * 5 // 4
         self._on_close = on_close
@@ -161,7 +160,7 @@ class LiveRecording:
         self._capture = Capture(
             directory,
             catalog,
-            target,
+            follow,
             known,
             name=name,
             tags=options.tags,
@@ -171,7 +170,6 @@ class LiveRecording:
             is_ring=options.is_ring,
             make_room=self._when_full,
             on_written=self._notify,
-            index_interval_s=_index_interval_s(options.flush_interval_s),
         )
         self.id = self._capture.entry.id
         """Recording id."""
@@ -300,11 +298,6 @@ class LiveRecording:
         return self._capture.writer.totals.segments
 
     @property
-    def first_unread(self) -> int:
-        """Number of the first segment that the index may still read."""
-        return self._capture.first_unread
-
-    @property
     def channels(self) -> Mapping[int, Channel]:
         """Channels so far by the numbers that they have in the segments."""
         return self._capture.writer.channels
@@ -336,7 +329,7 @@ class LiveRecording:
     @property
     def index_failure(self) -> HybridlogError | None:
         """The error that stopped the index, None while it works."""
-        return self._capture.index.failure
+        return self._capture.follower.state.failure
 
     def close(self) -> RecordReport:
         """Write, index and seal everything, and return a report.
@@ -383,7 +376,7 @@ class LiveRecording:
             self._capture.entry,
             [],
             self._capture.indexed,
-            self._capture.index.missed,
+            self._capture.follower.state.missed,
             failure,
             0,
             time.monotonic() - self._started,
@@ -545,9 +538,9 @@ def _check_channel(channel: object) -> None:
             ) from error
 
 
-def _index_interval_s(flush_interval_s: float) -> float:
-    """Longest time between two passes of the index, seconds."""
-    return min(_INDEX_INTERVALS * flush_interval_s, INTERVAL_S)
+def follow_interval_s(options: LiveOptions) -> float | None:
+    """Time between two looks of its follower, seconds; None to do everything at the end."""
+    return None if options.is_ring else min(_INDEX_INTERVALS * options.flush_interval_s, _LOOK_S)
 
 
 def _batch(messages: deque[_Message]) -> LooseBatch:

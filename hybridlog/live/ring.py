@@ -16,7 +16,7 @@ from hybridlog.maintenance.retention import is_pinned
 from hybridlog.query.latching import depth_of, publisher_of
 
 if TYPE_CHECKING:
-    from hybridlog.follow.child import TriggerProcess
+    from hybridlog.follow.child import FollowerProcess
     from hybridlog.live.recording import LiveRecording
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.manifest import File, Manifest
@@ -34,13 +34,13 @@ class Ring:
         directory: StoreDirectory,
         recording: LiveRecording,
         span_s: float,
-        triggers: TriggerProcess | None = None,
+        follower: FollowerProcess | None = None,
     ) -> None:
         self.messages = 0
         self._directory = directory
         self._recording = recording
         self._span_s = span_s + _LATE_S
-        self._triggers = triggers
+        self._follower = follower
         self._seen = 0
         self._ended: dict[int, float] = {}  # when each group was first seen sealed
         self._files: dict[int, set[int]] = {}  # their numbers, by group
@@ -58,7 +58,7 @@ class Ring:
                 self._files[log.group].add(log.number)
             self._seen, self._kept = sealed, set()
         old = {group for group, at in self._ended.items() if now - at >= self._span_s}
-        judged = None if self._triggers is None else self._triggers.judged
+        judged = None if self._follower is None else self._follower.judged
         if judged is not None:
             old = {group for group in old if self._files[group].issubset(judged)}
         return old - self._kept

@@ -9,7 +9,9 @@ that the next opening removes.
 
 from __future__ import annotations
 
+import os
 import secrets
+import time
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
@@ -20,7 +22,15 @@ from hybridlog.maintenance.report import reporter
 from hybridlog.record.losses import Cause
 from hybridlog_storage.disk import durability, files
 from hybridlog_storage.errors import ChangedError, DiskFullError, SegmentError, StoreError
-from hybridlog_storage.manifest import LetGo, Loss, Manifest, replace, with_rows, with_totals
+from hybridlog_storage.manifest import (
+    LetGo,
+    Loss,
+    Manifest,
+    hasher,
+    replace,
+    with_rows,
+    with_totals,
+)
 from hybridlog_storage.segments.gone_log import front
 from hybridlog_storage.segments.segment_reader import SegmentReader
 
@@ -36,6 +46,11 @@ if TYPE_CHECKING:
 
 NO_ROOM: Final = "deleted without its fields: the disk was full"
 """Reason in the loss ledger."""
+TOO_LATE: Final = "deleted without its fields: they were not written in time"
+"""Another one, of a recording in progress."""
+_WAIT_S: Final = 5.0  # for rows that a follower writes
+_POLL_S: Final = 0.1
+_PIECE: Final = 1 << 20
 
 
 @dataclass(slots=True)
@@ -62,6 +77,7 @@ def expire(
     version: int = 0,
     progress: Progress | None = None,
     make_room: Callable[[], bool] = lambda: False,
+    is_followed: bool = False,
 ) -> Expired:
     """Delete sealed logs of a recording that this process has locked; it may record it, too.
 
@@ -70,8 +86,11 @@ def expire(
     rows stay. They must have the `digests`, by number; `copy` is the address of a store with a
     proven copy of them. `check`, part of each change of the manifest, raises if they must stay by
     now; `make_room` returns False if there is none to make. After an error, logs that are listed
-    are as before.
+    are as before. Where another process writes the rows (`is_followed`), they are waited for,
+    and a log that gets none goes without.
     """
+    if is_followed:
+        _have_rows(directory, recording, segments, check, make_room)
     manifest, done = directory.manifests.read(recording), Expired()
     logs = [manifest.logs.get(number) for number in sorted(segments)]
     if any(log and digests.get(log.number, log.digest) != log.digest for log in logs):
@@ -110,14 +129,39 @@ def expire(
     return done
 
 
+def _have_rows(
+    directory: StoreDirectory,
+    recording: str,
+    segments: Collection[int],
+    check: Check,
+    make_room: Callable[[], bool],
+) -> None:
+    """Wait until a follower has written the rows of logs; delete those that have none in time."""
+
+    def lacking(now: Manifest) -> list[File]:
+        found = [now.logs[number] for number in segments if number in now.logs]
+        return [log for log in found if may_go(log) and log.number not in now.rows]
+
+    until = time.monotonic() + _WAIT_S
+    while lacking(directory.manifests.read(recording)):
+        if time.monotonic() >= until:
+            let_go(directory, recording, lacking, check, TOO_LATE)
+            return
+        make_room()
+        time.sleep(_POLL_S)
+
+
 def _are_whole(path: Path, rows: Collection[File]) -> bool:
     """True if files of rows are as listed: they will be all that is left."""
-    from hybridlog.columns.rows_file import RowsFile
-
     try:
         for line in rows:
-            RowsFile(path, line).check()
-    except StoreError:
+            with os.fdopen(files.open_file(path / line.name, os.O_RDONLY), "rb") as file:
+                digest = hasher()
+                while piece := file.read(_PIECE):
+                    digest.update(piece)
+            if digest.hexdigest() != line.digest:
+                return False
+    except OSError:
         return False
     return bool(rows)
 
@@ -136,7 +180,7 @@ def make_rows(
     manifest = directory.manifests.read(recording)
     for log in manifest.logs.values():
         if may_go(log) and log.number not in manifest.rows and is_wanted():
-            with suppress(SegmentError):  # it stays
+            with suppress(SegmentError, ChangedError):  # it stays, or is gone
                 _list(directory, recording, {log.number: _rows_of(directory, recording, log)})
 
 
@@ -178,6 +222,8 @@ def _list(
 
     def how(now: Manifest) -> Manifest:
         check(now)
+        if not made.keys() <= now.logs.keys():
+            raise ChangedError(f"{now.name}: a segment has gone meanwhile.")
         for number, rows in made.items():
             line = replace(now.logs[number], **values)
             now = with_rows(now, line, rows or now.rows[number])

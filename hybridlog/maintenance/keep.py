@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
-from hybridlog.maintenance.expiry import Expired, expire, let_go, make_rows
+from hybridlog.maintenance.expiry import Expired, expire, let_go
 from hybridlog.maintenance.retention import (
     Held,
     Plan,
@@ -65,10 +65,6 @@ class Own(Protocol):
     """The recording that this process makes; it holds the lock of it."""
 
     id: str
-
-    @property
-    def first_unread(self) -> int:
-        """Number of the first segment that it still reads."""
 
     @property
     def sealed(self) -> int:
@@ -202,10 +198,9 @@ class Keeper:
                 replace(s, may_go=False, is_pinned=True) if s.number in failed else s
                 for s in held.segments
             ]
-            if self._own is not None and held.id == self._own.id:
-                unread = self._own.first_unread
-                left = [s for s in left if s.number < unread]
-            elif _WHOLE in failed or (not held.is_ended and self._directory.is_recorded(held.id)):
+            if not is_own and (
+                _WHOLE in failed or (not held.is_ended and self._directory.is_recorded(held.id))
+            ):
                 left, held = [], replace(held, is_ended=False)
             yield replace(held, segments=left)
 
@@ -241,8 +236,9 @@ class Keeper:
         if not step.segments and not step.groups:
             self._remove(step.id, check)
             return Expired(freed=step.bytes)
+        is_own = self._own is not None and step.id == self._own.id
         with ExitStack() as held:
-            if self._own is None or step.id != self._own.id:
+            if not is_own:
                 lock = self._directory.writing(step.id, step.recording, wait_s=LOCK_WAIT_S)
                 held.enter_context(lock)
             if step.groups:
@@ -251,7 +247,11 @@ class Keeper:
             else:
                 at_hand = self._directory.at_hand(step.id, step.segments, check)
                 with at_hand as (here, version):
-                    how = {**how, "make_room": partial(_use_spare, self._directory)}
+                    how = {
+                        **how,
+                        "make_room": partial(_use_spare, self._directory),
+                        "is_followed": is_own,
+                    }
                     done = expire(here, step.id, step.segments, check=check, version=version, **how)
             self._changed(step.id)
         return done
@@ -324,8 +324,7 @@ class RetentionThread:
     """Makes room ahead of need, on a thread of its own.
 
     A pass is made when a segment was sealed, when less is free than the rules or the recorder
-    want, and once a minute. Where the store has rules, the rows of sealed segments are written
-    then. What it cannot do is told, and never stops the recorder.
+    want, and once a minute. What it cannot do is told, and never stops the recorder.
 
     Args:
         remove: Removes a whole recording, by its id, unless a check of its manifest raises.
@@ -416,7 +415,6 @@ class RetentionThread:
                 last_pass, sealed = now, count
                 if not self._rules.is_empty:
                     freed = self._make_pass()
-                    make_rows(self._directory, self._own.id, lambda: not self._over.is_set())
             except HeldError:
                 sealed, freed = -1, 1  # another process makes room: see later what is left
             except (HybridlogError, OSError) as error:

@@ -7,7 +7,6 @@ recording, provides its writer, and completes or removes the recording.
 from __future__ import annotations
 
 import math
-import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
@@ -24,8 +23,6 @@ from hybridlog.entries import (
     recording_metadata,
     text,
 )
-from hybridlog.follow.follower import Follower, FollowerThread, IndexTarget
-from hybridlog.maintenance.expiry import make_rows
 from hybridlog.maintenance.retention import Rules
 from hybridlog.query.latching import depth_of
 from hybridlog.schema.codecs import codec_for
@@ -36,23 +33,22 @@ from hybridlog_storage.errors import (
     DatabaseError,
     DiskFullError,
     HybridlogError,
-    StoreError,
     UsageError,
 )
 from hybridlog_storage.manifest import Manifest, Source, new_id
 from hybridlog_storage.manifest import replace as replaced
-from hybridlog_storage.mongo.index_state import IndexState
 from hybridlog_storage.segments.segment_format import LOSSES_METADATA, json_metadata
 from hybridlog_storage.segments.segment_writer import RecordingWriter, SegmentSettings
 
 if TYPE_CHECKING:
+    from hybridlog.follow.child import FollowerProcess
+    from hybridlog.follow.follower import FollowerThread
     from hybridlog.snapshot import Snapshot
     from hybridlog_storage.catalog import Catalog
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.messages import Channel
     from hybridlog_storage.segments.segment_file import Sealed
 
-_FOLLOW_S: Final = 0.5  # between two looks of the follower of a log
 _REMOTE_SEGMENT: Final = "128MiB"
 _REMOTE_SEGMENTS: Final = 64 << 20, 256 << 20
 """Least and greatest size in bytes: what a cut costs again, and what requests cost."""
@@ -64,7 +60,7 @@ class Capture:
     Args:
         directory: The store.
         catalog: Its catalog.
-        target: Where its index documents go.
+        follow: Begins to follow it.
         known: Returns all recordings of the store as they are now.
         name: Name of the recording.
         tags: Tags of the recording.
@@ -72,11 +68,10 @@ class Capture:
         settings: Rotation, chunks and compression of segments.
         on_written: Called on another thread when less content waits for the disk; for a caller
             that cannot wait for it.
-        index_interval_s: Time between two looks of the follower, seconds.
         no_index: Returns whether the messages of a topic get no documents in MongoDB; None for
             no topic.
-        is_ring: Whether files of it go while it is recorded. Then what is left is followed at its
-            end, and latched messages have files of their own.
+        is_ring: Whether files of it go while it is recorded: latched messages have files of their
+            own.
         check: Called with all recordings before anything is written, while no other process can
             start a recording; raises to refuse.
         make_room: Called when the disk is full; returns whether to try again.
@@ -84,14 +79,14 @@ class Capture:
     Attributes:
         entry: The recording's catalog entry.
         writer: Writer of its segments.
-        index: Makes what is derived of it.
+        follower: Makes what is derived of it.
     """
 
     def __init__(
         self,
         directory: StoreDirectory,
         catalog: Catalog,
-        target: IndexTarget,
+        follow: Callable[[RecordingEntry], FollowerThread | FollowerProcess],
         known: Callable[[], Snapshot],
         *,
         name: str,
@@ -99,7 +94,6 @@ class Capture:
         source: Mapping[str, Any],
         settings: SegmentSettings,
         on_written: Callable[[], None] | None = None,
-        index_interval_s: float = _FOLLOW_S,
         no_index: Callable[[str], bool] | None = None,
         is_ring: bool = False,
         check: Callable[[Snapshot], None] | None = None,
@@ -107,10 +101,9 @@ class Capture:
     ) -> None:
         self.catalog = catalog
         self._directory = directory
-        self._is_ring = is_ring
         self._make_room = make_room
         self._no_index = no_index or (lambda _: False)
-        self._rules = rules = Rules.of(directory.settings.retention)
+        rules = Rules.of(directory.settings.retention)
         largest = min(
             settings.segment_size,
             rules.segment_size,
@@ -140,10 +133,8 @@ class Capture:
                     directory.manifests.remove(recording)
                 raise
             self._held = self._held.pop_all()
-        self._target = target
         folder = directory.recording(recording)
-        self.index = Follower(directory, catalog, self.entry, target)
-        self._follower = FollowerThread(self.index, None if is_ring else index_interval_s)
+        self.follower = follow(self.entry)
         self.writer = RecordingWriter(
             folder,
             recording_metadata(self.entry),
@@ -160,18 +151,13 @@ class Capture:
     @property
     def indexed(self) -> int:
         """Number of messages in the index, after the end."""
-        return max(0, self.index.indexed - (self.entry.messages - self.entry.documents))
+        return max(0, self.follower.state.indexed - (self.entry.messages - self.entry.documents))
 
     @property
     def lag(self) -> int:
         """Messages that are to be in the index, and are not yet."""
-        lag = self.writer.totals.messages - self.index.indexed
-        return max(lag, 0) if self._target.is_wanted else 0
-
-    @property
-    def first_unread(self) -> int:
-        """Number of the first segment that is still read to make tables and documents."""
-        return sys.maxsize if self._is_ring else self.index.first_unread
+        state = self.follower.state
+        return max(self.writer.totals.messages - state.indexed, 0) if state.is_wanted else 0
 
     def expect(self, channel: Channel) -> None:
         """Prepare a channel before its first message."""
@@ -231,19 +217,15 @@ class Capture:
                     raise
 
     def _finish(self) -> DatabaseError | None:
-        recording = self.entry.id
-        if not self._rules.is_empty and not self._is_ring:
-            with suppress(StoreError):  # or else they are written when their logs go
-                make_rows(self._directory, recording)
-        self.entry = put_entry(self._directory, self.catalog, recording)
-        self.entry = self._follower.finish(self.entry)
+        self.entry = put_entry(self._directory, self.catalog, self.entry.id)
+        self.entry = self.follower.finish(self.entry)
         self._held.close()
-        return self.index.failure
+        return self.follower.state.failure
 
     def abort(self) -> None:
         """Stop at once; flushed messages stay, and the next opening of the store seals them."""
         self.writer.abort()
-        self._follower.abandon()
+        self.follower.abandon()
         self._held.close()
 
     def rollback(self) -> None:
@@ -252,18 +234,12 @@ class Capture:
         with suppress(HybridlogError):  # or else the files go first
             manifests.change(entry.id, lambda now: replaced(now, status="removed"))
         self.writer.abort()
-        self._follower.abandon()
+        self.follower.abandon()
         with suppress(HybridlogError):
             manifests.remove(entry.id)
         with suppress(HybridlogError):
             self.catalog.remove(entry.id)
-        # If MongoDB is unavailable, the next connection finds an entry without files.
-        database = self._target.database
-        with suppress(HybridlogError):
-            if database is not None:
-                state = IndexState(database)
-                state.clear_everywhere([entry.key])
-                state.remove([entry.key])
+        self.follower.forget()
         self._held.close()
 
     def _begin(self, create: Callable[[Manifest], None], manifest: Manifest) -> RecordingEntry:

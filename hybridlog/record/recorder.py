@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from hybridlog_storage.disk.directory import StoreDirectory
     from hybridlog_storage.summary import RecordingSummary
 
+_FOLLOW_S = 0.5  # between two looks of the follower
 _MAX_PARTS = 1000  # of a log, whose fingerprints the recording has
 
 
@@ -136,6 +137,8 @@ def record(
         SourceError: nothing could be read.
         DiskFullError: no space; nothing is stored.
     """
+    from hybridlog.follow.follower import in_thread  # a live recorder loads none of it
+
     started = time.monotonic()
 
     def refuse_known(snapshot: Snapshot) -> None:
@@ -145,7 +148,7 @@ def record(
     capture = Capture(
         directory,
         catalog,
-        target,
+        in_thread(directory, catalog, target, _FOLLOW_S),
         known,
         name=options.name or name_of(source.path),
         tags=options.tags,
@@ -173,7 +176,7 @@ def record(
         capture.entry,
         list(source.damage),
         capture.indexed,
-        capture.index.missed,
+        capture.follower.state.missed,
         failure,
         copy.skipped,
         time.monotonic() - started,

@@ -179,7 +179,7 @@ RECOVERS_WHEN_TOLD = """
 import sys, threading, time
 from importlib import import_module
 from pathlib import Path
-from hybridlog.maintenance import index, opening
+from hybridlog.maintenance import opening
 
 told = Path(sys.argv.pop(1))
 
@@ -192,7 +192,6 @@ def blocked(work):
     return wait
 
 opening.recover = blocked(opening.recover)
-index.StoreIndex._bring_one = blocked(index.StoreIndex._bring_one)
 import_module("hybridlog.cli.main").main()
 """
 
@@ -361,6 +360,50 @@ def test_a_ring_keeps_the_end_and_what_is_pinned(logs: Path, tmp_path: Path) -> 
     assert [pin["reason"] for pin in told["pins"]] == ["bump", "SIGUSR1"]
     run("export", tmp_path / "part.mcap", "--split-by", "mark", "-q", store=store)
     assert len([*tmp_path.glob("part-*.mcap")]) == 2
+
+
+LOADS_LITTLE = """
+import sys
+from importlib import import_module
+from hybridlog.live.recorder import Recorder
+
+look = Recorder.look
+
+def checked(self):
+    assert not {"pyarrow", "pandas", "pymongo"} & {*sys.modules}
+    return look(self)
+
+Recorder.look = checked
+import_module("hybridlog.cli.main").main()
+"""
+
+
+def test_a_recorder_loads_nothing_of_what_its_follower_does(logs: Path, tmp_path: Path) -> None:
+    store = tmp_path / "store"
+    with hl.open(store, create=True) as opened:
+        opened.directory.change_settings(retention={"quota": "4MB"})
+    words = ("--replay", logs / "robot.bag", "--speed", 5, "--split-size", "1MiB")
+    program = (sys.executable, "-c", LOADS_LITTLE)
+    with recorder(store, *words, "--trigger", "/map: data == 0", program=program) as process:
+        report = end(process, None)
+    (recording,) = report["recordings"]
+    assert recording["messages"] == recording["messages_indexed"] == report["messages_received"]
+    assert any(log.gone == "expired" for log in places.manifest(store, "robot").logs.values())
+
+
+def test_what_a_follower_has_left_is_made_by_the_next_command(logs: Path, tmp_path: Path) -> None:
+    store = tmp_path / "store"
+    with recorder(store, "--replay", logs / "robot.bag") as process:
+        until_it_speaks(process)
+        follower = follower_of(process)
+        assert follower is not None
+        os.kill(int(follower.name), signal.SIGSTOP)
+        report, said = end_and_hear(process, signal.SIGTERM)
+    assert "tables and index are not complete: the next command makes the rest" in said
+    (recording,) = report["recordings"]
+    assert recording["messages_indexed"] < recording["messages"] == report["messages_received"]
+    assert run("ls", "--json", store=store).json[0]["status"] == "complete"
+    assert "all is well" in run("verify", store=store).out
 
 
 def follower_of(recorder: subprocess.Popen[str]) -> Path | None:

@@ -130,7 +130,7 @@ class Robot:
         os.pwritev = lambda *words: self.write(pwritev, *words)  # type: ignore[assignment]
         self.recorder.start()
         if self.part == "box":  # a ring waits for its triggers
-            wait_for(lambda: self.recorder._triggers._read is not None)
+            wait_for(lambda: self.recorder._follower._task.seen is not None)
         events: list[tuple[float, Any]] = [
             (0.3, self.pin),
             (0.4, self.mark),

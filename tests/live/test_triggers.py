@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import random
 import struct
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from operator import itemgetter
 
 import pytest
@@ -15,10 +17,12 @@ from hybridlog.follow import child
 from hybridlog.follow.triggers import Trigger
 from hybridlog.live.policy import priority_rule, throttle_rule
 from hybridlog.live.recorder import RecorderOptions
+from hybridlog.live.recording import LIVE_SETTINGS
 from hybridlog.query.topics import matcher
 from hybridlog.record.marks import MARKS
 from hybridlog_storage.errors import TopicError, UsageError, WhereError
 from hybridlog_storage.messages import Channel, Schema
+from tests.indexed import documents_of
 from tests.limits import Limit
 from tests.live.speaker import Recorded, scan, scan_channel, text, text_channel
 from tests.waiting import wait_for
@@ -199,16 +203,15 @@ def test_a_trigger_fires_on_whole_and_exact_messages(
 
 def test_a_follower_that_is_killed_misses_nothing(store: hl.Store) -> None:
     recorded = robot(store, "/scan: id in (1, 3, 5)")
-    triggers = recorded.recorder._triggers
-    assert triggers is not None
+    follower = recorded.recorder._follower
     start, pids = time.time_ns(), set()
     for number in range(6):
         recorded.speaker.say(scan_channel(), scan(number, 10), start + number * SECOND)
         if number in {1, 3}:
             wait_for(lambda hits=number // 2: len(recorded.said) > hits)
-            assert triggers._process is not None
-            pids.add(triggers._process.pid)
-            triggers._process.kill()
+            assert follower._process is not None
+            pids.add(follower._process.pid)
+            follower._process.kill()
     (report,) = recorded.recorder.stop()
     assert len(pids) == 2
     times = sorted((mark["time"] - start) // SECOND for mark in report.entry.marks)
@@ -226,3 +229,24 @@ def test_a_follower_that_cannot_work_is_given_up(
     recorded.speaker.say(scan_channel(), scan(0, 10))
     (report,) = recorded.recorder.stop()
     assert (report.entry.messages, report.entry.marks) == (1, [])
+
+
+@pytest.mark.mongo
+def test_a_follower_that_is_killed_makes_each_row_and_document_once(store: hl.Store) -> None:
+    settings = replace(LIVE_SETTINGS, segment_size=1 << 18)
+    options = RecorderOptions(reserve_bytes=0, flush_interval_s=0.2, settings=settings)
+    recorded = Recorded(store, options)
+    follower = recorded.recorder._follower
+    noise, start = random.Random(3), time.time_ns()
+    for number in range(30):
+        payload = struct.pack("<IfI", number, 0, 40_000) + noise.randbytes(40_000)
+        recorded.speaker.say(scan_channel(), payload, start + number * SECOND)
+        if number in {9, 19}:
+            wait_for(lambda: follower.state.indexed > 0 and not recorded.recorder.look().lag)
+            assert follower._process is not None
+            follower._process.kill()
+    (report,) = recorded.recorder.stop()
+    assert (report.entry.messages, report.indexed, report.missed) == (30, 30, 0)
+    assert len(documents_of(store, "/scan")) == 30
+    assert sorted(store.topic("/scan").to_arrow()["id"].to_pylist()) == [*range(30)]
+    assert store.verify().findings == []

@@ -1,0 +1,239 @@
+"""The process beside a live recorder: evaluates triggers, then makes rows, tables and documents."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from collections import Counter
+from collections.abc import Collection
+from contextlib import suppress
+from functools import partial
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import hybridlog
+from hybridlog.entries import put_entry
+from hybridlog.follow.child import ENDED, RECOVERED, Followed, Task
+from hybridlog.follow.follower import Follower, begin_again
+from hybridlog.follow.triggers import Trigger
+from hybridlog.maintenance.tables import missing
+from hybridlog.query.answers.follow import Arrivals
+from hybridlog.query.counters import Counters
+from hybridlog.query.predicate.types import check
+from hybridlog.query.question import Question
+from hybridlog.record.marks import MARKS
+from hybridlog.schema.codecs import codec_for
+from hybridlog_storage.errors import (
+    DefinitionError,
+    DiskFullError,
+    HybridlogError,
+    StoreError,
+    WhereError,
+    WithoutMongoError,
+)
+
+if TYPE_CHECKING:
+    from hybridlog.store import Store
+    from hybridlog_storage.messages import Channel
+
+_EVERY_S: Final = 0.25
+_ROWS_S: Final = 5.0
+_NICE: Final = 5
+_FIRST_TO_GO: Final = "500"
+"""Added to its score where memory is short."""
+
+
+def serve(handle: int) -> None:
+    """Follow a recording to its end; ends with the recorder, too."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        # A service manager signals the recorder, too. MongoDB would inherit what is ignored.
+        signal.signal(number, lambda *_: None)
+    os.nice(_NICE)
+    with suppress(OSError):
+        Path("/proc/self/oom_score_adj").write_text(_FIRST_TO_GO, "ascii")
+    with Connection(handle) as control, suppress(EOFError, ConnectionError):
+        task: Task = control.recv()
+        store = hybridlog.open(task.store, mongo=task.mongo, cache_mb=task.cache_mb, recover=False)
+        beside = _Beside(control, task, store)
+        threading.Thread(target=beside.hear, daemon=True).start()
+        try:
+            with store:
+                beside.run()
+        except HybridlogError as error:
+            beside.tell("failed", str(error))
+        else:
+            beside.tell("done")
+
+
+class _Beside:
+    """Follows a recording, and tells its recorder."""
+
+    def __init__(self, control: Connection[Any, Any], task: Task, store: Store) -> None:
+        self._control = control
+        self._task = task
+        self._store = store
+        self._triggers = [Trigger.of(text) for text in task.triggers]
+        self._lock = threading.Lock()
+        self._ended = threading.Event()
+        self._follower: Follower | None = None
+        self._state: Followed | None = None
+        self._before = 0  # messages that an earlier process has indexed
+        self._sealed: Collection[int] = ()  # that have their rows
+        self._rows_due = 0.0
+        self._derives = threading.Thread(target=self._harmless, args=(self._derive,), daemon=True)
+        self._recovers = threading.Thread(target=self._harmless, args=(self._recover,), daemon=True)
+
+    def tell(self, *what: object) -> None:
+        """Tell the recorder something."""
+        with self._lock:
+            self._control.send(what)
+
+    def hear(self) -> None:
+        """Hear the recorder, until it ends."""
+        try:
+            while True:
+                order = self._control.recv()
+                if order == ENDED:
+                    if self._follower is not None:
+                        self._follower.is_stopped = True  # until it finishes
+                    self._ended.set()
+                elif order == RECOVERED:
+                    self._recovers.start()
+                else:
+                    self._check(order)
+        except (EOFError, OSError):
+            os._exit(0)
+
+    def _check(self, channel: Channel) -> None:
+        with suppress(DefinitionError):
+            types = {path.path: path.type for path in codec_for(channel).paths()} or None
+            for one in self._triggers:
+                if one.predicate is not None and one.fits(channel.topic):
+                    try:
+                        check(one.predicate, types)
+                    except WhereError as error:
+                        never = f"trigger {one.text!r} can never fire on {channel.topic}"
+                        self.tell("say", f"{never}: {error}")
+
+    def run(self) -> None:
+        """Do all that a recording needs until its end, and the rest then."""
+        self._derives.start()
+        self._watch(self._task.seen)
+        self.tell("seen")
+        for thread in (self._derives, self._recovers):
+            while thread.is_alive():
+                thread.join(_EVERY_S)
+                self._tell_state()
+        self._rows_due = 0.0
+        self._make_rows()
+        self._tell_state()
+
+    def _tell_state(self) -> None:
+        if self._follower is None:
+            return
+        state, before = self._follower.state, self._before
+        state = state._replace(read=state.read + before, indexed=state.indexed + before)
+        if state != self._state:
+            self._state = state
+            self.tell("state", state)
+
+    # Triggers, and rows.
+
+    def _watch(self, read: Any) -> None:
+        """Evaluate triggers on what the recording has and gets, but for what was read before.
+
+        Rows of what is sealed come next.
+        """
+        shared, recording = self._store.shared, self._task.recording
+        session, counters = shared.now(), Counters()
+        watched = [
+            Arrivals(
+                session,
+                Question((), (recording,), predicate=one.predicate),
+                counters,
+                partial(_takes, one),
+            )
+            for one in self._triggers
+        ]
+        for one in watched if read is not None else ():
+            one.read[recording], one.sealed[recording] = Counter(read[0]), set(read[1])
+        is_last = False
+        while not is_last:
+            is_last, started = self._ended.is_set(), time.monotonic()
+            session = shared.now().again() if watched else session
+            for trigger, one in zip(self._triggers, watched, strict=True):
+                runs, _ = one.look(session)
+                for run in runs:
+                    self.tell("hit", trigger.text, run.batch.log_time.tolist())
+            if counters.unreadable:
+                counters.unreadable = 0
+                self.tell("say", "triggers do not see messages that cannot be read, or lack arrays")
+            if watched:
+                now = dict(watched[0].read[recording]), frozenset(watched[0].sealed[recording])
+                if now != read:
+                    read = now
+                    self.tell("read", read)
+            self._make_rows()
+            self._tell_state()
+            if not is_last:
+                self._ended.wait(max(_EVERY_S - (time.monotonic() - started), 0))
+
+    def _make_rows(self) -> None:
+        """Write rows of new sealed segments; now and then also of others, for rules may be new."""
+        follower, now = self._follower, time.monotonic()
+        sealed = self._store.directory.listing(self._task.recording).sealed
+        if follower is not None and (sealed != self._sealed or now >= self._rows_due):
+            with suppress(StoreError, DiskFullError):  # the next look, or who lets them go
+                follower.make_rows()
+                self._sealed, self._rows_due = sealed, now + _ROWS_S
+
+    # The rest.
+
+    def _harmless(self, work: Any) -> None:
+        """Do something; the next command that writes makes what a failure has left."""
+        try:
+            work()
+        except Exception as error:
+            self.tell("say", f"tables and index are made later: {error or repr(error)}")
+
+    def _derive(self) -> None:
+        store, task = self._store, self._task
+        directory, catalog, index = store.directory, store.catalog, store.shared.index
+        target = index.index_to_record("Recording")
+        why = index.unavailable
+        if why is not None and not isinstance(why, WithoutMongoError):
+            doing = "the index is made later" if target.is_wanted else "there is no index"
+            self.tell("say", f"MongoDB is unavailable, so {doing}: {why}")
+        entry = put_entry(directory, catalog, task.recording, is_open=True)
+        done: Collection[str] = ()
+        topics: Collection[str] | None = None
+        if task.is_again:
+            if target.database is not None:
+                done, _ = begin_again(target.database, entry)
+            manifest = directory.manifests.read(task.recording)
+            logs = [log for number, log in manifest.logs.items() if str(number) in done]
+            self._before = sum(part.messages for log in logs for part in log.parts.values())
+            if manifest.is_ended:
+                topics = missing(directory, entry)
+        follower = Follower(directory, catalog, entry, target, topics=topics, done=done)
+        self._follower = follower
+        while not self._ended.wait(task.interval_s):
+            with suppress(StoreError):  # the next look or the end sees it
+                follower.follow()
+        follower.is_stopped = False
+        follower.finish(put_entry(directory, catalog, task.recording))
+        if follower.failure is None and index.connected is not None:
+            # The next connection need not look at it.
+            catalog.put_indexed([task.recording], index.id)
+
+    def _recover(self) -> None:
+        """Make documents that the index lacks of earlier recordings."""
+        self._store.shared.invalidate()
+        self._store.shared.index.database  # noqa: B018 - brings the index up to date
+
+
+def _takes(trigger: Trigger, topic: str) -> bool:
+    return topic != MARKS and trigger.fits(topic)  # which it makes itself
