@@ -271,7 +271,8 @@ class _Display:
         if self._table is not None:
             self._table.note(text)
         else:
-            output.note(f"hybridlog: {text}")
+            with suppress(OSError):  # who reads it may go; the recording goes on
+                output.note(f"hybridlog: {text}")
 
     def state(self, state: RecorderState) -> None:
         """Show the state, about once a second.
@@ -285,7 +286,8 @@ class _Display:
         elif self._as_json:
             from hybridlog.live.state import summary_of
 
-            output.print_json_line({"state": summary_of(state)})
+            with suppress(OSError):
+                output.print_json_line({"state": summary_of(state)})
 
 
 def notify_service(*assignments: str) -> None:

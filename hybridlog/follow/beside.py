@@ -116,7 +116,7 @@ class _Beside:
                         check(one.predicate, types)
                     except WhereError as error:
                         never = f"trigger {one.text!r} can never fire on {channel.topic}"
-                        self.tell("say", f"{never}: {error}")
+                        self.tell("say", f"{never}: {str(error).partition(chr(10))[0]}")
 
     def run(self) -> None:
         """Do all that a recording needs until its end, and the rest then."""

@@ -30,7 +30,7 @@ _START: Final = (
 _POLL_S: Final = 0.1
 _PATIENCE_S: Final = 1.0  # then the user hears of what is left at the end
 _TRIES: Final = 5
-"""So often in a row it may end before it has read anything."""
+"""So often in a row it may end before it has told how far it is."""
 _PAUSE_S: Final = 1.0
 _TOLD_TO_MANAGERS: Final = {"NOTIFY_SOCKET", "WATCHDOG_PID", "WATCHDOG_USEC"}
 RECOVERED: Final = "recovered"
@@ -100,6 +100,7 @@ class FollowerProcess:
         self._triggers = triggers
         self._task = task
         self._has_seen = not triggers
+        self._has_told = False
         self._why = "their process ends again and again"
         self._hit = hit
         self._say = say
@@ -159,16 +160,17 @@ class FollowerProcess:
         """Leave documents of a removed recording to the next connection, which finds them."""
 
     def _run(self) -> None:
-        tries = _TRIES
+        tries, deaths = _TRIES, 0
         while tries and not self._over.is_set():
-            seen, state, is_done = self._task.seen, self.state, False
+            before, self._has_told, is_done = (self._task.seen, self.state), False, False
             with suppress(EOFError, OSError):
                 is_done = self._follow()
             if is_done:
                 return
-            tries = _TRIES if (self._task.seen, self.state) != (seen, state) else tries - 1
+            tries = _TRIES if self._has_told else tries - 1
+            deaths = 0 if (self._task.seen, self.state) != before else deaths + 1
             self._task = self._task._replace(is_again=True)
-            self._over.wait(_PAUSE_S)
+            self._over.wait(_PAUSE_S * 2 ** min(deaths, _TRIES))
         self.judged = None
         if not self._over.is_set():
             what = "triggers are evaluated no more" if self._triggers else "tables are made later"
@@ -196,6 +198,7 @@ class FollowerProcess:
             if not control.poll(_POLL_S):
                 continue
             kind, *values = control.recv()
+            self._has_told |= kind in {"read", "state"}
             if kind == "hit":
                 text, times = values
                 for at in times:

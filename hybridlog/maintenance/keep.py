@@ -213,7 +213,7 @@ class Keeper:
             try:
                 done = self._done(step, check, how)
             except DiskFullError:
-                if not _use_spare(self._directory):
+                if not use_spare(self._directory):
                     raise
                 done = self._done(step, check, how)
         except DiskFullError:
@@ -249,7 +249,7 @@ class Keeper:
                 with at_hand as (here, version):
                     how = {
                         **how,
-                        "make_room": partial(_use_spare, self._directory),
+                        "make_room": partial(use_spare, self._directory),
                         "is_followed": is_own,
                     }
                     done = expire(here, step.id, step.segments, check=check, version=version, **how)
@@ -288,7 +288,7 @@ def _lay_spare(directory: StoreDirectory, rules: Rules) -> None:
                 os.close(fd)
 
 
-def _use_spare(directory: StoreDirectory) -> bool:
+def use_spare(directory: StoreDirectory) -> bool:
     """Free the room that was kept; False if there is none."""
     try:
         files.unlink(directory.path / SPARE)

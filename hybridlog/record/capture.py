@@ -23,6 +23,7 @@ from hybridlog.entries import (
     recording_metadata,
     text,
 )
+from hybridlog.maintenance.keep import use_spare
 from hybridlog.maintenance.retention import Rules
 from hybridlog.query.latching import depth_of
 from hybridlog.schema.codecs import codec_for
@@ -35,9 +36,8 @@ from hybridlog_storage.errors import (
     HybridlogError,
     UsageError,
 )
-from hybridlog_storage.manifest import Manifest, Source, new_id
+from hybridlog_storage.manifest import Manifest, Source, loss_of, new_id
 from hybridlog_storage.manifest import replace as replaced
-from hybridlog_storage.segments.segment_format import LOSSES_METADATA, json_metadata
 from hybridlog_storage.segments.segment_writer import RecordingWriter, SegmentSettings
 
 if TYPE_CHECKING:
@@ -189,12 +189,16 @@ class Capture:
         Raises:
             DiskFullError: No room for that either. Without any message, the recording is gone.
         """
-        self._end = end  # the segment holds the last losses
+        self._end = {**end, "losses": lost}
         try:
-            self.writer.close_truncated([json_metadata(LOSSES_METADATA, {"rows": lost})])
+            self.writer.close_truncated()
         except DiskFullError:
             if not self.writer.written.total():
                 self.rollback()
+                raise
+            rows = tuple(map(loss_of, self._end["losses"]))
+            with suppress(DiskFullError):  # the next opening seals it, and reads them there
+                self._change(lambda now: replaced(now, losses=(*now.losses, *rows)))
             raise
         return self._finish()
 
@@ -202,10 +206,11 @@ class Capture:
         """List the segments of a group in the manifest before they get their final names."""
         end = self._end
         change = listed(*group)
-        if end is not None:
-            self._change(lambda now: ended(end)(change(now)))
-        else:
+        if end is None:
             self._change(change)
+        else:
+            self._change(lambda now: ended(end)(change(now)))
+            self._end = {**end, "losses": ()}  # of further groups none
 
     def _change(self, how: Callable[[Manifest], Manifest]) -> None:
         while True:
@@ -213,7 +218,7 @@ class Capture:
                 self._directory.manifests.change(self.entry.id, how)
                 return
             except DiskFullError:
-                if not self._make_room():
+                if not (self._make_room() or use_spare(self._directory)):
                     raise
 
     def _finish(self) -> DatabaseError | None:

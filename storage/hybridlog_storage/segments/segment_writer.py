@@ -267,7 +267,7 @@ class RecordingWriter:
             self._shut_down()
         return self._closed
 
-    def close_truncated(self, extras: Sequence[Metadata]) -> None:
+    def close_truncated(self) -> None:
         """Seal the chunks in the file and drop the others, after a failed write.
 
         `DiskFullError` if no message is in the files, or there is no room: the next opening of the
@@ -281,7 +281,7 @@ class RecordingWriter:
             self._seal()
         first = self._open_group().first
         kept = [one for one in self._extras if isinstance(one, Metadata)]  # such as losses
-        for extra in (*kept, *extras):
+        for extra in kept:
             first.add_metadata(extra)
         self._seal()
 
