@@ -24,21 +24,15 @@ from hybridlog.columns.topic_table import TopicTable
 from hybridlog.follow.follower import make_tables
 from hybridlog_storage.cache import Cache
 from hybridlog_storage.errors import StoreError
+from tests.damage import flip
 from tests.some import in_turn
-from tests.tables.logs import decoded
+from tests.tables.logs import decoded, table_of
 from tests.tables.test_writer import compare, topics_of
 
 
 @pytest.fixture
 def tables(recorded: hl.Store) -> Tables:
     return Tables(recorded.directory.path)
-
-
-def table_of(store: hl.Store, topic: str = "/large") -> TopicTable:
-    (entry,) = store.recordings()
-    found = Tables(store.directory.path).of(entry, topic)
-    assert found is not None
-    return found
 
 
 def file_of(store: hl.Store, topic: str = "/large") -> Path:
@@ -50,7 +44,7 @@ def file_of(store: hl.Store, topic: str = "/large") -> Path:
 
 
 def test_only_what_is_wanted_is_read(recorded: hl.Store) -> None:
-    table = table_of(recorded)
+    table = table_of(recorded, "/large")
     (block,) = table.scan(["header.stamp", "points[].X", "Name", "covariance.max"], own=["pub"])
     kind = block.records.type
     assert [kind.field(n).name for n in range(kind.num_fields)] == [
@@ -113,15 +107,11 @@ def test_parts_are_merged(runs: list[list[tuple[int, int]]], size: int) -> None:
 
 
 def garble(path: Path) -> None:
-    content = bytearray(path.read_bytes())
-    content[len(content) // 3] ^= 1
-    path.write_bytes(content)
+    flip(path, 1 / 3)
 
 
 def garble_footer(path: Path) -> None:
-    content = bytearray(path.read_bytes())
-    content[-300] ^= 1
-    path.write_bytes(content)
+    flip(path, -300)
 
 
 def cut(path: Path) -> None:
