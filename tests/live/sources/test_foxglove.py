@@ -26,6 +26,7 @@ from hybridlog_storage.messages import Schema
 from tests.calls import Calls
 from tests.limits import Limit
 from tests.live.sources.heard import DEADLINE_S, Heard, Listening, must_return
+from tests.servers.mongods import free_port
 from tests.servers.test_tls import authority, certificate
 from tests.waiting import wait_for
 
@@ -701,9 +702,7 @@ def test_a_server_that_does_not_read_is_left(limit: Limit) -> None:
 
 
 def test_a_server_that_comes_late_is_waited_for() -> None:
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
-
+    port = free_port()
     heard = Heard()
     with FoxgloveSource(f"ws://127.0.0.1:{port}") as source:
         source.start(heard)
