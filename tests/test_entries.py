@@ -334,16 +334,6 @@ def test_one_that_lies_there_twice_under_a_number_of_its_own(made: Made) -> None
     check(made.entry())
 
 
-def test_one_of_another_recording_under_a_number_of_its_own(
-    made: Made, directory: StoreDirectory
-) -> None:
-    other = Made(directory, "other", segments=5)
-    shutil.copy(other.segments[4], made.path / "000004.mcap")
-    (misfit,) = made.inventory().misfits
-    assert (misfit.segment, misfit.is_unlisted) == (4, False)
-    check(made.entry())
-
-
 def test_any_flipped_bit_of_a_summary_costs_that_segment(made: Made) -> None:
     """Or nothing at all: no other answer comes of it."""
     path = made.segments[3]
