@@ -56,9 +56,6 @@ def test_a_wrong_predicate_is_pointed_at(store: Path) -> None:
     assert message.startswith("hybridlog: ")
     assert text.strip() == "ranges.min << 0.5"
     assert text[caret.index("^")] == "<"
-    for predicate in ("nothing < 1", "__import__('os') == 1", "ranges.min <", "$where == 1"):
-        refused = run(*SCAN, "--where", predicate, store=store, code=2)
-        assert "^" in refused.err or "angle" in refused.err or "field" in refused.err
 
 
 def test_latched_messages_stand_in_front(store: Path, seen: list[Seen], tmp_path: Path) -> None:

@@ -8,7 +8,6 @@ from pathlib import Path
 from urllib.parse import quote
 
 import bson
-import numpy as np
 import pymongo
 import pytest
 from pymongo import MongoClient
@@ -72,10 +71,6 @@ def encoded(number: int, size: int = 20) -> list[bytes]:
         bson.encode({"_id": i.to_bytes(20, "big"), "x": i, "nan": float("nan"), "s": "ü" * size})
         for i in range(number)
     ]
-
-
-def lengths_of(documents: list[bytes]) -> np.ndarray:
-    return np.array([len(d) for d in documents], dtype=np.int64)
 
 
 # --- raw documents ---
