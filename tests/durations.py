@@ -17,7 +17,6 @@ LEAST_S = 0.4
 QUICK_S = 12
 """What the tests in the file may take of the quick loop, one after another; the others are many,
 and take most of its two minutes."""
-ROOT = Path(__file__).parent
 
 
 def name_of(nodeid: str) -> str:

@@ -101,9 +101,6 @@ class Content:
             found[name] = self.text()
         return found
 
-    def rest(self) -> bytes:
-        return self._data[self._at :]
-
 
 def records(data: bytes) -> Iterator[tuple[int, int, bytes]]:
     """Offset, opcode and content of records that follow one another."""

@@ -42,8 +42,3 @@ def write_log(
 def mongod_of(store: hl.Store) -> Path:
     """The directory in /proc of the embedded mongod."""
     return Path("/proc", (store.directory.mongod / "data/mongod.lock").read_text().strip())
-
-
-def handles(store: hl.Store) -> int:
-    """Number of files and sockets that the embedded mongod has open."""
-    return len(list((mongod_of(store) / "fd").iterdir()))

@@ -20,6 +20,7 @@ import stat
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -280,6 +281,57 @@ def each_cut(
         power.after_cut(found, rng)
         yield found, is_done
         at += 1
+
+
+class _Dying(System):
+    """Ends the process at its n-th call, before or after it is done."""
+
+    def __init__(self, at: int, *, after: bool, only: frozenset[str] | None) -> None:
+        self._left, self._after, self._only = at, after, only
+
+    def __getattribute__(self, name: str) -> Any:
+        found = super().__getattribute__(name)
+        if name.startswith("_") or (self._only is not None and name not in self._only):
+            return found
+
+        def step(*arguments: Any, **options: Any) -> Any:
+            if self._left == 0 and not self._after:
+                os._exit(7)
+            result = found(*arguments, **options)
+            if self._left == 0:
+                os._exit(7)
+            self._left -= 1
+            return result
+
+        return step
+
+
+def dies(
+    at: int,
+    work: Callable[[], object],
+    *,
+    after: bool = False,
+    only: frozenset[str] | None = None,
+) -> bool:
+    """Whether a process that does some work died at a call of the file system, from 0.
+
+    Args:
+        at: The call.
+        work: What is done.
+        after: Whether the call is done first.
+        only: What is counted; all calls by default.
+    """
+    child = os.fork()
+    if child == 0:
+        try:
+            files.system = _Dying(at, after=after, only=only)
+            work()
+            os._exit(0)
+        finally:
+            os._exit(1)
+    code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    assert code in {0, 7}
+    return code == 7
 
 
 def _exists(name: str, folder: int | None) -> bool:

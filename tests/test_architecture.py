@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import ast
 import functools
 import json
 import re
 import subprocess
 import sys
 import tomllib
-from importlib import import_module
-from pathlib import Path
 
 import pytest
 
-from tests.imports import PACKAGES, ROOT, Import, imports_of, modules
+from tests.imports import ROOT, Import, imports_of, modules
 
 MODULES = modules()
 
@@ -157,11 +154,6 @@ WIRED_BY = {
 
 def _is(module: str, package: str) -> bool:
     return module == package or module.startswith(f"{package}.")
-
-
-def _order(name: str) -> tuple[int, str]:
-    """Constants, then classes, then the rest: the order that ruff keeps."""
-    return (0 if name.isupper() else 1 if name[:1].isupper() else 2), name
 
 
 def _places(name: str, imports: list[Import]) -> str:
@@ -328,31 +320,3 @@ def test_importing_a_module_loads_no_library(modules: str, heavy: str) -> None:
     script = f"import sys, {modules}\nprint(sorted({{*{heavy.split()}}} & {{*sys.modules}}))"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, cwd=ROOT, check=True)
     assert done.stdout == b"[]\n"
-
-
-@pytest.mark.parametrize("package", [*PACKAGES, ROOT / "benchmarks"], ids=lambda p: p.name)
-def test_every_module_says_what_it_is_for(package: Path) -> None:
-    paths = sorted(package.rglob("*.py"))
-    assert paths
-    silent = [
-        str(path.relative_to(ROOT))
-        for path in paths
-        if not ast.get_docstring(ast.parse(path.read_text(encoding="utf-8")))
-    ]
-    assert silent == []
-
-
-def test_public_names_are_sorted_and_exist() -> None:
-    lists = 0
-    for name, path in MODULES.items():
-        for node in ast.parse(path.read_text(encoding="utf-8")).body:
-            if not isinstance(node, ast.Assign):
-                continue
-            if [t.id for t in node.targets if isinstance(t, ast.Name)] != ["__all__"]:
-                continue
-            names = ast.literal_eval(node.value)
-            assert names == sorted(set(names), key=_order), f"__all__ of {name} is not sorted"
-            module = import_module(name)
-            assert [n for n in names if not hasattr(module, n)] == []
-            lists += 1
-    assert lists, "hybridlog itself has an __all__"

@@ -11,19 +11,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import pyarrow.parquet as parquet
 import pytest
-from click.shell_completion import ShellComplete
-from click.testing import CliRunner
 from mcap.writer import Writer
 
 import hybridlog as hl
-from hybridlog.cli.app import app
 from hybridlog.live import LiveOptions
-from hybridlog.query.choice import Choice
 from hybridlog.recordings import Recordings
 from hybridlog.snapshot import Snapshot
-from hybridlog.wording import listed
 from hybridlog_storage.errors import (
-    HybridlogError,
     TimeError,
     TopicError,
     UsageError,
@@ -31,6 +25,7 @@ from hybridlog_storage.errors import (
 )
 from hybridlog_storage.messages import Channel
 from tests.cli.running import run
+from tests.cli.within import Answer, answer
 from tests.test_snapshot import summary
 
 DAY = 86_400 * 10**9
@@ -79,21 +74,8 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
         yield opened
 
 
-class Called(NamedTuple):
-    code: int
-    out: str
-    err: str
-
-
-def call(store: hl.Store, *words: str, typed: str | None = None) -> Called:
-    """Run a command in this process."""
-    command, *rest = words
-    done = CliRunner().invoke(
-        app, [command, *rest, "--store", str(store.directory.path)], input=typed
-    )
-    if isinstance(done.exception, HybridlogError):
-        return Called(done.exception.exit_code, done.stdout, f"{done.stderr}{done.exception}")
-    return Called(done.exit_code, done.stdout, done.stderr)
+def call(store: hl.Store, *words: str) -> Answer:
+    return answer(*words, store=store.directory.path, code=None)
 
 
 CHOSEN: list[tuple[dict[str, Any], list[str]]] = [
@@ -199,18 +181,14 @@ def test_who_chooses_nothing_hears_why(store: hl.Store, words: tuple[str, ...], 
 
 def test_all_commands_choose_alike(store: hl.Store) -> None:
     chosen = ["--tag", "robot=7", "--with", "scan: n > 3"]
-    assert [one["name"] for one in json.loads(call(store, "ls", *chosen, "--json").out)] == [
-        "tuesday"
-    ]
-    assert [one["name"] for one in json.loads(call(store, "info", *chosen, "--json").out)] == [
-        "tuesday"
-    ]
+    assert [one["name"] for one in call(store, "ls", *chosen, "--json").json] == ["tuesday"]
+    assert [one["name"] for one in call(store, "info", *chosen, "--json").json] == ["tuesday"]
     assert call(store, "fetch", "-t", "scan", "--count", "-q", *chosen).out == "1\n"
     assert call(store, "intervals", "-t", "scan", "--count", "-q", *chosen).out == "1\n"
     assert call(store, "intervals", "scan", "--changes", "n", "--count", "-q", *chosen).out
     assert "/left/scan" in call(store, "info", "-t", "scan", *chosen).out
     assert "from 1 recording," in call(store, "info", "--losses", *chosen).err
-    rows = json.loads(call(store, "info", "--sizes", "recording", *chosen, "--json").out)["rows"]
+    rows = call(store, "info", "--sizes", "recording", *chosen, "--json").json["rows"]
     assert [row["recording"] for row in rows] == ["tuesday"]
     assert call(store, "verify", *chosen).out.startswith("1 recording,")
     assert call(store, "verify", "--repair", *chosen).out.startswith("1 recording,")
@@ -228,8 +206,8 @@ def test_the_index_of_chosen_recordings_is_made_anew(store: hl.Store) -> None:
 
 
 def test_names_of_commands_may_be_globs(store: hl.Store) -> None:
-    assert json.loads(call(store, "info", "run[1]", "--json").out)[0]["name"] == "run[1]"
-    found = json.loads(call(store, "info", "tues*", "--json").out)
+    assert call(store, "info", "run[1]", "--json").json[0]["name"] == "run[1]"
+    found = call(store, "info", "tues*", "--json").json
     assert [one["name"] for one in found] == ["tuesday"]
     assert call(store, "verify", "mon*", "-r", "run1").out.startswith("3 recordings,")
 
@@ -362,29 +340,9 @@ def test_columns_of_recordings_in_files(store: hl.Store, tmp_path: Path) -> None
 
 def test_copy_from_chooses_in_the_other_store(store: hl.Store, tmp_path: Path) -> None:
     path = tmp_path / "copy"
-    words = ["copy", "--from", str(store.directory.path), "--store", str(path), "--tag", "robot=7"]
-    done = CliRunner().invoke(app, words)
-    assert done.stdout == "copied monday 1\ncopied tuesday\n"
-    nothing = CliRunner().invoke(app, [*words[:-1], "robot=9"])
-    assert "robot=7" in str(nothing.exception)
-
-
-def test_completion_of_choices(store: hl.Store) -> None:
-    path = store.directory.path
-
-    def complete(*words: str) -> list[str]:
-        *before, last = words
-        asked = ShellComplete(app, {}, "hybridlog", "_HYBRIDLOG_COMPLETE")
-        found = asked.get_completions([before[0], "--store", str(path), *before[1:]], last)
-        return [item.value for item in found]
-
-    assert complete("ls", "--tag", "ro") == ["robot"]
-    assert complete("ls", "--tag", "robot=7") == ["robot=7"]
-    assert complete("info", "--type", "sensor_msgs/L") == [SCAN]
-    assert complete("info", "--type", "La") == ["LaserScan"]
-    assert complete("info", "--with", "/i") == ["/imu: "]
-    assert complete("info", "--with", "/imu: n") == []
-    assert complete("fetch", "-r", "tues*", "--topic", "/") == ["/left/scan", "/odd"]
+    words = ["copy", "--from", str(store.directory.path), "--tag", "robot=7"]
+    assert answer(*words, store=path).out == "copied monday 1\ncopied tuesday\n"
+    assert "robot=7" in answer(*words[:-1], "robot=9", store=path, code=None).err
 
 
 def test_a_running_recording_reaches_until_now() -> None:
@@ -405,16 +363,6 @@ def test_a_running_recording_reaches_until_now() -> None:
     assert chosen(60, 70) == {"r1", "r2"}
     assert chosen(8, 9) == {"r1", "r3"}
     assert chosen(100, 200) == set()
-
-
-def test_lists_say_how_many_they_leave_out() -> None:
-    assert listed([]) == "none"
-    assert listed("abc") == "a, b, c"
-    assert listed("abcde", 4) == "a, b, c, d, e"  # no room is won by leaving out one
-    assert listed("abcdef", 4) == "a, b, c, d and 2 more"
-    assert Choice.of() == Choice()
-    assert Choice.of().is_everything
-    assert not Choice.of(tag="x").is_everything
 
 
 def test_a_name_means_its_recording_while_others_are_recorded(tmp_path: Path) -> None:

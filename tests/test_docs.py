@@ -1015,14 +1015,6 @@ def test_a_manifest_with_any_other_byte_is_damaged(recorded: hl.Store, tmp_path:
     assert Manifest(data).id == robot.name
 
 
-def test_what_another_version_wrote_is_refused(recorded: hl.Store, tmp_path: Path) -> None:
-    copied(recorded, tmp_path / "store")
-    settings = tmp_path / "store" / "hybridlog.toml"
-    settings.write_text(settings.read_text().replace("format = 4", "format = 3"))
-    with pytest.raises(HybridlogError, match="of format 3, and"):
-        hl.open(tmp_path / "store")
-
-
 def test_the_index_is_as_specified(recorded: hl.Store) -> None:
 
     from pymongo import MongoClient

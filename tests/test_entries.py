@@ -29,7 +29,6 @@ from hybridlog.entries import (
     sealed_of,
     summary_by,
     take_inventory,
-    text,
     unlisted,
 )
 from hybridlog.maintenance.opening import StoreFiles
@@ -225,14 +224,6 @@ def test_a_whole_recording(made: Made) -> None:
     )
 
 
-def test_what_was_written_about_it_counts(made: Made) -> None:
-    made.set(name="other", tags={"who": "me"}, notes=(Note(5, "x"),))
-    entry = made.entry()
-    assert (entry.id, entry.name, entry.tags) == (made.id, "other", {"who": "me"})
-    assert [note["text"] for note in entry.notes] == ["x"]
-    check(entry)
-
-
 def test_while_it_is_written_it_is_open(made: Made) -> None:
     # Whoever holds one that has ended does something else with it.
     assert made.entry(is_open=True).status == "complete"
@@ -241,17 +232,6 @@ def test_while_it_is_written_it_is_open(made: Made) -> None:
     # One that is listed and has its old name is about to get the new one: it is not lost.
     assert (entry.status, entry.segments, lost(entry)) == ("open", 3, Counter())
     assert made.entry().status == "unfinished"
-
-
-def test_one_that_a_crash_ended(made: Made) -> None:
-    made.set(status="open")
-    made.segments[3].unlink()
-    made.drop(3)
-    entry = made.entry()
-    assert entry.status == "recovered"
-    assert made.entry(is_open=True).status == "open"
-    assert kept(entry) == by_topic(0, 1, 2)
-    assert lost(entry) == Counter()
 
 
 def test_the_end_of_a_recording_is_in_its_manifest(made: Made) -> None:
@@ -331,16 +311,6 @@ def test_one_that_lies_there_twice_under_a_number_of_its_own(made: Made) -> None
     assert (misfit.segment, misfit.file) == (7, "000007.mcap")
     assert not misfit.is_unlisted
     # Nothing is counted twice, and nothing is lost.
-    check(made.entry())
-
-
-def test_one_of_another_recording_under_a_number_of_its_own(
-    made: Made, directory: StoreDirectory
-) -> None:
-    other = Made(directory, "other", segments=5)
-    shutil.copy(other.segments[4], made.path / "000004.mcap")
-    (misfit,) = made.inventory().misfits
-    assert (misfit.segment, misfit.is_unlisted) == (4, False)
     check(made.entry())
 
 
@@ -516,11 +486,6 @@ def test_nothing_says_what_recording_it_is(directory: StoreDirectory) -> None:
             describe_now(directory, catalog, "x")
     with pytest.raises(SegmentError, match="neither a manifest nor a segment"):
         made_again(take_inventory(directory, "x"), None)
-
-
-def test_names_are_text(made: Made) -> None:
-    assert text("ä") == "ä"
-    assert text(os.fsdecode(b"a\xff")) == "a\\xff"
 
 
 # At the opening.

@@ -36,7 +36,6 @@ from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import independent, places
 from tests.calls import Calls
 from tests.cli import running
-from tests.storage.chunk_entries import chunk_entries
 from tests.waiting import wait_for
 
 pytestmark = pytest.mark.mongo("embedded")
@@ -375,16 +374,19 @@ def check_the_rest(store: hl.Store, said: Counter[Message], lost: set[tuple[int,
     (entry,) = store.select(["short"])
     topics = {c.id: c.topic for c in entry.channels}
     got: set[int] = set()
-    for chunk in chunk_entries(store.catalog, entry):
-        if (chunk.segment, chunk.number) in lost:
+    tables = {segment: store.catalog.table(entry, segment) for segment, _, _ in entry.spans}
+    for segment, number in (
+        (s, n) for s, table in tables.items() for n in range(len(table.chunks))
+    ):
+        if (segment, number) in lost:
             continue
         # Bounds that no other chunk of these topics can be needed for.
-        mine = [topics[c] for c in chunk.messages]
-        query = store.query(mine).where(
-            {"_meta.ref.chunk": chunk.number, "_meta.ref.seg": chunk.segment}
+        parts = tables[segment].chunk_parts(number)
+        query = store.query([topics[int(c)] for c in parts["channel"]]).where(
+            {"_meta.ref.chunk": number, "_meta.ref.seg": segment}
         )
         found = list(query)
-        assert len(found) == sum(chunk.messages.values())
+        assert len(found) == parts["messages"].sum()
         assert not content(found) - said
         got |= {m.seq for m in found}
     assert got

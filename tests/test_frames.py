@@ -82,27 +82,6 @@ def full(rows: int) -> Records:
     )
 
 
-def expected_rows(rows: int) -> list[dict[str, Any]]:
-    return [
-        {
-            "header.stamp": k * 10**9,
-            "header.frame_id": "imu",
-            "flag": k % 2 == 0,
-            "small": k,
-            "wait": 5 * k,
-            "cov": [0.5] * 4,
-            "ranges": [float(k)] * (k % 3),
-            "stamps": [k],
-            "names": [str(2 * k), str(2 * k + 1)],
-            "transforms": [
-                {"x": 2.0 * k, "name": str(2 * k)},
-                {"x": 2.0 * k + 1, "name": str(2 * k + 1)},
-            ],
-        }
-        for k in range(rows)
-    ]
-
-
 def nanoseconds(table: pa.Table) -> pa.Table:
     columns = []
     for column in table.columns:
@@ -121,7 +100,8 @@ def filled(rows: int) -> pa.Table:
     return table_of([block(times(), times(), full(0)), *some])
 
 
-def test_arrow_types_and_values() -> None:
+def test_types_of_columns() -> None:
+    """What the values are, the tests of every output say."""
     table = filled(5)
     table.validate(full=True)
     assert {name: str(table.schema.field(name).type) for name in table.column_names} == {
@@ -137,18 +117,10 @@ def test_arrow_types_and_values() -> None:
         "names": "list<item: string>",
         "transforms": "list<item: struct<x: double, name: string>>",
     }
-    rows = nanoseconds(table).to_pylist()
-    assert [row.pop("log_time") for row in rows] == [*range(5), *range(100, 105)]
-    assert rows == expected_rows(5) * 2
-
-
-def test_pandas_types_and_values() -> None:
     frame = frame_of(filled(5))
     assert frame.index.name == "log_time"
     assert str(frame.index.dtype) == "datetime64[ns, UTC]"
-    assert frame.index.astype("int64").tolist() == [*range(5), *range(100, 105)]
-    kinds = {name: str(kind) for name, kind in frame.dtypes.items()}
-    assert kinds == {
+    assert {name: str(kind) for name, kind in frame.dtypes.items()} == {
         "header.stamp": "datetime64[ns, UTC]",
         "header.frame_id": str(pd.Series(["a"]).dtype if pd.__version__ >= "3" else "string"),
         "flag": "bool",
@@ -157,18 +129,7 @@ def test_pandas_types_and_values() -> None:
         **dict.fromkeys(["cov", "ranges", "stamps", "names", "transforms"], "object"),
     }
     assert frame["cov"].iloc[0] is frame["cov"].iloc[-1]  # equal arrays are there once
-    assert np.stack(frame["cov"]).shape == (10, 4)
-    for row, wanted in zip(frame.to_dict("records"), expected_rows(5) * 2, strict=True):
-        assert row["header.stamp"].value == wanted["header.stamp"]
-        assert row["wait"].value == wanted["wait"]
-        assert [stamp.value for stamp in row["stamps"]] == wanted["stamps"]
-        for name in ("header.frame_id", "flag", "small", "transforms"):
-            assert row[name] == wanted[name]
-        for name in ("cov", "ranges"):
-            assert isinstance(row[name], np.ndarray)
-            assert row[name].tolist() == wanted[name]
-            assert not row[name].flags.writeable
-        assert list(row["names"]) == wanted["names"]
+    assert all(not cell.flags.writeable for name in ("cov", "ranges") for cell in frame[name])
 
 
 @settings(max_examples=60, deadline=None)

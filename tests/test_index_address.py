@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from pathlib import Path
 from types import SimpleNamespace
-from urllib.parse import unquote
 
 import psutil
 import pytest
@@ -13,7 +12,6 @@ from pymongo import MongoClient
 
 import hybridlog as hl
 from hybridlog.index.of_store import contents
-from hybridlog_storage.mongo import mongod_keeper
 from tests.cli.running import run
 from tests.faults import logs
 from tests.limits import Limit
@@ -47,13 +45,6 @@ def test_a_server_stays_while_a_client_is_connected(path: Path, limit: Limit) ->
     server.wait(30)
     with hl.open(path) as store:
         assert store.index.address() == address
-
-
-def test_a_record_of_the_kernel_tells_connections(path: Path) -> None:
-    with hl.open(path) as store:
-        socket = unquote(store.connect().address.removeprefix("mongodb://").rstrip("/"))
-        assert mongod_keeper._has_clients(socket)
-        assert not mongod_keeper._has_clients(socket + "x")
 
 
 def test_as_a_command(path: Path) -> None:

@@ -12,6 +12,7 @@ import pytest
 import hybridlog as hl
 from hybridlog.cli.open_store import _print_left
 from hybridlog_storage.catalog import CATALOG
+from tests.damage import flip
 from tests.running.methods import LABEL, rows, sent
 from tests.running.running import NO_MONGODB, Running, begun
 from tests.running.sequence import Known
@@ -97,9 +98,7 @@ def test_a_question_that_misses_tables_writes_none(
     died.entry(LABEL)
     died.mend()
     for file in (died.directory.path / "tables").rglob("*.parquet"):
-        data = bytearray(file.read_bytes())
-        data[len(data) // 2] ^= 1
-        file.write_bytes(data)
+        flip(file, 1 / 2)
     died.refresh()
     before = files_in(died)
     where = died.topic("arm").where("n > 3")

@@ -34,7 +34,6 @@ from hypothesis.stateful import (
     rule,
     run_state_machine_as_test,
 )
-from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 from rosbags.interfaces import ConnectionExtRosbag1
 from rosbags.rosbag1 import Writer as BagWriter
@@ -596,14 +595,6 @@ class Machine(RuleBasedStateMachine):
         self.changed = True
 
     # What happens to directories and files.
-
-    def messages_in(self, recording: str, path: Path) -> bool:
-        """Whether there are messages in a segment, by its own summary."""
-        with path.open("rb") as file:
-            summary = make_reader(file).get_summary()
-        assert summary is not None
-        assert summary.statistics is not None
-        return summary.statistics.message_count > 0
 
     @precondition(lambda self: self.model)
     @rule(which=st.integers(0, 9), segment=st.integers(0, 9), reopened=st.booleans())

@@ -12,7 +12,6 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-from mcap.writer import Writer
 from PIL import Image
 
 import hybridlog as hl
@@ -20,6 +19,7 @@ from hybridlog.drawing.notebook import message_html, recordings_html, shown
 from hybridlog.drawing.pixels import SIDE
 from hybridlog.message import Message
 from hybridlog_storage.errors import TopicError
+from hybridlog_storage.messages import Channel, Schema
 from tests.limits import Limit
 from tests.test_snapshot import summary
 
@@ -62,27 +62,22 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
     Image.fromarray(np.full((300, 400, 3), (200, 10, 10), np.uint8)).save(picture, "PNG")
     colours = np.zeros((300, 400, 3), np.uint8)
     colours[:, :, 0] = 255  # blue, as OpenCV has it
-    with (path / "log.mcap").open("wb") as file:
-        writer = Writer(file)
-        writer.start(profile="ros1")
-        odd = {HOSTILE: HOSTILE, "nested": {"list": list(range(100))}, "long": "x" * 1000}
-        many = {f"f{n}": n for n in range(50)}
-        raw = writer.register_schema("sensor_msgs/Image", "ros1msg", IMAGE)
-        packed = writer.register_schema("sensor_msgs/CompressedImage", "ros1msg", COMPRESSED)
-        data = HEADER + text("png") + struct.pack("<I", picture.getbuffer().nbytes)
-        for topic, encoding, schema, payload in (
-            (f"/{HOSTILE}", "json", 0, json.dumps(odd).encode()),
-            ("/many", "json", 0, json.dumps(many).encode()),
-            ("/image", "ros1", raw, image("bgr8", colours)),
-            ("/wrong", "ros1", raw, image("bgr8", colours)[:-5]),
-            ("/unknown", "ros1", raw, image("hsv99", colours)),
-            ("/packed", "ros1", packed, data + picture.getvalue()),
-        ):
-            channel = writer.register_channel(topic, encoding, schema)
-            writer.add_message(channel, 10**18, payload, 10**18)
-        writer.finish()
+    odd = {HOSTILE: HOSTILE, "nested": {"list": list(range(100))}, "long": "x" * 1000}
+    many = {f"f{n}": n for n in range(50)}
+    raw = Schema("sensor_msgs/Image", "ros1msg", IMAGE)
+    packed = Schema("sensor_msgs/CompressedImage", "ros1msg", COMPRESSED)
+    data = HEADER + text("png") + struct.pack("<I", picture.getbuffer().nbytes)
     with hl.open(path / "store", create=True) as opened:
-        opened.record(path / "log.mcap", name=HOSTILE, tags={HOSTILE: HOSTILE})
+        with opened.start(HOSTILE, tags={HOSTILE: HOSTILE}) as recording:
+            for channel, payload in (
+                (Channel(f"/{HOSTILE}", "json", None), json.dumps(odd).encode()),
+                (Channel("/many", "json", None), json.dumps(many).encode()),
+                (Channel("/image", "ros1", raw), image("bgr8", colours)),
+                (Channel("/wrong", "ros1", raw), image("bgr8", colours)[:-5]),
+                (Channel("/unknown", "ros1", raw), image("hsv99", colours)),
+                (Channel("/packed", "ros1", packed), data + picture.getvalue()),
+            ):
+                recording.write(channel, payload, log_time=10**18)
         yield opened
 
 

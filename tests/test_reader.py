@@ -5,20 +5,15 @@ from __future__ import annotations
 import dataclasses
 import gc
 import json
-import os
-import shutil
-import subprocess
-import sys
-import threading
 import tracemalloc
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from mcap.writer import CompressionType, Writer
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
@@ -37,7 +32,7 @@ from hybridlog_storage.messages import Channel, Schema
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.data import DATA
 from tests.indexed import documents_of
-from tests.other_user import User, open_place
+from tests.waiting import at_once
 
 pytestmark = pytest.mark.mongo
 
@@ -181,18 +176,15 @@ def test_a_predicate_reads_only_chunks_with_an_answer(store: hl.Store, robot: Tr
     assert query.counters.documents_read == 0
 
 
-def test_no_message_reads_no_chunk(store: hl.Store) -> None:
-    query = store.topic("/odom").limit(0)
-    assert list(query) == []
-    assert query.counters.chunks_read == 0
-
-
-def test_one_message_reads_one_chunk(store: hl.Store, robot: Truth) -> None:
+def test_a_limit_bounds_what_is_read(store: hl.Store, robot: Truth) -> None:
     query = store.topic("/camera/front/image_raw").limit(1)
     (message,) = query
     assert message.raw == robot["/camera/front/image_raw"][0].raw
     assert query.counters.messages == 1
     assert query.counters.chunks_read <= 4
+    query = query.limit(0)
+    assert list(query) == []
+    assert query.counters.chunks_read == 0
 
 
 # What it answers.
@@ -207,16 +199,6 @@ def test_a_table_without_rows_has_all_columns(store: hl.Store) -> None:
     assert query.to_arrow().column_names == whole
     assert list(query.to_pandas().columns) == whole[1:]
     assert list(query) == []
-
-
-def test_messages_decode_as_they_were(store: hl.Store, robot: Truth) -> None:
-    types = get_typestore(Stores.ROS1_NOETIC)
-    for topic in ("/imu/data", "/diagnostics", "/lidar/points"):
-        for got, want in zip(store.topic(topic).in_recording("robot"), robot[topic], strict=True):
-            name = got.type.replace("/", "/msg/")
-            assert types.serialize_ros1(got.decode(), name) == want.raw
-            assert (got.log_time_ns, got.publish_time_ns) == (want.log_time, None)
-            assert topic in repr(got)
 
 
 def test_fields_of_a_message_are_its_document(store: hl.Store) -> None:
@@ -235,28 +217,14 @@ def test_fields_of_a_message_are_its_document(store: hl.Store) -> None:
 # Which messages.
 
 
-def write_json(
-    path: Path, messages: Sequence[tuple[str, int, object]], metadata: dict[str, str] | None = None
-) -> None:
-    with path.open("wb") as file:
-        writer = Writer(file, compression=CompressionType.NONE)
-        writer.start()
-        channels: dict[str, int] = {}
-        for topic, time, value in messages:
-            if topic not in channels:
-                channels[topic] = writer.register_channel(topic, "json", 0, metadata or {})
-            writer.add_message(channels[topic], time, json.dumps(value).encode(), time)
-        writer.finish()  # type: ignore[no-untyped-call]
-
-
 def test_a_range_that_is_empty_in_some_recordings(tmp_path: Path) -> None:
     """`2025-01-01` to `end` leaves out what was recorded before, and is no mistake."""
     first, later = 1_600_000_000 * SECOND, 1_700_000_000 * SECOND
-    for name, epoch in (("first", first), ("later", later)):
-        write_json(tmp_path / f"{name}.mcap", [("/x", epoch + SECOND * t, {}) for t in range(5)])
-    with hl.open(tmp_path / "store", create=True, require_database=True) as store:
-        for name in ("first", "later"):
-            store.record(tmp_path / f"{name}.mcap")
+    with hl.open(tmp_path / "store", create=True, mongo="none") as store:
+        for name, epoch in (("first", first), ("later", later)):
+            with store.start(name) as recording:
+                for t in range(5):
+                    recording.write(Channel("/x", "json", None), b"{}", log_time=epoch + SECOND * t)
         query = store.topic("/x")
         for begin, end, want in (
             (1_650_000_000 * SECOND, "end", [later + SECOND * t for t in range(5)]),
@@ -265,11 +233,9 @@ def test_a_range_that_is_empty_in_some_recordings(tmp_path: Path) -> None:
         ):
             asked = query.between(begin, end)
             assert [m.log_time_ns for m in asked] == want
-            assert asked.count() == len(want)
-            assert len(asked.to_pandas()) == len(want)
+            assert asked.count() == len(asked.to_pandas()) == len(want)
         for begin, end, words in (
             ("2030-01-01", "end", "first spans .*; later spans"),
-            ("start", "1999-01-01", "first spans .*; later spans"),
             ("2030-01-01", "2029-01-01", "empty"),
             ("-1s", "+1s", "empty"),
             (1_650_000_000, 1_650_000_001, "later spans"),
@@ -305,15 +271,8 @@ def test_a_range_that_is_empty_in_some_recordings(tmp_path: Path) -> None:
         (lambda s: s.topic("/odom").where("header.seq >"), WhereError, "header.seq"),
         (lambda s: s.topic("/odom").where("nothing > 1"), HybridlogError, "nothing"),
         (lambda s: s.topic("/odom").where({"$where": "1"}), WhereError, "where"),
-        (lambda s: list(s.topic("/odom").between("+2s", "+1s")), TimeError, "empty"),
         (lambda s: list(s.topic("/odom").between("x", None)), TimeError, "x"),
-        (lambda s: list(s.topic("/odom").between("1999-01-01", "1999-01-02")), TimeError, "spans"),
         (lambda s: s.topic("/odom").between("+1h", "+2h").count(), TimeError, "spans"),
-        (
-            lambda s: s.topic("/odom").between("1999-01-01", "2000-01-01").to_pandas(),
-            TimeError,
-            "spans",
-        ),
         (
             lambda s: list(s.topic("/cmd_vel").clock("header").between("+1s", "+2s")),
             TopicError,
@@ -334,14 +293,9 @@ def test_wrong_questions(
 
 
 def test_a_topic_without_a_definition_makes_no_table(tmp_path: Path) -> None:
-    with (tmp_path / "x.mcap").open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        channel = writer.register_channel("/raw", "something", 0)
-        writer.add_message(channel, 5, b"abc", 5)
-        writer.finish()  # type: ignore[no-untyped-call]
-    with hl.open(tmp_path / "store", create=True, require_database=True) as store:
-        store.record(tmp_path / "x.mcap")
+    with hl.open(tmp_path / "store", create=True, mongo="none") as store:
+        with store.start("x") as recording:
+            recording.write(Channel("/raw", "something", None), b"abc", log_time=5)
         query = store.topic("/raw")
         with pytest.raises(DefinitionError, match="/raw"):
             query.to_pandas()
@@ -349,49 +303,6 @@ def test_a_topic_without_a_definition_makes_no_table(tmp_path: Path) -> None:
         assert (message.raw, message.fields, message.type) == (b"abc", {}, "")
         with pytest.raises(DefinitionError):
             message.decode()
-
-
-# Without leave to write.
-
-
-AS_A_READER = """
-import sys
-import hybridlog as hl
-from hybridlog_storage.errors import HybridlogError
-
-store, log = sys.argv[1:]
-with hl.open(store) as opened:
-    assert opened.database is None
-    query = opened.topic("/odom").in_recording("robot")
-    print(query.count(), sum(len(m.raw) for m in query))
-    try:
-        opened.record(log, again=True)
-    except HybridlogError:
-        print("refused")
-"""
-
-
-def test_a_store_that_cannot_be_written_can_be_read(
-    base: Path, store: hl.Store, robot: Truth
-) -> None:
-    with open_place() as place:
-        shutil.copytree(base / "store", place / "store", ignore=shutil.ignore_patterns("mongod"))
-        shutil.copy(base / "robot.bag", place)
-        for path in [place, *place.rglob("*")]:
-            path.chmod(0o555 if path.is_dir() else 0o444)
-        arguments = ["-c", AS_A_READER, str(place / "store"), str(place / "robot.bag")]
-        try:
-            if os.geteuid() == 0:  # root is stopped by no permission, so another user asks
-                place.chmod(0o755)
-                out = User(place).python(*arguments).out
-            else:
-                command = [sys.executable, *arguments]
-                out = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-        finally:
-            for path in [place, *place.rglob("*")]:
-                path.chmod(0o755)
-    size = sum(len(m.raw) for m in robot["/odom"])
-    assert out.split() == [str(len(robot["/odom"])), str(size), "refused"]
 
 
 # Memory and threads.
@@ -416,25 +327,15 @@ def test_memory_is_bounded_by_chunks_not_by_the_store(tmp_path: Path) -> None:
 
 
 def test_several_threads_share_a_store(store: hl.Store, robot: Truth) -> None:
-    topics = ["/odom", "/base/scan", "/imu/data", "/camera/front/image_raw"]
-    problems: list[object] = []
-
     def ask(topic: str) -> None:
-        try:
-            for _ in range(3):
-                query = store.topic(topic).in_recording("robot")
-                assert [m.raw for m in query] == [m.raw for m in robot[topic]]
-                assert query.where("header.seq >= 0").count() == len(robot[topic])
-                assert len(query.to_pandas()) == len(robot[topic])
-        except BaseException as error:
-            problems.append(error)
+        for _ in range(3):
+            query = store.topic(topic).in_recording("robot")
+            assert [m.raw for m in query] == [m.raw for m in robot[topic]]
+            assert query.where("header.seq >= 0").count() == len(robot[topic])
+            assert len(query.to_pandas()) == len(robot[topic])
 
-    threads = [threading.Thread(target=ask, args=(topic,)) for topic in topics]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert problems == []
+    topics = ["/odom", "/base/scan", "/imu/data", "/camera/front/image_raw"]
+    at_once(*(partial(ask, topic) for topic in topics))
 
 
 def test_an_answer_survives_its_store(base: Path, store: hl.Store, robot: Truth) -> None:
@@ -447,21 +348,15 @@ def test_an_answer_survives_its_store(base: Path, store: hl.Store, robot: Truth)
 
 def test_tables_in_parts_are_one_table_in_order(tmp_path: Path) -> None:
     """Parts of bounded size end between messages, on every topic at the same time."""
-    types = get_typestore(Stores.ROS2_HUMBLE)
     count = 75_000
-    with (tmp_path / "many.mcap").open("wb") as file:
-        writer = Writer(file, compression=CompressionType.NONE)
-        writer.start("ros2")
-        definition, _ = types.generate_msgdef("std_msgs/msg/Int32", ros_version=2)
-        schema = writer.register_schema("std_msgs/msg/Int32", "ros2msg", definition.encode())
-        channels = [writer.register_channel(topic, "cdr", schema) for topic in ("/x", "/y")]
-        for number in range(count):
-            for channel in channels:
-                payload = b"\0\1\0\0" + number.to_bytes(4, "little")
-                writer.add_message(channel, SECOND + number, payload, SECOND + number)
-        writer.finish()  # type: ignore[no-untyped-call]
-    with hl.open(tmp_path / "store", create=True, require_database=True) as store:
-        store.record(tmp_path / "many.mcap", settings=SegmentSettings(chunk_size=1 << 20))
+    number_type = Schema("std_msgs/Int32", "ros1msg", b"int32 data\n")
+    channels = [Channel(topic, "ros1", number_type) for topic in ("/x", "/y")]
+    settings = SegmentSettings(chunk_size=1 << 20)
+    with hl.open(tmp_path / "store", create=True, mongo="none") as store:
+        with store.start("many", settings=settings) as recording:
+            for number in range(count):
+                for channel in channels:
+                    recording.write(channel, number.to_bytes(4, "little"), log_time=number)
         for query in (store.topic("/x", "/y"), store.topic("/x", "/y").reverse()):
             parts = list(query.to_tables())
             assert len(parts) > 1

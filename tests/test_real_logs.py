@@ -10,6 +10,7 @@ from pathlib import Path
 
 import bson
 import pytest
+from bson.raw_bson import DEFAULT_RAW_BSON_OPTIONS
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
@@ -157,24 +158,15 @@ def dump(store: hl.Store) -> dict[str, list[bytes]]:
     assert store.database is not None
     found = {
         name: sorted(
-            document
+            document.raw
             for raw in store.database.each([(name, {})], lambda _: {"$match": {}})
-            for document in split_documents(raw)
+            for document in bson.decode_iter(raw, DEFAULT_RAW_BSON_OPTIONS)
         )
         for name in store.database.list_collections()
     }
     for name in ("hybridlog.recordings", "hybridlog.store"):
         documents = [bson.decode(document) for document in found[name]]
         found[name] = [bson.encode({**d, "made": ""}) for d in documents]
-    return found
-
-
-def split_documents(raw: bytes) -> list[bytes]:
-    found, at = [], 0
-    while at < len(raw):
-        size = int.from_bytes(raw[at : at + 4], "little")
-        found.append(raw[at : at + size])
-        at += size
     return found
 
 

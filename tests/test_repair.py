@@ -17,9 +17,9 @@ from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import places
 from tests.cli.within import answer
+from tests.damage import flip
+from tests.running.running import NO_MONGODB as NOWHERE
 from tests.test_identity import COUNT, make_log, payload
-
-NOWHERE = "mongodb://127.0.0.1:9/x?serverSelectionTimeoutMS=50&connectTimeoutMS=50"
 
 
 @pytest.fixture(scope="module")
@@ -74,9 +74,7 @@ def test_a_store_that_is_whole(store: Path) -> None:
 
 
 def flip_the_summary(store: Path) -> None:
-    data = bytearray(file(store, 1).read_bytes())
-    data[-60] ^= 4
-    file(store, 1).write_bytes(data)
+    flip(file(store, 1), -60)
 
 
 def cut_the_summary(store: Path) -> None:
@@ -108,31 +106,25 @@ def test_a_damaged_summary_names_its_cure(store: Path) -> None:
     assert said.count("no readable summary") == said.count("run `hybridlog verify") == 1
 
 
-def test_a_segment_whose_messages_are_damaged_stays_as_it_is(store: Path) -> None:
-    data = bytearray(file(store, 1).read_bytes())
-    data[400] ^= 4
-    data[-60] ^= 4
-    file(store, 1).write_bytes(data)
+@pytest.mark.parametrize("harmed", [(1400,), (400, -60)])
+def test_a_segment_whose_messages_are_damaged_stays_as_it_is(
+    store: Path, harmed: tuple[int, ...]
+) -> None:
+    """Only a copy mends it, whether its summary is whole or not."""
+    flip(file(store, 1), *harmed, bits=4)
+    data = file(store, 1).read_bytes()
     mended, left = repair(store)
     assert not mended
     assert {(one, place.partition(" ")[0]) for one, place in left} == {("one", "000001.mcap")}
     assert file(store, 1).read_bytes() == data
     assert not list(file(store, 1).parent.glob(".*"))
-    status, messages, lost = look(store)
-    assert (status, messages + lost) == ("damaged", COUNT)
-
-
-def test_damage_that_only_a_copy_mends_is_said(store: Path) -> None:
-    data = bytearray(file(store, 1).read_bytes())
-    data[1400] ^= 4
-    file(store, 1).write_bytes(data)
-    mended, (where,) = repair(store)
-    assert where[0] == "one"
-    assert where[1].startswith("000001.mcap byte ")
-    assert not mended
+    if -60 in harmed:
+        status, messages, lost = look(store)
+        assert (status, messages + lost) == ("damaged", COUNT)
+        return
     with closing(hl.open(store, mongo=NOWHERE)) as opened:
         (finding,) = opened.verify().findings
-        assert (finding.recording, finding.place) == where
+        assert {(finding.recording, finding.place)} == left
         assert finding.cure == RESTORE
 
 
@@ -196,9 +188,7 @@ def test_a_manifest_that_is_made_again_takes_no_name_of_another(store: Path) -> 
 @pytest.mark.mongo("embedded")
 def test_a_segment_that_was_restored_is_answered_from_again(store: Path) -> None:
     whole = file(store, 1).read_bytes()
-    data = bytearray(whole)
-    data[600] ^= 4
-    file(store, 1).write_bytes(data)
+    flip(file(store, 1), 600)
     with hl.open(store) as opened:
         opened.index.rebuild()
         entry = opened.entry("one")

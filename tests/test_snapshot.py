@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
-from mcap.writer import Writer
 
 import hybridlog as hl
 from hybridlog.maintenance.opening import StoreFiles
@@ -169,16 +168,10 @@ def overlapping(tmp_path_factory: pytest.TempPathFactory) -> Any:
             begin = 10**9 + number * 10_000 + dice.choice([0, 0, -15_000, 9_000])
             length = 45_000 if number == 4 else 8_000
             own = sorted(begin + dice.randrange(length) for _ in range(30))
-            log = path / f"{number}.mcap"
-            with log.open("wb") as file:
-                writer = Writer(file)
-                writer.start()
-                schema = writer.register_schema("n", "jsonschema", b"{}")
-                channel = writer.register_channel("/n", "json", schema)
+            with store.start(str(number)) as recording:
                 for n, time in enumerate(own):
-                    writer.add_message(channel, time, json.dumps({"n": n}).encode(), time)
-                writer.finish()
-            times[store.record(log).entry.id] = own
+                    recording.write(Channel("/n", "json", None), b'{"n": %d}' % n, log_time=time)
+            times[recording.id] = own
         yield store, times
 
 
@@ -212,20 +205,6 @@ def test_messages_are_in_order_however_recordings_are_grouped(
     assert seen(query.where("n >= 20")) == late
     moment = wanted[77][0]
     assert store.topic("/n").at(moment).log_time_ns == moment
-
-
-def test_a_manifest_that_has_changed_is_read_at_the_opening(tmp_path: Path) -> None:
-    """As by a process that was killed before it told the catalog."""
-    with hl.open(tmp_path / "store", create=True) as store:
-        with store.start("talk") as recording:
-            recording.write(Channel("/n", "json", None), b"{}")
-        path = places.folder(store.directory.path, "talk")
-        (before,) = store.summaries()
-    assert before.tags == {}
-    places.change_in(path, lambda now: replace(now, tags={"place": "hall"}))
-    with hl.open(tmp_path / "store") as store:
-        (now,) = store.summaries()
-    assert now.tags == {"place": "hall"}
 
 
 def test_a_store_without_a_catalog_is_listed_by_its_manifests(tmp_path: Path, calls: Calls) -> None:

@@ -24,7 +24,6 @@ from hybridlog.query import periods
 from hybridlog.query.answers.statistics import _Running
 from hybridlog_storage.errors import TimeError, TopicError, UsageError
 from hybridlog_storage.messages import Channel
-from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.calls import Calls
 from tests.cli.within import answer as run
 from tests.limits import Limit
@@ -116,21 +115,6 @@ def test_gaps(
         want += [(a, b) for a, b in pairwise([low, *times, high]) if b - a > limit]
     assert [(gap.begin_ns, gap.end_ns) for gap in found] == sorted(want)
     assert query.counters.chunks_read == 0
-
-
-def test_times_of_a_rare_topic_cost_no_payloads(tmp_path: Path) -> None:
-    """Its messages lie in chunks full of others': these are not read for times."""
-    settings = SegmentSettings(chunk_size=4096)
-    with hl.open(tmp_path / "store", create=True) as store:
-        with store.start("a", settings=settings) as recording:
-            for n in range(600):
-                topic = "/rare" if n % 20 == 0 else "/loud"
-                recording.write(Channel(topic, "json", None), b'"%0400d"' % n, log_time=BASE + n)
-        query = store.topic("rare")
-        assert sum(row["messages"] for row in query.rate("10ns").to_pylist()) == 30
-        assert query.counters.chunks_read == 0
-
-        assert len(store.topic("loud").gaps(periods=1.5)) == 29
 
 
 def test_of_very_many_steps_a_share_tells_the_usual_one(calls: Calls, limit: Limit) -> None:

@@ -251,10 +251,6 @@ def test_only_times_are_read_before_a_set_is_asked_for(logs: Logs) -> None:
         synced[len(synced)]
 
 
-def numbers(synced: Synced, place: int) -> list[int]:
-    return [int(message.decode().header.seq) for message in synced[place]]
-
-
 def collated(sets: list[tuple[hl.Message, ...]]) -> np.ndarray:
     """What a `collate_fn` makes of the sets of a batch."""
     return np.array([[m.decode().header.seq for m in messages] for messages in sets])

@@ -35,13 +35,7 @@ def test_topics_are_arguments_or_options(store: Path) -> None:
     for command in ABOUT_TOPICS:
         assert command in GROUPS["Ask"]
         more = ("--to", "scan") if command == "align" else ()
-        assert "Missing TOPIC" in str(_error(command, *more, store=store))
-
-
-def _error(*words: object, store: Path) -> str:
-    with pytest.raises(AssertionError) as caught:
-        answer(*words, store=store)
-    return str(caught.value)
+        assert "Missing TOPIC" in answer(command, *more, store=store, code=2).err
 
 
 @pytest.mark.parametrize(
@@ -66,11 +60,14 @@ def test_rows_have_all_forms(words: tuple[str, ...], store: Path, tmp_path: Path
     assert len(lines) == 1
     assert _set(json.loads(lines[0])) == _set(rows[0])
     assert len(answer(*words, "-n", "1", "--json", store=store, code=code).json) == 1
-    both = _error(*words, "--json", "-F", "csv", store=store)
+    both = answer(*words, "--json", "-F", "csv", store=store, code=2).err
     assert "--format and --json exclude each other" in both
     # Rows without a place are not offered the formats of places.
     assert "tum" not in answer(words[0], "--help", store=store).out
-    assert "does not give the format" in _error(*words, "-o", tmp_path / "a.tum", store=store)
+    assert (
+        "does not give the format"
+        in answer(*words, "-o", tmp_path / "a.tum", store=store, code=2).err
+    )
 
 
 def _set(row: dict[str, object]) -> dict[str, object]:
@@ -100,8 +97,11 @@ def test_ages_choose(tmp_path: Path) -> None:
     assert answer("fetch", "n", "--last", "30d", "--count", store=tmp_path / "s").out == "3\n"
     assert answer("stats", "n", "--last", "30d", "--json", store=tmp_path / "s").json[0]["max"] == 2
     for other in ("--between", "--during"):
-        assert f"--last and {other} exclude each other" in _error(
-            "fetch", "n", "--last", "30d", other, "start", "end", store=tmp_path / "s"
+        assert (
+            f"--last and {other} exclude each other"
+            in answer(
+                "fetch", "n", "--last", "30d", other, "start", "end", store=tmp_path / "s", code=2
+            ).err
         )
 
 
@@ -110,7 +110,7 @@ def test_what_needs_another_option(store: Path) -> None:
         (("keep", "--pin", "-r", "*", "--before", "1s"), "--before is for --at or --when"),
         (("record", "a.bag", "--settle", "3s"), "--settle is for --watch"),
     ):
-        assert said in _error(*words, store=store)
+        assert said in answer(*words, store=store, code=2).err
 
 
 def test_what_people_read(store: Path, tmp_path: Path) -> None:

@@ -174,7 +174,9 @@ def test_completion(store: Path) -> None:
     assert complete(f"mark x --store {store} -r r") == []  # nothing is recorded now
     assert "--between" in complete("fetch --be")
     assert complete(f"ls --store {store} --tag p") == ["place"]
+    assert complete(f"ls --store {store} --tag place=") == ["place=lab"]
     assert complete(f"ls --store {store} --type Laser") == ["LaserScan"]
+    assert complete(f"info --store {store} --with /imu") == ["/imu/data: "]
     assert complete(f"tf --store {store} -r robot base_l") == ["base_laser_link", "base_link"]
     assert complete(f"fetch --store {store} -r robot scan --in-frame o") == ["odom"]
     assert complete(f"align --store {store} --to odom scan --fields sc") == ["scan: "]

@@ -23,7 +23,6 @@ from tests.waiting import wait_for
 
 from .running import (
     BACKGROUND,
-    COMMAND,
     environment,
     open_bytes,
     run,
@@ -250,50 +249,6 @@ def test_a_directory_of_tables_is_complete_or_absent(store: Path, tmp_path: Path
     ended = stop_at("return Whole.__enter__", *command, store=store)
     assert ended.returncode == 130, ended.stderr
     assert [*tmp_path.iterdir()] == []
-
-
-def limited(kilobytes: int) -> tuple[str, ...]:
-    """Files of this process cannot become larger."""
-    return ("sh", "-c", f'ulimit -f {kilobytes * 2}; exec "$@"', "sh")
-
-
-def run_limited(kilobytes: int, *arguments: object) -> tuple[int, str]:
-    ended = subprocess.run(
-        [*limited(kilobytes), *COMMAND, *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        # Or Python would cut short what it compiles.
-        env=environment(PYTHONDONTWRITEBYTECODE="1"),
-        check=False,
-    )
-    assert "Traceback" not in ended.stderr
-    return ended.returncode, ended.stderr
-
-
-def test_no_space(logs: Path, fresh: Path, tmp_path: Path) -> None:
-    code, text = run_limited(400, "record", logs / "robot.bag", "--store", fresh)
-    assert code == 7
-    assert "No space left" in text
-    assert places.names(fresh) == ["small"]
-    assert [r["name"] for r in run("ls", "--json", store=fresh).json] == ["small"]
-    out = tmp_path / "out"
-    out.mkdir()
-    for form in ("mcap", "bag", "csv", "npz"):
-        code, text = run_limited(
-            *(
-                20,
-                "fetch",
-                "-t",
-                "scan",
-                "-t",
-                "imu/data",
-                "--store",
-                fresh,
-                "-o",
-                out / f"x.{form}",
-            )
-        )
-        assert (code, list(out.iterdir())) == (7, []), (form, text)
 
 
 @pytest.fixture

@@ -33,22 +33,11 @@ from hybridlog.cli import main
 main()
 """
 COMMANDS = {
-    "ls": ["ls"],
-    "info": ["info", "robot"],
-    "losses": ["info", "--losses", "--json"],
     "sql": ["sql", "select avg(ranges[1]) from scan where ranges_summary.min < 1"],
-    "schema": ["info", "-t", "/imu/data"],
-    "count": ["fetch", "-t", "/imu/data", "--count"],
-    "count in a range": ["fetch", "-t", "/imu/data", "--between", "+1s", "+2500ms", "--count"],
-    "raw": ["fetch", "-t", "/imu/data", "--between", "+1s", "+2s", "-F", "raw"],
-    "mcap": ["fetch", "-t", "/imu/data", "--between", "+1s", "+2s", "-F", "mcap"],
     "bag": ["fetch", "-t", "/imu/data", "--between", "+1s", "+2s", "-F", "bag"],
     "jsonl": ["fetch", "-t", "/imu/data", "--between", "+1s", "+2s", "-F", "jsonl"],
     "csv": ["fetch", "-t", "/imu/data", "--between", "+1s", "+2s", "-F", "csv"],
     "parquet": ["fetch", "-t", "/imu/data", "--between", "+1s", "+2s", "-F", "parquet"],
-    "the last ones": ["fetch", "-t", "/imu/data", "--reverse", "--limit", "3", "-F", "jsonl"],
-    "every tenth": ["fetch", "-t", "/imu/data", "--every", "10", "-F", "jsonl"],
-    "at a time": ["fetch", "-t", "/base/scan", "--at", "+2s", "-F", "jsonl"],
     "by header stamps": ["fetch", "-t", "/imu/data", "--clock", "header",
                          "--between", "+1s", "+2s", "-F", "raw"],
 }  # fmt: skip

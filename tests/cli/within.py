@@ -33,6 +33,8 @@ class Answer(NamedTuple):
 def answer(*arguments: object, store: Path, code: int | None = 0) -> Answer:
     """Run a command to its end; much faster than `run`, which starts a process.
 
+    The message of an error ends what was said on standard error.
+
     Args:
         arguments: Of the command.
         store: What HYBRIDLOG_STORE says.
@@ -45,4 +47,5 @@ def answer(*arguments: object, store: Path, code: int | None = 0) -> Answer:
         raise error
     found = done.exit_code if error is None else error.exit_code
     assert code in {None, found}, (error, done.output)
-    return Answer(done.stdout, done.stderr, found)
+    said = error.format_message() if isinstance(error, ClickException) else str(error or "")
+    return Answer(done.stdout, done.stderr + said, found, done.stdout_bytes)

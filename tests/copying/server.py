@@ -74,7 +74,6 @@ class Sshd:
         port: That of the relay.
         ssh: The program that reaches it, with options.
         left: Bytes from the client until the connections are cut; None for no cut.
-        passed: Bytes from the client so far.
     """
 
     def __init__(self, folder: Path, kind: str) -> None:
@@ -93,7 +92,6 @@ class Sshd:
             "-o UserKnownHostsFile=/dev/null"
         )
         self.left: int | None = None
-        self.passed = 0
         self._listening = socket.create_server(("127.0.0.1", 0))
         self.port = self._listening.getsockname()[1]
         threading.Thread(target=self._serve, daemon=True).start()
@@ -102,7 +100,7 @@ class Sshd:
         return f"ssh://127.0.0.1:{self.port}{path}"
 
     def reset(self) -> None:
-        self.left, self.passed = None, 0
+        self.left = None
 
     def close(self) -> None:
         self._listening.close()
@@ -131,7 +129,6 @@ class Sshd:
             if one is server:
                 client.sendall(data)
                 continue
-            self.passed += len(data)
             if self.left is not None:
                 data, self.left = data[: self.left], self.left - len(data[: self.left])
             server.sendall(data)

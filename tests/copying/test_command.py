@@ -37,7 +37,6 @@ def test_copies_to_a_directory(
     assert again.json["bytes_copied"] == 0
     assert answers(tmp_path / "lab", "noted") == answers(robots, "noted")
     for wrong, cure in {
-        "ssh://": "Write ssh://user@host/path",
         "ssh://-oProxyCommand=x/y": "Write ssh://user@host/path",
         "ssh://a:b@c/d": "has no password",
         **dict.fromkeys(

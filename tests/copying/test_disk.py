@@ -8,6 +8,7 @@ import random
 import shutil
 from collections.abc import Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -27,8 +28,7 @@ from hybridlog_storage.manifest import encode, replace
 from tests.calls import Calls
 from tests.copying.by_hand import RECORDING, Makes, Store, recording, without_payloads
 from tests.copying.test_any_place import as_of, edited
-from tests.manifests.test_disk import Dying
-from tests.power import each_cut
+from tests.power import dies, each_cut
 
 SMALL = recording(3)
 PART = f".{SMALL.files[0].digest[:32]}.part"
@@ -70,17 +70,7 @@ def test_killed_at_each_system_call(
     while went_on:
         place = tmp_path / f"{at}"
         shutil.copytree(target.folder, place)
-        child = os.fork()
-        if child == 0:
-            try:
-                files.system = Dying(at, after=after)
-                copies(source, place)
-                os._exit(0)
-            finally:
-                os._exit(1)
-        code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-        assert code in {0, 7}
-        went_on = code == 7
+        went_on = dies(at, partial(copies, source, place), after=after)
         if has_some and went_on:
             Store(Directory(place), place, None).check()
         else:

@@ -17,13 +17,7 @@ from tests import places
 from tests.cli.within import answer
 from tests.copying.conftest import STATES, all_answers, answers, expire, files_in
 from tests.copying.server import Sshd
-
-
-def _flip_a_bit(path: Path) -> None:
-    data = bytearray(path.read_bytes())
-    data[len(data) // 3] ^= 1
-    path.write_bytes(data)
-
+from tests.damage import flip
 
 To = Callable[[Path], dict[str, Any]]
 """Where a copy goes, and by what program, for the path of a store."""
@@ -86,8 +80,8 @@ def test_damaged_recordings_are_refused_and_others_are_copied(
 ) -> None:
     source = tmp_path / "damaged"
     shutil.copytree(robots, source)
-    _flip_a_bit(places.segment(source, "recorded", 1))
-    _flip_a_bit(next(places.folder(source, "expired").glob("*.rows.parquet")))
+    flip(places.segment(source, "recorded", 1), 1 / 3)
+    flip(next(places.folder(source, "expired").glob("*.rows.parquet")), 1 / 3)
     places.segment(source, "noted").unlink()
     for name in ("secret", "000000.mcap.old", "000077.rows.parquet"):
         (places.folder(source, "calm") / name).write_bytes(b"not listed")
@@ -108,7 +102,7 @@ def test_payloads_expire_here_when_they_are_proved_there(robots: Path, tmp_path:
     right = {label: answers(robot, label) for label in STATES}
     with hl.open(robot, mongo="none") as store:
         store.copy(lab, ["calm"])
-        _flip_a_bit(places.segment(lab, "calm"))
+        flip(places.segment(lab, "calm"), 1 / 3)
         report = store.copy(lab, None, CopyOptions(then_expire=True))
         assert report.problems == []
         assert report.freed_bytes
@@ -189,13 +183,13 @@ def test_damaged_copies_are_mended(robots: Path, tmp_path: Path, to: To) -> None
     robot, lab = tmp_path / "robot", tmp_path / "lab"
     shutil.copytree(robots, robot)
     copied(robot, to(lab), "recorded")
-    _flip_a_bit(places.segment(lab, "recorded", 1))
+    flip(places.segment(lab, "recorded", 1), 1 / 3)
     assert copied(robot, to(lab), "recorded").known == ["recorded"]
     assert copied(robot, to(lab), "recorded", check=True).copied == ["recorded"]
     assert answers(lab, "recorded") == answers(robots, "recorded")
     with hl.open(robot, mongo="none") as store:
         expire(store, "recorded", [0])
-    _flip_a_bit(places.segment(lab, "recorded", 1))
+    flip(places.segment(lab, "recorded", 1), 1 / 3)
     before = files_in(places.folder(lab, "recorded"))
     said = copied(robot, to(lab), "recorded", check=True).refused["recorded"]
     assert "has lost 000001.mcap, which this store does not have either" in said

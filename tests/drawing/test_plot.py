@@ -123,15 +123,7 @@ def test_what_is_refused(
     problem: str,
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    from click.testing import CliRunner
-
-    from hybridlog.cli.app import app
-
-    environment = {"HYBRIDLOG_STORE": str(drive.directory)}
-    asked = ["plot", "-t", "drive", "--fields", "y", *arguments]
-    done = CliRunner().invoke(app, asked, env=environment, standalone_mode=False)
-    assert isinstance(done.exception, UsageError)
-    assert problem in str(done.exception)
+    assert problem in plot(drive, "-t", "drive", "--fields", "y", *arguments, code=2).err
     assert [*tmp_path.iterdir()] == []
 
 

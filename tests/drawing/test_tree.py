@@ -248,9 +248,3 @@ def test_lines_with_a_text(odd: hl.Store, text: str) -> None:
             if text.lower() in row[2].lower() or text.lower() in row[3].lower()
         ]
         assert told(lines(*log, 0, -1, 1000)) == wanted
-
-
-def test_other_types_are_refused() -> None:
-    for name in ("sensor_msgs/Imu", "", "std_msgs/msg/Strings"):
-        with pytest.raises(UsageError, match="no text log"):
-            kind_of(name)

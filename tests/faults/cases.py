@@ -62,7 +62,6 @@ class Bench:
         path: Where stores are.
         scenarios: Those that were made already, by name.
         two: The store that most of them begin with, once it is made.
-        scans: A store with long arrays, once it is made.
     """
 
     server: Server
@@ -70,7 +69,6 @@ class Bench:
     path: Path
     scenarios: dict[str, Scenario] = field(default_factory=dict)
     two: Prepared | None = None
-    scans: Prepared | None = None
 
     def scenario(
         self,

@@ -6,13 +6,14 @@ from collections.abc import Iterator
 
 import pytest
 
+from tests.conftest import DATABASES
 from tests.faults.cases import Bench
 from tests.faults.steps import Stepper
 from tests.faults.stores import Server
 
 
 @pytest.fixture(scope="module")
-def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
-    path = tmp_path_factory.mktemp("faults")
-    with Server(path / "mongod") as server, Stepper() as stepper:
-        yield Bench(server, stepper, path)
+def bench(pytestconfig: pytest.Config, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
+    server = Server(pytestconfig.stash[DATABASES])
+    with server.client, Stepper() as stepper:
+        yield Bench(server, stepper, tmp_path_factory.mktemp("faults"))

@@ -38,12 +38,12 @@ Fault = Literal[
     "INT",
     "TERM",
 ]
-TORN = ("write", "insert", "delete", "replace all")
+TORN = ("write", "insert", "delete")
 """Steps of which half can be done."""
 ALLOCATES = ("create", "write", "mkdir", "sync")
 """Steps that a full disk fails."""
 
-DATABASE = ("insert", "delete", "replace", "update", "collection")
+DATABASE = ("insert", "delete", "update", "collection")
 """Steps of the database."""
 
 
@@ -345,7 +345,6 @@ COMMANDS: Mapping[str, Command] = {
     "reindex": _on_store(lambda store, args: store.index.rebuild(args or None)),
     "rename": _on_store(lambda store, args: store.edit(args[0], name=args[1])),
     "tag": _on_store(lambda store, args: store.edit(args[0], tag={args[1]: args[2]})),
-    "note": _on_store(lambda store, args: store.edit(args[0], note=args[1])),
     "mark": _on_store(lambda store, args: store.mark(args[0], args[1], args[2])),
     "import": _on_store(lambda store, args: bring(store, args[0])),
     "repair": _on_store(_repair),

@@ -32,8 +32,8 @@ from hybridlog_storage.manifests import MANIFEST_LOCK, MANIFEST_OLD
 from hybridlog_storage.mongo.collection_names import CATALOG_PREFIX, collection_of
 from hybridlog_storage.mongo.database import Database
 from hybridlog_storage.mongo.index_state import STORE, IndexState
-from hybridlog_storage.mongo.mongod import EmbeddedMongod
 from tests import places
+from tests.databases import Databases
 from tests.faults.logs import Content
 from tests.indexed import EVERYTHING
 
@@ -44,25 +44,15 @@ _MADE_UP = re.compile(r"\b([0-9]{8}-[a-z0-9-]+-)?[0-9a-f]{16}\b|\b[0-9a-f]{32}\b
 
 
 class Server:
-    """One mongod for many databases. A context manager."""
+    """One MongoDB for many databases.
 
-    def __init__(self, directory: Path) -> None:
-        self._mongod = EmbeddedMongod(directory)
-        self._count = 0
+    Args:
+        databases: Makes them.
+    """
 
-    def __enter__(self) -> Server:
-        self._uri = self._mongod.start()
-        self.client: MongoClient[Any] = MongoClient(self._uri)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.client.close()
-        self._mongod.stop()
-
-    def new(self) -> str:
-        """The URI of a database that is empty."""
-        self._count += 1
-        return self._uri.replace("/?", f"/case_{self._count}?")
+    def __init__(self, databases: Databases) -> None:
+        self.new = databases.new
+        self.client: MongoClient[Any] = MongoClient(databases.new())
 
     def drop(self, uri: str) -> None:
         """Remove a database."""
@@ -79,7 +69,7 @@ class Server:
 
 
 def _name(uri: str) -> str:
-    return uri.partition("/?")[0].rpartition("/")[2].partition("?")[0]
+    return uri.partition("?")[0].rpartition("/")[2]
 
 
 @dataclass(frozen=True)

@@ -6,11 +6,9 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from hybridlog_storage.catalog import channel_totals
 from hybridlog_storage.disk.directory import StoreDirectory
 from hybridlog_storage.errors import TopicError
 from hybridlog_storage.mongo.index_state import IndexState
-from hybridlog_storage.segments.chunk_table import TableBuilder
 from tests import places
 from tests.calls import Calls
 from tests.faults.cases import Bench
@@ -87,13 +85,6 @@ def test_what_goes_while_it_is_counted_is_noticed(case: Case, calls: Calls) -> N
             query.count()
         with pytest.raises(TopicError):
             store.query(["/number"], ["a"])
-
-
-def test_a_segment_without_messages_has_no_totals() -> None:
-    table = TableBuilder().build()
-    assert not len(table.parts)
-    assert channel_totals(table, None) == {}
-    assert channel_totals(table, {}) == {}
 
 
 def test_a_log_whose_last_segment_is_empty_is_recorded(bench: Bench) -> None:

@@ -187,6 +187,17 @@ def test_empty_parts_are_told(bag: Path) -> None:
     assert Found(bag).damage == [("bag_1.db3", 5)]
 
 
+def test_a_part_that_cannot_be_read_costs_no_other(bag: Path) -> None:
+    (bag / "bag_1.db3").write_bytes(b"SQLite format 3\0" + bytes(5000))
+    found = Found(bag)
+    assert found.numbers == [*FIFTEEN[:5], *FIFTEEN[10:]]
+    assert [name for name, _ in found.damage] == ["bag_1.db3"]
+    for part in (0, 2):
+        (bag / f"bag_{part}.db3").unlink()
+    with pytest.raises(SourceError, match="SQLite"):
+        open_source(bag).batches().__next__()
+
+
 def test_files_that_are_no_parts_are_told(bag: Path) -> None:
     put_metadata(bag, ["bag_0.db3", "bag_1.db3"], 15)
     put_db3(bag / "other.db3", range(100, 103))

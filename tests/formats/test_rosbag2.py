@@ -10,7 +10,6 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
-import yaml
 import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -173,44 +172,6 @@ def test_compressed_file_cut_short(tmp_path: Path, keep: float) -> None:
     assert 0 < found.total() < 5000
     assert all(each.file == file for each in damage)
     assert sum(each.messages_lost or 0 for each in damage) == 5000 - found.total()
-
-
-def split(folder: Path, parts: int) -> Path:
-    """Turns a bag into one of several files with the same metadata."""
-    whole = next(folder.glob("*.db3"))
-    for number in range(parts):
-        part = folder / f"bag_{number}.db3"
-        shutil.copy(whole, part)
-        with sqlite3.connect(part) as db:
-            db.execute("DELETE FROM messages WHERE id % ? != ?", (parts, number))
-        db.close()
-    whole.unlink()
-    text = yaml.safe_load((folder / "metadata.yaml").read_text())
-    bag = text["rosbag2_bagfile_information"]
-    bag["relative_file_paths"] = [f"bag_{number}.db3" for number in range(parts)]
-    bag.pop("files")
-    with (folder / "metadata.yaml").open("w") as file:
-        yaml.dump(text, file)
-    return folder
-
-
-def test_split_bag_with_missing_and_broken_files(tmp_path: Path) -> None:
-    folder = split(make(tmp_path / "bag"), 4)
-    expected = reference(folder)
-    (folder / "bag_1.db3").unlink()
-    (folder / "bag_2.db3").write_bytes(b"SQLite format 3\x00" + bytes(5000))
-    found, damage = read(folder)
-    assert found <= expected
-    assert found.total() == 150
-    assert [each.file.name for each in damage] == ["bag_1.db3", "bag_2.db3"]
-    assert "missing" in damage[0].reason
-    (folder / "bag_0.db3").unlink()
-    (folder / "bag_3.db3").unlink()
-    with pytest.raises(SourceError, match="SQLite"):
-        open_source(folder).batches().__next__()
-    (folder / "bag_2.db3").unlink()
-    with pytest.raises(SourceError, match="none of the files"):
-        open_source(folder)
 
 
 @settings(max_examples=100, deadline=None)

@@ -16,3 +16,10 @@ def store(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[hl.Store]:
     is_indexed = request.node.get_closest_marker("mongo") is not None
     with hl.open(tmp_path / "store", create=True, require_database=is_indexed) as opened:
         yield opened
+
+
+@pytest.fixture
+def plain(tmp_path: Path) -> Iterator[hl.Store]:
+    """An empty store without MongoDB."""
+    with hl.open(tmp_path / "store", create=True, mongo="none") as opened:
+        yield opened

@@ -24,8 +24,8 @@ def scan_channel(topic: str = "/scan") -> Channel:
     return Channel(topic, "ros1", SCAN, {}, has_publish_time=False)
 
 
-def text(content: str) -> bytes:
-    data = content.encode()
+def text(content: str | bytes) -> bytes:
+    data = content.encode() if isinstance(content, str) else content
     return len(data).to_bytes(4, "little") + data
 
 

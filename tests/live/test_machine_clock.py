@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Iterator
 from itertools import pairwise
 
 import pytest
@@ -79,14 +78,7 @@ def test_a_time_is_steady_however_often_the_clock_is_set() -> None:
     assert not clock.jumps()
 
 
-@pytest.fixture
-def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
-    path = tmp_path_factory.mktemp("clock") / "store"
-    with hl.open(path, create=True, mongo="none") as opened:
-        yield opened
-
-
-def test_a_clock_that_is_set_mid_recording(store: hl.Store) -> None:
+def test_a_clock_that_is_set_mid_recording(plain: hl.Store) -> None:
     contract = Contract({"/chatter": TopicRules(longest_gap=SECOND)})
     options = RecorderOptions(
         name="drive",
@@ -94,7 +86,7 @@ def test_a_clock_that_is_set_mid_recording(store: hl.Store) -> None:
         contract=contract,
         throttles=[throttle_rule("/slow", "5Hz")],
     )
-    robot = Robot(store, NOW, options)
+    robot = Robot(plain, NOW, options)
     chatter, slow = text_channel(), text_channel("/slow")
     eras = [NOW, BOOT, NOW + 30 * YEAR, NOW + 100 * SECOND]
     for number, era in enumerate(eras):
@@ -120,7 +112,7 @@ def test_a_clock_that_is_set_mid_recording(store: hl.Store) -> None:
     (report,) = robot.recorder.stop()
     assert len(robot.said) == 4  # the clock is no silence
     label = report.entry.name
-    query = store.query(["/chatter"], [label])
+    query = plain.query(["/chatter"], [label])
     assert [m.decode().data for m in query if m.log_time_ns < NOW][:20] == words(20, 40)
     assert query.count() == 4 * 21 + 1
     for number, era in enumerate(eras):
@@ -128,7 +120,7 @@ def test_a_clock_that_is_set_mid_recording(store: hl.Store) -> None:
         assert [m.decode().data for m in found] == words(20 * number, 20 * number + 20)
     assert query.between("-0.1s", "end").count() == 1  # of 2056
     assert query.between("start", "+1s").count() == 21
-    marks = [(m.log_time_ns, m.decode()["tags"]) for m in store.query([MARKS], [label])]
+    marks = [(m.log_time_ns, m.decode()["tags"]) for m in plain.query([MARKS], [label])]
     told = {at: int(tags["set_by_ns"]) for at, tags in marks if tags["cause"] == "clock"}
     assert told == dict(zip(eras[1:], jumps, strict=True))
     assert [at for at, tags in marks if tags["cause"] == "contract"] == [
@@ -137,33 +129,33 @@ def test_a_clock_that_is_set_mid_recording(store: hl.Store) -> None:
     rows = [row for row in report.entry.end["losses"] if row["cause"] == "transport"]
     assert rows
     assert all(row["from"] <= row["to"] for row in rows)
-    assert not store.verify().findings
+    assert not plain.verify().findings
 
 
-def test_a_clock_that_is_set_between_recordings(store: hl.Store) -> None:
+def test_a_clock_that_is_set_between_recordings(plain: hl.Store) -> None:
     told = []
     for begin in (NOW, BOOT, NOW + 30 * YEAR, BOOT):
-        robot = Robot(store, begin, RecorderOptions(name="drive", reserve_bytes=0))
+        robot = Robot(plain, begin, RecorderOptions(name="drive", reserve_bytes=0))
         robot.play(text_channel(), *words(0, 3))
         robot.recorder.look()
         (report,) = robot.recorder.stop()
         told.append((report.entry.name, len(report.entry.marks), len(robot.said)))
-        assert store.query(["/chatter"], [report.entry.id]).between("-0.1s", "end").count() == 1
+        assert plain.query(["/chatter"], [report.entry.id]).between("-0.1s", "end").count() == 1
     # Those whose clock is behind say so, and have a mark.
     assert told == [("drive", 0, 0), ("drive-2", 1, 1), ("drive-3", 0, 0), ("drive-4", 1, 1)]
     assert robot.said[0].startswith("the clock of this machine says 1970-01-01T00:00:05Z, and rec")
-    assert [m.decode()["tags"] for m in store.topic(MARKS)] == [{"cause": "clock"}] * 2
-    assert len({one.id for one in store.summaries()}) == 4
-    assert store.topic("/chatter").between("1970-01-01", "1970-01-02").count() == 6
+    assert [m.decode()["tags"] for m in plain.topic(MARKS)] == [{"cause": "clock"}] * 2
+    assert len({one.id for one in plain.summaries()}) == 4
+    assert plain.topic("/chatter").between("1970-01-01", "1970-01-02").count() == 6
     # A clock that is wrong while no robot is there leaves no recording.
-    robot = Robot(store, BOOT, RecorderOptions(name="drive", reserve_bytes=0), Absent())
+    robot = Robot(plain, BOOT, RecorderOptions(name="drive", reserve_bytes=0), Absent())
     assert (robot.recorder.stop(), len(robot.said)) == ([], 1)
 
 
 @pytest.mark.parametrize("set_to", [BOOT, NOW + 30 * YEAR])
-def test_a_ring_goes_by_the_time_that_passes(store: hl.Store, set_to: int) -> None:
+def test_a_ring_goes_by_the_time_that_passes(plain: hl.Store, set_to: int) -> None:
     options = RecorderOptions(name="ring", reserve_bytes=0, ring_s=10, before_s=5, after_s=2)
-    robot = Robot(store, NOW, options)
+    robot = Robot(plain, NOW, options)
     chatter = text_channel()
     robot.play(LATCHED, "map")
     robot.play(chatter, *words(0, 20), step=SECOND)
@@ -173,7 +165,7 @@ def test_a_ring_goes_by_the_time_that_passes(store: hl.Store, set_to: int) -> No
     robot.recorder.fire("by hand")
     robot.play(chatter, *words(23, 27), step=SECOND)
     (report,) = robot.recorder.stop()
-    messages = {m.decode().data: m.log_time_ns for m in store.topic("/chatter")}
+    messages = {m.decode().data: m.log_time_ns for m in plain.topic("/chatter")}
     assert sorted(messages, key=int) == words(0, 27)  # in no more than a second of this test
     (pin,) = report.entry.pins
     assert all(pin["from"] <= messages[word] < pin["to"] for word in words(18, 25))

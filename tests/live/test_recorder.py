@@ -365,21 +365,6 @@ def test_a_try_that_reached_nobody_leaves_nothing(
     assert len(places.folders(store.directory.path)) == recordings
 
 
-def test_marks_are_messages_that_questions_use(store: hl.Store) -> None:
-    robot = Running(store)
-    chatter = text_channel()
-    now = time.time_ns()
-    for number in range(10):
-        robot.speaker.say(chatter, text(str(number)), now + (number - 5) * SECOND)
-    robot.mark("gripper slipped", {"trial": "7"})
-    robot.recorder.stop()
-    marks = store.topic(MARKS).where("tags.trial = '7'")
-    assert [m.fields["text"] for m in marks] == ["gripper slipped"]
-    around = store.topic("/chatter").during(marks.windows("2s", "1500ms"))
-    assert {m.decode().data for m in around} <= {"3", "4", "5", "6", "7"}
-    assert around.count() >= 3
-
-
 def test_visitors(store: hl.Store) -> None:
     one, other = Running(store), Running(store)
     here = store.directory.path

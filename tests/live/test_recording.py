@@ -34,21 +34,17 @@ from tests import places
 from tests.calls import Calls
 from tests.limits import Limit
 from tests.live.sources.heard import must_return
+from tests.live.speaker import TEXT, text
 from tests.test_faults import kill_mongod
 from tests.waiting import at_once, wait_for
 
 pytestmark = pytest.mark.mongo
 
-TEXT = Schema("std_msgs/String", "ros1msg", b"string data\n")
 Seen = tuple[str, int, int, bytes]
 
 
 def channel(topic: str) -> Channel:
     return Channel(topic, "ros1", TEXT)
-
-
-def text(content: bytes) -> bytes:
-    return len(content).to_bytes(4, "little") + content
 
 
 def in_segments(store: hl.Store, recording: str) -> list[Seen]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -72,12 +71,7 @@ def ids(store: hl.Store) -> list[int]:
     return [message.fields["id"] for message in store.topic("/scan")]
 
 
-@pytest.fixture
-def plain(tmp_path: Path) -> Iterator[hl.Store]:
-    with hl.open(tmp_path / "store", create=True, mongo="none") as store:
-        yield store
-
-
+@pytest.mark.mongo
 def test_the_last_seconds_stay_and_nothing_else(store: hl.Store) -> None:
     robot = Robot(store)
     robot.recorder.lost(Loss("/scan", Cause.TRANSPORT, 4, time.time_ns(), time.time_ns()))
@@ -102,6 +96,8 @@ def test_the_last_seconds_stay_and_nothing_else(store: hl.Store) -> None:
     assert {path.name for path in robot.folder.glob("*.mcap")} == names
     # All that is derived is of what is left, and what was lost before is not in it.
     assert store.topic("/scan").where("near >= 0").count() == len(kept)
+    indexed = store.topic("/scan").where({"near": {"$gte": 0}})
+    assert (indexed.count(), indexed.remarks()) == (len(kept), [])
     assert store.topic("/scan").to_arrow().num_rows == len(kept)
     assert store.sql("select count(*) as n from scan").to_pandas()["n"][0] == len(kept)
     assert entry.end["losses"] == []
@@ -130,16 +126,6 @@ def test_questions_are_answered_while_files_go(plain: hl.Store) -> None:
     robot.stop()
     assert asked > 10
     assert robot.recorder.look().let_go
-
-
-@pytest.mark.mongo
-def test_mongodb_has_what_is_left(store: hl.Store) -> None:
-    robot = Robot(store)
-    robot.run(1.2)
-    robot.stop()
-    found = store.topic("/scan").where({"near": {"$gte": 0}})
-    assert found.count() == store.topic("/scan").count() > 0
-    assert found.remarks() == []
 
 
 def test_what_is_pinned_stays(plain: hl.Store) -> None:
@@ -179,15 +165,17 @@ def test_nothing_goes_before_triggers_have_seen_it(
     assert 120 in [m.fields["id"] for m in plain.topic("/scan") if m.log_time_ns <= at]
 
 
-def test_latched_messages_in_force_stay(plain: hl.Store) -> None:
+def test_latched_messages_in_force_stay_and_marks(plain: hl.Store) -> None:
     robot = Robot(plain)
+    robot.mark("slipped", {})
     for word in ("old", "map"):
         robot.speaker.say(LATCHED, text(word))
         robot.speaker.say(text_channel(), text("small"))
         robot.run(0.3)
     robot.run(1.2)
     entry = robot.stop()
-    assert plain.topics() == ["/map", "/scan"]  # only what is latched stays
+    assert plain.topics() == [MARKS, "/map", "/scan"]  # of the others all is gone
+    assert [mark.fields["text"] for mark in plain.topic(MARKS)] == ["slipped"]
     assert [m.fields["data"] for m in plain.topic("/map")] == ["map"]
     last = plain.topic("/scan").between("-0.1s", "end")
     assert last.count() > 0
@@ -196,15 +184,6 @@ def test_latched_messages_in_force_stay(plain: hl.Store) -> None:
     assert front == [text("map")]
     plain.keep({"max-age": "0s"})
     assert [m.raw for m in plain.topic("/map")] == [text("map")]
-
-
-def test_marks_stay_whatever_goes(plain: hl.Store) -> None:
-    robot = Robot(plain)
-    robot.run(0.2)
-    robot.mark("slipped", {})
-    robot.run(1.2)
-    robot.stop()
-    assert [mark.fields["text"] for mark in plain.topic(MARKS)] == ["slipped"]
 
 
 def test_a_ring_in_which_nothing_comes_any_more(plain: hl.Store) -> None:

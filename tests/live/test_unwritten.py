@@ -9,14 +9,13 @@ from pathlib import Path
 import pytest
 
 import hybridlog as hl
-from hybridlog_storage.errors import HeldError, IncompleteError
+from hybridlog_storage.errors import IncompleteError
 from tests.cli.running import run
 from tests.indexed import documents_of
 from tests.limits import Limit
 from tests.live.robot import robot
 from tests.live.speaker import text, text_channel
 from tests.live.test_follow import NOWHERE, wait_until_flushed
-from tests.waiting import wait_for
 
 SECOND = 1_000_000_000
 CHANNEL = text_channel("/a")
@@ -37,86 +36,79 @@ def half_written(path: Path) -> Iterator[hl.Store]:
             yield store
 
 
-def test_the_number_is_that_of_the_topics_asked(tmp_path: Path) -> None:
-    with half_written(tmp_path / "store") as store:
-        query = store.topic("/a")
-        assert query.count() == 2
-        expected = "live is being recorded: 3 messages not written yet, nor in this answer."
-        assert query.remarks() == [expected]
-        assert query.completeness().unwritten == 3
-        assert not query.completeness().has_losses
-        with pytest.raises(IncompleteError, match="3 messages not written yet"):
-            query.completeness().check()
-        quiet = store.topic("/quiet")
-        assert quiet.remarks() == []
-        assert quiet.completeness().unwritten == 0
-        quiet.completeness().check()
+TOLD = "live is being recorded: 3 messages not written yet"
 
 
-def test_it_is_told_only_where_the_time_reaches_past_the_last_flush(tmp_path: Path) -> None:
-    path = tmp_path / "store"
-    with half_written(path) as store:
-        query = store.topic("/a")
-        whole = store.topic("/a").windows(after="1s")
-        early = query.between(None, 2 * SECOND).windows(after="500ms")
-        for part, unwritten in (
-            (query.between("start", "end"), 3),
-            (query.between(None, 2 * SECOND + 1), 3),
-            (query.between("+1s", None), 3),
-            (query.between(None, 2 * SECOND), 0),
-            (query.between("start", "-1s"), 0),
-            (query.during(whole), 3),
-            (query.during(whole).between(None, 2 * SECOND), 0),
-            (query.during(early), 0),
-            (query.between(None, 2 * SECOND).clock("header"), 3),
-        ):
-            assert part.completeness().unwritten == unwritten, part
-            assert len(part.remarks(is_empty=False)) == (unwritten > 0)
-        options = ["fetch", "-t", "/a", "--count", "--strict", "--between", "start"]
-        done = run(*options, "2000000000ns", store=path)
-        assert (done.out, "not written" in done.err) == ("1\n", False)
-        assert "3 messages not written yet" in run(*options, "end", store=path, code=11).err
+@pytest.fixture(scope="module")
+def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hl.Store]:
+    with half_written(tmp_path_factory.mktemp("live") / "store") as store:
+        yield store
 
 
-def test_every_command_tells_it(tmp_path: Path) -> None:
-    path = tmp_path / "store"
-    with half_written(path):
-        told = "live is being recorded: 3 messages not written yet"
-        for words in (
-            ["fetch", "-t", "/a", "--count"],
-            ["fetch", "-t", "/a", "--where", "data == '1'"],
-            ["stats", "-t", "/a", "--rate"],
-            ["intervals", "-t", "/a", "--gaps"],
-            ["intervals", "-t", "/a", "--where", "data == '1'"],
-            ["intervals", "-t", "/a", "--changes", "data"],
-            ["export", tmp_path / "a.mcap", "-t", "/a", "--force"],
-            ["sql", "select count(*) from a"],
-        ):
-            done = run(*words, "--mongo", NOWHERE, store=path)
-            assert told in done.err, (words, done.err)
-            assert "lost" not in done.err
-        ended = run("fetch", "-t", "/a", "--count", "--between", "start", "-1s", store=path)
-        assert "being recorded" not in ended.err
+def test_the_number_is_that_of_the_topics_asked(live: hl.Store) -> None:
+    query = live.topic("/a")
+    assert query.count() == 2
+    assert query.remarks() == [f"{TOLD}, nor in this answer."]
+    assert query.completeness().unwritten == 3
+    assert not query.completeness().has_losses
+    with pytest.raises(IncompleteError, match="3 messages not written yet"):
+        query.completeness().check()
+    quiet = live.topic("/quiet")
+    assert quiet.remarks() == []
+    assert quiet.completeness().unwritten == 0
+    quiet.completeness().check()
+    # An alignment tells it once for all topics.
+    aligned = live.align("/a", ["/quiet"])
+    aligned.to_arrow()
+    told = [line for line in aligned.remarks() if "being recorded" in line]
+    assert told == [f"{TOLD}, nor in this answer."]
+    # An answer that is full lacks nothing that comes later.
+    for limit, lacks in ((1, False), (2, False), (3, True)):
+        query = live.topic("/a").limit(limit)
+        assert len(list(query)) == min(limit, 2)
+        assert bool(query.remarks()) == lacks
+    last = live.topic("/a").limit(1).reverse()
+    list(last)
+    assert last.remarks()
 
 
-def test_an_alignment_tells_it_once_for_all_topics(tmp_path: Path) -> None:
-    with half_written(tmp_path / "store") as store:
-        aligned = store.align("/a", ["/quiet"])
-        aligned.to_arrow()
-        told = [line for line in aligned.remarks() if "being recorded" in line]
-        assert told == ["live is being recorded: 3 messages not written yet, nor in this answer."]
+def test_it_is_told_only_where_the_time_reaches_past_the_last_flush(live: hl.Store) -> None:
+    query = live.topic("/a")
+    whole = live.topic("/a").windows(after="1s")
+    early = query.between(None, 2 * SECOND).windows(after="500ms")
+    for part, unwritten in (
+        (query.between("start", "end"), 3),
+        (query.between(None, 2 * SECOND + 1), 3),
+        (query.between("+1s", None), 3),
+        (query.between(None, 2 * SECOND), 0),
+        (query.between("start", "-1s"), 0),
+        (query.during(whole), 3),
+        (query.during(whole).between(None, 2 * SECOND), 0),
+        (query.during(early), 0),
+        (query.between(None, 2 * SECOND).clock("header"), 3),
+    ):
+        assert part.completeness().unwritten == unwritten, part
+        assert len(part.remarks(is_empty=False)) == (unwritten > 0)
+    options = ["fetch", "-t", "/a", "--count", "--strict", "--between", "start"]
+    done = run(*options, "2000000000ns", store=live.directory.path)
+    assert (done.out, "not written" in done.err) == ("1\n", False)
+    assert TOLD.partition(": ")[2] in run(*options, "end", store=live.directory.path, code=11).err
 
 
-def test_an_answer_that_is_full_lacks_nothing_that_comes_later(tmp_path: Path) -> None:
-    path = tmp_path / "store"
-    with half_written(path) as store:
-        for limit, lacks in ((1, False), (2, False), (3, True)):
-            query = store.topic("/a").limit(limit)
-            assert len(list(query)) == min(limit, 2)
-            assert bool(query.remarks()) == lacks
-        last = store.topic("/a").limit(1).reverse()
-        list(last)
-        assert last.remarks()
+def test_every_command_tells_it(live: hl.Store, tmp_path: Path) -> None:
+    for words in (
+        ["fetch", "-t", "/a", "--count"],
+        ["fetch", "-t", "/a", "--where", "data == '1'"],
+        ["stats", "-t", "/a", "--rate"],
+        ["intervals", "-t", "/a", "--gaps"],
+        ["intervals", "-t", "/a", "--where", "data == '1'"],
+        ["intervals", "-t", "/a", "--changes", "data"],
+        ["export", tmp_path / "a.mcap", "-t", "/a"],
+        ["sql", "select count(*) from a"],
+    ):
+        done = run(*words, "--mongo", NOWHERE, store=live.directory.path)
+        assert TOLD in done.err, (words, done.err)
+        assert "lost" not in done.err
 
 
 def test_an_import_copies_what_has_ended(tmp_path: Path) -> None:
@@ -183,25 +175,3 @@ def test_what_the_index_lacks_is_told_where_mongodb_answers(tmp_path: Path, limi
         recording.close()
         assert raw.count() == 5
         assert raw.counters.unindexed == 0
-
-
-def test_a_killed_recording_is_not_said_to_go_on(tmp_path: Path) -> None:
-    path = tmp_path / "store"
-    with robot(path, "load", flush_s=0.05) as killed:
-        killed.say("/a", "x")
-        before = hl.open(path)
-        wait_for(lambda: before.summaries()[0].messages)
-        assert [entry.status for entry in before.recordings()] == ["open"]
-        with pytest.raises(HeldError, match=f"is being written by process {killed.pid} "):
-            before.remove("load")
-        killed.kill()
-    with before:
-        # Another process is about to recover it, so nobody else can.
-        with before.directory.writing(before.entry("load").id), hl.open(path) as after:
-            for store in (before, after):
-                assert [one.status for one in store.summaries()] == ["unfinished"]
-                assert [entry.status for entry in store.recordings()] == ["unfinished"]
-                assert store.recordings()[0].messages > 0
-        with hl.open(path) as after:
-            for store in (after, before):
-                assert [entry.status for entry in store.recordings()] == ["recovered"]

@@ -12,8 +12,8 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -28,7 +28,7 @@ from hybridlog_storage.manifest import Manifest, encode, new_id, replace
 from hybridlog_storage.manifests import DiskManifests
 from tests.calls import Calls
 from tests.limits import Limit
-from tests.power import each_cut
+from tests.power import dies, each_cut
 
 ONE = Manifest(new_id("run"), "run", 1)
 
@@ -110,44 +110,6 @@ def test_nothing_comes_back_after_a_removal(store: Path) -> None:
     assert list((store / "recordings").iterdir()) == []
 
 
-class Dying(files.System):
-    """Ends the process at its n-th call, before or after it is done."""
-
-    def __init__(self, at: int, *, after: bool) -> None:
-        self._left, self._after = at, after
-
-    def __getattribute__(self, name: str) -> Any:
-        found = super().__getattribute__(name)
-        if name.startswith("_"):
-            return found
-
-        def step(*arguments: Any, **options: Any) -> Any:
-            if self._left == 0 and not self._after:
-                os._exit(7)
-            result = found(*arguments, **options)
-            if self._left == 0:
-                os._exit(7)
-            self._left -= 1
-            return result
-
-        return step
-
-
-def dies(store: Path, at: int, work: Callable[[DiskManifests], object], *, after: bool) -> bool:
-    """Whether a process that works on the store died at a call."""
-    child = os.fork()
-    if child == 0:
-        try:
-            files.system = Dying(at, after=after)
-            work(DiskManifests(store))
-            os._exit(0)
-        finally:
-            os._exit(1)
-    code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-    assert code in {0, 7}
-    return code == 7
-
-
 OTHER = Manifest(new_id("other"), "other", 2)
 WORKS: dict[str, Callable[[DiskManifests], object]] = {
     "change": lambda m: m.change(ONE.id, tagged),
@@ -183,7 +145,7 @@ def test_killed_at_each_system_call(store: Path, tmp_path: Path, what: str, afte
     while went_on:
         place = tmp_path / f"{at}"
         shutil.copytree(store, place)
-        went_on = dies(place, at, WORKS[what], after=after)
+        went_on = dies(at, partial(WORKS[what], DiskManifests(place)), after=after)
         check(place, what)
         at += 1
     assert at > 6

@@ -31,6 +31,7 @@ from hybridlog_storage.errors import PayloadError, StoreError, TopicError, Usage
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import places
 from tests.cli.within import answer
+from tests.damage import flip
 from tests.payloads.logs import (
     BASE,
     CLOUD,
@@ -240,10 +241,7 @@ def test_shared_files_have_no_holes_and_cost_what_it_says(copy: Path, tmp_path: 
 def test_a_damaged_chunk_costs_no_table(copy: Path, *, off: bool) -> None:
     with hl.open(copy, mongo="none") as store:
         store.index.arrays("scan", off=not off)
-        segment = places.segment(store.directory.path, "log", 1)
-        data = bytearray(segment.read_bytes())
-        data[2000] ^= 1
-        segment.write_bytes(data)
+        flip(places.segment(store.directory.path, "log", 1), 2000)
         query = store.topic("scan").where("ranges.min < 1.0005")
         expected, tables = query.count(), columns_of(copy)
         (found,) = store.index.arrays("scan", off=off)
@@ -288,9 +286,7 @@ def test_deleted_tables_change_no_answer(copy: Path) -> None:
     assert answers_of(copy) == right  # and tables with arrays were made again
     (file,) = (copy / "tables").glob("sensor_msgs_msg_LaserScan~*/*.parquet")
     assert pq.read_table(file)["ranges"].null_count == 0
-    data = bytearray(file.read_bytes())
-    data[len(data) // 3] ^= 4
-    file.write_bytes(data)
+    flip(file, 1 / 3)
     assert answers_of(copy) == right
     (copy / "tables").chmod(0o500)
     assert answers_of(copy) == right

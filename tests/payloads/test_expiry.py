@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-import os
 import shutil
 from collections import Counter
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,17 +14,15 @@ import pytest
 from blake3 import blake3
 
 import hybridlog as hl
-from hybridlog.entries import put_entry, summary_of, topic_of
+from hybridlog.entries import put_entry, topic_of
 from hybridlog.maintenance import expiry
-from hybridlog_storage.catalog import CATALOG
-from hybridlog_storage.disk import files
-from hybridlog_storage.errors import IncompleteError, PayloadError
+from hybridlog_storage.errors import IncompleteError
 from hybridlog_storage.manifest import replace, with_rows
 from tests import places
 from tests.cli.within import answer
-from tests.copies import bring
 from tests.format_reader import FormatReader
-from tests.payloads.logs import COUNT
+from tests.payloads.logs import COUNT, recording_of
+from tests.power import dies
 
 TOPICS = ["/cloud", "/image", "/number", "/scan"]
 
@@ -75,58 +72,8 @@ def answers(path: Path) -> dict[str, Any]:
     return found
 
 
-def recording_of(store: Path) -> Path:
-    return places.folder(store, "log")
-
-
 def row_files(store: Path) -> list[Path]:
     return sorted(recording_of(store).glob("*.rows.parquet"))
-
-
-def payloads(path: Path, topic: str) -> list[bytes | str]:
-    """The payloads of a topic; of those that are gone the reason."""
-    found: list[bytes | str] = []
-    with hl.open(path, mongo="none") as store:
-        for message in store.topic(topic):
-            try:
-                found.append(message.raw)
-            except PayloadError as error:
-                found.append(str(error))
-    return found
-
-
-def check_list(path: Path) -> None:
-    """A list says by manifests alone what it says by the files."""
-    (path / CATALOG).unlink()
-    with hl.open(path, mongo="none") as store:
-        (known,) = store.summaries()
-        assert known == summary_of(store.entry(known.id), known.look)
-
-
-STEPS = {"a group": [[0]], "one after the other": [[0], [1]], "all": [[0, 1]]}
-
-
-@pytest.mark.parametrize("steps", STEPS.values(), ids=STEPS)
-def test_answers_stay_when_payloads_go(copy: Path, steps: list[list[int]]) -> None:
-    before, raw = answers(copy), {topic: payloads(copy, topic) for topic in TOPICS}
-    gone = dict.fromkeys(TOPICS, 0)
-    for segments in steps:
-        done = expire(copy, segments)
-        for topic, count in done.items():
-            gone[topic] += count
-        check_list(copy)
-        assert not expire(copy, segments)
-    assert answers(copy) == before
-    shutil.rmtree(copy / "tables")
-    assert answers(copy) == before
-    for topic in TOPICS:
-        left = payloads(copy, topic)
-        reasons = [one for one in left if isinstance(one, str)]
-        assert len(reasons) == gone[topic]
-        assert all("deleted to make room" in reason for reason in reasons)
-        assert all(a == b for a, b in zip(raw[topic], left, strict=True) if isinstance(b, bytes))
-    with hl.open(copy, mongo="none") as store:
-        assert store.verify().findings == []
 
 
 def logs(store: Path) -> dict[str, bytes]:
@@ -223,34 +170,7 @@ def test_another_file_than_the_listed_one_is_found(copy: Path, kind: str) -> Non
         assert store.verify(repair=True).findings == [found]
 
 
-class Dying(files.System):
-    """A file system of a process that dies before its n-th change."""
-
-    def __init__(self, left: int) -> None:
-        self.left = left
-
-    def __getattribute__(self, name: str) -> Any:
-        if name in {"writev", "pwritev", "truncate", "sync", "rename", "unlink", "rmdir", "mkdir"}:
-            self.left -= 1
-            if self.left < 0:
-                os._exit(9)
-        return super().__getattribute__(name)
-
-
-def die_at(step: int, work: Callable[[], object]) -> bool:
-    """Do some work in a process that dies before a change of the disk; true if it lives."""
-    pid = os.fork()
-    if pid == 0:
-        try:
-            files.system = Dying(step)
-            work()
-        except BaseException:
-            os._exit(1)
-        os._exit(0)
-    _, status = os.waitpid(pid, 0)
-    code = os.waitstatus_to_exitcode(status)
-    assert code in {0, 9}
-    return code == 0
+CHANGES = frozenset({"writev", "pwritev", "truncate", "sync", "rename", "unlink", "rmdir", "mkdir"})
 
 
 @pytest.mark.parametrize(
@@ -262,7 +182,7 @@ def test_a_death_at_any_step_is_finished_or_undone(copy: Path, tmp_path: Path, s
     while not lived:
         place = tmp_path / f"at {step}"
         shutil.copytree(copy, place)
-        lived = die_at(step, partial(expire, place, [0, 1]))
+        lived = not dies(step, partial(expire, place, [0, 1]), only=CHANGES)
         with hl.open(place, mongo="none") as store:  # finishes or undoes it
             assert not store.verify().findings
             listed = {file.name for file in places.manifest(place, "log").files if file.is_here}
@@ -279,25 +199,6 @@ def test_a_death_at_any_step_is_finished_or_undone(copy: Path, tmp_path: Path, s
         step += stride
     assert step > 40
     assert len(seen) > 3  # none, those of a log, of several, of all
-
-
-def test_what_is_left_is_copied_checked_and_never_made_again(copy: Path, tmp_path: Path) -> None:
-    right = answers(copy)
-    expire(copy, [0, 1])
-    other = tmp_path / "other"
-    with hl.open(other, create=True, mongo="none") as store:
-        bring(store, copy)
-        assert store.verify().findings == []
-        store.edit("log", name="new")
-        store.edit("new", name="log")
-    assert answers(other) == right
-    (places.manifest_of(recording_of(copy))).unlink()
-    with hl.open(copy, mongo="none") as store:
-        store.verify(repair=True)
-    assert answers(copy) | {"status": 0} == right | {"status": 0}
-    with hl.open(other, mongo="none") as store:
-        store.remove("log")
-        assert not store.recordings()
 
 
 def test_strict_answers_need_payloads(copy: Path) -> None:

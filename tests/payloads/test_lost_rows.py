@@ -19,20 +19,15 @@ from hybridlog_storage.manifest import File
 from tests import places
 from tests.cli.within import answer
 from tests.copies import bring
-from tests.payloads.logs import COUNT, messages
-from tests.payloads.test_expiry import TOPICS, answers, expire, recording_of, row_files
+from tests.damage import flip
+from tests.payloads.logs import COUNT, messages, recording_of
+from tests.payloads.test_expiry import TOPICS, answers, expire, row_files
 
 FIELDS = {"/scan": "angle_min", "/cloud": "width"}
 
 
 def cut(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-100])
-
-
-def flip(path: Path, at: int) -> None:
-    data = bytearray(path.read_bytes())
-    data[at] ^= 1
-    path.write_bytes(data)
 
 
 LOSSES: dict[str, Callable[[Path], None]] = {"missing": Path.unlink, "has another size": cut}
@@ -188,7 +183,7 @@ def test_a_copy_with_the_segment_brings_it_in_place_of_damaged_rows(
         assert store.verify().findings == []
 
 
-@pytest.mark.parametrize("fault", LOSSES.values())
+@pytest.mark.parametrize("fault", [*LOSSES.values(), lambda path: flip(path, 900)])
 def test_rows_that_are_lost_before_their_log_goes_are_made_again(
     copy: Path, fault: Callable[[Path], None]
 ) -> None:

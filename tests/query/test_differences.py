@@ -54,31 +54,6 @@ def counts(store: hl.Store, topic: str, predicate: Any) -> set[int]:
     return found
 
 
-@pytest.mark.parametrize(
-    ("predicate", "want"), [("a.n == 7", 1), ("a.n == 2", 2), ("not (a.n == 2)", 1)]
-)
-def test_lists_of_several_types_may_have_a_field_n(
-    store: hl.Store, predicate: str, want: int
-) -> None:
-    record(store, as_json({"a": [1, {"n": 7}]}, {"a": [1, {"n": 2}]}, {"a": [1, 2]}))
-    assert counts(store, "/j", predicate) == {want}
-
-
-@pytest.mark.parametrize(
-    ("predicate", "want"), [("x missing", 0), ("not (x > 1)", 2), ("_meta.seq >= 0", 8)]
-)
-def test_unreadable_messages_have_no_fields_to_be_asked_for(
-    store: hl.Store, predicate: str, want: int
-) -> None:
-    channel = Channel("/n", "ros1", NUMBER)
-    rows = [(channel, number(value)) for value in range(6)]
-    record(store, [*rows, (channel, b"short"), (channel, b"shorter")])
-    assert counts(store, "/n", predicate) == {want}
-    query = store.topic("/n")
-    assert len(query.to_pandas()["x"].dropna()) == 6
-    assert query.counters.unreadable == 2
-
-
 def test_a_field_may_begin_as_ours_do(store: hl.Store) -> None:
     rows = as_json({"_metadata": 1}, {"_metadata": 3}, {"y": 1})
     record(store, [*rows, (rows[0][0], b"{broken")])

@@ -198,20 +198,6 @@ class Model:
                     found.add((name, one.time))
         return found
 
-    def near(
-        self, event: Callable[[Said], bool], before: int, after: int
-    ) -> list[tuple[int, str, str]]:
-        found = []
-        for name, log in self.logs.items():
-            start = self.span(name)[0]
-            moments = [m.time for m in self.of(name) if event(m)]
-            found += [
-                (m.time, name, m.topic)
-                for m in log
-                if any(max(t - before, start) <= m.time < t + after for t in moments)
-            ]
-        return sorted(found)
-
 
 values = st.fixed_dictionaries(
     {"s": st.integers(0, 2)},
@@ -358,55 +344,6 @@ def _key(fields: Sequence[str]) -> Callable[[Said], object]:
     return key
 
 
-@several
-@given(
-    logs=st.fixed_dictionaries({"a": log, "b": log}),
-    before=st.integers(0, 3),
-    after=st.integers(0, 3),
-    pick=st.tuples(st.integers(1, 3), st.none() | st.integers(0, 5), st.booleans()),
-)
-def test_messages_near_events_are_what_a_loop_finds(
-    store: hl.Store,
-    logs: dict[str, Any],
-    before: int,
-    after: int,
-    pick: tuple[int, int | None, bool],
-) -> None:
-    model = recorded(store, logs)
-    if "/state" not in store.topics() or not before + after:
-        return
-    events = store.topic("/state").where("s == 2")
-    want = model.near(lambda m: m.value["s"] == 2, before * SECOND, after * SECOND)
-    everything = store.all_topics()
-    near = everything.during(events.windows(f"{before}s", timedelta(seconds=after)))
-    got = [(m.log_time_ns, m.recording, m.topic) for m in near]
-    assert sorted(got) == want
-    keys = {r.id: r.key for r in store.recordings()}
-    places = [(time, keys[name]) for time, name, _ in got]
-    assert places == sorted(places)
-    assert near.count() == len(want)
-    assert [m.log_time_ns for m in near.reverse()] == [w[0] for w in want][::-1]
-    windows = events.windows(f"{before}s", f"{after}s")
-    assert len(windows) == events.count()
-    assert [m.seq for m in everything.during(windows)] == [m.seq for m in near]
-
-    state = store.topic("/state").during(windows)
-    times = [w[0] for w in want if w[2] == "/state"]
-    assert (state.to_pandas().index.asi8 if times else np.array([])).tolist() == times
-    assert state.fields("s").to_arrow().num_rows == len(times) == state.where("s >= 0").count()
-    assert [m.log_time_ns for m in state.where("s >= 0")] == times
-    step, most, reverse = pick
-    thinned = times[:: -1 if reverse else 1][::step][:most]
-    query = state.every(step)
-    query = query if most is None else query.limit(most)
-    query = query.reverse() if reverse else query
-    assert [m.log_time_ns for m in query] == thinned
-    assert query.count() == len(thinned)
-    # What holds during the windows is what holds, and is in a window.
-    both = seconds(state.where("s >= 1").intervals())
-    assert both == seconds(store.topic("/state").where("s >= 1").intervals()) & seconds(windows)
-
-
 def test_the_order_does_not_depend_on_indexes_of_the_user(store: hl.Store) -> None:
     logs = [(second, "/state", {"s": 9 - second}) for second in range(10)]
     model = recorded(store, {"a": logs})
@@ -467,6 +404,8 @@ def test_times_within_windows_by_another_clock(plain: hl.Store) -> None:
     ]
     assert query.between("+2s", "+6s").clock("publish").count() == 2
     assert len(list(query.between("+2s", "+6s").clock("publish"))) == 2
+    # What holds during the windows is what holds, and is in a window.
+    assert seconds(query.where("s >= 0").intervals()) == seconds(windows)
 
 
 def test_the_cost_is_counted_and_no_payload_is_read(plain: hl.Store) -> None:

@@ -305,13 +305,6 @@ def test_times_of_a_front_without_publish_times() -> None:
     assert front.messages == 3
 
 
-def test_a_recorded_slice_without_latched_messages(store: hl.Store, log: Path) -> None:
-    begin, end = BEGIN + 41 * SECOND, BEGIN + 43 * SECOND
-    report = store.record(log, name="bare", between=(begin, end), again=True, latched=False)
-    assert report.entry.messages == sum(begin <= m.time < end for m in sent())
-    assert (report.latched, report.latched_left_out) == (0, 0)
-
-
 def test_what_does_not_fit_in_memory_is_told(store: hl.Store, log: Path, limit: Limit) -> None:
     limit(latched_held=1)
     begin = BEGIN + 45 * SECOND

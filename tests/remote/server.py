@@ -15,6 +15,8 @@ from pathlib import Path
 from threading import Lock, Thread
 from typing import Any
 
+from tests.servers.mongods import free_port
+
 KEEP = ("content-type", "content-range", "etag", "last-modified", "accept-ranges")
 
 
@@ -22,9 +24,7 @@ class Moto:
     """The server, in a process of its own."""
 
     def __init__(self, log: Path) -> None:
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            self.port = free.getsockname()[1]
+        self.port = free_port()
         code = f"from moto.server import main; main(['-H', '127.0.0.1', '-p', '{self.port}'])"
         with log.open("w") as errors:
             self._process = subprocess.Popen(

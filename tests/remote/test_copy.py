@@ -20,9 +20,6 @@ from tests.copying.conftest import (
     sshd,  # noqa: F401 - a fixture
 )
 
-SEED = 20_261_128
-CUTS = 4
-
 
 def test_a_bucket_answers_like_the_robot(
     robots: Path,  # noqa: F811

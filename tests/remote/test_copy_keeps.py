@@ -20,6 +20,7 @@ from hybridlog_storage.remote.bucket import Bucket, Object
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests.remote.conftest import BEGIN, SCAN
 from tests.remote.server import Proxy
+from tests.remote.test_store import lose
 
 THEN = CopyOptions(then_expire=True)
 COUNT = 60
@@ -51,20 +52,6 @@ def test_messages_have_addresses(robot: hl.Store, address: str) -> None:
         choose(directory_of(Path(address)), [])
 
 
-def lose(address: str, *names: str) -> None:
-    bucket = Bucket(address)
-    found = [one.name for one in bucket.objects("recordings") if one.name.endswith(names)]
-    assert len(found) == len(names)
-    bucket.delete(found)
-    files.mounted.clear()
-
-
-def lose_manifest(address: str) -> None:
-    bucket = Bucket(address)
-    bucket.delete([one.name for one in bucket.objects("manifests") if one.name.endswith(".json")])
-    files.mounted.clear()
-
-
 def test_a_lost_manifest_is_brought_back(robot: hl.Store, address: str) -> None:
     """With what was added there since, as far as the catalog knows."""
     robot.copy(address)
@@ -73,7 +60,8 @@ def test_a_lost_manifest_is_brought_back(robot: hl.Store, address: str) -> None:
         there.mark("run", "+1s", "lab")
         there.pin("run", "+1s", "+2s", topics=["scan"], reason="mine")
         before = replace(there.entry("run"), flushed={})
-    lose_manifest(address)
+    lose(address, ".json")
+    files.mounted.clear()
     assert robot.copy(address).known == ["run"]
     files.mounted.clear()
     with hl.open(address) as there:
@@ -114,6 +102,7 @@ def test_only_fields_mend_a_damaged_copy(robot: hl.Store, address: str) -> None:
     """With the whole file, as it was there; tables may be lost, since the messages answer."""
     robot.copy(address)
     lose(address, "000001.mcap")
+    files.mounted.clear()
     Bucket(address).delete([one.name for one in Bucket(address).objects("tables")])
     assert robot.copy(address, options=CopyOptions(only_fields=True)).copied == ["run"]
     assert states(address) == {"whole": COUNT}

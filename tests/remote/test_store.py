@@ -27,9 +27,9 @@ from hybridlog_storage.remote import address_of
 from hybridlog_storage.remote.blocks import BLOCK, BlockCache
 from hybridlog_storage.remote.bucket import Bucket
 from hybridlog_storage.remote.store import RemoteDirectory
-from tests.cli import running as commands
-from tests.cli.within import Answer, answer
+from tests.cli.within import answer
 from tests.copies import bring
+from tests.damage import flip
 from tests.remote.conftest import BEGIN, RECORDINGS, SECOND, publish_all
 from tests.remote.server import Proxy
 
@@ -268,9 +268,7 @@ def test_damaged_fields_are_left_out(
     source = Path(shutil.copytree(here, tmp_path / "source"))
     shared = [*source.glob("tables/*/shared-*.parquet")]
     for path in shared:
-        data = bytearray(path.read_bytes())
-        data[len(data) // 2] ^= 1
-        path.write_bytes(data)
+        flip(path, 1 / 2)
     publish_all(source, address, ("short-0", "short-1"))
     with hl.open(address) as store:
         assert store.topic("/arm").where("x >= 5").count() == 20
@@ -456,9 +454,7 @@ def test_the_cache_heals_and_is_bounded(published: str, proxy: Proxy, tmp_path: 
     assert files.pread(handle, about.size, 0) == whole
     assert len(proxy.requests) == 2
     (data,) = (tmp_path / "blocks").glob("*.data")
-    flipped = bytearray(data.read_bytes())
-    flipped[5] ^= 1
-    data.write_bytes(flipped)
+    flip(data, 5)
     other = BlockCache(tmp_path / "blocks", BLOCK)  # of another process
     again = other.open(bucket, about)
     assert files.pread(again, about.size, 0) == whole
@@ -521,31 +517,3 @@ def test_what_does_not_work_says_so(published: str, proxy: Proxy) -> None:
         hl.open(published, mongo="embedded")
     assert address_of(Path(published)) == published
     assert address_of("./s3") is None
-
-
-def test_all_commands_tell_of_lost_objects(here: Path, address: str) -> None:
-    """In words and in JSON; also one that has never seen the object."""
-    publish_all(here, address, ("run", "short-0"))
-    with hl.open(here, mongo="none") as source:
-        run = source.entry("run").id
-
-    def told(*words: str) -> Answer:
-        files.mounted.clear()
-        return answer(*words, store=Path(address))
-
-    assert told("fetch", "arm", "--count").err == ""
-    lose(address, "000001.mcap", run)
-    assert "stored data lost" in told("ls").out
-    assert told("ls", "--json").json[0]["status"] != "complete"
-    said = told("fetch", "scan")
-    assert f"{420 - len(said.lines)} messages lost" in said.err
-    assert [one["place"] for one in told("verify", "--json").json["findings"]] == ["segment 1"]
-    assert "000001.mcap is missing" in commands.run("verify", store=Path(address), code=1).out
-    lose(address, f"{run}.json")
-    for _ in range(2):
-        assert "has no manifest" in told("ls").err
-        assert "has no manifest" in told("fetch", "arm", "--count").err
-    with hl.open(here, mongo="none") as source:
-        assert not source.copy(address, ["run"]).refused
-    assert not told("verify", "--json").json["findings"]
-    assert told("ls", "--json").json[0]["status"] == "complete"

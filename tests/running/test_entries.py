@@ -86,15 +86,6 @@ def check(found: RecordingEntry) -> None:
     assert not found.end.get("losses")
 
 
-def test_it_has_each_message_once(running: Running) -> None:
-    """However often it is looked at: what is sealed stays as it was read."""
-    before = replace(running.sealed, spans=list(running.sealed.spans))
-    for _ in range(3):
-        check(running.follow(StoreDirectory(running.path)))
-    assert running.sealed.spans == before.spans
-    assert running.sealed.messages < COUNT
-
-
 def test_what_is_sealed_while_it_is_listed_counts_once(
     running: Running, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -132,14 +123,6 @@ def test_a_segment_that_is_about_to_be_noted_is_no_problem(running: Running) -> 
         catalog.remove(running.entry.id)
         assert not verify(directory, catalog, None, recordings=[running.entry.id]).findings
         put_entry(directory, catalog, running.entry.id, is_open=True)
-
-
-def test_each_segment_has_the_span_of_its_messages(running: Running) -> None:
-    found = running.follow(StoreDirectory(running.path))
-    for number, first, last in found.spans:
-        if number in found.flushed:
-            parts = found.flushed[number].table.parts
-            assert (first, last) == (int(parts["first"].min()), int(parts["last"].max()))
 
 
 @pytest.mark.parametrize("is_file", [True, False])

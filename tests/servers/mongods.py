@@ -81,13 +81,6 @@ class Mongod:
             self._process.wait()
         self._process = None
 
-    def stop(self) -> None:
-        """End it, after it has written what it acknowledged."""
-        self.signal(signal.SIGTERM)
-        if self._process is not None:
-            self._process.wait()
-        self._process = None
-
     def __enter__(self) -> Mongod:
         return self
 

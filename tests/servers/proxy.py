@@ -1,4 +1,4 @@
-"""A proxy before a server that delays what passes, or breaks connections in the middle."""
+"""A proxy before a server that breaks connections in the middle."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import select
 import socket
 import struct
 import threading
-import time
 from contextlib import suppress
 from typing import Self
 
@@ -21,13 +20,11 @@ class Proxy:
 
     Attributes:
         port: Its own port.
-        delay_s: Seconds until bytes are passed on, in each direction.
         reset_after: Bytes from the server after which a connection is reset; 0 for never.
         resets: Connections that were reset.
     """
 
     def __init__(self, target: int) -> None:
-        self.delay_s = 0.0
         self.reset_after = 0
         self.resets = 0
         self._target = target
@@ -70,7 +67,6 @@ class Proxy:
                     data = source.recv(1 << 16)
                     if not data:
                         return
-                    time.sleep(self.delay_s)
                     if source is ours:
                         theirs.sendall(data)
                         continue

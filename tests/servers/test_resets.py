@@ -28,7 +28,7 @@ def way(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Proxy]:
 
 @pytest.fixture
 def uri(way: Proxy) -> Iterator[str]:
-    way.reset_after, way.resets, way.delay_s = 0, 0, 0.0
+    way.reset_after = way.resets = 0
     yield f"mongodb://127.0.0.1:{way.port}/store{next(NUMBERS)}"
     way.reset_after = 0
 

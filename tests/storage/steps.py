@@ -28,7 +28,6 @@ class Steps(files.System):
         only: frozenset[str] | None = None,
     ) -> None:
         self.log: list[tuple[str, str]] = []
-        self.failed = 0
         self._count = 0
         self._from = fail_from
         self._until = fail_until
@@ -41,7 +40,6 @@ class Steps(files.System):
         number, self._count = self._count, self._count + 1
         is_late = self._from is not None and number >= self._from
         if is_late and (self._until is None or number < self._until):
-            self.failed += 1
             raise OSError(errno.ENOSPC, "no space left")
 
     def open(self, name: str, flags: int, mode: int = 0o666, *, folder: int | None = None) -> int:

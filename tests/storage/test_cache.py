@@ -5,53 +5,36 @@ from __future__ import annotations
 from hybridlog_storage.cache import Cache
 
 
-class Reading:
-    """Counts what is made."""
+def test_those_that_were_not_asked_for_longest_go_first() -> None:
+    cache, made = Cache(3500), list[int]()
 
-    def __init__(self, cache: Cache) -> None:
-        self._cache = cache
-        self.made: list[int] = []
-
-    def get(self, number: int, size: int = 1000) -> bytes:
+    def get(number: int, size: int = 1000) -> bytes:
         def make() -> bytes:
-            self.made.append(number)
+            made.append(number)
             return bytes([number]) * size
 
-        return self._cache.made("chunk", "a", number, make=make, size_of=len)
+        return cache.made("chunk", "a", number, make=make, size_of=len)
 
-
-def test_those_that_were_not_asked_for_longest_go_first() -> None:
-    reading = Reading(Cache(3500))
     for number in (1, 2, 3, 1, 4, 1, 2):
-        assert reading.get(number)[0] == number
-    assert reading.made == [1, 2, 3, 4, 2]  # 2 had to go for 4
+        assert get(number)[0] == number
+    assert made == [1, 2, 3, 4, 2]  # 2 had to go for 4
+    # A value without room is given, and not kept.
+    for _ in range(2):
+        assert get(5, size=4000) == b"\5" * 4000
+    assert get(1)[0] == 1
+    assert made == [1, 2, 3, 4, 2, 5, 5]
 
 
-def test_a_value_without_room_is_given_and_not_kept() -> None:
-    reading = Reading(Cache(3500))
-    reading.get(1)
-    assert len(reading.get(2, size=4000)) == 4000
-    assert reading.get(2, size=4000)[0] == 2
-    assert reading.get(1)[0] == 1
-    assert reading.made == [1, 2, 2]
-
-
-def test_another_value_takes_the_place_of_the_one_before() -> None:
+def test_another_value_takes_the_place_of_the_one_before_and_a_kind_is_dropped() -> None:
     cache = Cache(100)
     cache.put("chunk", 1, value="a", size=60)
     cache.put("chunk", 1, value="b", size=70)
     assert cache.get("chunk", 1) == "b"
     cache.put("density", 1, value="c", size=30)
     assert (cache.get("chunk", 1), cache.get("density", 1)) == ("b", "c")
-    cache.put("chunk", 1, value="d", size=101)  # has no room: the old one does not hold any more
-    assert cache.get("chunk", 1) is None
-
-
-def test_a_kind_is_dropped() -> None:
-    cache = Cache(100)
-    cache.put("chunk", 1, value="a", size=60)
-    cache.put("density", 1, value="b", size=30)
     cache.drop("chunk")
-    assert (cache.get("chunk", 1), cache.get("density", 1)) == (None, "b")
-    cache.put("matches", 1, value="c", size=70)  # there is room for it
-    assert cache.get("density", 1) == "b"
+    assert (cache.get("chunk", 1), cache.get("density", 1)) == (None, "c")
+    cache.put("matches", 1, value="d", size=70)  # there is room for it
+    assert cache.get("density", 1) == "c"
+    cache.put("matches", 1, value="e", size=101)  # there is none: the old one holds no more
+    assert cache.get("matches", 1) is None

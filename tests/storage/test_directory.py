@@ -75,24 +75,6 @@ def test_segments_are_told_by_their_numbers(store: StoreDirectory) -> None:
     assert store.segments("nothing") == []
 
 
-def test_what_a_recording_looks_like_changes_with_its_files(store: StoreDirectory) -> None:
-    recording = made(store)
-    seen = [store.listing("r").print]
-
-    def changed() -> bool:
-        seen.append(store.listing("r").print)
-        return seen[-1] not in seen[:-1]
-
-    (recording / "000000.mcap").write_bytes(b"segment")
-    assert changed()
-    (recording / "000000.mcap").rename(recording / "000001.mcap")
-    assert changed()
-    (recording / "000002.mcap.open").write_bytes(b"")
-    assert changed()
-    (recording / "notes.txt").write_bytes(b"x")
-    assert not changed()
-
-
 HOLD = """
 import sys
 from pathlib import Path

@@ -238,18 +238,13 @@ def test_users_that_come_all_at_once_start_one(directory: Path) -> None:
 
 
 @pytest.mark.usefixtures("directory")
-def test_any_path_of_the_store_will_do(tmp_path: Path) -> None:
+def test_any_path_of_the_store_and_any_locale_will_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("LC_ALL", "xx_XX.UTF-8")  # which is not installed
     store = tmp_path / "with space & 'quote'" / "Größe-日本語" / "/".join(["d" * 60] * 5)
     store.mkdir(parents=True)
     with EmbeddedMongod(store / "mongod", linger_s=LINGER_S) as user:
-        assert ping(user.start())
-
-
-def test_runs_under_a_locale_that_is_not_installed(
-    directory: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("LC_ALL", "xx_XX.UTF-8")
-    with EmbeddedMongod(directory, linger_s=LINGER_S) as user:
         assert ping(user.start())
 
 

@@ -8,6 +8,7 @@ import pytest
 
 from hybridlog_storage.lazy import lazy
 from hybridlog_storage.threads import Threads
+from tests.waiting import at_once
 
 
 class Interrupted(BaseException):
@@ -66,10 +67,6 @@ def test_threads_get_one_value_of_a_lazy_attribute() -> None:
             return object()
 
     made, found = Made(), []
-    threads = [threading.Thread(target=lambda: found.append(made.value)) for _ in range(2)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    at_once(*[lambda: found.append(made.value)] * 2)
     assert found == [made.value] * 2
     assert Made.value.__doc__ == "Another object each time."

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import secrets
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,25 +9,11 @@ from pathlib import Path
 import pytest
 
 import hybridlog as hl
-from hybridlog_storage.mongo.mongod import EmbeddedMongod
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from hybridlog_storage.settings import NONE
 from tests.tables.logs import BASE, varied, write_log
 
 SMALL_CHUNKS = SegmentSettings(chunk_size=4096)
-
-
-@pytest.fixture(scope="session")
-def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """A MongoDB for all stores."""
-    with EmbeddedMongod(tmp_path_factory.mktemp("server") / "mongod") as user:
-        yield user.start()
-
-
-@pytest.fixture
-def mongo(server: str) -> str:
-    """The address of a database of its own."""
-    return server.replace("/?", f"/t{secrets.token_hex(6)}?")
 
 
 @pytest.fixture

@@ -12,6 +12,8 @@ import numpy as np
 from mcap.writer import Writer
 
 import hybridlog as hl
+from hybridlog.columns.tables import Tables
+from hybridlog.columns.topic_table import TopicTable
 from hybridlog_storage.errors import PayloadError
 from hybridlog_storage.messages import Channel, Schema
 
@@ -160,6 +162,14 @@ def decoded(store: hl.Store, recording: str, topic: str) -> list[Decoded]:
             _DECODED.clear()
         _DECODED[key] = [Decoded(message) for message in store.query([topic], [entry.id])]
     return _DECODED[key]
+
+
+def table_of(store: hl.Store, topic: str = "/a") -> TopicTable:
+    """The table of a topic of the only recording."""
+    (entry,) = store.recordings()
+    found = Tables(store.directory.path).of(entry, topic)
+    assert found is not None
+    return found
 
 
 def same(cell: Any, value: Any) -> bool:

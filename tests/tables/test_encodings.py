@@ -15,7 +15,7 @@ from hybridlog.columns.tables import Tables
 from hybridlog_storage.messages import Schema
 from tests.limits import Limit
 from tests.tables.conftest import SMALL_CHUNKS
-from tests.tables.logs import BASE, write_log
+from tests.tables.logs import BASE, table_of, write_log
 
 
 def record(store: hl.Store, path: Path, values: Sequence[Any], topic: str = "/a") -> None:
@@ -85,10 +85,7 @@ def test_json_that_is_none(store: hl.Store, tmp_path: Path) -> None:
     write_log(tmp_path / "log.mcap", said, {"/a": ("json", Schema("x", "jsonschema", b"{}"))})
     store.record(tmp_path / "log.mcap", name="log")
     assert rows(store) == [{"n": None}, {"n": 1}]
-    (entry,) = store.recordings()
-    table = Tables(store.directory.path).of(entry, "/a")
-    assert table is not None
-    assert table.unreadable == 1
+    assert table_of(store).unreadable == 1
     query = store.topic("/a")
     assert [json.loads(line)["n"] for some in query.to_json_lines() for line in some] == [1]
     assert query.counters.unreadable == 1

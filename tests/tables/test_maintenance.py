@@ -18,6 +18,7 @@ from hybridlog.maintenance import tables as making
 from hybridlog.maintenance.verify import RESTORE
 from hybridlog.record.marks import MARKS
 from tests import places
+from tests.damage import flip
 from tests.limits import Limit
 from tests.tables.logs import BASE, varied, write_log
 from tests.tables.test_writer import compare, topics_of
@@ -103,17 +104,14 @@ def test_a_damaged_chunk_costs_no_table(few: hl.Store) -> None:
     before = contents(few)
     (entry,) = few.recordings()
     (path,) = places.folder(few.directory.path, "few").glob("*.mcap")
-    data = bytearray(path.read_bytes())
-    data[2000] ^= 1
-    path.write_bytes(data)
+    flip(path, 2000)
     make_tables(few.directory, few.catalog, entry, topics=["/a"])
     assert contents(few) == before
     (finding,) = few.verify().findings
     assert finding.cure == RESTORE
     few.index.rebuild()
     assert contents(few) == before
-    data[2000] ^= 1
-    path.write_bytes(data)
+    flip(path, 2000)
     few.index.rebuild()
     assert compare(few) == 90
 
@@ -128,9 +126,7 @@ def test_repair_makes_missing_tables(few: hl.Store, limit: Limit) -> None:
     assert contents(few) == before
     assert not few.verify(repair=True).repaired
     path = next((few.directory.path / TABLES).glob("*/*.parquet"))
-    data = bytearray(path.read_bytes())
-    data[1000:1400] = bytes(400)
-    path.write_bytes(data)
+    flip(path, *range(1000, 1400), bits=0xFF)
     topics = [one.place for one in few.verify().findings]
     limit(table_reserve_bytes=1 << 60)
     done = few.verify(repair=True)

@@ -20,6 +20,7 @@ from hybridlog.columns.layout import (
 )
 from hybridlog.columns.parquet_file import ParquetFileWriter
 from hybridlog_storage.errors import StoreError
+from tests.damage import flip
 
 ROWS = 20_000
 
@@ -113,9 +114,7 @@ def test_a_file_that_is_cut_while_it_is_open(path: Path, table: pa.Table) -> Non
 
 def test_parts_of_a_damaged_file_that_are_whole_are_read(path: Path, table: pa.Table) -> None:
     write(path, table)
-    content = bytearray(path.read_bytes())
-    content[-len(content) // 3] ^= 1
-    path.write_bytes(content)
+    flip(path, 2 / 3)
     reader = ColumnFile(path)
     assert reader.read(0, [0]).equals(table.select(["t"]))
     with pytest.raises(StoreError):

@@ -24,21 +24,15 @@ from hybridlog.columns.topic_table import TopicTable
 from hybridlog.follow.follower import make_tables
 from hybridlog_storage.cache import Cache
 from hybridlog_storage.errors import StoreError
+from tests.damage import flip
 from tests.some import in_turn
-from tests.tables.logs import decoded
+from tests.tables.logs import decoded, table_of
 from tests.tables.test_writer import compare, topics_of
 
 
 @pytest.fixture
 def tables(recorded: hl.Store) -> Tables:
     return Tables(recorded.directory.path)
-
-
-def table_of(store: hl.Store, topic: str = "/large") -> TopicTable:
-    (entry,) = store.recordings()
-    found = Tables(store.directory.path).of(entry, topic)
-    assert found is not None
-    return found
 
 
 def file_of(store: hl.Store, topic: str = "/large") -> Path:
@@ -50,7 +44,7 @@ def file_of(store: hl.Store, topic: str = "/large") -> Path:
 
 
 def test_only_what_is_wanted_is_read(recorded: hl.Store) -> None:
-    table = table_of(recorded)
+    table = table_of(recorded, "/large")
     (block,) = table.scan(["header.stamp", "points[].X", "Name", "covariance.max"], own=["pub"])
     kind = block.records.type
     assert [kind.field(n).name for n in range(kind.num_fields)] == [
@@ -112,62 +106,32 @@ def test_parts_are_merged(runs: list[list[tuple[int, int]]], size: int) -> None:
 # --- what is believed -----------------------------------------------------------------
 
 
-def garble(path: Path) -> None:
-    content = bytearray(path.read_bytes())
-    content[len(content) // 3] ^= 1
-    path.write_bytes(content)
-
-
-def garble_footer(path: Path) -> None:
-    content = bytearray(path.read_bytes())
-    content[-300] ^= 1
-    path.write_bytes(content)
-
-
-def cut(path: Path) -> None:
-    path.write_bytes(path.read_bytes()[:-1000])
-
-
-def empty(path: Path) -> None:
-    path.write_bytes(b"")
-
-
-def delete(path: Path) -> None:
-    path.unlink()
-
-
-def be_a_folder(path: Path) -> None:
-    path.unlink()
-    path.mkdir()
-
-
-def be_a_pipe(path: Path) -> None:
-    path.unlink()
-    os.mkfifo(path)
-
-
-def lead_elsewhere(path: Path) -> None:
-    path.rename(path.with_suffix(".real"))
-    path.symlink_to(path.with_suffix(".real"))
-
-
-DAMAGE = [garble, garble_footer, cut, empty, delete, be_a_folder, be_a_pipe, lead_elsewhere]
+DAMAGE: dict[str, Callable[[Path], object]] = {
+    "garbled": lambda path: flip(path, 1 / 3),
+    "its footer garbled": lambda path: flip(path, -300),
+    "cut": lambda path: os.truncate(path, path.stat().st_size - 1000),
+    "empty": lambda path: path.write_bytes(b""),
+    "deleted": Path.unlink,
+    "a folder": lambda path: (path.unlink(), path.mkdir()),
+    "a pipe": lambda path: (path.unlink(), os.mkfifo(path)),
+    "a link": lambda path: path.symlink_to(path.rename(path.with_suffix(".real"))),
+}
 
 
 @pytest.mark.parametrize(("harm", "topic"), in_turn(DAMAGE, ["/large", "/small/one"]))
 def test_damaged_tables_are_none_and_are_made_again(
-    recorded: hl.Store, tables: Tables, harm: Callable[[Path], None], topic: str
+    recorded: hl.Store, tables: Tables, harm: str, topic: str
 ) -> None:
     want = sum(m.value.i8 > 0 for m in decoded(recorded, "log", topic))
     (entry,) = recorded.recordings()
     path = file_of(recorded, topic)
     whole = path.read_bytes()
-    harm(path)
+    DAMAGE[harm](path)
     tables.invalidate()
-    if harm is not garble:  # of that, only who reads the part is told
+    if harm != "garbled":  # of that, only who reads the part is told
         assert tables.of(entry, topic) is None
     places = {f.place for f in recorded.verify().findings}
-    if harm is not delete:
+    if harm != "deleted":
         assert f"table of {topic}" in places
         done = recorded.verify(repair=True)
         assert {f"table of {topic}"} <= {one.place for one in done.repaired}

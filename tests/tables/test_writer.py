@@ -34,6 +34,7 @@ from tests.tables.logs import (
     decoded,
     payload,
     same,
+    table_of,
     varied,
     write_log,
 )
@@ -121,9 +122,7 @@ def test_tables_are_what_the_messages_say(
 
 
 def test_where_a_message_lies(recorded: hl.Store) -> None:
-    (entry,) = recorded.recordings()
-    table = Tables(recorded.directory.path).of(entry, "/large")
-    assert table is not None
+    table = table_of(recorded, "/large")
     with hl.open(recorded.directory.path, mongo="embedded") as indexed:
         documents = documents_of(indexed, "/large")
     want = [
@@ -183,11 +182,9 @@ def test_a_topic_with_files_shares_one_for_its_last_rows(
     said += [(BASE + 3000 + n, "/a", varied(n)) for n in range(5)]
     write_log(tmp_path / "log.mcap", said)
     settings = SegmentSettings(chunk_size=4096, segment_size=1 << 17)
-    entry = store.record(tmp_path / "log.mcap", name="log", settings=settings).entry
+    store.record(tmp_path / "log.mcap", name="log", settings=settings)
     assert compare(store) == 3005
-    table = Tables(store.directory.path).of(entry, "/a")
-    assert table is not None
-    assert len(table.files) == 2
+    assert len(table_of(store).files) == 2
 
 
 @pytest.mark.parametrize("count", [40, 1200])
@@ -196,9 +193,7 @@ def test_unreadable_messages_say_why(store: hl.Store, tmp_path: Path, count: int
     write_log(tmp_path / "log.mcap", said)
     store.record(tmp_path / "log.mcap", name="log")
     assert compare(store) == count
-    (entry,) = store.recordings()
-    table = Tables(store.directory.path).of(entry, "/a")
-    assert table is not None
+    table = table_of(store)
     want = [d["_meta"].get("error") for d in documents_of(store, "/a")]
     have = [e for block in table.scan(own=["error"]) for e in block.own["error"].to_pylist()]
     assert have == want
@@ -210,9 +205,7 @@ def test_messages_that_nobody_can_read(store: hl.Store, tmp_path: Path) -> None:
     schemas = {"/a": ("secret", Schema("x/Secret", "secret", b"?"))}
     write_log(tmp_path / "log.mcap", said, schemas)
     store.record(tmp_path / "log.mcap", name="log")
-    (entry,) = store.recordings()
-    table = Tables(store.directory.path).of(entry, "/a")
-    assert table is not None
+    table = table_of(store)
     (block,) = table.scan(None, own=["ref", "state"])
     assert block.own["ref"].field("len").to_pylist() == list(range(20))
     assert set(block.own["state"].to_pylist()) == {"whole"}
@@ -269,9 +262,7 @@ def test_chunks_that_come_late_are_put_in_their_place(
         writer.add(chunk, channels)
     writer.close(entry)
     assert compare(store) == 4000
-    tables = Tables(store.directory.path)
-    table = tables.of(entry, "/a")
-    assert table is not None
+    table = table_of(store)
     parts = table.parts  # they are merged when they are read
     assert any(one.last > other.first for one, other in itertools.pairwise(parts))
     bounds = [BASE + 100, BASE + 350, BASE + 2000]

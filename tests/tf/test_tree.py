@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -212,15 +211,6 @@ def test_no_transforms(tmp_path: Path) -> None:
             recording.write(Channel("/a", "json", None), b"{}", log_time=1)
         with pytest.raises(TopicError, match="No topic has transforms"):
             store.tf("x")
-
-
-def test_a_running_recording(tmp_path: Path) -> None:
-    with hl.open(tmp_path / "store", create=True, mongo="none") as store:
-        with store.start("x", flush_interval_s=0.01) as recording:
-            recording.write(MOVING, said(0, "a", "b"), log_time=BEGIN)
-            time.sleep(0.3)
-            with hl.open(tmp_path / "store", mongo="none") as other:
-                assert other.tf("x").names == ["a", "b"]
 
 
 def test_gaps_and_rates(log: Log) -> None:

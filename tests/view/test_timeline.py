@@ -13,7 +13,6 @@ import pytest
 
 import hybridlog as hl
 from hybridlog.live import LiveRecording
-from hybridlog_storage.errors import TimeError
 from hybridlog_storage.messages import Channel
 from hybridlog_storage.segments.segment_writer import SegmentSettings
 from tests import places
@@ -55,13 +54,6 @@ def picture_of(client: TestClient, asked: dict[str, Any]) -> Picture:
         for n, one in enumerate(head["lanes"])
     ]
     return Picture(head, lanes, len(answer.content))
-
-
-def counted(store: hl.Store, topic: str, begin: int, end: int) -> int:
-    try:
-        return store.topic(topic).between(begin, end).count()
-    except TimeError:
-        return 0
 
 
 def test_an_answer_is_as_large_as_the_picture(client: TestClient) -> None:

@@ -9,7 +9,6 @@ import shutil
 import socket
 import ssl
 import struct
-import subprocess
 import sys
 import threading
 import time
@@ -27,6 +26,8 @@ from hybridlog_storage.messages import Schema
 from tests.calls import Calls
 from tests.limits import Limit
 from tests.live.sources.heard import DEADLINE_S, Heard, Listening, must_return
+from tests.servers.mongods import free_port
+from tests.servers.test_tls import authority, certificate
 from tests.waiting import wait_for
 
 pytest.importorskip(
@@ -701,9 +702,7 @@ def test_a_server_that_does_not_read_is_left(limit: Limit) -> None:
 
 
 def test_a_server_that_comes_late_is_waited_for() -> None:
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
-
+    port = free_port()
     heard = Heard()
     with FoxgloveSource(f"ws://127.0.0.1:{port}") as source:
         source.start(heard)
@@ -784,34 +783,27 @@ def test_a_sink_that_fails_is_told(monkeypatch: pytest.MonkeyPatch, calls: Calls
 
 
 @pytest.fixture(scope="module")
-def certificate(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    program = shutil.which("openssl")
-    if program is None:
+def trusted(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """An authority, and a certificate of it with its key."""
+    if shutil.which("openssl") is None:
         pytest.skip("openssl is not installed: wss:// is not tested")
     folder = tmp_path_factory.mktemp("tls")
-    subprocess.run(
-        f"{program} req -x509 -newkey ec -pkeyopt ec_paramgen_curve:P-256 -nodes -days 2 "
-        "-keyout key.pem -out cert.pem -subj /CN=localhost -addext subjectAltName=IP:127.0.0.1",
-        shell=True,
-        check=True,
-        cwd=folder,
-        capture_output=True,
-    )
-    return folder / "cert.pem", folder / "key.pem"
+    ours = authority(folder / "ours.pem")
+    return ours, certificate(folder / "server.pem", ours)
 
 
-def tls_server(script: Script, certificate: tuple[Path, Path]) -> Server:
+def tls_server(script: Script, trusted: tuple[Path, Path]) -> Server:
     server = Server(script)
     server.tls = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    server.tls.load_cert_chain(*certificate)
+    server.tls.load_cert_chain(trusted[1])
     server.url = server.url.replace("ws:", "wss:")
     return server
 
 
 def test_tls_carries_messages_of_any_size(
-    certificate: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+    trusted: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("SSL_CERT_FILE", str(certificate[0]))
+    monkeypatch.setenv("SSL_CERT_FILE", str(trusted[0]))
     payloads = [random.randbytes(size) for size in SIZES]
 
     def script(peer: Peer) -> None:
@@ -819,16 +811,16 @@ def test_tls_carries_messages_of_any_size(
         peer.send(*(message(number, 0, payload) for payload in payloads))
         peer.wait()
 
-    server = tls_server(script, certificate)
+    server = tls_server(script, trusted)
     heard = hear(lambda h: len(h.taken) == len(payloads), server=server)
     assert heard.payloads() == payloads
     assert heard.said == []
 
 
 def test_a_certificate_that_nobody_vouches_for_is_refused(
-    certificate: tuple[Path, Path],
+    trusted: tuple[Path, Path],
 ) -> None:
-    server = tls_server(Peer.wait, certificate)
+    server = tls_server(Peer.wait, trusted)
     heard = hear(lambda h: h.said_of("certificate is not trusted"), server=server)
     assert heard.said_of("SSL_CERT_FILE")
 

@@ -25,6 +25,7 @@ from tests.live.sources.ros1_peers import (
     sends,
     until_closed,
 )
+from tests.servers.mongods import free_port
 from tests.waiting import wait_for
 
 Script = Callable[[socket.socket], None]
@@ -66,11 +67,6 @@ def _system(
 
 def _announce(master: FakeMaster, publisher: FakePublisher) -> None:
     master.add(publisher.topic, publisher.fields["type"], publisher.node, publisher.uri)
-
-
-def _free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return int(server.getsockname()[1])
 
 
 def test_messages_come_as_they_were_sent() -> None:
@@ -217,7 +213,7 @@ def test_a_type_that_the_master_does_not_know() -> None:
 
 
 def test_a_master_that_is_not_there_yet() -> None:
-    sink, port = Collector(), _free_port()
+    sink, port = Collector(), free_port()
     with Ros1Source(f"http://127.0.0.1:{port}") as source:
         source.start(sink)
         sink.wait_said("no ROS master", f"127.0.0.1:{port}", "refused", "roscore")
@@ -404,7 +400,7 @@ def test_broken_text_in_a_header() -> None:
 def test_a_publisher_that_is_not_there() -> None:
     with _system(FakePublisher(sends(b"good"))) as (master, sink):
         sink.wait_for(b"good")
-        master.add("/topic", "", "/dead", f"http://127.0.0.1:{_free_port()}/")
+        master.add("/topic", "", "/dead", f"http://127.0.0.1:{free_port()}/")
         master.add("/topic", "", "/odd", "tcp://\x9bnowhere")
         sink.wait_said("refused", "rosnode cleanup", "ROS_IP")
         sink.wait_said("/topic", "not an address")
@@ -415,7 +411,7 @@ def test_a_publisher_that_is_not_there() -> None:
 def test_a_dead_node_is_told_of_once_and_its_topics_do_not_come() -> None:
     with FakeMaster() as master, Ros1Source(master.uri, poll_s=0.05) as source:
         assert not source.was_reached
-        uri = f"http://127.0.0.1:{_free_port()}/"
+        uri = f"http://127.0.0.1:{free_port()}/"
         for number in range(11):
             master.add(f"/dead/{number:02}", "std_msgs/String", "/dead", uri)
         sink = Collector()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import socket
 import subprocess
 import xmlrpc.client
 from collections.abc import Iterator
@@ -18,6 +17,7 @@ import pytest
 from hybridlog.live.sources.ros1.source import Ros1Source
 from tests.live.sources.ros1_debian import PACKAGES, Ros1, ros1
 from tests.live.sources.ros1_peers import Collector
+from tests.servers.mongods import free_port
 from tests.waiting import wait_for
 
 PUBLISHER = """
@@ -73,8 +73,7 @@ class _Master:
 
     def __init__(self, debian: Ros1) -> None:
         self.debian = debian
-        with socket.create_server(("127.0.0.1", 0)) as server:
-            self.port = server.getsockname()[1]
+        self.port = free_port()
         self.uri = f"http://127.0.0.1:{self.port}"
         self.environment = {
             **{name: value for name, value in os.environ.items() if not name.startswith("ROS_")},

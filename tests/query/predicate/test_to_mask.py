@@ -60,30 +60,6 @@ def mask_of(
     return None if mask is None else mask.tolist()
 
 
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("x == 1", [True, False]),
-        ("x < 5", [True, False]),
-        ("x in [1, 2]", [True, False]),
-        ("not x == 1", [False, True]),
-        ("x != 2", None),  # a null is not 2, and what is missing is nothing
-        ("x != 1", None),
-        ("x == null", None),
-        ("x in [1, null]", None),
-        ("x exists", None),
-        ("x missing", None),
-        ("y != 3", [True, True]),
-        ("y exists", [True, True]),
-        ("z == 1", None),  # there is no such column
-    ],
-)
-def test_nulls(text: str, expected: list[bool] | None) -> None:
-    table = pa.record_batch({"x": [1, None], "y": [2, 2]})
-    assert mask_of(text, table) == expected
-    assert mask_of(text, table, {"x": "int64", "y": "int64", "z": "int64"}) == expected
-
-
 def test_times_are_nanoseconds() -> None:
     table = pa.record_batch(
         {
@@ -95,38 +71,6 @@ def test_times_are_nanoseconds() -> None:
     assert mask_of("t == 1000000000000000001", table) == [False, True]
     assert mask_of("d < 0ms", table) == [False, True]
     assert mask_of("us > 5", table) is None
-
-
-SUMMARY = pa.struct(
-    [("n", pa.int64()), ("min", pa.float64()), ("max", pa.float64()), ("mean", pa.float64())]
-)
-
-
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("a < 2", [True, False]),
-        ("a > 8", [True, False]),
-        ("a == 5", None),
-        ("a != 5", None),
-        ("a == inf", None),
-        ("a[3] < 2", None),
-        ("a.n == 40", [True, True]),
-        ("a.min == null", [False, True]),
-        ("a.max >= 9", [True, False]),
-        ("a exists", [True, True]),
-        ("a ~ 'x'", None),
-    ],
-)
-def test_summaries(text: str, expected: list[bool] | None) -> None:
-    summaries: list[dict[str, float | None]] = [
-        {"n": 40, "min": 1.0, "max": 9.0, "mean": 5.0},
-        {"n": 40, "min": None, "max": None, "mean": None},
-    ]
-    table = pa.record_batch({"a": pa.array(summaries, SUMMARY)})
-    assert mask_of(text, table, {"a": "float64[]"}) == expected
-    if "exists" not in text and ".max" not in text:
-        assert mask_of("a < 2", table) is None, "it may be a message"
 
 
 def test_what_columns_cannot_tell() -> None:

@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 import pickle
 
-import pytest
-
 from hybridlog.query.predicate.mongo_filter import mongo_filter
 from hybridlog.query.predicate.parser import parse
 from hybridlog.query.predicate.tree import And, Compare, Field, Predicate
@@ -47,17 +45,6 @@ def test_predicates_are_equal_when_they_ask_for_the_same() -> None:
     assert one == other == parse("x == nan")
     assert hash(one) == hash(other)
     assert parse("x == 1") != 1
-
-
-@pytest.mark.parametrize("text", TEXTS)
-def test_a_predicate_shows_what_it_asks(text: str) -> None:
-    shown = repr(parse(text))
-    assert shown.startswith("<Predicate ")
-    for word in ("a.0.b", "a.b", "not in", "~", "nan", "true", "null"):
-        if word in text.replace("[0]", ".0"):
-            assert word in shown
-    # It is text of the language.
-    assert parse(shown.removeprefix("<Predicate ").removesuffix(">")) == parse(text)
 
 
 def test_what_mongodb_is_asked_is_shown_as_it_is_written() -> None:

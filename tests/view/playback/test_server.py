@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import shutil
-import socket
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -24,7 +23,7 @@ from websockets.sync.client import connect
 
 import hybridlog as hl
 from hybridlog.view.playback.played import PlayedLog
-from hybridlog_storage.errors import TimeError, UsageError
+from hybridlog_storage.errors import TimeError
 from hybridlog_storage.messages import Channel
 from tests.independent import Seen, read_mcap
 from tests.limits import Limit
@@ -458,10 +457,3 @@ def test_a_damaged_log_is_said(store: hl.Store, tmp_path: Path) -> None:
             assert said == [error["message"]]
             viewer.control(plays=True)
             assert viewer.text("status")["level"] == 2, "playing on meets the damage again"
-
-
-def test_a_port_that_is_taken(one: PlayedLog) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
-        with pytest.raises(UsageError, match="--port"), served(one, port=port):
-            pass
