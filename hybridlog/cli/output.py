@@ -8,6 +8,7 @@ import sys
 import textwrap
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import asdict, is_dataclass
 from typing import TYPE_CHECKING, TextIO
 
@@ -100,8 +101,9 @@ def print_json_line(value: object) -> None:
 
 
 def note(text: str) -> None:
-    """A line for the person, on standard error."""
-    print(folded(text), file=sys.stderr)  # noqa: T201
+    """A line for the person, on standard error; who reads it may go, and the work goes on."""
+    with suppress(BrokenPipeError):
+        print(folded(text), file=sys.stderr)  # noqa: T201
 
 
 def remarks(lines: Iterable[str]) -> None:

@@ -271,8 +271,7 @@ class _Display:
         if self._table is not None:
             self._table.note(text)
         else:
-            with suppress(OSError):  # who reads it may go; the recording goes on
-                output.note(f"hybridlog: {text}")
+            output.note(f"hybridlog: {text}")
 
     def state(self, state: RecorderState) -> None:
         """Show the state, about once a second.
@@ -286,7 +285,7 @@ class _Display:
         elif self._as_json:
             from hybridlog.live.state import summary_of
 
-            with suppress(OSError):
+            with suppress(BrokenPipeError):  # who reads it may go; the recording goes on
                 output.print_json_line({"state": summary_of(state)})
 
 

@@ -276,6 +276,18 @@ def test_a_simulation_is_recorded_by_its_clock(tmp_path: Path) -> None:
     assert {at for at, _ in found} == {5, second + 5, 2 * second + 5}
 
 
+@pytest.mark.parametrize("stream", ["stdout", "stderr"])
+def test_who_reads_what_it_says_may_go(logs: Path, tmp_path: Path, stream: str) -> None:
+    words = ("--replay", logs / "robot.bag", "--speed", 4, "--trigger", "/nothing")
+    with recorder(tmp_path / "store", *words) as process:
+        until_it_speaks(process)
+        getattr(process, stream).close()
+        (process.stdout if stream == "stderr" else process.stderr).read()
+        assert process.wait(60) in {0, 1}
+    (entry,) = run("ls", "--json", store=tmp_path / "store").json
+    assert entry["status"] == "complete"
+
+
 def test_a_recorder_is_visited(logs: Path, tmp_path: Path) -> None:
     store = tmp_path / "store"
     with recorder(
