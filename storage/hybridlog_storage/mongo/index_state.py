@@ -98,17 +98,22 @@ class IndexState:
     def clear(self, entry: RecordingEntry, but: Collection[str] = ()) -> None:
         """Remove the index documents of a recording, but those of some segments, numbers as text.
 
-        They are looked for in its topics, within its times and an hour around them: a crash may
-        have cut messages whose documents are here.
+        They are looked for within its times, its losses and an hour around them, and of one that
+        is whole in its topics: a crash may have cut messages whose documents are here.
         """
         chosen: dict[str, object] = {"_meta.rec": entry.key}
-        if entry.span is not None:
-            first, last = entry.span
-            chosen.update(between(max(0, first - _AROUND_NS), last + _AROUND_NS))
+        rows = entry.end.get("losses", ())
+        times = [*(entry.span or (None,)), *(row[one] for row in rows for one in ("from", "to"))]
+        known = [time for time in times if time is not None]
+        if len(known) == len(times):
+            chosen.update(between(max(0, min(known) - _AROUND_NS), max(known) + _AROUND_NS))
         if but:
             chosen["_meta.ref.seg"] = {"$nin": sorted(map(int, but))}
-        for topic in {channel.topic for channel in entry.channels}:
-            self._db.delete(collection_of(topic), chosen)
+        collections = {collection_of(channel.topic) for channel in entry.channels}
+        if entry.status != "complete":
+            collections |= {*self.document_collections()}
+        for collection in collections:
+            self._db.delete(collection, chosen)
 
     def clear_everywhere(self, keys: Collection[object]) -> None:
         """Remove all documents of recordings, looking through everything.
