@@ -423,6 +423,10 @@ def _lines_of(table: pa.Table) -> Iterator[list[Line]]:
     from hybridlog.formats.jsonl import json_rows
 
     names = ["log_time_ns" if name == "log_time" else name for name in table.column_names]
+    if names.count("log_time_ns") > 1:
+        raise UsageError(
+            "JSON has log_time as 'log_time_ns', as another column: name one with `as`."
+        )
     for batch in table.combine_chunks().to_batches(max_chunksize=_LINES_AT_ONCE):
         yield list(json_rows(pa.StructArray.from_arrays(batch.columns, names)))
 
