@@ -247,6 +247,7 @@ def answer_tables(
         if OUTPUTS[to.form].content == "table":
             answer.schema = schema()
         OUTPUTS[to.form].write(answer, to.target)
+    output.notes(answer.notes)
 
 
 def write_answer(
@@ -345,6 +346,7 @@ def write_following(following: Following, form: str) -> None:
 
     answer = Answer(lines=lines(following), tables=stream(following, at_once=True), is_live=True)
     OUTPUTS[form].write(answer, cast("BinaryIO", _Anywhere()))
+    output.notes(answer.notes)
 
 
 class _Anywhere:
