@@ -247,6 +247,7 @@ def answer_tables(
         if OUTPUTS[to.form].content == "table":
             answer.schema = schema()
         OUTPUTS[to.form].write(answer, to.target)
+    output.notes(answer.notes)
 
 
 def write_answer(
@@ -345,6 +346,7 @@ def write_following(following: Following, form: str) -> None:
 
     answer = Answer(lines=lines(following), tables=stream(following, at_once=True), is_live=True)
     OUTPUTS[form].write(answer, cast("BinaryIO", _Anywhere()))
+    output.notes(answer.notes)
 
 
 class _Anywhere:
@@ -423,6 +425,10 @@ def _lines_of(table: pa.Table) -> Iterator[list[Line]]:
     from hybridlog.formats.jsonl import json_rows
 
     names = ["log_time_ns" if name == "log_time" else name for name in table.column_names]
+    if names.count("log_time_ns") > 1:
+        raise UsageError(
+            "JSON has log_time as 'log_time_ns', as another column: name one with `as`."
+        )
     for batch in table.combine_chunks().to_batches(max_chunksize=_LINES_AT_ONCE):
         yield list(json_rows(pa.StructArray.from_arrays(batch.columns, names)))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 
-from hybridlog.cli.answers import Tabular, answer_tables
+from hybridlog.cli.answers import SCREEN, Tabular, answer_tables
 from hybridlog.cli.binder import SECONDS, SIZE, argument, command, option
 from hybridlog.cli.options import Ranged, Strict
 from hybridlog.cli.output import remarks
@@ -53,6 +53,8 @@ def sql_command(given: _Given) -> None:
                 if answer.columns:
                     from pyarrow import Table
 
+                    if to.form != SCREEN:
+                        answer.check_names()
                     answer_tables((Table.from_batches([one]) for one in answer.to_batches()), to)
             sys.stdout.flush()
             remarks(answer.sentences())

@@ -36,7 +36,7 @@ class Answer:
         extras: What a log has beside its messages.
         profile: MCAP profile of the messages.
         is_live: Rows are written as they come.
-        notes: Gets a sentence about each extra that is left out because it is damaged.
+        notes: Gets sentences about what is left out: damaged extras, rows without a place.
         unreadable: Gets the error of each message that is left out.
     """
 

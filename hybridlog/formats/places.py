@@ -10,6 +10,7 @@ import pyarrow as pa
 
 from hybridlog.formats.answer import Answer
 from hybridlog.formats.writing import Sink, Target
+from hybridlog.wording import counted
 from hybridlog_storage.errors import UsageError
 
 if TYPE_CHECKING:
@@ -25,9 +26,11 @@ _FIX = ("latitude", "longitude", "altitude")
 
 def write_tum(answer: Answer, target: Target) -> None:
     """Write poses as lines of `time x y z qx qy qz qw`, s and m, which evo reads."""
+    left_out = 0
     with Sink(target) as sink:
         for table, columns in _places(answer, _pose_among):
             rows = table.select(columns).drop_null()
+            left_out += table.num_rows - rows.num_rows
             times = rows[columns[0]].cast(pa.int64()).to_pylist()
             numbers = np.stack([rows[name].to_numpy() for name in columns[1:]], axis=1)
             lines = (
@@ -37,10 +40,12 @@ def write_tum(answer: Answer, target: Target) -> None:
             sink.write("".join(lines).encode())
             if answer.is_live:
                 sink.flush()
+    _tell(answer, left_out, "without a time or a whole pose")
 
 
 def write_geojson(answer: Answer, target: Target) -> None:
     """Write fixes as a collection of points (RFC 7946): longitude, latitude, altitude."""
+    left_out = 0
     with Sink(target) as sink:
         before = b'{"type": "FeatureCollection", "features": ['
         for table, columns in _places(answer, _fix_among):
@@ -50,6 +55,7 @@ def write_geojson(answer: Answer, target: Target) -> None:
                 longitude, latitude = row.pop("longitude"), row.pop("latitude")
                 place = [longitude, latitude, row.pop("altitude", None)]
                 if not all(_is_number(one) for one in place[:2]):
+                    left_out += 1
                     continue
                 feature = {
                     "type": "Feature",
@@ -61,6 +67,12 @@ def write_geojson(answer: Answer, target: Target) -> None:
             if answer.is_live:
                 sink.flush()
         sink.write((b"" if sink.tell() else before) + b"\n]}\n")
+    _tell(answer, left_out, "without a latitude and a longitude")
+
+
+def _tell(answer: Answer, rows: int, why: str) -> None:
+    if rows:
+        answer.notes.append(f"{counted(rows, 'row')} {why} left out.")
 
 
 def _places(

@@ -169,9 +169,11 @@ class Planner:
         """Fields of the matching messages of a part, in order."""
         return self._lasting(part, lambda own: self._rows.values(own, fields))
 
-    def columns(self, part: Part, fields: Collection[str] | None) -> Iterator[Values]:
-        """The same by dotted path; also summaries of arrays."""
-        return self._lasting(part, lambda own: self._rows.columns(own, fields))
+    def columns(
+        self, part: Part, fields: Collection[str] | None, *, partial: bool = False
+    ) -> Iterator[Values]:
+        """The same by dotted path; also summaries of arrays. See `Rows.columns`."""
+        return self._lasting(part, lambda own: self._rows.columns(own, fields, partial=partial))
 
     def values_of_tables(
         self, parts: Sequence[Part], fields: Collection[str] | None

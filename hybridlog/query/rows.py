@@ -234,8 +234,13 @@ class Rows:
         for found, _ in self._values(part, self._answering(part, fields), fields):
             yield found
 
-    def columns(self, part: Part, fields: Collection[str] | None) -> Iterator[Values]:
-        """The same by dotted path, as tables have them; also summaries of arrays."""
+    def columns(
+        self, part: Part, fields: Collection[str] | None, *, partial: bool = False
+    ) -> Iterator[Values]:
+        """The same by dotted path, as tables have them; also summaries of arrays.
+
+        With `partial`, also of messages that lack arrays without their payload; these are null.
+        """
         from hybridlog.frames.columns import flat, with_summaries
         from hybridlog.schema.arrow_columns import structs
 
@@ -243,7 +248,9 @@ class Rows:
         found = self._answering(part, None if fields is None else {*fields} - summaries)
         if found is not None and not all(map(found.table.has, summaries)):
             found = None
-        for (times, seq, records), left in self._values(part, found, fields, summaries):
+        for (times, seq, records), left in self._values(
+            part, found, fields, summaries, partial=partial
+        ):
             made: dict[str, pa.Array[Any]] = {}
             for path in summaries if left is not None else ():
                 array, _, what = path.rpartition(".")
@@ -258,6 +265,8 @@ class Rows:
         found: Tabled | None,
         fields: Collection[str] | None,
         summaries: Collection[str] = (),
+        *,
+        partial: bool = False,
     ) -> Iterator[tuple[Values, LeftFields | None]]:
         """Fields of the matching messages, of a table or decoded, and what is left of them."""
         from hybridlog.schema.arrow_types import converted
@@ -282,8 +291,12 @@ class Rows:
             if channel.is_reduced:
                 from hybridlog.schema.left import LeftFields, without_lacking
 
-                decoded, lacking = without_lacking(decoded, arrays.difference(fields or ()))
-                self._counters.leave_out(lacking, channel.state)
+                whole, lacking = without_lacking(decoded, arrays.difference(fields or ()))
+                if partial:
+                    self._counters.lacking += lacking
+                else:
+                    decoded = whole
+                    self._counters.leave_out(lacking, channel.state)
                 left = decoded.records if isinstance(decoded.records, LeftFields) else None
             good = decoded.rows
             yield Values(run.batch.log_time[good], run.seq[good], decoded.arrow()), left

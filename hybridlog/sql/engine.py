@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import threading
+from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
@@ -324,6 +325,16 @@ class SqlAnswer:
         if self._relation is not None:
             self._result = self._computed(self._table)
 
+    def check_names(self) -> None:
+        """Check that no two columns have one name, for forms that go by names.
+
+        Raises:
+            UsageError: two have.
+        """
+        for name, number in Counter(self.columns).items():
+            if number > 1:
+                raise UsageError(f"There are two columns {name!r}: name one with `as`.")
+
     def to_arrow(self) -> pa.Table:
         """The whole answer as an Arrow table.
 
@@ -385,9 +396,11 @@ class SqlAnswer:
 
         Raises:
             ResourceError: it needs more memory or time than it may.
+            UsageError: two columns have one name.
         """
         from hybridlog.frames.frame import frame_of_table
 
+        self.check_names()
         return frame_of_table(self.to_arrow())
 
     def to_polars(self) -> Any:
@@ -396,9 +409,11 @@ class SqlAnswer:
         Raises:
             MissingDependencyError: polars is not installed.
             ResourceError: it needs more memory or time than it may.
+            UsageError: two columns have one name.
         """
         from hybridlog.frames.frame import to_polars
 
+        self.check_names()
         return to_polars(self.to_arrow())
 
     def rows(self) -> list[tuple[Any, ...]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -40,9 +40,10 @@ def read_ply(data: bytes) -> np.ndarray[Any, Any]:
     return rows
 
 
-def written(form: str, *tables: pa.Table) -> str:
-    stream = io.BytesIO()
-    OUTPUTS[form].write(Answer(tables=tables), stream)
+def written(form: str, *tables: pa.Table, notes: Sequence[str] = ()) -> str:
+    stream, answer = io.BytesIO(), Answer(tables=tables)
+    OUTPUTS[form].write(answer, stream)
+    assert answer.notes == [*notes]
     return stream.getvalue().decode()
 
 
@@ -122,7 +123,8 @@ def test_the_pose_of_a_table() -> None:
     pose = {f"pose.position.{axis}": [1.0, None] for axis in "xyz"}
     pose |= {f"pose.orientation.{axis}": [0.5, 0.5] for axis in "xyzw"}
     table = pa.table({"log_time": pa.array([-1, 5], pa.timestamp("ns", "UTC")), **pose})
-    assert written("tum", table) == "-1.999999999 1.0 1.0 1.0 0.5 0.5 0.5 0.5\n"
+    told = ["1 row without a time or a whole pose left out."]
+    assert written("tum", table, notes=told) == "-1.999999999 1.0 1.0 1.0 0.5 0.5 0.5 0.5\n"
     with pytest.raises(UsageError, match="tum takes poses"):
         written("tum", table.drop_columns(["pose.orientation.w"]))
     two = pa.table({**{name: table[name] for name in table.column_names}, "topic": ["a", "b"]})
@@ -155,7 +157,8 @@ def test_no_fixes() -> None:
             "altitude": [float("nan"), 1.0, None],
         }
     )
-    found = json.loads(written("geojson", table))
+    told = ["1 row without a latitude and a longitude left out."]
+    found = json.loads(written("geojson", table, notes=told))
     assert [one["geometry"]["coordinates"] for one in found["features"]] == [[3, 1], [5, 2]]
     assert json.loads(written("geojson")) == {"type": "FeatureCollection", "features": []}
     with pytest.raises(UsageError, match="takes fixes"):

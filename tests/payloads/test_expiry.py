@@ -221,6 +221,32 @@ def test_strict_answers_need_payloads(copy: Path) -> None:
     answer("fetch", "-t", "/scan", *words, "ranges[3] > 0", store=copy, code=11)
 
 
+@pytest.mark.parametrize("groups", [[0], [0, 1]])
+def test_statistics_of_other_fields_stay(copy: Path, groups: list[int]) -> None:
+    """An array that is gone takes nothing from the count of what is asked beside it."""
+    fields = ("ranges", "angle_min", "ranges.min")
+
+    def stats() -> tuple[list[Any], list[str]]:
+        with hl.open(copy, mongo="none") as store:
+            query = store.topic("/scan")
+            return query.stats(*fields), query.remarks()
+
+    before, _ = stats()
+    gone = expire(copy, groups)["/scan"]
+    found, remarks = stats()
+    by_field = {one.field: one for one in found}
+    assert [by_field[name] for name in fields[1:]] == [
+        one for one in before if one.field in fields[1:]
+    ]
+    assert by_field["angle_min"].count == by_field["ranges.min"].count == COUNT
+    with hl.open(copy, mongo="none") as store:
+        left = [len(one.decode().ranges) for one in store.topic("/scan") if not one.is_reduced]
+    assert len(left) == COUNT - gone
+    ranges = by_field["ranges"]
+    assert ranges.count + ranges.nan + ranges.infinite == sum(left)
+    assert sum(f"{gone} messages have no long arrays" in one for one in remarks) == 1
+
+
 def test_the_second_reader_tells_what_is_left(copy: Path) -> None:
     """By the specification: size, hash and fields of each expired message."""
 

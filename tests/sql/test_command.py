@@ -96,6 +96,26 @@ def test_files(root: Path, tmp_path: Path) -> None:
     assert printed == '"a","b"\n1,"x,y"\n'
 
 
+@pytest.mark.parametrize("form", ["jsonl", "json", "csv", "parquet", "arrow", "npz"])
+def test_two_columns_of_one_name_are_refused(root: Path, tmp_path: Path, form: str) -> None:
+    query = "select a.t, b.t from large a join large b using (t) order by a.t limit 1"
+    with pytest.raises(UsageError, match="two columns 't': name one with `as`"):
+        run(root, query, "-F", form, "-o", tmp_path / "answer")
+    assert not (tmp_path / "answer").exists()
+    assert run(root, query, "-F", "table").stdout.split()[:2] == ["t", "t"]
+    with hl.open(root, mongo="none") as store:
+        answer = store.sql(query)
+        assert len(answer.rows()[0]) == answer.to_arrow().num_columns == 2
+        for made in (answer.to_pandas, answer.to_polars):
+            with pytest.raises(UsageError, match="two columns"):
+                made()
+
+
+def test_json_has_no_other_log_time(root: Path) -> None:
+    with pytest.raises(UsageError, match="name one with `as`"):
+        run(root, "select log_time, t as log_time_ns from large limit 1", "-F", "jsonl")
+
+
 def test_tables_and_notes(root: Path) -> None:
     done = run(
         root, "select recording, count(*) n from large group by all order by all", "-F", "table"

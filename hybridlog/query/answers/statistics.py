@@ -151,7 +151,9 @@ def statistics(session: Session, question: Question, counters: Counters) -> list
         if not all(channel.codec.indexed for channel in part.channels):
             continue
         fields = _numbers(part.field_types) if question.fields is None else question.fields
-        for times, _, records in planner.columns(part, fields) if fields != [] else ():
+        if fields == []:
+            continue
+        for times, _, records in planner.columns(part, fields, partial=True):
             counters.messages += len(times)
             _add(found[part.topic], question, records)
     if question.fields is not None and not any(found.values()):
