@@ -1034,10 +1034,7 @@ class Index:
                 }
             )
         begun = {"made": "", "segments": {}}
-        self._db["hybridlog.recordings"].update_one(
-            {"_id": self._key},
-            {"$set": {"index": begun, "status": "open", "channels": [], "end": {}}},
-        )
+        self._db["hybridlog.recordings"].update_one({"_id": self._key}, {"$set": begun})
 
 
 @pytest.fixture(scope="module")
