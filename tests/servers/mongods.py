@@ -74,6 +74,13 @@ class Mongod:
         if self._process is not None:
             self._process.send_signal(number)
 
+    def stop(self) -> None:
+        """End it, after it has written what it acknowledged."""
+        self.signal(signal.SIGTERM)
+        if self._process is not None:
+            self._process.wait()
+        self._process = None
+
     def kill(self) -> None:
         """Kill it, unless it is dead."""
         if self._process is not None:
