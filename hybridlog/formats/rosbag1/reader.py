@@ -74,6 +74,9 @@ _USUAL: Final = re.compile(
 )
 """The header of a message without further fields, and the length of its data."""
 _USUAL_BYTES: Final = 46
+_SORTED: Final = struct.Struct("<13s4x17s8xI").unpack_from
+_SORTED_NAMES: Final = b"\x26\0\0\0\x09\0\0\0conn=", b"\x04\0\0\0op=\x02\x0d\0\0\0time="
+"""The same with its fields in the order in which rosbag writes them: names, and length."""
 
 _u32 = struct.Struct("<I").unpack_from
 
@@ -146,8 +149,18 @@ def walk(data: bytes, most: int) -> _Walk:
     """Read the whole message and connection records at the beginning of some bytes."""
     rows: list[tuple[int, int, int, int]] = []
     connections: list[tuple[int, _Record]] = []
-    pos, size, u32, usual = 0, len(data), _u32, _USUAL.match
+    pos, size, u32, usual, in_order = 0, len(data), _u32, _USUAL.match, _SORTED
+    first, second = _SORTED_NAMES
     while pos + 8 <= size and len(rows) < most:
+        if pos + _USUAL_BYTES <= size:
+            before, between, count = in_order(data, pos)
+            if before == first and between == second:
+                start = pos + _USUAL_BYTES
+                if start + count > size:
+                    break
+                rows.append((start, count, pos + 13, pos + 34))
+                pos = start + count
+                continue
         head = usual(data, pos)
         if head is not None and head.end() == pos + _USUAL_BYTES:
             conn, time = head.start(1), head.start(2)
