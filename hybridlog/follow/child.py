@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import os
-import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
-from multiprocessing import Pipe
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -18,6 +15,9 @@ from hybridlog.entries import put_entry
 from hybridlog_storage.settings import EMBEDDED, NONE
 
 if TYPE_CHECKING:
+    import subprocess
+    from multiprocessing.connection import Connection
+
     from hybridlog.follow.triggers import Trigger
     from hybridlog_storage.catalog import Catalog, RecordingEntry
     from hybridlog_storage.disk.directory import StoreDirectory
@@ -178,6 +178,8 @@ class FollowerProcess:
 
     def _follow(self) -> bool:
         """Start it, and hear it to its end; True if it has done everything."""
+        from multiprocessing import Pipe
+
         ours, theirs = Pipe()
         with ours:
             with theirs:
@@ -221,6 +223,8 @@ class FollowerProcess:
 
 
 def _started(control: Connection[Any, Any]) -> subprocess.Popen[bytes]:
+    import subprocess
+
     places = [str(Path(place).absolute()) for place in sys.path]
     return subprocess.Popen(  # noqa: S603 - our own module
         [sys.executable, "-c", _START.format(places, control.fileno())],

@@ -23,7 +23,6 @@ from hybridlog.entries import (
     recording_metadata,
     text,
 )
-from hybridlog.maintenance.keep import use_spare
 from hybridlog.maintenance.retention import Rules
 from hybridlog.query.latching import depth_of
 from hybridlog.schema.codecs import codec_for
@@ -218,6 +217,8 @@ class Capture:
                 self._directory.manifests.change(self.entry.id, how)
                 return
             except DiskFullError:
+                from hybridlog.maintenance.keep import use_spare
+
                 if not (self._make_room() or use_spare(self._directory)):
                     raise
 
