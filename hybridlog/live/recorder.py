@@ -210,6 +210,7 @@ class Recorder:
                 options.reserve_bytes,
                 self.say,
                 window=round((options.before_s or ring_s or 0) * 1e9),
+                judged=lambda: self._follower.judged,
             )
             self._target.make_room = self._retention.make_room
         except BaseException:

@@ -12,7 +12,7 @@ import shutil
 import threading
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -93,6 +93,8 @@ class Keeper:
         remove: Removes a whole recording, by its id, unless a check of its manifest raises.
         own: The recording that this process makes; None if it makes none.
         window: The newest of it that goes last, ns: a trigger may want it.
+        judged: Returns the numbers of its segments that triggers have seen, None for all: the
+            others go last.
         is_wanted: Returns whether to go on; asked before each deletion.
         changed: Called with the id of each recording that lost payloads, while it is held.
     """
@@ -104,6 +106,7 @@ class Keeper:
         own: Own | None = None,
         *,
         window: int = 0,
+        judged: Callable[[], Collection[int] | None] = lambda: None,
         is_wanted: Callable[[], bool] = lambda: True,
         changed: Callable[[str], object] = lambda _: None,
     ) -> None:
@@ -111,6 +114,7 @@ class Keeper:
         self._remove = remove
         self._own = own
         self._window = window
+        self._judged = judged
         self._is_wanted = is_wanted
         self._changed = changed
         # Segments that this pass could not change, by recording; -1 for all of it.
@@ -193,9 +197,14 @@ class Keeper:
             failed = self._failed[manifest.id]
             is_own = self._own is not None and manifest.id == self._own.id
             held = held_of(manifest, now, self._window if is_own else 0)
+            seen = self._judged() if is_own else None
             # Of a damaged log, its group stays, too.
             left = [
-                replace(s, may_go=False, is_pinned=True) if s.number in failed else s
+                replace(s, may_go=False, is_pinned=True)
+                if s.number in failed
+                else replace(
+                    s, goes_last=s.goes_last or (seen is not None and s.number not in seen)
+                )
                 for s in held.segments
             ]
             if not is_own and (
@@ -331,6 +340,7 @@ class RetentionThread:
         reserve: Bytes that the recorder wants free at least, where rules may make room.
         say: Shows a line to the user, each text once.
         window: The newest of the recording that goes last, ns.
+        judged: Returns what triggers have seen of it, as for `Keeper`.
     """
 
     def __init__(
@@ -342,10 +352,16 @@ class RetentionThread:
         say: Callable[[str], None],
         *,
         window: int,
+        judged: Callable[[], Collection[int] | None],
     ) -> None:
         self._directory = directory
         self._keeper = Keeper(
-            directory, remove, own, window=window, is_wanted=lambda: not self._over.is_set()
+            directory,
+            remove,
+            own,
+            window=window,
+            judged=judged,
+            is_wanted=lambda: not self._over.is_set(),
         )
         self._own = own
         self._reserve = self._wanted = reserve
