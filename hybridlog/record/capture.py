@@ -37,6 +37,7 @@ from hybridlog_storage.errors import (
 )
 from hybridlog_storage.manifest import Manifest, Source, loss_of, new_id
 from hybridlog_storage.manifest import replace as replaced
+from hybridlog_storage.segments.segment_format import LOSSES_METADATA, json_metadata
 from hybridlog_storage.segments.segment_writer import RecordingWriter, SegmentSettings
 
 if TYPE_CHECKING:
@@ -188,16 +189,17 @@ class Capture:
         Raises:
             DiskFullError: No room for that either. Without any message, the recording is gone.
         """
-        self._end = {**end, "losses": lost}
+        self._end = end  # the segment holds the last losses
         try:
-            self.writer.close_truncated()
+            self.writer.close_truncated([json_metadata(LOSSES_METADATA, {"rows": lost})])
         except DiskFullError:
             if not self.writer.written.total():
                 self.rollback()
                 raise
-            rows = tuple(map(loss_of, self._end["losses"]))
-            with suppress(DiskFullError):  # the next opening seals it, and reads them there
-                self._change(lambda now: replaced(now, losses=(*now.losses, *rows)))
+            if not self.writer.has_extras:  # or else the next opening reads them in the segment
+                rows = tuple(map(loss_of, lost))
+                with suppress(DiskFullError):
+                    self._change(lambda now: replaced(now, losses=(*now.losses, *rows)))
             raise
         return self._finish()
 

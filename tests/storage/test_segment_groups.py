@@ -248,7 +248,7 @@ def test_a_group_that_cannot_be_listed_is_sealed_later(tmp_path: Path) -> None:
     with pytest.raises(DiskFullError, match="line"):
         made.close()
     assert {path.suffix for path in made.folder.iterdir()} == {".open"}
-    made.writer.close_truncated()
+    made.writer.close_truncated([])
     assert tries[0] == tries[1] == ["000000.mcap", "000001.mcap", "000002.mcap"]
     assert tries[2] == ["000003.mcap"]
     assert [message for _, message in read_in(made.folder)] == of_rows(made.rows)
@@ -271,7 +271,7 @@ def test_a_group_is_sealed_after_a_full_disk(
     monkeypatch.setattr(SegmentFile, "complete", complete)
     with pytest.raises(DiskFullError, match="summary"):
         made.close()
-    made.writer.close_truncated()
+    made.writer.close_truncated([])
     assert [[sealed.file.number for sealed in group] for group in made.groups] == [[0, 1, 2]]
 
 
@@ -296,7 +296,7 @@ def test_losses_that_found_no_room_come_in_the_end(
             made.writer.add_extra(json_metadata(LOSSES_METADATA, {"rows": ledger.take()}))
     with pytest.raises(DiskFullError):
         made.writer.close()
-    made.writer.close_truncated()
+    made.writer.close_truncated([])
     with SegmentReader(made.folder / "000000.mcap", 0) as reader:
         assert {row["count"] for row in reader.summary().losses} == {16, 3}
 

@@ -854,7 +854,7 @@ def test_a_full_disk_costs_nothing_that_was_told_of(
         except (DiskFullError, StoreError):
             try:
                 if gives_up:
-                    writer.close_truncated()
+                    writer.close_truncated([])
                 else:
                     writer.abort()
             except (DiskFullError, StoreError):

@@ -151,6 +151,7 @@ class RecordingWriter:
         self.written: Counter[int] = Counter()
         """Number of messages in the files, by channel id."""
         self.stored_bytes = 0
+        self.has_extras = False  # those of `close_truncated` are in a segment
         """Bytes of content in the files, before compression."""
         self._closed_bytes = 0  # of content in closed chunks, those in the files included
         self._last_times: dict[int, int] = {}  # in the files, by channel id
@@ -267,7 +268,7 @@ class RecordingWriter:
             self._shut_down()
         return self._closed
 
-    def close_truncated(self) -> None:
+    def close_truncated(self, extras: Sequence[Metadata]) -> None:
         """Seal the chunks in the file and drop the others, after a failed write.
 
         `DiskFullError` if no message is in the files, or there is no room: the next opening of the
@@ -281,8 +282,9 @@ class RecordingWriter:
             self._seal()
         first = self._open_group().first
         kept = [one for one in self._extras if isinstance(one, Metadata)]  # such as losses
-        for extra in kept:
+        for extra in (*kept, *extras):
             first.add_metadata(extra)
+        self.has_extras = True
         self._seal()
 
     def written_of(self, channel: Channel) -> int:
