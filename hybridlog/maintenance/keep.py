@@ -195,16 +195,14 @@ class Keeper:
                 self._unproven.add(manifest.name)
                 continue
             failed = self._failed[manifest.id]
-            is_own = self._own is not None and manifest.id == self._own.id
-            held = held_of(manifest, now, self._window if is_own else 0)
-            seen = self._judged() if is_own else None
+            is_own = self._is_own(manifest.id)
+            if is_own:
+                held = held_of(manifest, now, self._window, self._judged())
+            else:
+                held = held_of(manifest, now)
             # Of a damaged log, its group stays, too.
             left = [
-                replace(s, may_go=False, is_pinned=True)
-                if s.number in failed
-                else replace(
-                    s, goes_last=s.goes_last or (seen is not None and s.number not in seen)
-                )
+                replace(s, may_go=False, is_pinned=True) if s.number in failed else s
                 for s in held.segments
             ]
             if not is_own and (
@@ -212,6 +210,9 @@ class Keeper:
             ):
                 left, held = [], replace(held, is_ended=False)
             yield replace(held, segments=left)
+
+    def _is_own(self, recording: str) -> bool:
+        return self._own is not None and recording == self._own.id
 
     def _do(self, step: Step, rules: Rules, found: KeepReport, how: Mapping[str, Any]) -> None:
         """Do a step, with the room of the spare file if there is no other; reports in `found`."""
@@ -245,7 +246,7 @@ class Keeper:
         if not step.segments and not step.groups:
             self._remove(step.id, check)
             return Expired(freed=step.bytes)
-        is_own = self._own is not None and step.id == self._own.id
+        is_own = self._is_own(step.id)
         with ExitStack() as held:
             if not is_own:
                 lock = self._directory.writing(step.id, step.recording, wait_s=LOCK_WAIT_S)

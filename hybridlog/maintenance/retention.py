@@ -7,7 +7,7 @@ topics and times of their channels. Nothing is deleted here; see `keep.py`.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -200,14 +200,19 @@ class Held:
     pins: int = 0
 
 
-def held_of(manifest: Manifest, now: int, window: int = 0) -> Held:
+def held_of(
+    manifest: Manifest, now: int, window: int = 0, seen: Collection[int] | None = None
+) -> Held:
     """The content of a recording at `now`, ns.
 
-    Segments that are at most `window` (ns) older than its newest sealed message go last.
+    Segments that are at most `window` (ns) older than its newest sealed message go last, and those
+    that are not among the numbers that triggers have `seen`; None if there are no triggers.
     """
     found: list[HeldSegment] = []
-    ends = [part.last or 0 for log in manifest.logs.values() for part in log.parts.values()]
-    recent = max(ends, default=0) - window
+    recent = math.inf
+    if window:
+        ends = [part.last or 0 for log in manifest.logs.values() for part in log.parts.values()]
+        recent = max(ends, default=0) - window
     later, last, rows = now, 0, manifest.rows
     for number, log in sorted(manifest.logs.items(), reverse=True):
         parts = _parts_of(log, manifest)
@@ -225,7 +230,7 @@ def held_of(manifest: Manifest, now: int, window: int = 0) -> Held:
                 frozenset(topic for topic, _ in parts),
                 may_go(log),
                 is_pinned(log, manifest),
-                window > 0 and max(times, default=0) >= recent,
+                max(times, default=0) >= recent or (seen is not None and number not in seen),
             )
         )
     return Held(
