@@ -211,7 +211,6 @@ class Capture:
             self._change(change)
         else:
             self._change(lambda now: ended(end)(change(now)))
-            self._end = {**end, "losses": ()}  # of further groups none
 
     def _change(self, how: Callable[[Manifest], Manifest]) -> None:
         while True:
