@@ -29,7 +29,7 @@ from hybridlog_storage.checksum import crc32
 from hybridlog_storage.disk import files
 from hybridlog_storage.errors import HybridlogError, StoreError, exhausted
 from hybridlog_storage.lazy import lazy
-from hybridlog_storage.manifest import hasher
+from hybridlog_storage.manifest import digest_of
 
 if TYPE_CHECKING:
     from hybridlog_storage.cache import Cache
@@ -364,10 +364,9 @@ class _Source:
 
     def digest(self) -> str:
         """BLAKE3 of all bytes."""
-        digest = hasher()
-        for at in range(0, self.size, _READ):
-            digest.update(self.raw(at, min(at + _READ, self.size)))
-        return digest.hexdigest()
+        return digest_of(
+            self.raw(at, min(at + _READ, self.size)) for at in range(0, self.size, _READ)
+        )
 
     def fetch(self, group: Any, leaves: Iterable[int]) -> None:
         """Ask a bucket once for some columns of a row group."""

@@ -26,7 +26,7 @@ from hybridlog_storage.manifest import (
     LetGo,
     Loss,
     Manifest,
-    hasher,
+    digest_of,
     replace,
     with_rows,
     with_totals,
@@ -156,10 +156,8 @@ def _are_whole(path: Path, rows: Collection[File]) -> bool:
     try:
         for line in rows:
             with os.fdopen(files.open_file(path / line.name, os.O_RDONLY), "rb") as file:
-                digest = hasher()
-                while piece := file.read(_PIECE):
-                    digest.update(piece)
-            if digest.hexdigest() != line.digest:
+                digest = digest_of(iter(partial(file.read, _PIECE), b""))
+            if digest != line.digest:
                 return False
     except OSError:
         return False

@@ -28,11 +28,11 @@ from hybridlog_storage.errors import (
     TopicError,
     unreadable,
 )
-from hybridlog_storage.manifest import hasher
+from hybridlog_storage.manifest import digest_of, hasher
 from hybridlog_storage.manifests import BucketManifests, DiskManifests
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Callable, Iterator
     from contextlib import AbstractContextManager
 
     from hybridlog_storage.manifests import Manifests
@@ -48,14 +48,6 @@ _FETCHED: Final = 8 << 20  # bytes that a bucket is asked for
 
 class RefusedError(StoreError):
     """A recording that is not copied; others are."""
-
-
-def digest_of(pieces: Iterable[bytes]) -> str:
-    """The digest of a file, as a manifest has it."""
-    found = hasher()
-    for piece in pieces:
-        found.update(piece)
-    return found.hexdigest()
 
 
 @dataclass(frozen=True, slots=True)

@@ -352,6 +352,14 @@ def hasher(data: bytes = b"") -> blake3:
     return blake3(data)
 
 
+def digest_of(pieces: Iterable[bytes]) -> str:
+    """The digest of a file, as a manifest has it."""
+    found = hasher()
+    for piece in pieces:
+        found.update(piece)
+    return found.hexdigest()
+
+
 def loss_of(row: Mapping[str, Any]) -> Loss:
     """A row of the loss ledger as a log has it."""
     same = {name: row[name] for name in ("cause", "count", "reason", "offset", "length")}
